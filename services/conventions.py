@@ -1,0 +1,28 @@
+"""Axes, units, signs and pixel origin of everything inside `services`. Read this page first.
+
+**Image.** A position is `line_sample`, (n, 2) float64 pixels. (0, 0) is the *centre* of the first
+pixel; lines grow downwards, samples to the right. The pixel `image[i, j]` covers lines
+`i - 0.5 .. i + 0.5` and samples `j - 0.5 .. j + 0.5`. Files with another origin (GDAL counts from the
+corner, DIMAP v2 from one) are converted in `services.formats` and nowhere else.
+
+**Ground.** A position is `lon_lat_h`, (n, 3): degrees, degrees, metres above the WGS 84 ellipsoid.
+Heights above a geoid are named `orthometric_height_m` and converted before they enter.
+`ecef` is (n, 3) metres, Earth-centred and Earth-fixed; `east_north_up` is (n, 3) metres in the frame
+tangent to the ellipsoid at a named origin.
+
+**Models.** `project` goes from the ground to the image, `locate` from the image to the ground at a
+known height, `intersect` from the rays of several images to one ground point.
+
+**Chips.** `CHIP_SIZE` x `CHIP_SIZE` pixels, north up, on the horizontal plane through the point. Pixel
+`(r, c)` of a chip with ground sampling `g` lies at east `(c - CHIP_CENTRE) g` and north
+`(CHIP_CENTRE - r) g` metres of the point, along the axes of the point's own east-north-up frame.
+
+**Statistics.** `sigma_*` is assumed before, `std_*` is found after; both are one standard deviation.
+A residual is observed minus computed. Angles are in degrees in data and in radians inside formulas.
+Azimuths count clockwise from north; `azimuth_deg` of a view points from the ground to the sensor.
+
+**Missing values** are NaN in float arrays, with a status beside them where the reason matters.
+"""
+
+CHIP_SIZE = 101
+CHIP_CENTRE = 50

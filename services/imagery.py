@@ -1,0 +1,200 @@
+"""Reading pixels at a scale, and cutting chips out of images."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from services.conventions import CHIP_CENTRE
+from services.geodesy import lon_lat_h_from_east_north_up
+from services.sensors.base import SensorModel
+from services.types import Array, FloatImage
+
+BLUR_PER_RATIO = 0.4
+"""Width of the low-pass, in source pixels per unit of sqrt(ratio^2 - 1): between the aliasing of a plain
+box (0.29) and the loss of detail of a half-pixel Gaussian (0.5)."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of pixels; it may reach beyond the image.
+
+    Attributes:
+        line, sample: of its first pixel.
+        lines, samples: its size.
+    """
+
+    line: int
+    sample: int
+    lines: int
+    samples: int
+
+
+class ImageSource(Protocol):
+    """One band of an image, readable by windows."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        ...
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window, (lines, samples) float32; NaN beyond the image and where nodata."""
+        ...
+
+
+@dataclass(frozen=True)
+class ArrayImage:
+    """An image held in memory.
+
+    Attributes:
+        pixels: (lines, samples) float32, NaN where nodata.
+    """
+
+    pixels: FloatImage
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        return self.pixels.shape[0], self.pixels.shape[1]
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window; NaN beyond the image."""
+        out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
+        first = np.maximum([window.line, window.sample], 0)
+        last = np.minimum(
+            [window.line + window.lines, window.sample + window.samples], self.pixels.shape
+        )
+        if (last > first).all():
+            out[
+                first[0] - window.line : last[0] - window.line,
+                first[1] - window.sample : last[1] - window.sample,
+            ] = self.pixels[first[0] : last[0], first[1] : last[1]]
+        return out
+
+
+@dataclass(frozen=True)
+class ReducedImage:
+    """An image at a fraction of its resolution, held in memory.
+
+    Attributes:
+        pixels: (lines, samples) float32, means over `factor` x `factor` pixels of the original.
+        factor: 1 or more.
+    """
+
+    pixels: FloatImage
+    factor: int
+
+
+def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_000) -> ReducedImage:
+    """The whole image at a fraction of its resolution, read once, strip by strip.
+
+    Args:
+        source: the image.
+        factor: whole number of pixels averaged in each direction.
+        strip_pixels: pixels of the original held in memory at once.
+    """
+    lines, samples = source.shape[0] // factor, source.shape[1] // factor
+    pixels = np.empty((lines, samples), dtype=np.float32)
+    step = max(1, strip_pixels // (source.shape[1] * factor))
+    for line in range(0, lines, step):
+        count = min(step, lines - line)
+        strip = source.read(Window(line * factor, 0, count * factor, samples * factor))
+        pixels[line : line + count] = mean_pixels(strip, factor)
+    return ReducedImage(pixels, factor)
+
+
+def mean_pixels(pixels: FloatImage, factor: int) -> FloatImage:
+    """Means over squares of `factor` pixels; what does not fill a square at the end is left out."""
+    if factor == 1:
+        return pixels
+    lines, samples = pixels.shape[0] // factor, pixels.shape[1] // factor
+    whole = np.ascontiguousarray(pixels[: lines * factor, : samples * factor])
+    return np.asarray(cv2.resize(whole, (samples, lines), interpolation=cv2.INTER_AREA))
+
+
+def low_pass(pixels: FloatImage, ratio: float) -> FloatImage:
+    """Pixels blurred to the resolution of pixels `ratio` times larger; unchanged below 1."""
+    if ratio <= 1.0:
+        return pixels
+    sigma = BLUR_PER_RATIO * float(np.sqrt(ratio * ratio - 1.0))
+    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+
+
+def image_gsd_m(model: SensorModel, lon_lat_h: Array) -> float:
+    """Ground sampling at one point (3,): side of the square as large as a pixel's footprint, metres."""
+    derivative = model.project_derivative(lon_lat_h[None, :])[0]
+    return float(abs(np.linalg.det(derivative[:, :2])) ** -0.5)
+
+
+def chip_ground(lon_lat_h: Array, gsd_m: float, size: int) -> Array:
+    """Ground positions of the pixels of a chip around one point (3,).
+
+    Args:
+        lon_lat_h: the point, at the centre of the chip.
+        gsd_m: ground sampling.
+        size: odd number of pixels a side.
+
+    Returns:
+        (size * size, 3), row by row from the north-west.
+    """
+    offset = (np.arange(size) - size // 2) * gsd_m
+    enu = np.zeros((size, size, 3))
+    enu[..., 0] = offset[None, :]
+    enu[..., 1] = -offset[:, None]
+    return lon_lat_h_from_east_north_up(enu.reshape(-1, 3), lon_lat_h)
+
+
+def render_chip(
+    source: ImageSource | ReducedImage,
+    model: SensorModel,
+    lon_lat_h: Array,
+    gsd_m: float,
+    size: int = 2 * CHIP_CENTRE + 1,
+) -> FloatImage:
+    """What an image shows around a point, in the geometry of a chip.
+
+    The image is low-passed to the resolution of the chip before it is resampled (bicubic); where the
+    image is coarser than the chip it is only resampled.
+
+    Args:
+        source: the image, or a reduction of it.
+        model: its model; positions are those of the original image.
+        lon_lat_h: (3,) the point.
+        gsd_m: ground sampling of the chip.
+        size: odd number of pixels a side.
+
+    Returns:
+        (size, size) float32; NaN where the image shows nothing.
+    """
+    line_sample = model.project(chip_ground(lon_lat_h, gsd_m, size)).reshape(size, size, 2)
+    if not np.isfinite(line_sample).all():
+        return np.full((size, size), np.nan, dtype=np.float32)
+    ratio = gsd_m / image_gsd_m(model, lon_lat_h)
+    if isinstance(source, ReducedImage):
+        factor, reduced = source.factor, source.pixels
+        image: ImageSource = ArrayImage(reduced)
+        line_sample = (line_sample - (factor - 1) / 2.0) / factor
+        ratio /= factor
+    else:
+        image = source
+    factor = max(1, int(ratio / 2.0))
+    margin = 4 * factor + int(2.0 * ratio)
+    first = np.floor(line_sample.min(axis=(0, 1))).astype(int) - margin
+    last = np.ceil(line_sample.max(axis=(0, 1))).astype(int) + margin + 1
+    if (last < 0).any() or (first > image.shape).any():
+        return np.full((size, size), np.nan, dtype=np.float32)
+    window = Window(int(first[0]), int(first[1]), *(int(v) for v in last - first))
+    pixels = low_pass(mean_pixels(image.read(window), factor), ratio / factor)
+    position = (line_sample - first - (factor - 1) / 2.0) / factor
+    return np.asarray(
+        cv2.remap(
+            pixels,
+            position[..., 1].astype(np.float32),
+            position[..., 0].astype(np.float32),
+            cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )
+    )

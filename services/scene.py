@@ -1,0 +1,93 @@
+"""An image, its model and how it was taken: the input of registration and production."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from services.geodesy import ecef_from_east_north_up
+from services.imagery import ImageSource, image_gsd_m
+from services.sensors.base import SensorModel
+from services.types import Acquisition, Array
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One image with a model of its geometry.
+
+    Attributes:
+        image: its pixels.
+        model: from ground to image.
+        acquisition: how it was taken.
+        sigma_m: horizontal accuracy of the model before registration, one standard deviation a
+            coordinate, metres.
+    """
+
+    image: ImageSource
+    model: SensorModel
+    acquisition: Acquisition
+    sigma_m: float
+
+
+def scene_centre(scene: Scene) -> Array:
+    """Ground position (3,) of the centre of the image, at the middle height of its model."""
+    centre = (np.array(scene.image.shape, dtype=np.float64) - 1.0) / 2.0
+    height_m = sum(scene.model.height_range_m) / 2.0
+    return scene.model.locate(centre[None, :], np.array([height_m]))[0]
+
+
+def scene_gsd_m(scene: Scene) -> float:
+    """Ground sampling at the centre of the image, metres."""
+    return image_gsd_m(scene.model, scene_centre(scene))
+
+
+def scene_footprint(scene: Scene, per_side: int = 8) -> Array:
+    """Outline of the ground the image can show at any height of its model.
+
+    Returns:
+        (m, 2) lon, lat of the convex hull of the image's border at both ends of the height range,
+        counter-clockwise, not closed. Longitudes are continuous: beyond 180 degrees where the
+        outline crosses the antimeridian.
+    """
+    lines, samples = scene.image.shape
+    t = np.linspace(0.0, 1.0, per_side, endpoint=False)
+    corners = np.array(
+        [
+            [-0.5, -0.5],
+            [-0.5, samples - 0.5],
+            [lines - 0.5, samples - 0.5],
+            [lines - 0.5, -0.5],
+        ]
+    )
+    border = np.concatenate(
+        [a + t[:, None] * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    )
+    rings = [
+        scene.model.locate(border, np.full(len(border), height_m))[:, :2]
+        for height_m in scene.model.height_range_m
+    ]
+    outline = np.concatenate(rings)
+    outline = outline[np.isfinite(outline).all(axis=1)]
+    outline[:, 0] = outline[0, 0] + (outline[:, 0] - outline[0, 0] + 180.0) % 360.0 - 180.0
+    return np.asarray(outline[ConvexHull(outline).vertices])
+
+
+def view_direction(model: SensorModel, line_sample: Array, lon_lat_h: Array) -> tuple[Array, Array]:
+    """Incidence and azimuth from ground points to the sensor.
+
+    Args:
+        model: of the image.
+        line_sample: (n, 2) where the points are in the image.
+        lon_lat_h: (n, 3) the points.
+
+    Returns:
+        Incidence (n,) and azimuth (n,), degrees.
+    """
+    _, direction = model.line_of_sight(line_sample)
+    incidence = np.empty(len(lon_lat_h))
+    azimuth = np.empty(len(lon_lat_h))
+    for i, point in enumerate(lon_lat_h):
+        east, north, up = -direction[i] @ ecef_from_east_north_up(point)
+        incidence[i] = np.degrees(np.arctan2(np.hypot(east, north), up))
+        azimuth[i] = np.degrees(np.arctan2(east, north)) % 360.0
+    return incidence, azimuth

@@ -1,0 +1,144 @@
+"""What travels between the services: frozen dataclasses of arrays."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+FloatImage = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+ChipArray = npt.NDArray[Any]
+
+
+class Progress(Protocol):
+    """How a long computation tells where it stands."""
+
+    def __call__(self, fraction: float, message: str) -> None:
+        """Report the fraction done (0 to 1) and, in a few words, the work under way."""
+        ...
+
+
+def no_progress(fraction: float, message: str) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """How and when an image was taken.
+
+    Attributes:
+        image_id: name of the image, unique within a block.
+        sensor: platform or instrument, "" when unknown.
+        acquired_at: UTC, None when unknown.
+        incidence_deg: angle between the vertical and the line of sight at the ground, at the centre.
+        azimuth_deg: from the ground to the sensor, clockwise from north.
+        sun_elevation_deg, sun_azimuth_deg: at the centre of the image; NaN when unknown.
+    """
+
+    image_id: str
+    sensor: str = ""
+    acquired_at: datetime | None = None
+    incidence_deg: float = float("nan")
+    azimuth_deg: float = float("nan")
+    sun_elevation_deg: float = float("nan")
+    sun_azimuth_deg: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Views:
+    """The views of n points, flattened: those of point i are rows `start[i]` to `start[i + 1]`.
+
+    Within a point they are ordered as its chips are: finest ground sampling first.
+
+    Attributes:
+        start: (n + 1,) int64.
+        gsd_m: (m,) ground sampling of each chip, metres.
+        image: (m,) int64, rows of `images`.
+        incidence_deg, azimuth_deg: (m,) direction from the point to the sensor.
+        images: the images the chips were cut from.
+    """
+
+    start: IntArray
+    gsd_m: Array
+    image: IntArray
+    incidence_deg: Array
+    azimuth_deg: Array
+    images: tuple[Acquisition, ...]
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """n control points and where their chips lie.
+
+    Attributes:
+        id: (n,) int64, unique.
+        lon_lat_h: (n, 3).
+        covariance_m2: (n, 3, 3) of east, north, up, relative to the frame of the point's block.
+        saliency: (n,) 0 to 1, how well the point's chip can be located.
+        views: the views of the points.
+        chip_file: (n,) int64, rows of `chip_files`.
+        chip_row: (n,) int64, row of the point's first chip in its file; its views follow.
+        chip_files: names by which a `ChipSource` knows the files.
+    """
+
+    id: IntArray
+    lon_lat_h: Array
+    covariance_m2: Array
+    saliency: Array
+    views: Views
+    chip_file: IntArray
+    chip_row: IntArray
+    chip_files: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, rows: IntArray) -> "ControlPoints":
+        """The points of the given rows, in that order."""
+        counts = np.diff(self.views.start)[rows]
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        kept = np.repeat(self.views.start[:-1][rows] - start[:-1], counts) + np.arange(start[-1])
+        views = Views(
+            start=start,
+            gsd_m=self.views.gsd_m[kept],
+            image=self.views.image[kept],
+            incidence_deg=self.views.incidence_deg[kept],
+            azimuth_deg=self.views.azimuth_deg[kept],
+            images=self.views.images,
+        )
+        return ControlPoints(
+            id=self.id[rows],
+            lon_lat_h=self.lon_lat_h[rows],
+            covariance_m2=self.covariance_m2[rows],
+            saliency=self.saliency[rows],
+            views=views,
+            chip_file=self.chip_file[rows],
+            chip_row=self.chip_row[rows],
+            chip_files=self.chip_files,
+        )
+
+
+class ChipSource(Protocol):
+    """Where chips are read from: a block folder or the storage of the service."""
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """Consecutive chips of one file.
+
+        Returns:
+            (count, 101, 101) uint8 or uint16; 0 is nodata.
+        """
+        ...
+
+
+def point_chips(points: ControlPoints, chips: ChipSource, row: int) -> ChipArray:
+    """All the chips of one point, in the order of its views.
+
+    Returns:
+        (views, 101, 101) uint8 or uint16; 0 is nodata.
+    """
+    count = int(points.views.start[row + 1] - points.views.start[row])
+    return chips.read(points.chip_files[points.chip_file[row]], int(points.chip_row[row]), count)
