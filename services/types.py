@@ -142,3 +142,36 @@ def point_chips(points: ControlPoints, chips: ChipSource, row: int) -> ChipArray
     """
     count = int(points.views.start[row + 1] - points.views.start[row])
     return chips.read(points.chip_files[points.chip_file[row]], int(points.chip_row[row]), count)
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a registration did with each of n points that its scene could show.
+
+    Attributes:
+        point_id: (n,) int64.
+        lon_lat_h: (n, 3).
+        predicted: (n, 2) line, sample by the model before registration.
+        line_sample: (n, 2) where the point was found; NaN where it was not.
+        sigma_px: (n,) one standard deviation a coordinate, pixels of the scene; NaN where not found.
+        score: (n,) best correlation seen; NaN where none was computed.
+        views: (n,) int64, how many views of the point agree on the measure.
+        residual_px: (n, 2) found minus computed by the refined model, line and sample; NaN where not found.
+        residual_m: (n, 2) the same on the ground, east and north.
+        matched: (n,) found, and views agree.
+        active: (n,) used by the final adjustment; a subset of `matched`.
+        reason: (n,) str, why a point is not active; "" for active points.
+    """
+
+    point_id: IntArray
+    lon_lat_h: Array
+    predicted: Array
+    line_sample: Array
+    sigma_px: Array
+    score: Array
+    views: IntArray
+    residual_px: Array
+    residual_m: Array
+    matched: BoolArray
+    active: BoolArray
+    reason: npt.NDArray[np.str_]

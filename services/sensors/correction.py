@@ -1,0 +1,106 @@
+"""A correction in image space, and the model that carries it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.sensors.base import SensorModel
+from services.sensors.rpc import RpcModel
+from services.types import Array
+
+
+@dataclass(frozen=True)
+class ImageCorrection:
+    """An affine displacement of image positions: from where the model says to where things are.
+
+    With `t = (line_sample - centre) / half_size`, a position moves by
+    `parameters @ (1, t_line, t_sample)`. A shift fills the first column only, a drift adds the
+    diagonal (line by line, sample by sample), an affine fills everything.
+
+    Attributes:
+        parameters: (2, 3) pixels; rows line and sample; constant, along lines, along samples. The last
+            two are displacements at the edge of the image.
+        centre, half_size: (2,) pixels.
+    """
+
+    parameters: Array
+    centre: Array
+    half_size: Array
+
+    def apply(self, line_sample: Array) -> Array:
+        """Corrected positions (n, 2) of positions given by the model (n, 2)."""
+        t = (line_sample - self.centre) / self.half_size
+        return np.asarray(line_sample + self.parameters[:, 0] + t @ self.parameters[:, 1:].T)
+
+    def invert(self, line_sample: Array) -> Array:
+        """Positions (n, 2) the uncorrected model would give for corrected ones (n, 2)."""
+        moved = line_sample - self.centre - self.parameters[:, 0]
+        return np.asarray(self.centre + moved @ np.linalg.inv(self.jacobian).T)
+
+    @property
+    def jacobian(self) -> Array:
+        """Derivative (2, 2) of `apply`."""
+        return np.asarray(np.eye(2) + self.parameters[:, 1:] / self.half_size)
+
+
+def no_correction(shape: tuple[int, int]) -> ImageCorrection:
+    """The correction that changes nothing, for an image of the given lines and samples."""
+    size = np.array(shape, dtype=np.float64)
+    return ImageCorrection(np.zeros((2, 3)), (size - 1.0) / 2.0, size / 2.0)
+
+
+@dataclass(frozen=True)
+class CorrectedModel:
+    """A sensor model followed by a correction in image space.
+
+    Attributes:
+        base: the model as delivered.
+        correction: from its image positions to the true ones.
+    """
+
+    base: SensorModel
+    correction: ImageCorrection
+
+    @property
+    def height_range_m(self) -> tuple[float, float]:
+        """Lowest and highest ground the model is meant for, metres above the ellipsoid."""
+        return self.base.height_range_m
+
+    def project(self, lon_lat_h: Array) -> Array:
+        """Image position of ground points: (n, 3) to (n, 2)."""
+        return self.correction.apply(self.base.project(lon_lat_h))
+
+    def project_derivative(self, lon_lat_h: Array) -> Array:
+        """Derivative of `project`: (n, 2, 3), pixels per metre east, north, up."""
+        return np.asarray(self.correction.jacobian @ self.base.project_derivative(lon_lat_h))
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        """Ground position of image points at known heights: (n, 2) and (n,) to (n, 3)."""
+        return self.base.locate(self.correction.invert(line_sample), height_m)
+
+    def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
+        """Origin (n, 3) and unit direction (n, 3) in ECEF, from the sensor towards the ground."""
+        return self.base.line_of_sight(self.correction.invert(line_sample))
+
+
+def fold_into_rpc(model: RpcModel, correction: ImageCorrection) -> RpcModel:
+    """The RPC that carries a shift or a drift exactly.
+
+    A displacement of each coordinate by itself is a change of its offset and scale, hence of its
+    numerator: `num' = m num + c den`.
+
+    Raises:
+        ValueError: when the correction mixes lines and samples; such a one has to be refitted.
+    """
+    mixed_px = np.abs(correction.parameters[[0, 1], [2, 1]])
+    if mixed_px.any():
+        raise ValueError("only corrections of each coordinate by itself fold into an RPC")
+    gain = np.diag(correction.jacobian)
+    constant = correction.apply(model.image_offset[None, :])[0] - model.image_offset
+    numerators = [
+        gain[k] * num + constant[k] / model.image_scale[k] * den
+        for k, (num, den) in enumerate(
+            ((model.line_num, model.line_den), (model.sample_num, model.sample_den))
+        )
+    ]
+    return replace(model, line_num=numerators[0], sample_num=numerators[1])
