@@ -156,7 +156,8 @@ class Measures:
         sigma_px: (n,) one standard deviation a coordinate, pixels of the scene; NaN where not found.
         score: (n,) best correlation seen; NaN where none was computed.
         views: (n,) int64, how many views of the point agree on the measure.
-        residual_px: (n, 2) found minus computed by the refined model, line and sample; NaN where not found.
+        residual_px: (n, 2) found minus computed by the refined model, line and sample; NaN where not
+            found.
         residual_m: (n, 2) the same on the ground, east and north.
         matched: (n,) found, and views agree.
         active: (n,) used by the final adjustment; a subset of `matched`.
@@ -175,3 +176,29 @@ class Measures:
     matched: BoolArray
     active: BoolArray
     reason: npt.NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """m image positions of points seen in several images.
+
+    Attributes:
+        point: (m,) int64, rows of whatever holds the points; ascending.
+        image: (m,) int64, rows of whatever holds the images.
+        line_sample: (m, 2) pixels.
+        sigma_px: (m,) one standard deviation a coordinate.
+    """
+
+    point: IntArray
+    image: IntArray
+    line_sample: Array
+    sigma_px: Array
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def take(self, rows: BoolArray | IntArray) -> "Observations":
+        """The observations of the given rows, in that order."""
+        return Observations(
+            self.point[rows], self.image[rows], self.line_sample[rows], self.sigma_px[rows]
+        )

@@ -1,13 +1,51 @@
 """The least squares: the image correction of one scene from points on known ground."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from services.adjustment.robust import cauchy_weights, deactivate
+from services.errors import NotEnoughPoints
 from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection
+from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
 
 Order = Literal["shift", "drift", "affine"]
+
+_FREE = {
+    "shift": np.array([[True, False, False], [True, False, False]]),
+    "drift": np.array([[True, True, False], [True, False, True]]),
+    "affine": np.ones((2, 3), dtype=bool),
+}
+ORDERS: tuple[Order, ...] = ("shift", "drift", "affine")
+
+
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """How a scene is adjusted.
+
+    Attributes:
+        order: of the correction; None lets cross-validation choose.
+        tolerance: a measure leaves when its residual exceeds so many standard deviations.
+        min_points: fewer active measures than this are not an adjustment.
+        points_per_parameter: an order is considered from so many measures a parameter on.
+        min_spread: an order beyond the shift is considered when the measures spread over the image
+            with at least this standard deviation along each axis, in half sizes of the image (an even
+            spread has 0.58).
+        min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
+            this fraction.
+        folds: of the cross-validation.
+    """
+
+    order: Order | None = None
+    tolerance: float = 2.7
+    min_points: int = 4
+    points_per_parameter: float = 2.0
+    min_spread: float = 0.2
+    min_gain: float = 0.03
+    folds: int = 5
 
 
 @dataclass(frozen=True)
@@ -17,6 +55,7 @@ class SceneAdjustment:
     Attributes:
         correction: of the scene's model.
         order: how many parameters were free.
+        validation_px: every order tried, with its cross-validated residual (rms, pixels).
         covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for fixed parameters.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
@@ -25,7 +64,188 @@ class SceneAdjustment:
 
     correction: ImageCorrection
     order: Order
+    validation_px: tuple[tuple[Order, float], ...]
     covariance: Array
     residual_px: Array
     active: BoolArray
     sigma0: float
+
+
+def adjust_scene(
+    model: SensorModel,
+    shape: tuple[int, int],
+    lon_lat_h: Array,
+    line_sample: Array,
+    sigma_px: Array,
+    covariance_m2: Array,
+    options: AdjustmentOptions = AdjustmentOptions(),
+    candidates: BoolArray | None = None,
+) -> SceneAdjustment:
+    """Find the correction of a model that best explains where control points were seen.
+
+    Weighted least squares on `line_sample - model.project(lon_lat_h)`. Weights come from each
+    measure's own sigma and from its point's covariance seen in the image. Robust weights find a first
+    solution; then the worst measure beyond tolerance leaves, one at a time, until all agree.
+
+    Args:
+        model: as delivered.
+        shape: lines and samples of the image.
+        lon_lat_h: (n, 3) where the points are.
+        line_sample: (n, 2) where they were seen.
+        sigma_px: (n,) of the measures.
+        covariance_m2: (n, 3, 3) of the points, east, north, up.
+        options: thresholds.
+        candidates: (n,) measures that may be used; all that are finite when None.
+
+    Raises:
+        NotEnoughPoints: when fewer than `min_points` measures are usable, before or after deactivation.
+    """
+    misfit = line_sample - model.project(lon_lat_h)
+    usable = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
+    if candidates is not None:
+        usable &= candidates
+    if usable.sum() < options.min_points:
+        raise NotEnoughPoints(
+            int(usable.sum()), options.min_points, "measures with a position and a sigma"
+        )
+    derivative = np.nan_to_num(model.project_derivative(lon_lat_h))
+    covariance_px2 = derivative @ covariance_m2 @ derivative.transpose(0, 2, 1)
+    variance = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2 + np.diagonal(covariance_px2, 0, 1, 2)
+    frame = no_correction(shape)
+    t = (line_sample - misfit - frame.centre) / frame.half_size
+    problem = _Problem(t, np.where(usable[:, None], misfit, 0.0), variance)
+
+    order, validation = _choose_order(problem, usable, options)
+    free = _FREE[order]
+    start = problem.robust_solution(usable, free)
+    scale = max(problem.scale(start, usable), 1e-9)
+
+    def magnitude(active: BoolArray) -> Array:
+        parameters, _ = problem.solution(active, free)
+        # The scale of the robust start: one that followed the survivors would shrink with them.
+        return np.asarray(problem.magnitude(parameters) / scale)
+
+    agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
+    active = deactivate(magnitude, agreeing, options.tolerance, options.min_points)
+    parameters, cofactor = problem.solution(active, free)
+    residual = problem.residual(parameters)
+    freedom = 2 * int(active.sum()) - int(free.sum())
+    chi2 = float((residual[active] ** 2 / variance[active]).sum())
+    sigma0 = float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
+    return SceneAdjustment(
+        correction=ImageCorrection(parameters, frame.centre, frame.half_size),
+        order=order,
+        validation_px=validation,
+        # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
+        covariance=cofactor * max(sigma0, 1.0) ** 2,
+        residual_px=np.where(usable[:, None], residual, np.nan),
+        active=active,
+        sigma0=sigma0,
+    )
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Misfits to be explained by an affine displacement; the two coordinates are independent.
+
+    Attributes:
+        t: (n, 2) positions, -1 to 1 over the image.
+        misfit: (n, 2) pixels.
+        variance: (n, 2) px^2.
+    """
+
+    t: Array
+    misfit: Array
+    variance: Array
+
+    def solution(
+        self, active: BoolArray, free: BoolArray, weights: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Parameters (2, 3) and their cofactor matrix (6, 6)."""
+        design = np.column_stack([np.ones(len(self.t)), self.t])[active]
+        parameters = np.zeros((2, 3))
+        cofactor = np.zeros((6, 6))
+        for k in range(2):
+            columns = np.flatnonzero(free[k])
+            weight = 1.0 / self.variance[active, k]
+            if weights is not None:
+                weight = weight * weights[active]
+            a = design[:, columns]
+            inverse = np.linalg.pinv((a * weight[:, None]).T @ a)
+            parameters[k, columns] = inverse @ (a.T @ (weight * self.misfit[active, k]))
+            cofactor[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
+        return parameters, cofactor
+
+    def residual(self, parameters: Array) -> Array:
+        """(n, 2) pixels."""
+        return np.asarray(self.misfit - parameters[:, 0] - self.t @ parameters[:, 1:].T)
+
+    def magnitude(self, parameters: Array) -> Array:
+        """(n,) the larger of both normalised residuals."""
+        return np.asarray(np.abs(self.residual(parameters) / np.sqrt(self.variance)).max(axis=1))
+
+    def scale(self, parameters: Array, active: BoolArray) -> float:
+        """Robust standard deviation of the normalised residuals, not below what small samples hide."""
+        normalised = self.residual(parameters)[active] / np.sqrt(self.variance[active])
+        return float(1.4826 * np.median(np.abs(normalised)))
+
+    def robust_solution(self, active: BoolArray, free: BoolArray) -> Array:
+        """Parameters (2, 3) by re-weighting, from the median shift on."""
+        parameters = np.zeros((2, 3))
+        parameters[:, 0] = np.median(self.misfit[active], axis=0)
+        for _ in range(20):
+            scale = max(self.scale(parameters, active), 1e-9)
+            weights = cauchy_weights(self.magnitude(parameters) / scale)
+            updated, _ = self.solution(active, free, weights)
+            if np.abs(updated - parameters).max() < 1e-4:
+                return updated
+            parameters = updated
+        return parameters
+
+
+def _choose_order(
+    problem: _Problem, usable: BoolArray, options: AdjustmentOptions
+) -> tuple[Order, tuple[tuple[Order, float], ...]]:
+    """The simplest order that predicts held-out measures as well as any."""
+    orders = [options.order] if options.order else _considered(problem, usable, options)
+    validation = tuple(
+        (order, _validation_px(problem, usable, order, options.folds)) for order in orders
+    )
+    best, best_px = validation[0]
+    for order, value_px in validation[1:]:
+        if value_px < best_px * (1.0 - options.min_gain):
+            best, best_px = order, value_px
+    return best, validation
+
+
+def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions) -> Sequence[Order]:
+    """Orders that the number and the spread of the measures can carry."""
+    start = problem.robust_solution(usable, _FREE["shift"])
+    agreeing = usable & (problem.magnitude(start) <= 5.0 * max(problem.scale(start, usable), 1e-9))
+    count = int(agreeing.sum())
+    spread = problem.t[agreeing].std(axis=0).min()
+    return [
+        order
+        for order in ORDERS
+        if order == "shift"
+        or (spread >= options.min_spread and count >= options.points_per_parameter * _FREE[order].sum())
+    ]
+
+
+def _validation_px(problem: _Problem, usable: BoolArray, order: Order, folds: int) -> float:
+    """Robust size of the residuals of measures that were left out of the fit, pixels."""
+    rows = np.flatnonzero(usable)
+    folds = min(folds, len(rows))
+    # Neighbours in the image fall into different folds.
+    rank = np.empty(len(rows), dtype=np.int64)
+    rank[np.lexsort((problem.t[rows, 1], problem.t[rows, 0]))] = np.arange(len(rows))
+    held_out = np.empty((len(rows), 2))
+    for fold in range(folds):
+        out = rank % folds == fold
+        active = usable.copy()
+        active[rows[out]] = False
+        parameters = problem.robust_solution(active, _FREE[order])
+        held_out[out] = problem.residual(parameters)[rows[out]]
+    distance = np.hypot(held_out[:, 0], held_out[:, 1])
+    near = np.sort(distance)[: max(1, int(0.8 * len(distance)))]
+    return float(np.sqrt(np.mean(near**2)))

@@ -1,0 +1,162 @@
+"""Control points found in a scene: their chips, the views combined, every failure with its reason."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from services.conventions import CHIP_SIZE
+from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
+from services.intersection import move_metres
+from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
+from services.matching.predict import choose_views
+from services.sensors.base import SensorModel
+from services.types import (
+    Array,
+    ChipSource,
+    ControlPoints,
+    FloatImage,
+    IntArray,
+    Progress,
+    no_progress,
+    point_chips,
+)
+
+TILE_PX = 512
+
+
+@dataclass(frozen=True)
+class MatchingOptions:
+    """How points are searched.
+
+    Attributes:
+        max_views: how many views of a point are tried.
+        agreement_px: views of a point agree when their measures are this near, in chip pixels.
+        correlation: when a correlation peak is believed.
+    """
+
+    max_views: int = 4
+    agreement_px: float = 0.7
+    correlation: CorrelationOptions = field(default_factory=CorrelationOptions)
+
+
+@dataclass(frozen=True)
+class PointMatches:
+    """Where n points were found.
+
+    Attributes:
+        line_sample: (n, 2) pixels of the scene; NaN where not found.
+        displacement_m: (n, 2) east, north, from where the model expected them; NaN where not found.
+        sigma_px: (n,) pixels of the scene.
+        score: (n,) best correlation among the views.
+        views: (n,) how many views agree.
+        reason: (n,) "" where found.
+    """
+
+    line_sample: Array
+    displacement_m: Array
+    sigma_px: Array
+    score: Array
+    views: IntArray
+    reason: np.ndarray
+
+
+def match_points(
+    image: ImageSource | ReducedImage,
+    model: SensorModel,
+    points: ControlPoints,
+    chips: ChipSource,
+    gsd_m: float,
+    radius_px: int,
+    direction_deg: tuple[float, float],
+    options: MatchingOptions,
+    progress: Progress = no_progress,
+) -> PointMatches:
+    """Search every point around where a model expects it.
+
+    The scene is rendered into the geometry of the chips through the model; the displacement found there
+    goes back through the same model, so that relief and sampling are the chip's own.
+
+    Args:
+        image: the scene, or a reduction of it.
+        model: of the scene.
+        points: all of them are tried.
+        chips: of the points.
+        gsd_m: ground sampling of the chips to use.
+        radius_px: how far to search, chip pixels.
+        direction_deg: incidence and azimuth from the ground to the scene's sensor.
+        options: thresholds.
+        progress: told the fraction of the points done.
+    """
+    n = len(points)
+    displacement_m = np.full((n, 2), np.nan)
+    sigma_m = np.full(n, np.nan)
+    score = np.full(n, np.nan)
+    views = np.zeros(n, dtype=np.int64)
+    reason = np.full(n, "", dtype="<U16")
+    scene_gsd_m = np.full(n, np.nan)
+    for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
+        if done % 64 == 0:
+            progress(done / n, f"searching {n} points with chips of {gsd_m:g} m")
+        numbers = choose_views(points, row, gsd_m, *direction_deg, options.max_views)
+        if len(numbers) == 0:
+            reason[row] = "no_chip"
+            continue
+        ground = points.lon_lat_h[row]
+        patch = render_chip(image, model, ground, gsd_m, CHIP_SIZE + 2 * radius_px)
+        if not np.isfinite(patch).any():
+            reason[row] = "nodata"
+            continue
+        scene_gsd_m[row] = image_gsd_m(model, ground)
+        stack = point_chips(points, chips, row)
+        peaks = [
+            find_chip(patch, _as_seen(stack[number], scene_gsd_m[row] / gsd_m), options.correlation)
+            for number in numbers
+        ]
+        row_col, sigma, agreeing, reason[row] = _combined(peaks, options.agreement_px)
+        views[row] = agreeing
+        score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
+        displacement_m[row] = row_col[1] * gsd_m, -row_col[0] * gsd_m
+        sigma_m[row] = sigma * gsd_m
+    moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
+    return PointMatches(
+        model.project(moved), displacement_m, sigma_m / scene_gsd_m, score, views, reason
+    )
+
+
+def chip_pixels(chip: np.ndarray) -> FloatImage:
+    """A stored chip as float32, NaN where nodata."""
+    pixels = chip.astype(np.float32)
+    pixels[chip == 0] = np.nan
+    return pixels
+
+
+def _as_seen(chip: np.ndarray, ratio: float) -> FloatImage:
+    """A chip at the resolution of a scene whose pixels are `ratio` times larger."""
+    return low_pass(chip_pixels(chip), ratio)
+
+
+def _tile_order(line_sample: Array) -> Sequence[int]:
+    """Rows in the order of the tiles of the image they fall in."""
+    tile = np.nan_to_num(line_sample // TILE_PX, nan=-1.0)
+    return [int(row) for row in np.lexsort((tile[:, 1], tile[:, 0]))]
+
+
+def _combined(peaks: list[Peak], agreement_px: float) -> tuple[Array, float, int, str]:
+    """One measure from the views of a point: displacement, sigma, how many agree, reason."""
+    nothing = np.full(2, np.nan)
+    found = [p for p in peaks if p.reason == FOUND]
+    if not found:
+        best = max(peaks, key=lambda p: -1.0 if np.isnan(p.score) else p.score)
+        return nothing, np.nan, 0, best.reason
+    row_col = np.array([p.row_col for p in found])
+    sigma = np.array([p.sigma_px for p in found])
+    near = np.hypot(*(row_col - np.median(row_col, axis=0)).T) <= agreement_px
+    agreeing = int(near.sum())
+    if 2 * agreeing <= len(found) and len(found) > 1:
+        return nothing, np.nan, agreeing, "views_disagree"
+    weight = sigma[near] ** -2.0
+    mean = (row_col[near] * weight[:, None]).sum(axis=0) / weight.sum()
+    # Views of one scene share its noise and its shadows: their mean is no better than the best of them.
+    spread = row_col[near].std() / np.sqrt(agreeing)
+    return mean, float(np.hypot(sigma[near].min(), spread)), agreeing, FOUND
