@@ -130,7 +130,7 @@ def check_rpc(model: RpcModel, source: str) -> RpcModel:
     axis = np.linspace(-1.0, 1.0, 5)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     for name, den in (("line", model.line_den), ("sample", model.sample_den)):
-        values = _cubic_terms(grid) @ den
+        values = cubic_terms(grid) @ den
         if np.abs(values).min() < 1e-3 or (np.sign(values) != np.sign(values[0])).any():
             raise FormatError(
                 f"{source}: the {name} denominator of the RPC vanishes within its own range"
@@ -163,7 +163,7 @@ def _packed(model: RpcModel) -> Array:
     return packed
 
 
-def _cubic_terms(normalised: Array) -> Array:
+def cubic_terms(normalised: Array) -> Array:
     """The 20 terms of RPC00B for normalised lon, lat, height (n, 3)."""
     lon, lat, h = normalised.T
     return np.column_stack(

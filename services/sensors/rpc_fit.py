@@ -1,0 +1,142 @@
+"""Fitting a rational polynomial model to any other sensor model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.errors import CoverageError
+from services.sensors.base import SensorModel
+from services.sensors.rpc import RpcModel, cubic_terms
+from services.types import Array
+
+RIDGES = (1e-5, 1e-3, 1e-1)
+"""Dampings of a coefficient against a misfit of one normalised unit; without them the 39 coefficients of
+a smooth model are not determined. The one that fits best is kept: where a model is not smooth, a weak
+damping lets the denominators vanish."""
+
+_ROUNDS = 8
+_MARGIN = 1.02
+_CHECK_MARGIN = 0.98
+
+
+@dataclass(frozen=True)
+class RpcFit:
+    """A fitted model and how far it is from what it was fitted to.
+
+    Attributes:
+        model: the rational polynomials.
+        max_error_px, rms_error_px: distance in the image, over a grid of points that were not used by
+            the fit and lie between those that were.
+    """
+
+    model: RpcModel
+    max_error_px: float
+    rms_error_px: float
+
+
+def fit_rpc(
+    model: SensorModel,
+    shape: tuple[int, int],
+    height_range_m: tuple[float, float],
+    nodes: tuple[int, int, int] = (16, 16, 8),
+) -> RpcFit:
+    """Fit an RPC to a sensor model over an image and a range of heights.
+
+    Each coordinate is a ratio with its own denominator. The ratio is multiplied out and solved by
+    linear least squares, weighted by the denominator of the round before and damped around the
+    coefficients of the round before, so that the damping leaves no bias.
+
+    Source: Tao and Hu (2001), "A comprehensive study of the rational function model".
+
+    Args:
+        model: what to fit.
+        shape: lines and samples of the image.
+        height_range_m: lowest and highest ground; becomes the range of the fitted model.
+        nodes: lines, samples and heights of the grid of points.
+
+    Raises:
+        CoverageError: when the model cannot locate the whole image over the range of heights.
+    """
+    between = (nodes[0] - 1, nodes[1] - 1, nodes[2] - 1)
+    image, ground = _grid(model, shape, height_range_m, nodes, _MARGIN)
+    check_image, check_ground = _grid(model, shape, height_range_m, between, _CHECK_MARGIN)
+    fits = []
+    for ridge in RIDGES:
+        fitted = _fit(image, ground, shape, height_range_m, ridge)
+        error_px = np.linalg.norm(fitted.project(check_ground) - check_image, axis=1)
+        rms_px = float(np.sqrt(np.mean(error_px**2)))
+        fits.append(RpcFit(fitted, float(error_px.max()), rms_px))
+    return min(fits, key=lambda fit: fit.max_error_px)
+
+
+def _fit(
+    image: Array,
+    ground: Array,
+    shape: tuple[int, int],
+    height_range_m: tuple[float, float],
+    ridge: float,
+) -> RpcModel:
+    """The model (line and sample each by itself) of image positions (n, 2) and ground points (n, 3)."""
+    size = np.array(shape, dtype=np.float64)
+    image_offset, image_scale = (size - 1.0) / 2.0, size / 2.0
+    lon = ground[0, 0] + (ground[:, 0] - ground[0, 0] + 180.0) % 360.0 - 180.0
+    low = np.array([lon.min(), ground[:, 1].min(), height_range_m[0]])
+    high = np.array([lon.max(), ground[:, 1].max(), height_range_m[1]])
+    ground_offset, ground_scale = (low + high) / 2.0, (high - low) / 2.0
+    terms = cubic_terms((np.column_stack([lon, ground[:, 1:]]) - ground_offset) / ground_scale)
+    normalised = (image - image_offset) / image_scale
+    line_num, line_den = _fit_ratio(terms, normalised[:, 0], ridge)
+    sample_num, sample_den = _fit_ratio(terms, normalised[:, 1], ridge)
+    return RpcModel(
+        line_num,
+        line_den,
+        sample_num,
+        sample_den,
+        image_offset,
+        image_scale,
+        ground_offset,
+        ground_scale,
+    )
+
+
+def _grid(
+    model: SensorModel,
+    shape: tuple[int, int],
+    height_range_m: tuple[float, float],
+    nodes: tuple[int, int, int],
+    extent: float,
+) -> tuple[Array, Array]:
+    """Image positions (n, 2) over an image times `extent`, and what is seen there at all heights."""
+    size = np.array(shape, dtype=np.float64)
+    centre, half = (size - 1.0) / 2.0, extent * size / 2.0
+    middle = sum(height_range_m) / 2.0
+    half_height = min(extent, 1.0) * (height_range_m[1] - height_range_m[0]) / 2.0
+    line, sample, height = np.meshgrid(
+        centre[0] + half[0] * np.linspace(-1.0, 1.0, nodes[0]),
+        centre[1] + half[1] * np.linspace(-1.0, 1.0, nodes[1]),
+        middle + half_height * np.linspace(-1.0, 1.0, nodes[2]),
+        indexing="ij",
+    )
+    image = np.column_stack([line.ravel(), sample.ravel()])
+    ground = model.locate(image, height.ravel())
+    lost = int(np.isnan(ground).any(axis=1).sum())
+    if lost:
+        raise CoverageError(
+            f"the model locates only {len(image) - lost} of {len(image)} points over "
+            f"{shape[0]} x {shape[1]} px and heights {height_range_m[0]:g} to {height_range_m[1]:g} m"
+        )
+    return image, ground
+
+
+def _fit_ratio(terms: Array, value: Array, ridge: float) -> tuple[Array, Array]:
+    """Numerator and denominator (20,) of one coordinate; the denominator starts with one."""
+    design = np.hstack([terms, -value[:, None] * terms[:, 1:]])
+    coefficients = np.zeros(39)
+    damping = ridge * np.sqrt(len(value)) * np.eye(39)
+    for _ in range(_ROUNDS):
+        weight = 1.0 / (1.0 + terms[:, 1:] @ coefficients[20:])
+        misfit = weight * (value - design @ coefficients)
+        stacked = np.vstack([weight[:, None] * design, damping])
+        step = np.linalg.lstsq(stacked, np.concatenate([misfit, np.zeros(39)]), rcond=None)[0]
+        coefficients = coefficients + step
+    return coefficients[:20], np.concatenate([[1.0], coefficients[20:]])

@@ -1,0 +1,193 @@
+"""A true pushbroom: a satellite on its orbit that turns to see a place from where it was asked to."""
+
+import math
+from datetime import datetime
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from services.errors import InputError
+from services.geodesy import (
+    WGS84_A,
+    ecef_from_east_north_up,
+    ecef_from_lon_lat_h,
+    lon_lat_h_from_ecef,
+)
+from services.sensors.pushbroom import PushbroomModel
+from services.sensors.rpc import VALIDITY
+from services.types import Array
+
+EARTH_GM_M3_S2 = 3.986004418e14
+EARTH_ROTATION_RAD_S = 7.292115e-5
+INCLINATION_DEG = 98.2
+"""Of a sun-synchronous orbit at 700 km."""
+
+JITTER_HZ = 1.5
+_STEP_S = 0.05
+_MARGIN_STEPS = 6
+
+
+def pushbroom_over(
+    target_lon_lat_h: Array,
+    shape: tuple[int, int],
+    gsd_m: float,
+    incidence_deg: float,
+    azimuth_deg: float,
+    height_range_m: tuple[float, float],
+    orbit_height_m: float = 700e3,
+    jitter_px: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> PushbroomModel:
+    """A pushbroom on a circular, descending orbit whose central pixel sees a target as asked.
+
+    The line of sight follows the ground at the speed of the satellite's track, and the row of detectors
+    stays across it, so that pixels are square at the target.
+
+    Args:
+        target_lon_lat_h: (3,) seen by the centre of the image.
+        shape: lines and samples.
+        gsd_m: ground sampling at the target, along and across.
+        incidence_deg, azimuth_deg: direction from the target to the satellite.
+        height_range_m: of the model.
+        orbit_height_m: above the equatorial radius.
+        jitter_px: amplitude of an oscillation of the line of sight on each axis, in pixels at 1.5 Hz.
+        rng: phases of that oscillation; without it they are zero.
+
+    Raises:
+        InputError: when the target cannot be seen from that orbit under that incidence.
+    """
+    ground_axes = ecef_from_east_north_up(target_lon_lat_h)
+    target = ecef_from_lon_lat_h(target_lon_lat_h[None, :])[0]
+    satellite = _satellite(target, ground_axes, incidence_deg, azimuth_deg, orbit_height_m)
+    track = _Track(satellite)
+    heading = track.velocity(np.zeros(1))[0]
+    heading = heading - (heading @ ground_axes[:, 2]) * ground_axes[:, 2]
+    ground_speed = np.linalg.norm(heading) * np.linalg.norm(target) / np.linalg.norm(satellite)
+    heading /= np.linalg.norm(heading)
+    line_period_s = gsd_m / float(ground_speed)
+
+    half_s = VALIDITY * shape[0] / 2.0 * line_period_s
+    step_s = max(_STEP_S, half_s / 400.0)
+    steps = math.ceil(half_s / step_s) + _MARGIN_STEPS
+    times = step_s * np.arange(-steps, steps + 1)
+    position = track.position(times)
+    seen = target + times[:, None] * ground_speed * heading
+    seen = _at_height(seen, float(target_lon_lat_h[2]))
+    attitude = _steering(position, seen, heading)
+    distance = float(np.linalg.norm(target - satellite))
+    if jitter_px:
+        phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
+        angles = np.sin(2.0 * np.pi * JITTER_HZ * times[:, None] + phase)
+        attitude = attitude * Rotation.from_rotvec(jitter_px * gsd_m / distance * angles)
+    quaternions = attitude.as_quat()
+    flips = np.cumprod(
+        np.concatenate([[1.0], np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))])
+    )
+    across = np.cross(heading, ground_axes[:, 2])
+    sight = (target - satellite) / distance
+    across_per_px = gsd_m * float(np.linalg.norm(across - (across @ sight) * sight)) / distance
+    return PushbroomModel(
+        image_shape=shape,
+        first_line_s=-(shape[0] - 1.0) / 2.0 * line_period_s,
+        line_period_s=line_period_s,
+        orbit_s=times,
+        position=position,
+        attitude_s=times,
+        ecef_from_body=quaternions * flips[:, None],
+        look=np.array([[0.0, 0.0], [0.0, -across_per_px * shape[1] / 2.0]]),
+        height_range_m=height_range_m,
+    )
+
+
+def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
+    """Elevation and azimuth of the sun, degrees, to about half a degree.
+
+    Source: the low-precision formulas of the Astronomical Almanac.
+
+    Args:
+        lon_lat: (2,) degrees.
+        when: UTC.
+    """
+    days = (when.replace(tzinfo=None) - datetime(2000, 1, 1, 12)).total_seconds() / 86400.0
+    anomaly = np.radians(357.528 + 0.9856003 * days)
+    longitude = np.radians(
+        280.460 + 0.9856474 * days + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2.0 * anomaly)
+    )
+    obliquity = np.radians(23.439)
+    ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
+    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
+    sidereal = np.radians(280.46062 + 360.98564737 * days + lon_lat[0])
+    hour, lat = sidereal - ascension, np.radians(lon_lat[1])
+    up = np.sin(lat) * np.sin(declination) + np.cos(lat) * np.cos(declination) * np.cos(hour)
+    east = -np.cos(declination) * np.sin(hour)
+    north = np.cos(lat) * np.sin(declination) - np.sin(lat) * np.cos(declination) * np.cos(hour)
+    return float(np.degrees(np.arcsin(up))), float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+def _satellite(
+    target: Array, axes: Array, incidence_deg: float, azimuth_deg: float, orbit_height_m: float
+) -> Array:
+    """Where the line of sight from a target meets the orbit's sphere, ECEF."""
+    incidence, azimuth = np.radians([incidence_deg, azimuth_deg])
+    direction = axes @ np.array(
+        [
+            np.sin(incidence) * np.sin(azimuth),
+            np.sin(incidence) * np.cos(azimuth),
+            np.cos(incidence),
+        ]
+    )
+    radius = WGS84_A + orbit_height_m
+    along = float(target @ direction)
+    square = along * along + radius * radius - float(target @ target)
+    if not 0.0 <= incidence_deg < 60.0 or square <= 0.0:
+        raise InputError(
+            f"no view under {incidence_deg:g} degrees from an orbit at {orbit_height_m / 1e3:g} km"
+        )
+    return np.asarray(target + (math.sqrt(square) - along) * direction)
+
+
+class _Track:
+    """A circular orbit through a position (3,) ECEF at time zero, flown southwards."""
+
+    def __init__(self, satellite: Array) -> None:
+        radius = float(np.linalg.norm(satellite))
+        self._rate = math.sqrt(EARTH_GM_M3_S2 / radius**3)
+        self._out = satellite
+        lon_lat_h = lon_lat_h_from_ecef(satellite[None, :])[0]
+        ratio = math.cos(math.radians(INCLINATION_DEG)) / math.cos(math.radians(lon_lat_h[1]))
+        course = math.pi - math.asin(min(max(ratio, -1.0), 1.0))
+        axes = ecef_from_east_north_up(lon_lat_h)
+        ahead = axes @ np.array([math.sin(course), math.cos(course), 0.0])
+        ahead -= (ahead @ satellite) * satellite / radius**2
+        self._ahead = radius * ahead / np.linalg.norm(ahead)
+
+    def position(self, times: Array) -> Array:
+        """(n, 3) ECEF metres: the orbit stands still among the stars, the Earth turns below it."""
+        angle = self._rate * times[:, None]
+        inertial = np.cos(angle) * self._out + np.sin(angle) * self._ahead
+        return Rotation.from_rotvec(np.outer(times, [0.0, 0.0, -EARTH_ROTATION_RAD_S])).apply(inertial)
+
+    def velocity(self, times: Array) -> Array:
+        """(n, 3) ECEF metres a second."""
+        half_s = 0.01
+        return np.asarray(
+            (self.position(times + half_s) - self.position(times - half_s)) / (2.0 * half_s)
+        )
+
+
+def _at_height(ecef: Array, height_m: float) -> Array:
+    """Points (n, 3) moved vertically to one height."""
+    lon_lat_h = lon_lat_h_from_ecef(ecef)
+    lon_lat_h[:, 2] = height_m
+    return ecef_from_lon_lat_h(lon_lat_h)
+
+
+def _steering(position: Array, seen: Array, heading: Array) -> Rotation:
+    """Attitudes (n) that look at ground points (n, 3) with the row of detectors across a heading (3,)."""
+    down = seen - position
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    up = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    right = np.cross(heading[None, :], up)
+    right -= (right * down).sum(axis=1, keepdims=True) * down
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([np.cross(right, down), right, down], axis=-1))
