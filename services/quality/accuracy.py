@@ -1,0 +1,214 @@
+"""How large errors are: sample quantiles with what the sample allows to say about them."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import erf
+from scipy.stats import binom, chi2
+
+from services.types import Array
+
+FEW_POINTS = 30
+"""ASPRS (Positional Accuracy Standards, edition 2) asks for at least as many check points."""
+
+CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
+"""CE90 of a circular normal law of unit sigma (2.1460)."""
+
+
+@dataclass(frozen=True)
+class Quantile:
+    """A quantile of a sample with a confidence interval that assumes no law.
+
+    Attributes:
+        value: estimate; NaN without a sample.
+        lower, upper: bounds of the true quantile, order statistics of the sample; NaN where the sample
+            is too small to bound it on that side.
+        n: size of the sample.
+        probability: which quantile, 0.9 for CE90 and LE90.
+        confidence: of the interval; the true one is at least this.
+        note: what a small sample does not allow to say; "" when there is nothing to add.
+    """
+
+    value: float
+    lower: float
+    upper: float
+    n: int
+    probability: float
+    confidence: float
+    note: str
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Moments of one coordinate.
+
+    Attributes:
+        n: finite values.
+        mean: NaN without values.
+        std: about the mean, n - 1 in the denominator; NaN below two values.
+        rms: about zero.
+    """
+
+    n: int
+    mean: float
+    std: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of points against something better.
+
+    Attributes:
+        n: points.
+        bias_m, std_m, rmse_m: east, north and, when known, up.
+        ce90_m: of the horizontal distance.
+        le90_m: of the height error without its sign; None when heights were not compared.
+    """
+
+    n: int
+    bias_m: tuple[float, ...]
+    std_m: tuple[float, ...]
+    rmse_m: tuple[float, ...]
+    ce90_m: Quantile
+    le90_m: Quantile | None
+
+
+@dataclass(frozen=True)
+class NormalisedError:
+    """Mean square of errors in units of their stated precision; 1 when the precision is honest.
+
+    Attributes:
+        mean_square: above 1, errors are larger than stated; below 1, smaller.
+        lower, upper: where it lies, with the given confidence, when errors are as large as stated.
+        n: rows.
+        confidence: of the interval.
+    """
+
+    mean_square: float
+    lower: float
+    upper: float
+    n: int
+    confidence: float
+
+
+def statistics(values: Array) -> Statistics:
+    """Mean, standard deviation and root mean square of the finite values of (n,) `values`."""
+    finite = values[np.isfinite(values)]
+    n = len(finite)
+    if n == 0:
+        return Statistics(0, np.nan, np.nan, np.nan)
+    std = float(finite.std(ddof=1)) if n > 1 else float("nan")
+    return Statistics(n, float(finite.mean()), std, float(np.sqrt(np.mean(finite**2))))
+
+
+def sample_quantile(values: Array, probability: float = 0.9, confidence: float = 0.9) -> Quantile:
+    """A quantile of a sample and its distribution-free confidence interval.
+
+    The number of values below the true quantile is binomial whatever the law, so order statistics
+    bound it (Dolloff and Carr, Computation of scalar accuracy metrics LE, CE and SE as both predictive
+    and sample-based statistics, ASPRS 2016). Half of the risk is given to each side: at 90 % confidence
+    the 90 % quantile has an upper bound from 29 values on. The estimate is the median-unbiased one
+    (Hyndman and Fan, type 8): no law is assumed, and small samples do not flatter.
+
+    Args:
+        values: (n,) any order; values that are not finite are left out.
+        probability, confidence: between 0 and 1.
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    n = len(ordered)
+    if n == 0:
+        return Quantile(np.nan, np.nan, np.nan, 0, probability, confidence, "no points")
+    risk = (1.0 - confidence) / 2.0
+    less_than = binom.cdf(np.arange(-1, n), n, probability)
+    first = int(np.flatnonzero(less_than <= risk)[-1])
+    enough = np.flatnonzero(1.0 - less_than <= risk)
+    last = int(enough[0]) if len(enough) else 0
+    return Quantile(
+        value=float(np.quantile(ordered, probability, method="median_unbiased")),
+        lower=float(ordered[first - 1]) if first > 0 else float("nan"),
+        upper=float(ordered[last - 1]) if last > 0 else float("nan"),
+        n=n,
+        probability=probability,
+        confidence=confidence,
+        note=_small_sample_note(n, bounded=last > 0),
+    )
+
+
+def _small_sample_note(n: int, bounded: bool) -> str:
+    """What a sample of n does not allow to say."""
+    if n >= FEW_POINTS:
+        return "" if bounded else f"{n} points do not bound it from above"
+    note = f"{n} points; {FEW_POINTS} are needed for a statement of accuracy"
+    return note if bounded else f"{note}, so few do not bound it from above"
+
+
+def accuracy(error_m: Array, confidence: float = 0.9) -> Accuracy:
+    """Accuracy of points whose errors are known.
+
+    Args:
+        error_m: (n, 2) east, north or (n, 3) east, north, up; rows with a NaN are left out.
+        confidence: of the intervals of CE90 and LE90.
+    """
+    kept = error_m[np.isfinite(error_m).all(axis=1)]
+    axes = [statistics(column) for column in kept.T]
+    return Accuracy(
+        n=len(kept),
+        bias_m=tuple(axis.mean for axis in axes),
+        std_m=tuple(axis.std for axis in axes),
+        rmse_m=tuple(axis.rms for axis in axes),
+        ce90_m=sample_quantile(np.hypot(kept[:, 0], kept[:, 1]), 0.9, confidence),
+        le90_m=sample_quantile(np.abs(kept[:, 2]), 0.9, confidence) if kept.shape[1] > 2 else None,
+    )
+
+
+def normalised_error(error: Array, covariance: Array, confidence: float = 0.95) -> NormalisedError:
+    """Whether errors are as large as their covariances say.
+
+    Args:
+        error: (n, k); rows with a NaN, in the error or its covariance, are left out.
+        covariance: (n, k, k) stated for them, same units squared.
+        confidence: of the interval of an honest statement, by the chi-square law.
+    """
+    kept = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    rows, k = int(kept.sum()), error.shape[1]
+    if rows == 0:
+        return NormalisedError(np.nan, np.nan, np.nan, 0, confidence)
+    weighted = np.linalg.solve(covariance[kept], error[kept][:, :, None])[:, :, 0]
+    lower, upper = chi2.interval(confidence, rows * k) / np.float64(rows * k)
+    mean_square = float(np.sum(weighted * error[kept]) / (rows * k))
+    return NormalisedError(mean_square, float(lower), float(upper), rows, confidence)
+
+
+def normal_ce90(covariance: Array) -> Array:
+    """CE90 of normal errors without bias: a prediction, not a measurement.
+
+    Args:
+        covariance: (n, 2, 2).
+
+    Returns:
+        (n,) radius that holds 90 %, in the square root of the covariance's unit; NaN where it is NaN.
+    """
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    variance = np.linalg.eigvalsh(np.where(finite[:, None, None], covariance, 0.0))
+    small, large = np.sqrt(np.clip(variance, 0.0, None)).T
+    ratio = np.divide(small, large, out=np.zeros_like(small), where=large > 0.0)
+    return np.where(finite, large * np.interp(ratio, *_ce90_of_ratio()), np.nan)
+
+
+@lru_cache(maxsize=1)
+def _ce90_of_ratio() -> tuple[Array, Array]:
+    """CE90 of a normal law of standard deviations 1 and ratio, by bisection of its integral."""
+    ratio = np.linspace(0.0, 1.0, 129)
+    nodes, weights = np.polynomial.legendre.leggauss(128)
+    angle = nodes * np.pi / 2.0
+    low, high = np.full(len(ratio), 1.0), np.full(len(ratio), 3.0)
+    width = np.maximum(ratio, 1e-9)[:, None] * np.sqrt(2.0)
+    for _ in range(40):
+        radius = ((low + high) / 2.0)[:, None]
+        density = np.exp(-((radius * np.sin(angle)) ** 2) / 2.0) / np.sqrt(2.0 * np.pi)
+        inside = density * erf(radius * np.cos(angle) / width) * radius * np.cos(angle)
+        enough = inside @ weights * np.pi / 2.0 > 0.9
+        low, high = np.where(enough, low, radius[:, 0]), np.where(enough, radius[:, 0], high)
+    return ratio, (low + high) / 2.0

@@ -1,0 +1,221 @@
+"""How sure a correction is: redone with fewer points, and by its own covariance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.adjustment.scene import SceneAdjustment
+from services.errors import ComputationError
+from services.quality.accuracy import CIRCULAR_CE90, Statistics, normal_ce90, statistics
+from services.sensors.correction import ImageCorrection
+from services.types import Array, BoolArray, Measures
+
+Refit = Callable[[BoolArray], SceneAdjustment]
+PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
+
+
+@dataclass(frozen=True)
+class ImageResiduals:
+    """Residuals of the active points in the image, pixels.
+
+    Attributes:
+        x: along samples.
+        y: along lines.
+        xy: length of the residual.
+    """
+
+    x: Statistics
+    y: Statistics
+    xy: Statistics
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """How far one place of the image moves between the full solution and those of fewer points.
+
+    Attributes:
+        place: "top left", "top right", "bottom right", "bottom left" or "centre".
+        median_px, max_px, median_m, max_m: over the draws.
+    """
+
+    place: str
+    median_px: float
+    max_px: float
+    median_m: float
+    max_m: float
+
+
+@dataclass(frozen=True)
+class Stability:
+    """The adjustment redone without a part of its points. Shows stability, not absolute accuracy.
+
+    Attributes:
+        kept_share: of the active points in each draw.
+        draws: adjustments that succeeded.
+        failed_draws: adjustments that gave no solution.
+        held_out_per_draw: points held out of each draw.
+        displacements: of the four corners and the centre; empty when no draw succeeded.
+        held_out_px: residuals of the points held out, all draws together; a point counts once in each
+            draw it was held out of.
+        held_out_m: the same on the ground, by the ground sampling of the image.
+        note: why there is no figure; "" otherwise.
+    """
+
+    kept_share: float
+    draws: int
+    failed_draws: int
+    held_out_per_draw: int
+    displacements: tuple[Displacement, ...]
+    held_out_px: ImageResiduals
+    held_out_m: ImageResiduals
+    note: str
+
+
+@dataclass(frozen=True)
+class PredictedAccuracy:
+    """What the covariance of the correction says about positions all over the image.
+
+    It covers the random part of the measures. What all points of a block have in common does not show in
+    it: that is `frame_ce90_m`.
+
+    Attributes:
+        std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner.
+        ce90_px: (g, g) by the normal law.
+        worst_px, median_px, worst_m, median_m: of `ce90_px` over the image.
+        frame_ce90_m: of the frame of the points' blocks, by the circular normal law; NaN when unknown.
+    """
+
+    std_line_px: Array
+    std_sample_px: Array
+    ce90_px: Array
+    worst_px: float
+    median_px: float
+    worst_m: float
+    median_m: float
+    frame_ce90_m: float
+
+
+def residuals_in_image(residual: Array) -> ImageResiduals:
+    """Statistics of residuals (n, 2), line and sample."""
+    line, sample = residual[:, 0], residual[:, 1]
+    return ImageResiduals(
+        x=statistics(sample), y=statistics(line), xy=statistics(np.hypot(line, sample))
+    )
+
+
+def measure_stability(
+    measures: Measures,
+    adjustment: SceneAdjustment,
+    shape: tuple[int, int],
+    refit: Refit,
+    gsd_m: float,
+    draws: int,
+    kept_share: float,
+    rng: np.random.Generator,
+) -> Stability:
+    """Redo the adjustment with a part of the active points, several times.
+
+    Args:
+        measures: all n points the scene could show.
+        adjustment: of all active points.
+        shape: lines and samples of the image.
+        refit: redoes the adjustment on the measures of a mask (n,).
+        gsd_m: ground sampling of the image.
+        draws: how often.
+        kept_share: of the active points in each draw.
+        rng: draws the points that are held out.
+    """
+    active = np.flatnonzero(measures.active)
+    held_count = len(active) - round(kept_share * len(active))
+    places = image_places(shape)
+    moved, held_out = [], []
+    for _ in range(draws if held_count else 0):
+        held = rng.permutation(active)[:held_count]
+        kept = measures.active.copy()
+        kept[held] = False
+        try:
+            correction = refit(kept).correction
+        except ComputationError:
+            continue
+        moved.append(_distance_px(correction, adjustment.correction, places))
+        held_out.append(measures.line_sample[held] - correction.apply(measures.predicted[held]))
+    residual = np.concatenate(held_out) if held_out else np.empty((0, 2))
+    return Stability(
+        kept_share=kept_share,
+        draws=len(moved),
+        failed_draws=(draws if held_count else 0) - len(moved),
+        held_out_per_draw=held_count,
+        displacements=_displacements(np.array(moved), gsd_m) if moved else (),
+        held_out_px=residuals_in_image(residual),
+        held_out_m=residuals_in_image(residual * gsd_m),
+        note="" if moved else _why_no_stability(len(active), held_count),
+    )
+
+
+def image_places(shape: tuple[int, int]) -> Array:
+    """Line and sample (5, 2) of the four corners and the centre, in the order of `PLACES`."""
+    line, sample = shape[0] - 1.0, shape[1] - 1.0
+    return np.array(
+        [[0, 0], [0, sample], [line, sample], [line, 0], [line / 2, sample / 2]], dtype=float
+    )
+
+
+def _distance_px(a: ImageCorrection, b: ImageCorrection, line_sample: Array) -> Array:
+    """Distance (n,) between the positions two corrections give."""
+    return np.asarray(np.linalg.norm(a.apply(line_sample) - b.apply(line_sample), axis=1))
+
+
+def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
+    """Median and largest displacement over the draws (d, 5)."""
+    median, largest = np.median(moved_px, axis=0), moved_px.max(axis=0)
+    return tuple(
+        Displacement(place, float(m), float(top), float(m * gsd_m), float(top * gsd_m))
+        for place, m, top in zip(PLACES, median, largest, strict=True)
+    )
+
+
+def _why_no_stability(active: int, held_count: int) -> str:
+    """Why no draw gave a solution."""
+    if held_count == 0:
+        return f"{active} active points leave none to hold out"
+    return f"{active - held_count} of {active} active points gave no solution in any draw"
+
+
+def predict_accuracy(
+    adjustment: SceneAdjustment,
+    shape: tuple[int, int],
+    gsd_m: float,
+    grid: int,
+    frame_sigma_m: float = float("nan"),
+) -> PredictedAccuracy:
+    """Propagate the covariance of the correction to a grid over the image.
+
+    Args:
+        adjustment: with its covariance.
+        shape: lines and samples of the image.
+        gsd_m: ground sampling of the image.
+        grid: nodes along each side.
+        frame_sigma_m: systematic error of the frame of the points' blocks; NaN when unknown.
+    """
+    line, sample = np.meshgrid(
+        np.linspace(0.0, shape[0] - 1.0, grid), np.linspace(0.0, shape[1] - 1.0, grid), indexing="ij"
+    )
+    correction = adjustment.correction
+    t = (np.column_stack([line.ravel(), sample.ravel()]) - correction.centre) / correction.half_size
+    design = np.zeros((grid * grid, 2, 6))
+    design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
+    covariance = design @ adjustment.covariance @ design.transpose(0, 2, 1)
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
+    ce90 = normal_ce90(covariance)
+    worst, median = float(ce90.max()), float(np.median(ce90))
+    return PredictedAccuracy(
+        std_line_px=std[..., 0],
+        std_sample_px=std[..., 1],
+        ce90_px=ce90.reshape(grid, grid),
+        worst_px=worst,
+        median_px=median,
+        worst_m=worst * gsd_m,
+        median_m=median * gsd_m,
+        frame_ce90_m=CIRCULAR_CE90 * frame_sigma_m,
+    )

@@ -1,0 +1,378 @@
+"""What a report needs, and what it says: the record of one registration."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from services.adjustment.scene import SceneAdjustment
+from services.quality.accuracy import Accuracy
+from services.quality.qualification import (
+    Coverage,
+    Criterion,
+    Equipment,
+    GroundResiduals,
+    Qualification,
+    Verdict,
+)
+from services.quality.stability import ImageResiduals, PredictedAccuracy, Stability
+from services.types import Acquisition, Array, ChipArray, FloatImage, Measures
+
+REPORT_FORMAT = "amers-registration-report/1"
+
+
+@dataclass(frozen=True)
+class BlockUsed:
+    """A block whose points were used.
+
+    Attributes:
+        id, version: of the block.
+    """
+
+    id: str
+    version: str
+
+
+@dataclass(frozen=True)
+class PassSummary:
+    """One round of matching.
+
+    Attributes:
+        chip_gsd_m: ground sampling of the chips looked for, metres.
+        search_radius_px: how far from the prediction, pixels of the scene.
+        tried: points looked for.
+        matched: points found.
+        agreeing: found points that agree on one correction.
+    """
+
+    chip_gsd_m: float
+    search_radius_px: float
+    tried: int
+    matched: int
+    agreeing: int
+
+
+@dataclass(frozen=True)
+class OrderScore:
+    """How well an order of the correction predicts points that it was not fitted to.
+
+    Attributes:
+        order: "shift", "drift" or "affine".
+        left_out_px: cross-validation score, pixels; the smaller the better. NaN when it was not tried.
+    """
+
+    order: str
+    left_out_px: float
+
+
+@dataclass(frozen=True)
+class Quicklook:
+    """The scene, reduced to a size that fits a page.
+
+    Attributes:
+        pixels: (h, w); NaN or 0 where there is no data.
+        reduction: pixels of the scene for one of the quicklook.
+    """
+
+    pixels: FloatImage
+    reduction: float
+
+
+@dataclass(frozen=True)
+class ChipPair:
+    """A chip beside what was found in the scene, both in the chip's geometry.
+
+    Attributes:
+        point_id: of the control point.
+        gsd_m: ground sampling of the chip.
+        chip: (101, 101) as stored.
+        found: (101, 101) the scene seen through the refined model, on the chip's grid.
+        score: correlation; NaN when none was computed.
+        residual_px: (2,) line and sample; NaN when not found.
+        status: "active", or why the point is not.
+    """
+
+    point_id: int
+    gsd_m: float
+    chip: ChipArray
+    found: ChipArray
+    score: float
+    residual_px: Array
+    status: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """Accuracy against points that had no part in the registration.
+
+    Attributes:
+        against: what the points are, in words.
+        accuracy: of the registered model there.
+    """
+
+    against: str
+    accuracy: Accuracy
+
+
+@dataclass(frozen=True)
+class RegistrationSummary:
+    """All that a report is made from.
+
+    Attributes:
+        scene: name for people.
+        acquisition: how the scene was taken.
+        shape: lines and samples.
+        gsd_m: ground sampling at the centre.
+        model_kind: of the delivered model, "RPC" for one.
+        sigma_m: a priori accuracy of the model, one standard deviation a coordinate.
+        footprint: (m, 2) lon, lat outline of the scene, not closed.
+        blocks: those whose points were used.
+        options: the dataclass of options of the registration.
+        passes: in the order they were run.
+        order_scores: of the orders that were compared.
+        order_reason: why the order of the correction was chosen.
+        measures: what was done with each point.
+        adjustment: the final one.
+        qualification: of the registration.
+        quicklook: the scene reduced; None when there is none.
+        gallery: chips beside what was found; the report picks the best, middle and worst scores.
+        refit_error_px: largest difference between the corrected model and the delivered one; NaN when no
+            model was fitted.
+        software_version: of Amers.
+        started_at, finished_at: UTC, given by the caller; None when unknown.
+        checks: against independent points, if there are any.
+    """
+
+    scene: str
+    acquisition: Acquisition
+    shape: tuple[int, int]
+    gsd_m: float
+    model_kind: str
+    sigma_m: float
+    footprint: Array
+    blocks: tuple[BlockUsed, ...]
+    options: Any
+    passes: tuple[PassSummary, ...]
+    order_scores: tuple[OrderScore, ...]
+    order_reason: str
+    measures: Measures
+    adjustment: SceneAdjustment
+    qualification: Qualification
+    quicklook: Quicklook | None
+    gallery: tuple[ChipPair, ...]
+    refit_error_px: float
+    software_version: str
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    checks: tuple[Check, ...] = ()
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """The scene that was registered.
+
+    Attributes:
+        name: for people.
+        acquisition: how it was taken.
+        lines, samples: size of the image, pixels.
+        gsd_m: ground sampling at the centre, metres.
+        model: kind of the delivered model.
+        sigma_m: accuracy of the model before registration, one standard deviation a coordinate, metres.
+        footprint_lon_lat: outline on the ground, degrees, not closed.
+    """
+
+    name: str
+    acquisition: Acquisition
+    lines: int
+    samples: int
+    gsd_m: float
+    model: str
+    sigma_m: float
+    footprint_lon_lat: Array
+
+
+@dataclass(frozen=True)
+class CorrectionRecord:
+    """The correction that was found, from positions by the delivered model to true ones.
+
+    Attributes:
+        order: "shift", "drift" or "affine".
+        order_reason: why this order.
+        order_scores: of the orders that were compared.
+        parameters_px: rows line and sample; constant, along lines, along samples (at the image's edge).
+        std_px: one standard deviation of each parameter.
+        centre_px, half_size_px: line and sample that the parameters refer to.
+        shift_px: displacement at the centre, line and sample.
+        shift_m: length of that displacement on the ground, by the ground sampling of the image.
+        words: the parameters as sentences.
+        sigma0: a posteriori standard deviation of unit weight.
+        refit_error_px: largest difference between the corrected model and the delivered one.
+    """
+
+    order: str
+    order_reason: str
+    order_scores: tuple[OrderScore, ...]
+    parameters_px: Array
+    std_px: Array
+    centre_px: Array
+    half_size_px: Array
+    shift_px: Array
+    shift_m: float
+    words: tuple[str, ...]
+    sigma0: float
+    refit_error_px: float
+
+
+@dataclass(frozen=True)
+class ReasonCount:
+    """How many points left for one reason.
+
+    Attributes:
+        stage: "not matched", or "deactivated" after a match.
+        reason: as given by the matching or the adjustment.
+        count: points.
+    """
+
+    stage: str
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RegistrationReport:
+    """The record of one registration, as `report.json` holds it.
+
+    Attributes:
+        format: of the document, with its version.
+        software_version: of Amers.
+        started_at, finished_at: UTC.
+        verdict: "good", "usable" or "failed"; follows from the criteria alone.
+        criteria: every threshold with the value held against it.
+        scene: what was registered.
+        blocks: whose points were used.
+        correction: what was found.
+        passes: rounds of matching, in order.
+        equipment: points visible, matched and active.
+        reasons: why points are not active, commonest first.
+        image_residuals_px: of the active points; x along samples, y along lines.
+        ground_residuals_m: of the active points; no heights, which a single scene does not give.
+        stability: the adjustment redone without a part of its points; not absolute accuracy.
+        predicted: accuracy by the covariance of the correction.
+        coverage: of the image by active points.
+        checks: against points that had no part in the registration.
+        options: of the registration, as it was run.
+    """
+
+    format: str
+    software_version: str
+    started_at: datetime | None
+    finished_at: datetime | None
+    verdict: Verdict
+    criteria: tuple[Criterion, ...]
+    scene: SceneRecord
+    blocks: tuple[BlockUsed, ...]
+    correction: CorrectionRecord
+    passes: tuple[PassSummary, ...]
+    equipment: Equipment
+    reasons: tuple[ReasonCount, ...]
+    image_residuals_px: ImageResiduals
+    ground_residuals_m: GroundResiduals
+    stability: Stability
+    predicted: PredictedAccuracy
+    coverage: Coverage
+    checks: tuple[Check, ...]
+    options: Any
+
+
+def build_report(summary: RegistrationSummary) -> RegistrationReport:
+    """The report of a registration."""
+    found = summary.qualification
+    return RegistrationReport(
+        format=REPORT_FORMAT,
+        software_version=summary.software_version,
+        started_at=summary.started_at,
+        finished_at=summary.finished_at,
+        verdict=found.verdict,
+        criteria=found.criteria,
+        scene=SceneRecord(
+            name=summary.scene,
+            acquisition=summary.acquisition,
+            lines=summary.shape[0],
+            samples=summary.shape[1],
+            gsd_m=summary.gsd_m,
+            model=summary.model_kind,
+            sigma_m=summary.sigma_m,
+            footprint_lon_lat=summary.footprint,
+        ),
+        blocks=summary.blocks,
+        correction=_correction_record(summary),
+        passes=summary.passes,
+        equipment=found.equipment,
+        reasons=count_reasons(summary.measures),
+        image_residuals_px=found.image_residuals_px,
+        ground_residuals_m=found.ground_residuals_m,
+        stability=found.stability,
+        predicted=found.predicted,
+        coverage=found.coverage,
+        checks=summary.checks,
+        options=summary.options,
+    )
+
+
+def _correction_record(summary: RegistrationSummary) -> CorrectionRecord:
+    """The correction with its precision."""
+    adjustment = summary.adjustment
+    correction = adjustment.correction
+    shift_px = correction.parameters[:, 0]
+    variance = np.clip(np.diagonal(adjustment.covariance), 0.0, None)
+    return CorrectionRecord(
+        order=adjustment.order,
+        order_reason=summary.order_reason,
+        order_scores=summary.order_scores,
+        parameters_px=correction.parameters,
+        std_px=np.sqrt(variance).reshape(2, 3),
+        centre_px=correction.centre,
+        half_size_px=correction.half_size,
+        shift_px=shift_px,
+        shift_m=float(np.hypot(*shift_px) * summary.gsd_m),
+        words=correction_in_words(adjustment, summary.gsd_m),
+        sigma0=adjustment.sigma0,
+        refit_error_px=summary.refit_error_px,
+    )
+
+
+def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str, ...]:
+    """One sentence for each part of the correction that was free.
+
+    Args:
+        adjustment: with the correction.
+        gsd_m: ground sampling of the image, turns pixels into metres.
+    """
+    parameters = adjustment.correction.parameters
+    parts: tuple[tuple[str, float, float], ...] = (("shift", *parameters[:, 0]),)
+    if adjustment.order == "drift":
+        parts += (("drift at the last line and sample", parameters[0, 1], parameters[1, 2]),)
+    elif adjustment.order == "affine":
+        parts += (
+            ("drift along the lines, at the last line", *parameters[:, 1]),
+            ("drift along the samples, at the last sample", *parameters[:, 2]),
+        )
+    return tuple(
+        f"{name}: {line:+.2f} px in line, {sample:+.2f} px in sample"
+        f" ({np.hypot(line, sample) * gsd_m:.2f} m)"
+        for name, line, sample in parts
+    )
+
+
+def count_reasons(measures: Measures) -> tuple[ReasonCount, ...]:
+    """Why points are not active: first those that were not matched, the commonest reason first."""
+    counts = []
+    for stage, left in (
+        ("not matched", ~measures.matched),
+        ("deactivated", measures.matched & ~measures.active),
+    ):
+        names, numbers = np.unique(measures.reason[left], return_counts=True)
+        for k in np.argsort(-numbers, kind="stable"):
+            counts.append(ReasonCount(stage, str(names[k]) or "no reason given", int(numbers[k])))
+    return tuple(counts)

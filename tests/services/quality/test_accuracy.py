@@ -1,0 +1,135 @@
+"""Quantiles, their intervals and normalised errors against known laws and tables."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.quality.accuracy import (
+    CIRCULAR_CE90,
+    accuracy,
+    normal_ce90,
+    normalised_error,
+    sample_quantile,
+    statistics,
+)
+
+a_ten_thousandth = 1e-4
+
+
+def test_the_interval_of_a_quantile_is_made_of_the_tabulated_order_statistics():
+    """n = 100, 90 %: binomial tables give orders 85 and 96 at 5 % a side."""
+    quantile = sample_quantile(np.arange(1.0, 101.0))
+    assert (quantile.lower, quantile.upper) == (85.0, 96.0)
+    assert quantile.note == ""
+
+
+@pytest.mark.parametrize(("n", "bounded"), [(28, False), (29, True)])
+def test_the_90_percent_quantile_is_bounded_above_from_29_values_on(n, bounded):
+    quantile = sample_quantile(np.arange(float(n)))
+    assert np.isfinite(quantile.upper) == bounded
+    assert f"{n} points; 30 are needed" in quantile.note
+    assert ("do not bound" in quantile.note) == (not bounded)
+
+
+def test_the_interval_holds_the_true_quantile_as_often_as_it_says():
+    rng = np.random.default_rng(5)
+    trials, n, truth = 2000, 60, -np.log(0.1)
+    inside = 0
+    for _ in range(trials):
+        quantile = sample_quantile(rng.exponential(size=n))
+        inside += quantile.lower <= truth <= quantile.upper
+    three_standard_errors = 3.0 * np.sqrt(0.9 * 0.1 / trials)
+    assert inside / trials > 0.9 - three_standard_errors
+
+
+def test_the_estimate_is_above_the_truth_as_often_as_below():
+    rng = np.random.default_rng(6)
+    trials, truth = 4000, -np.log(0.1)
+    above = np.mean([sample_quantile(rng.exponential(size=40)).value > truth for _ in range(trials)])
+    assert above == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("values", [np.empty(0), np.array([np.nan, np.nan])])
+def test_no_points_give_no_figure(values):
+    quantile = sample_quantile(values)
+    assert quantile.n == 0
+    assert np.isnan([quantile.value, quantile.lower, quantile.upper]).all()
+    assert quantile.note == "no points"
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=200))
+def test_a_quantile_lies_within_its_interval_and_its_sample(values):
+    quantile = sample_quantile(np.array(values))
+    rounding = 1e-9 * (1.0 + np.abs(values).max())
+    assert min(values) - rounding <= quantile.value <= max(values) + rounding
+    assert np.isnan(quantile.lower) or quantile.lower <= quantile.value + rounding
+    assert np.isnan(quantile.upper) or quantile.value <= quantile.upper + rounding
+
+
+def test_statistics_are_those_of_the_finite_values():
+    found = statistics(np.array([1.0, np.nan, 3.0]))
+    assert (found.n, found.mean) == (2, 2.0)
+    assert found.std == pytest.approx(np.sqrt(2.0))
+    assert found.rms == pytest.approx(np.sqrt(5.0))
+
+
+def test_one_value_has_no_standard_deviation():
+    assert np.isnan(statistics(np.array([4.0])).std)
+
+
+def test_accuracy_separates_bias_from_spread_on_each_axis():
+    error_m = np.array([[1.0, 2.0, -3.0], [3.0, 2.0, -5.0], [np.nan, 0.0, 0.0]])
+    found = accuracy(error_m)
+    assert found.n == 2
+    assert found.bias_m == (2.0, 2.0, -4.0)
+    assert found.std_m == pytest.approx((np.sqrt(2.0), 0.0, np.sqrt(2.0)))
+    assert found.rmse_m == pytest.approx((np.sqrt(5.0), 2.0, np.sqrt(17.0)))
+    assert found.le90_m is not None
+    assert found.le90_m.value == pytest.approx(5.0)
+
+
+def test_planimetric_errors_say_nothing_about_heights():
+    assert accuracy(np.zeros((40, 2))).le90_m is None
+
+
+def test_ce90_of_a_circular_sample_is_the_known_factor():
+    error_m = np.random.default_rng(1).normal(0.0, 2.0, (200_000, 2))
+    quantile = accuracy(error_m).ce90_m
+    assert quantile.value == pytest.approx(2.0 * CIRCULAR_CE90, rel=0.005)
+
+
+def test_an_honest_precision_has_normalised_errors_near_one():
+    rng = np.random.default_rng(2)
+    covariance = np.array([[0.5, 0.2], [0.2, 0.3]])
+    error = rng.multivariate_normal(np.zeros(2), covariance, 500)
+    honest = normalised_error(error, np.broadcast_to(covariance, (500, 2, 2)))
+    flattering = normalised_error(error, np.broadcast_to(covariance / 4.0, (500, 2, 2)))
+    assert honest.lower < honest.mean_square < honest.upper
+    assert flattering.mean_square == pytest.approx(4.0 * honest.mean_square)
+    assert flattering.mean_square > flattering.upper
+
+
+def test_normalised_errors_leave_out_what_is_not_known():
+    error = np.array([[1.0, 1.0], [np.nan, 1.0], [1.0, 1.0]])
+    covariance = np.stack([np.eye(2), np.eye(2), np.full((2, 2), np.nan)])
+    found = normalised_error(error, covariance)
+    assert (found.n, found.mean_square) == (1, 1.0)
+    assert np.isnan(normalised_error(error[1:2], covariance[1:2]).mean_square)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "factor"),
+    [(0.0, 1.64485), (0.25, 1.66461), (0.5, 1.73708), (0.75, 1.90335), (1.0, 2.14597)],
+)
+def test_predicted_ce90_agrees_with_a_quadrature_of_its_own(ratio, factor):
+    """Factors by adaptive quadrature of the bivariate normal law (scipy.integrate.quad), to 1e-5."""
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    covariance = turn @ np.diag([4.0, 4.0 * ratio**2]) @ turn.T
+    assert normal_ce90(covariance[None])[0] == pytest.approx(2.0 * factor, rel=a_ten_thousandth)
+
+
+def test_predicted_ce90_of_an_unknown_covariance_is_unknown():
+    found = normal_ce90(np.stack([np.full((2, 2), np.nan), np.zeros((2, 2))]))
+    assert np.isnan(found[0])
+    assert found[1] == 0.0
