@@ -11,7 +11,9 @@ from services.geodesy import ecef_from_lon_lat_h, metres_per_degree
 from services.types import Array
 
 VALIDITY = 2.0
-"""How far a normalised coordinate may go: a model is used up to twice the range it was fitted on."""
+"""How far a normalised ground coordinate may go: a model is used up to twice the range it was fitted on.
+
+Image coordinates are not held to it: crops exist whose image scale is that of the crop."""
 
 _LOCATE_TOLERANCE_PX = 1e-7
 _LOCATE_ITERATIONS = 20
@@ -328,7 +330,7 @@ def _locate(c: Array, image: Array, height: Array) -> Array:
         x = 0.0
         y = 0.0
         found = False
-        if abs(z) <= VALIDITY and abs(u) <= VALIDITY and abs(v) <= VALIDITY:
+        if abs(z) <= VALIDITY:
             for _ in range(_LOCATE_ITERATIONS):
                 line, lx, ly, _lz = _value_and_gradient(c, 0, x, y, z)
                 sample, sx, sy, _sz = _value_and_gradient(c, 40, x, y, z)
