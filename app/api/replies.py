@@ -1,0 +1,102 @@
+"""Errors into replies: the only place that knows both. Replies are RFC 9457 problem details."""
+
+from http import HTTPStatus
+from typing import Any
+
+import psycopg
+from fastapi import FastAPI, Request
+from fastapi.encoders import jsonable_encoder
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from psycopg_pool import PoolTimeout
+from starlette.exceptions import HTTPException
+
+from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
+
+PROBLEM_JSON = "application/problem+json"
+HTTP_STATUS: dict[type[Exception], int] = {
+    InputError: 422,
+    ComputationError: 409,
+    Conflict: 409,
+    NotFound: 404,
+    TooLarge: 413,
+    AmersError: 500,
+}
+RETRY_SECONDS = "5"
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the application a problem reply."""
+    app.add_exception_handler(AmersError, _refused)
+    app.add_exception_handler(RequestValidationError, _malformed)
+    app.add_exception_handler(HTTPException, _not_routed)
+    app.add_exception_handler(psycopg.OperationalError, _unavailable)
+    app.add_exception_handler(PoolTimeout, _unavailable)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def problem(
+    status: int,
+    detail: str,
+    *,
+    title: str | None = None,
+    headers: dict[str, str] | None = None,
+    **more: Any,
+) -> JSONResponse:
+    """A problem reply.
+
+    Args:
+        status: HTTP status.
+        detail: what is wrong with this request, with its numbers.
+        title: what kind of problem it is; the status in words if not given.
+        more: members of the reply beside the standard ones.
+    """
+    body = {
+        "type": "about:blank",
+        "title": title or HTTPStatus(status).phrase,
+        "status": status,
+        "detail": detail,
+    }
+    return JSONResponse(jsonable_encoder({**body, **more}), status, headers, media_type=PROBLEM_JSON)
+
+
+def status_of(error: AmersError) -> int:
+    """The HTTP status of an error of Amers."""
+    if isinstance(error, NotAllowed):
+        return 403 if error.known else 401
+    return next(HTTP_STATUS[kind] for kind in type(error).__mro__ if kind in HTTP_STATUS)
+
+
+def _refused(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, AmersError)
+    status = status_of(error)
+    headers = {"WWW-Authenticate": 'Bearer realm="amers"'} if status == 401 else None
+    return problem(status, str(error), headers=headers, error=type(error).__name__)
+
+
+def _malformed(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    wrong = [
+        {"field": ".".join(map(str, item["loc"])), "message": item["msg"]} for item in error.errors()
+    ]
+    detail = "; ".join(f"{item['field']}: {item['message']}" for item in wrong)
+    return problem(422, detail, error="InputError", errors=wrong)
+
+
+def _not_routed(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    headers = dict(error.headers) if error.headers else None
+    return problem(error.status_code, str(error.detail), headers=headers)
+
+
+def _unavailable(request: Request, error: Exception) -> JSONResponse:
+    if isinstance(error, psycopg.errors.QueryCanceled):
+        return problem(503, "the database stopped this request: it took too long; ask for less")
+    return problem(
+        503, "the database does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
+    )
+
+
+def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    """Says nothing of what happened inside; the server logs the error with its trace."""
+    return problem(500, "an unexpected error, which has been logged")

@@ -1,0 +1,68 @@
+"""Who calls, and what he may do: bearer tokens of 256 random bits with scopes."""
+
+import hashlib
+import secrets
+from enum import StrEnum
+
+from app.db.engine import Connection
+from app.db.tokens import Token, find_valid_token
+from app.errors import NotAllowed
+
+SECRET_BYTES = 32
+
+
+class Scope(StrEnum):
+    """What a token allows; `register` includes `read`, `admin` includes everything."""
+
+    READ = "read"
+    REGISTER = "register"
+    ADMIN = "admin"
+
+
+INCLUDED = {
+    Scope.READ: frozenset({Scope.READ}),
+    Scope.REGISTER: frozenset({Scope.READ, Scope.REGISTER}),
+    Scope.ADMIN: frozenset(Scope),
+}
+
+
+def new_secret() -> str:
+    """A secret for a new token, 43 characters that need no quoting anywhere."""
+    return secrets.token_urlsafe(SECRET_BYTES)
+
+
+def secret_hash(secret: str) -> bytes:
+    """What is stored of a secret; 256 random bits need no salt and no slow hash."""
+    return hashlib.sha256(secret.encode()).digest()
+
+
+def authenticate(connection: Connection, secret: str) -> Token:
+    """The token of a secret.
+
+    Raises:
+        NotAllowed: unknown, expired and revoked secrets get the same answer.
+    """
+    token = find_valid_token(connection, secret_hash(secret))
+    if token is None:
+        raise NotAllowed("the token is unknown, expired or revoked", known=False)
+    return token
+
+
+def allows(token: Token, scope: Scope) -> bool:
+    """Whether a token carries a scope or one that includes it."""
+    return any(scope in INCLUDED[Scope(own)] for own in token.scopes)
+
+
+def require(token: Token | None, scope: Scope) -> Token:
+    """The token, if it allows the scope.
+
+    Raises:
+        NotAllowed: there is no token, or it lacks the scope.
+    """
+    if token is None:
+        raise NotAllowed("this needs a token: send `Authorization: Bearer …`", known=False)
+    if not allows(token, scope):
+        raise NotAllowed(
+            f"this needs scope {scope}; token {token.name} has {', '.join(token.scopes)}", known=True
+        )
+    return token

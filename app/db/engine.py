@@ -1,0 +1,189 @@
+"""Connections, pools and the version of the schema."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import psycopg
+from psycopg.rows import DictRow, dict_row
+from psycopg_pool import ConnectionPool
+
+from app.config import Settings
+from app.db import embedded
+from app.errors import InputError
+
+Connection = psycopg.Connection[DictRow]
+Pool = ConnectionPool[Connection]
+
+FIRST_SPATIAL_PLAN = "select st_asgeojson(st_makepoint(0, 0, 0)), 1 from point where false"
+
+
+@dataclass(frozen=True)
+class Database:
+    """An open database.
+
+    Attributes:
+        dsn: its connection string.
+        reader, writer: pools; connections of the first can only read, and not for long.
+    """
+
+    dsn: str
+    reader: Pool
+    writer: Pool
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """One read-only transaction; every statement of it has the time limit of the settings."""
+        with self.reader.connection() as connection:
+            yield connection
+
+    @contextmanager
+    def transaction(self) -> Iterator[Connection]:
+        """One transaction, committed at the end of the context, rolled back by an exception."""
+        with self.writer.connection() as connection:
+            yield connection
+
+
+@dataclass(frozen=True)
+class SchemaStatus:
+    """The version of the schema: as found in a database (None: empty) and as this Amers needs it."""
+
+    found: str | None
+    needed: str
+
+    @property
+    def current(self) -> bool:
+        """Whether the database can be used as it is."""
+        return self.found == self.needed
+
+
+@contextmanager
+def opened(settings: Settings) -> Iterator[Database]:
+    """The installation's database, ready for use: running, with the schema of this Amers, pools warm.
+
+    The schema of the private cluster is upgraded on the way; that of a database of your own is not.
+
+    Raises:
+        InputError: the database cannot be used; the message says what to do.
+    """
+    with embedded.database(settings) as dsn, pooled(dsn, settings) as database:
+        ensure_schema(dsn, upgradable=settings.database_url is None)
+        _warm(database)
+        yield database
+
+
+@contextmanager
+def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
+    """Pools on a database, whatever its schema."""
+    limit_ms = round(1000 * settings.read_timeout_seconds)
+    reading = f"-c default_transaction_read_only=on -c statement_timeout={limit_ms}"
+    with (
+        _pool(dsn, settings.pool_size, {"options": reading}) as reader,
+        _pool(dsn, settings.pool_size, {}) as writer,
+    ):
+        yield Database(dsn, reader, writer)
+
+
+@contextmanager
+def connect(dsn: str) -> Iterator[Connection]:
+    """A connection without a pool: one transaction, committed at the end of the context."""
+    with _reachable(dsn) as connection:
+        yield connection
+
+
+def status(dsn: str) -> SchemaStatus:
+    """The version of a database's schema beside the one this Amers needs."""
+    with _reachable(dsn) as connection:
+        known = connection.execute(
+            "select to_regclass('alembic_version') is not null as known"
+        ).fetchone()
+        row = (
+            connection.execute("select version_num from alembic_version").fetchone()
+            if known and known["known"]
+            else None
+        )
+    return SchemaStatus(found=row["version_num"] if row else None, needed=newest_revision())
+
+
+def ensure_schema(dsn: str, *, upgradable: bool) -> None:
+    """Bring the schema up to date, or say that it is not.
+
+    Raises:
+        InputError: the schema is another one and may not be upgraded here.
+    """
+    state = status(dsn)
+    if state.current:
+        return
+    if not upgradable:
+        raise InputError(
+            f"the schema of the database is at revision {state.found or 'none'}, "
+            f"this Amers needs {state.needed}: run `amers db upgrade`"
+        )
+    upgrade(dsn)
+
+
+def upgrade(dsn: str) -> None:
+    """Apply the migrations that the database lacks; safe when several commands do it at once.
+
+    Raises:
+        InputError: the database was upgraded by a newer Amers.
+    """
+    from alembic import command
+    from alembic.config import Config
+
+    state = status(dsn)
+    if state.found is not None and state.found > state.needed:
+        raise InputError(
+            f"the database is at revision {state.found}, newer than this Amers knows ({state.needed})"
+        )
+    config = Config()
+    config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
+    config.attributes["dsn"] = dsn
+    command.upgrade(config, "head")
+
+
+def migrations_folder() -> Path:
+    """Where the migrations are installed."""
+    return Path(str(resources.files("migrations")))
+
+
+def newest_revision() -> str:
+    """The revision this Amers needs; migrations are named `REVISION_what_it_does.py`, in order."""
+    return max(path.name.split("_")[0] for path in (migrations_folder() / "versions").glob("[0-9]*.py"))
+
+
+def _pool(dsn: str, size: int, options: dict[str, Any]) -> Pool:
+    return ConnectionPool(
+        dsn,
+        min_size=min(2, size),
+        max_size=size,
+        open=False,
+        timeout=10.0,
+        connection_class=psycopg.Connection[DictRow],
+        kwargs={"row_factory": dict_row, **options},
+        check=ConnectionPool.check_connection,
+    )
+
+
+def _warm(database: Database) -> None:
+    """The first spatial query of a connection loads PostGIS, 20 ms that no caller should wait for."""
+    for pool in (database.reader, database.writer):
+        pool.wait()
+        taken = [pool.getconn() for _ in range(pool.min_size)]
+        for connection in taken:
+            connection.execute(FIRST_SPATIAL_PLAN)
+            connection.rollback()
+            pool.putconn(connection)
+
+
+@contextmanager
+def _reachable(dsn: str) -> Iterator[Connection]:
+    try:
+        connection = psycopg.connect(dsn, row_factory=dict_row, connect_timeout=10)
+    except psycopg.OperationalError as error:
+        raise InputError(f"the database cannot be reached: {str(error).strip()}") from error
+    with connection:
+        yield connection

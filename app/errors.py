@@ -1,0 +1,37 @@
+"""The errors of the doors and the store; those of the science are in `services.errors`."""
+
+from services.errors import AmersError, ComputationError, InputError
+
+__all__ = [
+    "AmersError",
+    "ComputationError",
+    "Conflict",
+    "InputError",
+    "NotAllowed",
+    "NotFound",
+    "TooLarge",
+]
+
+
+class NotFound(AmersError):
+    """There is no such thing, or not for this caller."""
+
+
+class Conflict(AmersError):
+    """The thing is not in a state that allows this."""
+
+
+class TooLarge(AmersError):
+    """More bytes than the installation accepts."""
+
+
+class NotAllowed(AmersError):
+    """The caller may not do this.
+
+    Attributes:
+        known: whether the caller showed a valid token (403) or not (401).
+    """
+
+    def __init__(self, message: str, *, known: bool) -> None:
+        super().__init__(message)
+        self.known = known

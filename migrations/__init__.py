@@ -1,0 +1,1 @@
+"""Migrations of the store, applied by `amers db upgrade`; each revision says why in one sentence."""

@@ -1,0 +1,16 @@
+"""Run by Alembic: all missing revisions in one transaction, one upgrade at a time."""
+
+import psycopg
+from alembic import context
+from sqlalchemy import create_engine
+from sqlalchemy.pool import NullPool
+
+UPGRADE_LOCK = 0x616D657273  # "amers"
+
+dsn = context.config.attributes["dsn"]
+engine = create_engine("postgresql+psycopg://", creator=lambda: psycopg.connect(dsn), poolclass=NullPool)
+
+with engine.begin() as connection:
+    connection.exec_driver_sql(f"select pg_advisory_xact_lock({UPGRADE_LOCK})")
+    context.configure(connection=connection, transactional_ddl=True)
+    context.run_migrations()

@@ -1,0 +1,115 @@
+"""A real PostGIS for the tests: one private cluster a session, one database a test."""
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+import psycopg
+import pytest
+from fastapi.testclient import TestClient
+from psycopg import sql
+from pydantic import SecretStr
+
+from app.config import Settings
+from app.db import engine
+from app.db.embedded import Cluster
+from app.db.engine import Connection
+from app.main import create_app
+from app.storage import Storage
+from app.usecases.tokens import create_token
+
+TEMPLATE = "amers_template"
+
+
+@pytest.fixture(scope="session")
+def open_folder() -> Iterator[Path]:
+    """A short temporary folder that the server's user can pass, unlike pytest's own."""
+    folder = Path(tempfile.mkdtemp(prefix="amers-test-", dir="/tmp"))
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def cluster(open_folder: Path) -> Iterator[Cluster]:
+    """A running cluster whose database `amers_template` has the schema."""
+    cluster = Cluster(open_folder / "postgres", durable=False)
+    with cluster.lease():
+        with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
+            connection.execute(sql.SQL("create database {}").format(sql.Identifier(TEMPLATE)))
+        engine.upgrade(cluster.dsn(TEMPLATE))
+        yield cluster
+
+
+@contextmanager
+def fresh_database(cluster: Cluster, template: str) -> Iterator[str]:
+    """The connection string of a new database, dropped at the end."""
+    name = sql.Identifier(f"test_{uuid4().hex}")
+    with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
+        connection.execute(
+            sql.SQL("create database {} template {}").format(name, sql.Identifier(template))
+        )
+        try:
+            yield cluster.dsn(name.as_string(connection).strip('"'))
+        finally:
+            connection.execute(sql.SQL("drop database {} with (force)").format(name))
+
+
+@pytest.fixture
+def dsn(cluster: Cluster) -> Iterator[str]:
+    """A database of this test alone, empty but for its tables."""
+    with fresh_database(cluster, TEMPLATE) as dsn:
+        yield dsn
+
+
+@pytest.fixture
+def empty_dsn(cluster: Cluster) -> Iterator[str]:
+    """A database of this test alone without any table."""
+    with fresh_database(cluster, "template1") as dsn:
+        yield dsn
+
+
+@pytest.fixture
+def settings(dsn: str, tmp_path: Path) -> Settings:
+    """Settings on the test's database and a temporary data folder."""
+    return Settings(database_url=SecretStr(dsn), data_folder=tmp_path / "data")
+
+
+@pytest.fixture
+def storage(settings: Settings) -> Storage:
+    """The storage that the client of the same test uses."""
+    return Storage(settings.data_folder / "storage")
+
+
+@pytest.fixture
+def connection(dsn: str) -> Iterator[Connection]:
+    """A connection in a transaction of its own; commit for others to see."""
+    with engine.connect(dsn) as connection:
+        yield connection
+
+
+@pytest.fixture
+def client(settings: Settings) -> Iterator[TestClient]:
+    """The application, started, without a token; unexpected errors are replies, as for a real caller."""
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def token(dsn: str) -> Callable[[str], str]:
+    """Makes a token with a scope and returns its secret."""
+
+    def make(scope: str) -> str:
+        with engine.connect(dsn) as connection:
+            return create_token(connection, f"a token to {scope}", [scope]).secret
+
+    return make
+
+
+@pytest.fixture
+def bearer(token: Callable[[str], str]) -> Callable[[str], dict[str, str]]:
+    """Makes the headers of a caller with a scope: `client.get(path, headers=bearer("read"))`."""
+    return lambda scope: {"Authorization": f"Bearer {token(scope)}"}
