@@ -59,7 +59,7 @@ class OrderScore:
 
     Attributes:
         order: "shift", "drift" or "affine".
-        left_out_px: cross-validation score, pixels; the smaller the better. NaN when it was not tried.
+        left_out_px: root mean square of the residuals of left-out points, pixels.
     """
 
     order: str
@@ -130,7 +130,6 @@ class RegistrationSummary:
         blocks: those whose points were used.
         options: the dataclass of options of the registration.
         passes: in the order they were run.
-        order_scores: of the orders that were compared.
         order_reason: why the order of the correction was chosen.
         measures: what was done with each point.
         adjustment: the final one.
@@ -154,7 +153,6 @@ class RegistrationSummary:
     blocks: tuple[BlockUsed, ...]
     options: Any
     passes: tuple[PassSummary, ...]
-    order_scores: tuple[OrderScore, ...]
     order_reason: str
     measures: Measures
     adjustment: SceneAdjustment
@@ -329,7 +327,7 @@ def _correction_record(summary: RegistrationSummary) -> CorrectionRecord:
     return CorrectionRecord(
         order=adjustment.order,
         order_reason=summary.order_reason,
-        order_scores=summary.order_scores,
+        order_scores=tuple(OrderScore(*score) for score in adjustment.validation_px),
         parameters_px=correction.parameters,
         std_px=np.sqrt(variance).reshape(2, 3),
         centre_px=correction.centre,

@@ -1,0 +1,110 @@
+"""A registration whose truth is known, small enough to make anew in every test."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.types import Array, BoolArray, Measures
+
+SHAPE = (4000, 5000)
+GSD_M = 0.5
+METRE_DEG = 1.0 / 111_320.0
+
+
+@dataclass(frozen=True)
+class FlatModel:
+    """A vertical view of a plane at the equator: 0.5 m pixels, lines to the south."""
+
+    height_range_m: tuple[float, float] = (-100.0, 100.0)
+
+    def project(self, lon_lat_h: Array) -> Array:
+        east_m, north_m = lon_lat_h[:, 0] / METRE_DEG, lon_lat_h[:, 1] / METRE_DEG
+        return np.column_stack([-north_m, east_m]) / GSD_M
+
+    def project_derivative(self, lon_lat_h: Array) -> Array:
+        one = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]) / GSD_M
+        return np.broadcast_to(one, (len(lon_lat_h), 2, 3))
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        metres = np.column_stack([line_sample[:, 1], -line_sample[:, 0]]) * GSD_M
+        return np.column_stack([metres * METRE_DEG, height_m])
+
+    def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
+        raise NotImplementedError("a vertical view of a plane has no orbit")
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Measures of a scene, their adjustment, and the way to redo it."""
+
+    measures: Measures
+    adjustment: SceneAdjustment
+    refit: Callable[[BoolArray], SceneAdjustment]
+    truth: ImageCorrection
+    shape: tuple[int, int] = SHAPE
+    gsd_m: float = GSD_M
+
+
+def register(
+    n: int = 60, noise_px: float = 0.2, lost: int = 8, wrong: int = 4, extent: float = 1.0, seed: int = 0
+) -> Registered:
+    """Register a scene on n visible points.
+
+    Args:
+        n: visible points, `lost` of them not found and `wrong` of them found elsewhere.
+        noise_px: of the measures.
+        extent: part of each side of the image where points are.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    model, frame = FlatModel(), no_correction(SHAPE)
+    truth = replace(frame, parameters=np.array([[12.0, 1.5, 0.0], [-7.0, 0.0, 0.0]]))
+    predicted = rng.uniform(0.0, 1.0, (n, 2)) * (np.array(SHAPE) - 1.0) * extent
+    lon_lat_h = model.locate(predicted, np.zeros(n))
+    seen = truth.apply(predicted) + rng.normal(0.0, noise_px, (n, 2))
+    seen[:lost] = np.nan
+    seen[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(6.0, 15.0, (wrong, 2))
+
+    def refit(candidates: BoolArray) -> SceneAdjustment:
+        return adjust_scene(
+            model,
+            SHAPE,
+            lon_lat_h,
+            seen,
+            np.full(n, noise_px),
+            np.zeros((n, 3, 3)),
+            AdjustmentOptions(order="drift"),
+            candidates,
+        )
+
+    matched = np.isfinite(seen).all(axis=1)
+    adjustment = refit(matched)
+    corrected = CorrectedModel(model, adjustment.correction)
+    residual_px = seen - corrected.project(lon_lat_h)
+    reason = np.where(adjustment.active, "", np.where(matched, "beyond 2.7 sigma", "score under 0.8"))
+    reason[: lost // 2] = np.where(matched[: lost // 2], reason[: lost // 2], "second peak too close")
+    measures = Measures(
+        point_id=np.arange(n),
+        lon_lat_h=lon_lat_h,
+        predicted=predicted,
+        line_sample=seen,
+        sigma_px=np.where(matched, noise_px, np.nan),
+        score=np.where(matched, rng.uniform(0.8, 0.98, n), rng.uniform(0.1, 0.7, n)),
+        views=np.full(n, 3),
+        residual_px=residual_px,
+        residual_m=np.column_stack([residual_px[:, 1], -residual_px[:, 0]]) * GSD_M,
+        matched=matched,
+        active=adjustment.active,
+        reason=reason,
+    )
+    return Registered(measures, adjustment, refit, truth)
+
+
+@pytest.fixture
+def registered() -> Callable[..., Registered]:
+    """Makes a registration; see `register`."""
+    return register

@@ -1,0 +1,239 @@
+"""The figures of a qualification against a registration whose truth is known, and its verdicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.errors import NotEnoughPoints
+from services.quality.qualification import (
+    QualificationOptions,
+    count_equipment,
+    image_coverage,
+    qualify,
+    verdict_of,
+)
+from services.quality.stability import predict_accuracy
+
+a_millionth_px = 1e-6
+DEFAULT = QualificationOptions()
+
+
+def qualified(scene, options=DEFAULT, **changes):
+    """The qualification of a synthetic registration."""
+    refit = changes.pop("refit", scene.refit)
+    return qualify(
+        scene.measures,
+        scene.adjustment,
+        scene.shape,
+        refit,
+        scene.gsd_m,
+        options,
+        np.random.default_rng(3),
+        **changes,
+    )
+
+
+def failed(qualification):
+    """Names of the criteria that were not met, with what they are needed for."""
+    return {(c.name, c.needed_for) for c in qualification.criteria if not c.passed}
+
+
+def test_a_clean_registration_is_good(registered):
+    found = qualified(registered())
+    assert found.verdict == "good"
+    assert failed(found) == set()
+
+
+def test_the_equipment_counts_visible_matched_and_active_points(registered):
+    equipment = count_equipment(registered(n=60, lost=8, wrong=4).measures)
+    assert (equipment.visible, equipment.matched) == (60, 52)
+    assert 46 <= equipment.active <= 48
+    assert equipment.active_of_matched == equipment.active / 52
+    assert equipment.active_of_visible == equipment.active / 60
+
+
+def test_ratios_over_nothing_are_not_invented(registered):
+    measures = registered().measures
+    nothing = replace(measures, matched=np.zeros(60, bool), active=np.zeros(60, bool))
+    assert np.isnan(count_equipment(nothing).active_of_matched)
+
+
+def test_residuals_of_the_image_are_x_along_samples_and_y_along_lines(registered):
+    scene = registered()
+    active = scene.measures.active
+    residual = np.tile([3.0, -4.0], (60, 1))
+    measures = replace(scene.measures, residual_px=residual, residual_m=residual[:, ::-1] / 2.0)
+    found = qualified(replace(scene, measures=measures))
+    assert (found.image_residuals_px.y.mean, found.image_residuals_px.x.mean) == (3.0, -4.0)
+    assert (found.image_residuals_px.xy.mean, found.image_residuals_px.xy.std) == (5.0, 0.0)
+    assert found.image_residuals_px.xy.n == active.sum()
+    assert (found.ground_residuals_m.east.mean, found.ground_residuals_m.north.mean) == (-2.0, 1.5)
+    assert found.ground_residuals_m.horizontal.mean == 2.5
+
+
+def test_residuals_count_active_points_only(registered):
+    scene = registered()
+    residual = np.where(scene.measures.active[:, None], [0.1, 0.1], 1000.0)
+    found = qualified(replace(scene, measures=replace(scene.measures, residual_px=residual)))
+    assert found.image_residuals_px.x.mean == pytest.approx(0.1)
+
+
+def test_held_out_residuals_have_the_size_of_the_noise(registered):
+    stability = qualified(registered(n=400, noise_px=0.3)).stability
+    assert stability.held_out_px.x.std == pytest.approx(0.3, rel=0.1)
+    assert stability.held_out_px.x.n == stability.draws * stability.held_out_per_draw
+    assert stability.held_out_m.y.std == pytest.approx(stability.held_out_px.y.std / 2.0)
+
+
+def test_held_out_points_take_no_part_in_the_adjustment_that_judges_them(registered):
+    scene = registered()
+    masks = []
+
+    def refit(mask):
+        masks.append(mask)
+        return scene.refit(mask)
+
+    stability = qualified(scene, refit=refit).stability
+    active = scene.measures.active
+    assert len(masks) == DEFAULT.draws
+    for mask in masks:
+        assert not (mask & ~active).any()
+        assert mask.sum() == active.sum() - stability.held_out_per_draw
+    assert stability.held_out_per_draw == pytest.approx(0.2 * active.sum(), abs=1)
+
+
+def test_displacements_are_those_of_the_corners_and_the_centre(registered):
+    scene = registered()
+    moved = replace(
+        scene.adjustment.correction,
+        parameters=scene.adjustment.correction.parameters + [[0.0, 0.3, 0.0], [0.4, 0.0, 0.0]],
+    )
+    found = qualified(scene, refit=lambda mask: replace(scene.adjustment, correction=moved))
+    at = {place.place: place for place in found.stability.displacements}
+    assert at["centre"].median_px == pytest.approx(0.4, abs=a_millionth_px)
+    assert at["top left"].max_px == pytest.approx(0.5, rel=1e-3)
+    assert at["bottom right"].max_m == pytest.approx(0.25, rel=1e-3)
+
+
+def test_an_adjustment_that_cannot_be_redone_says_so(registered):
+    def refit(mask):
+        raise NotEnoughPoints(3, 4)
+
+    scene = registered()
+    stability = qualified(scene, refit=refit).stability
+    assert (stability.draws, stability.failed_draws, stability.displacements) == (0, 10, ())
+    assert "gave no solution in any draw" in stability.note
+    assert np.isnan(stability.held_out_px.x.mean)
+
+
+def test_a_bug_in_the_adjustment_is_not_taken_for_an_instability(registered):
+    def refit(mask):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        qualified(registered(), refit=refit)
+
+
+def test_the_predicted_accuracy_is_honest_about_the_true_correction(registered):
+    """The true error at a corner stays within the predicted CE90 nine times in ten."""
+    inside = []
+    for seed in range(60):
+        scene = registered(n=40, seed=seed, wrong=0)
+        predicted = predict_accuracy(scene.adjustment, scene.shape, scene.gsd_m, 7)
+        corner = np.array([[0.0, scene.shape[1] - 1.0]])
+        error = scene.adjustment.correction.apply(corner) - scene.truth.apply(corner)
+        inside.append(np.hypot(*error[0]) <= predicted.ce90_px[0, -1])
+    three_standard_errors = 3.0 * np.sqrt(0.9 * 0.1 / 60)
+    assert np.mean(inside) == pytest.approx(0.9, abs=three_standard_errors)
+
+
+def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
+    scene = registered()
+    covariance = np.zeros((6, 6))
+    covariance[0, 0] = covariance[3, 3] = 0.04
+    found = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 5, 2.0)
+    assert found.std_line_px == pytest.approx(np.full((5, 5), 0.2))
+    assert found.worst_px == pytest.approx(found.median_px)
+    assert found.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
+    assert found.frame_ce90_m == pytest.approx(2.0 * 2.1460, rel=1e-3)
+
+
+def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
+    scene = registered()
+    covariance = np.diag([0.01, 0.03, 0.0, 0.01, 0.0, 0.0])
+    found = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3)
+    assert found.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
+    assert found.std_line_px[1, 0] == pytest.approx(0.1)
+    assert found.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
+    assert np.isnan(found.frame_ce90_m)
+
+
+def test_coverage_is_the_share_of_cells_with_an_active_point():
+    line_sample = np.array([[-0.5, -0.5], [10.0, 10.0], [99.4, 199.4], [50.0, np.nan]])
+    coverage = image_coverage(line_sample, (100, 200), 5)
+    assert (coverage.occupied, coverage.percent) == (2, 8.0)
+    assert (coverage.cells[0, 0], coverage.cells[4, 4]) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("field", "limit", "lost"),
+    [
+        ("good_active_points", 1000, ("active_points", "good")),
+        ("good_coverage_percent", 101.0, ("coverage_percent", "good")),
+        ("good_active_of_matched", 1.01, ("active_of_matched", "good")),
+        ("good_residual_std_px", 0.01, ("residual_std_px", "good")),
+        ("good_displacement_px", 0.0001, ("displacement_px", "good")),
+        ("good_ce90_px", 0.001, ("predicted_ce90_px", "good")),
+        ("usable_active_points", 1000, ("active_points", "usable")),
+        ("usable_residual_std_px", 0.01, ("residual_std_px", "usable")),
+        ("usable_displacement_px", 0.0001, ("displacement_px", "usable")),
+        ("usable_ce90_px", 0.001, ("predicted_ce90_px", "usable")),
+    ],
+)
+def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
+    found = qualified(registered(), replace(DEFAULT, **{field: limit}))
+    assert failed(found) == {lost}
+    assert found.verdict == ("usable" if lost[1] == "good" else "failed")
+
+
+def test_nineteen_active_points_are_never_good(registered):
+    scene = registered(n=19, lost=0, wrong=0)
+    found = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
+    assert found.equipment.active <= 19
+    assert ("active_points", "good") in failed(found)
+    assert found.verdict == "usable"
+
+
+def test_points_in_a_corner_are_never_good(registered):
+    found = qualified(registered(n=100, extent=0.5))
+    assert found.coverage.percent == 36.0
+    assert ("coverage_percent", "good") in failed(found)
+    assert found.verdict != "good"
+
+
+def test_without_active_points_every_figure_is_absent_and_the_verdict_is_failed(registered):
+    scene = registered()
+    measures = replace(scene.measures, active=np.zeros(60, bool))
+    found = qualified(replace(scene, measures=measures))
+    assert found.verdict == "failed"
+    assert np.isnan(found.image_residuals_px.x.mean)
+    assert found.stability.note == "0 active points leave none to hold out"
+    assert ("residual_std_px", "usable") in failed(found)
+
+
+def test_a_criterion_without_a_value_is_not_met(registered):
+    unknown = replace(registered().adjustment, covariance=np.full((6, 6), np.nan))
+    found = qualified(replace(registered(), adjustment=unknown))
+    assert failed(found) == {("predicted_ce90_px", "good"), ("predicted_ce90_px", "usable")}
+    assert found.verdict == "failed"
+
+
+def test_the_verdict_is_recomputed_from_the_criteria_alone(registered):
+    found = qualified(registered(n=30))
+    assert verdict_of(found.criteria) == found.verdict
+
+
+def test_the_same_seed_gives_the_same_figures(registered):
+    first, second = qualified(registered()), qualified(registered())
+    assert first.stability == second.stability
