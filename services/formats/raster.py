@@ -1,0 +1,218 @@
+"""Images in files, opened with suspicion: few drivers, no address, no sidecar, no surprise in size."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.rpc
+from rasterio.enums import MaskFlags
+from rasterio.errors import RasterioError
+from rasterio.windows import Window as RasterWindow
+
+from services.errors import FormatError
+from services.imagery import Window
+from services.sensors.rpc import RpcModel
+from services.types import FloatImage
+
+DRIVER_OF_SIGNATURE = {
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
+    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
+    b"NITF": "NITF",
+    b"NSIF": "NITF",
+}
+"""The drivers that may open a file, by its first bytes; no other driver is ever asked."""
+MAX_PIXELS = 40_000_000_000
+"""Pixels an image may declare: twice a strip of 40,000 samples and 500,000 lines."""
+MAX_EXPANSION = 5_000
+"""Bytes of pixels a byte of file may declare: Deflate reaches 1,032 on a constant image."""
+
+_OPTIONS = {
+    "GDAL_PAM_ENABLED": "NO",
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_CACHEMAX": 256_000_000,
+    "GDAL_NUM_THREADS": 1,
+    "OPJ_NUM_THREADS": 1,
+}
+
+
+@dataclass(frozen=True)
+class RasterImage:
+    """One band of an image file, an `ImageSource`; for one thread at a time.
+
+    Attributes:
+        path: the file.
+        dataset: as opened by `open_raster`.
+        band: counted from one.
+    """
+
+    path: Path
+    dataset: rasterio.DatasetReader
+    band: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        return self.dataset.height, self.dataset.width
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window, (lines, samples) float32; NaN beyond the image and where nodata.
+
+        Raises:
+            FormatError: when the file cannot be read there.
+        """
+        out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
+        line, sample = max(window.line, 0), max(window.sample, 0)
+        lines = min(window.line + window.lines, self.shape[0]) - line
+        samples = min(window.sample + window.samples, self.shape[1]) - sample
+        if lines > 0 and samples > 0:
+            inside = out[
+                line - window.line : line - window.line + lines,
+                sample - window.sample : sample - window.sample + samples,
+            ]
+            self._fill(inside, RasterWindow(sample, line, samples, lines))
+        return out
+
+    def close(self) -> None:
+        """Give the file back; nothing can be read after."""
+        self.dataset.close()
+
+    def _fill(self, out: FloatImage, window: RasterWindow) -> None:
+        flags = self.dataset.mask_flag_enums[self.band - 1]
+        nodata = self.dataset.nodatavals[self.band - 1]
+        with _as_format_error(self.path, "its pixels"):
+            pixels = self.dataset.read(self.band, window=window)
+            out[:] = pixels
+            if MaskFlags.nodata in flags:
+                out[pixels == nodata] = np.nan
+            elif MaskFlags.all_valid not in flags:
+                out[self.dataset.read_masks(self.band, window=window) == 0] = np.nan
+
+
+def open_raster(path: Path, band: int = 1) -> RasterImage:
+    """Open one band of a GeoTIFF (or COG), JPEG 2000 or NITF file.
+
+    Only the file itself is looked at: no sidecar, no address, no archive, no file that names others.
+    The far corner is read, so that a truncated file is told now rather than in the middle of the work.
+
+    Args:
+        path: of a regular file.
+        band: counted from one.
+
+    Raises:
+        FormatError: when the file cannot be used; the message says why and what was expected.
+    """
+    resolved = path.resolve()
+    if "://" in str(path) or str(path).startswith("/vsi") or not resolved.is_file():
+        raise FormatError(f"{path}: expected the name of an image file")
+    driver = _driver(path)
+    with _as_format_error(path, f"the image as {driver}"), rasterio.Env(**_OPTIONS):
+        dataset = rasterio.open(resolved, driver=driver)
+    image = RasterImage(path, dataset, band)
+    try:
+        _check_declaration(image)
+        image.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
+    except FormatError:
+        dataset.close()
+        raise
+    return image
+
+
+def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:
+    """A copy of a GeoTIFF, to the byte but for its RPC tags.
+
+    Args:
+        path_in: the image as delivered; never written to.
+        path_out: the copy; must not be there yet.
+        model: in pixels from the centre of the first one.
+
+    Raises:
+        FormatError: when the image is not a GeoTIFF, or the copy is there already.
+    """
+    image = open_raster(path_in)
+    driver = image.dataset.driver
+    image.close()
+    if driver != "GTiff":
+        raise FormatError(f"{path_in}: only a GeoTIFF can carry RPC tags, this is {driver}")
+    if path_out.exists():
+        raise FormatError(f"{path_out}: there is a file of that name already")
+    shutil.copyfile(path_in, path_out)
+    with (
+        _as_format_error(path_out, "a GeoTIFF whose tags can be written"),
+        rasterio.Env(**_OPTIONS),
+        rasterio.open(path_out.resolve(), "r+", driver="GTiff", IGNORE_COG_LAYOUT_BREAK="YES") as copy,
+    ):
+        copy.rpcs = gdal_rpc(model)
+
+
+def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
+    """The model as GDAL holds it; GDAL writes unknown errors as -1."""
+    line_off, samp_off = model.image_offset.tolist()
+    line_scale, samp_scale = model.image_scale.tolist()
+    long_off, lat_off, height_off = model.ground_offset.tolist()
+    long_scale, lat_scale, height_scale = model.ground_scale.tolist()
+    return rasterio.rpc.RPC(
+        line_off=line_off,
+        samp_off=samp_off,
+        line_scale=line_scale,
+        samp_scale=samp_scale,
+        long_off=long_off,
+        lat_off=lat_off,
+        height_off=height_off,
+        long_scale=long_scale,
+        lat_scale=lat_scale,
+        height_scale=height_scale,
+        line_num_coeff=model.line_num.tolist(),
+        line_den_coeff=model.line_den.tolist(),
+        samp_num_coeff=model.sample_num.tolist(),
+        samp_den_coeff=model.sample_den.tolist(),
+        err_bias=-1.0 if np.isnan(model.error_bias_m) else model.error_bias_m,
+        err_rand=-1.0 if np.isnan(model.error_random_m) else model.error_random_m,
+    )
+
+
+def _driver(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            start = file.read(12)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be opened: {error.strerror}") from error
+    for signature, driver in DRIVER_OF_SIGNATURE.items():
+        if start.startswith(signature):
+            return driver
+    raise FormatError(f"{path}: expected a GeoTIFF, JPEG 2000 or NITF image, found another kind of file")
+
+
+def _check_declaration(image: RasterImage) -> None:
+    """Refuse sizes and bands that cannot be, before anything is allocated for them."""
+    dataset, path = image.dataset, image.path
+    if not 1 <= image.band <= dataset.count:
+        raise FormatError(f"{path}: expected a band {image.band}, the image has {dataset.count}")
+    dtype = np.dtype(dataset.dtypes[image.band - 1])
+    if dtype.kind not in "uif":
+        raise FormatError(f"{path}: expected whole or real pixels, found {dtype.name}")
+    pixels, size = dataset.width * dataset.height, os.path.getsize(path)
+    if pixels > MAX_PIXELS or pixels * dtype.itemsize > MAX_EXPANSION * size:
+        raise FormatError(
+            f"{path}: declares {dataset.height} lines of {dataset.width} samples in {size} bytes; "
+            f"at most {MAX_PIXELS} pixels and {MAX_EXPANSION} bytes of pixels a byte are read"
+        )
+
+
+@contextmanager
+def _as_format_error(path: Path, expected: str) -> Iterator[None]:
+    """Tell the driver's errors as errors of the file."""
+    try:
+        yield
+    except RasterioError as error:
+        raise FormatError(
+            f"{path}: truncated or damaged, expected {expected} to be readable: {error}"
+        ) from error
