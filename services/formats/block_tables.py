@@ -1,0 +1,281 @@
+"""The two tables of an Amers block, points.parquet and views.parquet, as arrays and back."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pyproj
+import shapely
+
+from services.errors import FormatError
+from services.types import Acquisition, Array, IntArray
+
+POINTS_PARQUET = "points.parquet"
+VIEWS_PARQUET = "views.parquet"
+
+Dates = npt.NDArray[np.datetime64]
+Texts = npt.NDArray[np.object_]
+
+_SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
+_CORRELATIONS = ("corr_east_north", "corr_east_up", "corr_north_up")
+
+POINTS_SCHEMA = pa.schema(
+    [
+        pa.field("id", pa.int64(), nullable=False),
+        pa.field("geometry", pa.binary(), nullable=False),
+        *(pa.field(name, pa.float64(), nullable=False) for name in _SIGMAS + _CORRELATIONS),
+        pa.field("n_views", pa.int16(), nullable=False),
+        pa.field("saliency", pa.float32(), nullable=False),
+        pa.field("typology", pa.string()),
+        pa.field("first_view", pa.date32()),
+        pa.field("last_view", pa.date32()),
+        pa.field("chip_file", pa.string(), nullable=False),
+        pa.field("chip_row", pa.int64(), nullable=False),
+        pa.field("chip_count", pa.int16(), nullable=False),
+    ]
+)
+
+VIEWS_SCHEMA = pa.schema(
+    [
+        pa.field("point_id", pa.int64(), nullable=False),
+        pa.field("view", pa.int16(), nullable=False),
+        pa.field("gsd_m", pa.float64(), nullable=False),
+        pa.field("image_id", pa.string(), nullable=False),
+        pa.field("sensor", pa.string(), nullable=False),
+        pa.field("acquired_at", pa.timestamp("us", tz="UTC")),
+        pa.field("incidence_deg", pa.float64()),
+        pa.field("azimuth_deg", pa.float64()),
+        pa.field("sun_elevation_deg", pa.float64()),
+        pa.field("sun_azimuth_deg", pa.float64()),
+        pa.field("chip_file", pa.string(), nullable=False),
+        pa.field("chip_row", pa.int64(), nullable=False),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class PointRows:
+    """The rows of points.parquet.
+
+    Attributes:
+        id: (n,) int64.
+        lon_lat_h: (n, 3).
+        sigma_m: (n, 3) east, north, up.
+        correlation: (n, 3) east-north, east-up, north-up.
+        n_views: (n,) int64, images that see the point.
+        saliency: (n,).
+        typology: (n,) str or None.
+        first_view, last_view: (n,) datetime64[D], NaT when unknown.
+        chip_file: (n,) int64, rows of `chip_files`.
+        chip_row, chip_count: (n,) int64, the point's chips in its file.
+        chip_files: paths in the block.
+    """
+
+    id: IntArray
+    lon_lat_h: Array
+    sigma_m: Array
+    correlation: Array
+    n_views: IntArray
+    saliency: Array
+    typology: Texts
+    first_view: Dates
+    last_view: Dates
+    chip_file: IntArray
+    chip_row: IntArray
+    chip_count: IntArray
+    chip_files: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ViewRows:
+    """The rows of views.parquet that block.json does not say already.
+
+    Attributes:
+        point_id, view: (m,) int64.
+        gsd_m: (m,) metres.
+        image: (m,) int64, rows of `image_ids`.
+        incidence_deg, azimuth_deg: (m,) NaN when unknown.
+        chip_file: (m,) int64, rows of `chip_files`.
+        chip_row: (m,) int64.
+        image_ids: names of the images.
+        chip_files: paths in the block.
+    """
+
+    point_id: IntArray
+    view: IntArray
+    gsd_m: Array
+    image: IntArray
+    incidence_deg: Array
+    azimuth_deg: Array
+    chip_file: IntArray
+    chip_row: IntArray
+    image_ids: tuple[str, ...]
+    chip_files: tuple[str, ...]
+
+
+def covariance_from_spread(sigma_m: Array, correlation: Array) -> Array:
+    """Covariances (n, 3, 3) of sigmas (n, 3) and correlations (n, 3) east-north, east-up, north-up."""
+    covariance = sigma_m[:, :, None] * sigma_m[:, None, :]
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        covariance[:, i, j] *= correlation[:, k]
+        covariance[:, j, i] *= correlation[:, k]
+    return covariance
+
+
+def spread_from_covariance(covariance_m2: Array) -> tuple[Array, Array]:
+    """Sigmas (n, 3) and correlations (n, 3) east-north, east-up, north-up of covariances (n, 3, 3)."""
+    sigma = np.sqrt(np.diagonal(covariance_m2, axis1=1, axis2=2))
+    rows, columns = [0, 0, 1], [1, 2, 2]
+    return sigma, covariance_m2[:, rows, columns] / (sigma[:, rows] * sigma[:, columns])
+
+
+def write_points(path: Path, rows: PointRows) -> None:
+    """Write points.parquet: GeoParquet 1.1, WKB PointZ in EPSG:4979."""
+    columns = {
+        "id": rows.id,
+        "geometry": shapely.to_wkb(shapely.points(rows.lon_lat_h), flavor="iso"),
+        "n_views": rows.n_views,
+        "saliency": rows.saliency.astype(np.float32),
+        "typology": rows.typology,
+        "first_view": rows.first_view,
+        "last_view": rows.last_view,
+        "chip_file": pa.array(rows.chip_files, pa.string()).take(pa.array(rows.chip_file)),
+        "chip_row": rows.chip_row,
+        "chip_count": rows.chip_count,
+    }
+    columns |= {name: rows.sigma_m[:, i] for i, name in enumerate(_SIGMAS)}
+    columns |= {name: rows.correlation[:, i] for i, name in enumerate(_CORRELATIONS)}
+    low, high = rows.lon_lat_h.min(axis=0), rows.lon_lat_h.max(axis=0)
+    geo = {
+        "version": "1.1.0",
+        "primary_column": "geometry",
+        "columns": {
+            "geometry": {
+                "encoding": "WKB",
+                "geometry_types": ["Point Z"],
+                "crs": pyproj.CRS.from_epsg(4979).to_json_dict(),
+                "bbox": [*low.tolist(), *high.tolist()],
+            }
+        },
+    }
+    schema = POINTS_SCHEMA.with_metadata({"geo": json.dumps(geo)})
+    arrays = [pa.array(columns[field.name], field.type) for field in schema]
+    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path, compression="zstd")
+
+
+def write_views(path: Path, rows: ViewRows, images: tuple[Acquisition, ...]) -> None:
+    """Write views.parquet; `images` in the order of `rows.image_ids`."""
+    image = pa.array(rows.image)
+
+    def of_image(values: list[object], name: str) -> pa.Array:
+        return pa.array(values, VIEWS_SCHEMA.field(name).type).take(image)
+
+    columns = {
+        "point_id": rows.point_id,
+        "view": rows.view,
+        "gsd_m": rows.gsd_m,
+        "image_id": of_image(list(rows.image_ids), "image_id"),
+        "sensor": of_image([image.sensor for image in images], "sensor"),
+        "acquired_at": of_image([image.acquired_at for image in images], "acquired_at"),
+        "incidence_deg": rows.incidence_deg,
+        "azimuth_deg": rows.azimuth_deg,
+        "sun_elevation_deg": of_image([i.sun_elevation_deg for i in images], "sun_elevation_deg"),
+        "sun_azimuth_deg": of_image([i.sun_azimuth_deg for i in images], "sun_azimuth_deg"),
+        "chip_file": pa.array(rows.chip_files, pa.string()).take(pa.array(rows.chip_file)),
+        "chip_row": rows.chip_row,
+    }
+    arrays = [pa.array(columns[field.name], field.type) for field in VIEWS_SCHEMA]
+    pq.write_table(pa.Table.from_arrays(arrays, schema=VIEWS_SCHEMA), path, compression="zstd")
+
+
+def read_points(path: Path) -> PointRows:
+    """Read points.parquet; values are not judged, a position that is none is NaN.
+
+    Raises:
+        FormatError: when the file is not Parquet, or a column is missing, of another type or null.
+    """
+    table = _read_table(path, POINTS_SCHEMA)
+    try:
+        geometry = shapely.from_wkb(table["geometry"].to_numpy())
+    except shapely.errors.ShapelyError as error:
+        raise FormatError(f"{path.name}: geometry: not WKB: {error}") from error
+    point = shapely.get_type_id(geometry) == shapely.GeometryType.POINT
+    if not point.all():
+        row = int(np.argmin(point))
+        raise FormatError(
+            f"{path.name}: geometry: row {row}: {geometry[row].geom_type} found, Point Z expected"
+        )
+    chip_file, chip_files = _coded(table["chip_file"])
+    return PointRows(
+        id=table["id"].to_numpy(),
+        lon_lat_h=np.column_stack([f(geometry) for f in (shapely.get_x, shapely.get_y, shapely.get_z)]),
+        sigma_m=np.column_stack([table[name].to_numpy() for name in _SIGMAS]),
+        correlation=np.column_stack([table[name].to_numpy() for name in _CORRELATIONS]),
+        n_views=table["n_views"].to_numpy().astype(np.int64),
+        saliency=table["saliency"].to_numpy().astype(np.float64),
+        typology=np.array(table["typology"].to_pylist(), dtype=object),
+        first_view=table["first_view"].to_numpy().astype("datetime64[D]"),
+        last_view=table["last_view"].to_numpy().astype("datetime64[D]"),
+        chip_file=chip_file,
+        chip_row=table["chip_row"].to_numpy(),
+        chip_count=table["chip_count"].to_numpy().astype(np.int64),
+        chip_files=chip_files,
+    )
+
+
+def read_views(path: Path) -> ViewRows:
+    """Read views.parquet; values are not judged.
+
+    Raises:
+        FormatError: when the file is not Parquet, or a column is missing, of another type or null.
+    """
+    table = _read_table(path, VIEWS_SCHEMA)
+    image, image_ids = _coded(table["image_id"])
+    chip_file, chip_files = _coded(table["chip_file"])
+    return ViewRows(
+        point_id=table["point_id"].to_numpy(),
+        view=table["view"].to_numpy().astype(np.int64),
+        gsd_m=table["gsd_m"].to_numpy(),
+        image=image,
+        incidence_deg=table["incidence_deg"].to_numpy(),
+        azimuth_deg=table["azimuth_deg"].to_numpy(),
+        chip_file=chip_file,
+        chip_row=table["chip_row"].to_numpy(),
+        image_ids=image_ids,
+        chip_files=chip_files,
+    )
+
+
+def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
+    try:
+        with pq.ParquetFile(path, memory_map=False) as file:
+            found = file.schema_arrow
+            _check_schema(path.name, found, schema)
+            table = file.read(columns=schema.names)
+    except (pa.ArrowException, OSError) as error:
+        raise FormatError(f"{path.name}: cannot be read as Parquet: {error}") from error
+    for field in schema:
+        if not field.nullable and table[field.name].null_count:
+            row = int(np.argmax(table[field.name].is_null().to_numpy()))
+            raise FormatError(f"{path.name}: {field.name}: row {row}: null found, a value expected")
+    return table
+
+
+def _check_schema(name: str, found: pa.Schema, expected: pa.Schema) -> None:
+    for field in expected:
+        if field.name not in found.names:
+            raise FormatError(f"{name}: {field.name}: no such column, {field.type} expected")
+        if found.field(field.name).type != field.type:
+            raise FormatError(
+                f"{name}: {field.name}: {found.field(field.name).type} found, {field.type} expected"
+            )
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[IntArray, tuple[str, ...]]:
+    """A column of few texts as rows of the list of them."""
+    coded = column.combine_chunks().dictionary_encode()
+    return coded.indices.to_numpy().astype(np.int64), tuple(coded.dictionary.to_pylist())

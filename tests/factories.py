@@ -1,0 +1,182 @@
+"""Small valid blocks: points anywhere, chips of noise that can be told apart."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from services.conventions import CHIP_SIZE
+from services.formats.block import write_block
+from services.formats.block_json import (
+    AccuracyFigure,
+    BlockMetadata,
+    BlockSpecification,
+    Provenance,
+    rectangle,
+)
+from services.sensors.rpc import RpcModel
+from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
+
+GSDS_M = (0.5, 2.0)
+BOX = (5.2, 43.2, 5.3, 43.3)
+
+
+@dataclass(frozen=True)
+class MadeBlock:
+    """A block on the disk and what was put into it.
+
+    Attributes:
+        folder: of the block.
+        metadata: as written.
+        points: in the order of the block, with the ids they have there.
+        chips: (views, 101, 101) of the point of a row.
+    """
+
+    folder: Path
+    metadata: BlockMetadata
+    points: ControlPoints
+    chips: Callable[[int], ChipArray]
+
+
+def images(count: int) -> tuple[Acquisition, ...]:
+    """Images taken a hundred days apart; the last one does not say when, nor by whom."""
+    first = datetime(2023, 3, 1, 10, 30, tzinfo=UTC)
+    dated = tuple(
+        Acquisition(
+            image_id=f"IMG_{i:02d}",
+            sensor="PHR 1A",
+            acquired_at=first + timedelta(days=100 * i),
+            incidence_deg=5.0 * i,
+            azimuth_deg=30.0 * i,
+            sun_elevation_deg=50.0,
+            sun_azimuth_deg=150.0,
+        )
+        for i in range(count - 1)
+    )
+    return (*dated, Acquisition(image_id=f"IMG_{count - 1:02d}"))
+
+
+def control_points(
+    count: int,
+    rng: np.random.Generator,
+    box: tuple[float, float, float, float] = BOX,
+    n_images: int = 3,
+    gsds_m: tuple[float, ...] = GSDS_M,
+) -> ControlPoints:
+    """Points anywhere in a box, each seen by all images at every ground sampling.
+
+    Args:
+        box: west, south, east, north; east below west crosses the antimeridian.
+    """
+    outline = rectangle(*box)
+    lon_lat_h = np.column_stack(
+        [
+            rng.uniform(outline[0, 0], outline[1, 0], count),
+            rng.uniform(outline[0, 1], outline[2, 1], count),
+            rng.uniform(40.0, 400.0, count),
+        ]
+    )
+    lon_lat_h[:, 0] = np.where(lon_lat_h[:, 0] > 180.0, lon_lat_h[:, 0] - 360.0, lon_lat_h[:, 0])
+    factor = rng.normal(0.0, 0.3, (count, 3, 3)) + np.eye(3)
+    n_views = n_images * len(gsds_m)
+    return ControlPoints(
+        id=np.arange(count, dtype=np.int64),
+        lon_lat_h=lon_lat_h,
+        covariance_m2=factor @ factor.transpose(0, 2, 1),
+        saliency=rng.uniform(0.0, 1.0, count).astype(np.float32).astype(np.float64),
+        views=Views(
+            start=np.arange(count + 1, dtype=np.int64) * n_views,
+            gsd_m=np.tile(np.repeat(np.sort(gsds_m), n_images), count),
+            image=np.tile(np.arange(n_images, dtype=np.int64), count * len(gsds_m)),
+            incidence_deg=rng.uniform(0.0, 30.0, count * n_views),
+            azimuth_deg=rng.uniform(0.0, 360.0, count * n_views),
+            images=images(n_images),
+        ),
+        chip_file=np.zeros(count, dtype=np.int64),
+        chip_row=np.zeros(count, dtype=np.int64),
+        chip_files=(),
+    )
+
+
+def noise_chips(points: ControlPoints, dtype: type = np.uint16) -> Callable[[int], ChipArray]:
+    """Chips of noise; the same point has always the same, whatever its row."""
+
+    def chips(row: int) -> ChipArray:
+        views = int(points.views.start[row + 1] - points.views.start[row])
+        rng = np.random.default_rng(zlib.crc32(points.lon_lat_h[row].tobytes()))
+        top = 256 if dtype is np.uint8 else 4096
+        return rng.integers(1, top, (views, CHIP_SIZE, CHIP_SIZE), dtype=dtype)
+
+    return chips
+
+
+def affine_model(centre_lon_lat: Array) -> RpcModel:
+    """An RPC that is plainly affine: 0.5 m pixels, north up, a lean with height."""
+    one = np.eye(20)[0]
+    line_num, sample_num = np.zeros(20), np.zeros(20)
+    line_num[[2, 3]] = -1.0, 0.02
+    sample_num[[1, 3]] = 1.0, 0.03
+    return RpcModel(
+        line_num=line_num,
+        line_den=one,
+        sample_num=sample_num,
+        sample_den=one,
+        image_offset=np.array([10_000.0, 10_000.0]),
+        image_scale=np.array([10_000.0, 10_000.0]),
+        ground_offset=np.array([*centre_lon_lat, 200.0]),
+        ground_scale=np.array([0.06, 0.045, 500.0]),
+    )
+
+
+def metadata(
+    name: str = "calanques",
+    version: str = "1",
+    box: tuple[float, float, float, float] = BOX,
+    gsds_m: tuple[float, ...] = GSDS_M,
+) -> BlockMetadata:
+    """What a producer would say about a block."""
+    return BlockMetadata(
+        id=name,
+        version=version,
+        title=f"Test block {name}",
+        description='Points of noise, with "quotes" and accents: é.',
+        license="CC-BY-4.0",
+        extent=rectangle(*box),
+        created=datetime(2024, 5, 6, 7, 8, 9, tzinfo=UTC),
+        specification=BlockSpecification(gsds_m=gsds_m, min_views=2, points_per_km2=0.5),
+        provenance=Provenance("amers", "0.1.0", ("IMG_00", "IMG_01"), {"seed": 1}),
+        epoch=2024.5,
+        accuracy=(AccuracyFigure("relative", "ce90_m", 0.42, 120, "tie points left out"),),
+    )
+
+
+def make_block(
+    folder: Path,
+    count: int = 40,
+    seed: int = 1,
+    name: str = "calanques",
+    version: str = "1",
+    box: tuple[float, float, float, float] = BOX,
+    n_images: int = 3,
+    gsds_m: tuple[float, ...] = GSDS_M,
+    dtype: type = np.uint16,
+) -> MadeBlock:
+    """Write a small valid block: `count` points in a box with `n_images` x `len(gsds_m)` chips each."""
+    rng = np.random.default_rng(seed)
+    points = control_points(count, rng, box, n_images, gsds_m)
+    said = metadata(name, version, box, gsds_m)
+    outline = rectangle(*box)
+    typology = [("crossroads", "building corner", 'a "rare" kind', None)[i % 4] for i in range(count)]
+    order = write_block(
+        folder,
+        said,
+        points,
+        noise_chips(points, dtype),
+        {"IMG_00": affine_model(outline.mean(axis=0))},
+        typology,
+    )
+    written = replace(points.take(order), id=np.arange(count, dtype=np.int64))
+    return MadeBlock(folder, said, written, noise_chips(written, dtype))
