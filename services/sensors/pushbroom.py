@@ -114,7 +114,7 @@ def _packed(model: PushbroomModel) -> tuple[Any, ...]:
 @njit(cache=True)
 def _interpolate(times: Array, values: Array, t: float, out: Array) -> None:
     """Lagrange polynomial over the eight samples around t, into `out`."""
-    first = min(max(np.searchsorted(times, t) - _NODES // 2, 0), len(times) - _NODES)
+    first = min(max(int(np.searchsorted(times, t)) - _NODES // 2, 0), len(times) - _NODES)
     out[:] = 0.0
     for i in range(first, first + _NODES):
         weight = 1.0

@@ -69,7 +69,7 @@ def pushbroom_over(
     half_s = VALIDITY * shape[0] / 2.0 * line_period_s
     step_s = max(_STEP_S, half_s / 400.0)
     steps = math.ceil(half_s / step_s) + _MARGIN_STEPS
-    times = step_s * np.arange(-steps, steps + 1)
+    times = step_s * np.arange(-steps, steps + 1, dtype=np.float64)
     position = track.position(times)
     seen = target + times[:, None] * ground_speed * heading
     seen = _at_height(seen, float(target_lon_lat_h[2]))
@@ -183,7 +183,7 @@ def _at_height(ecef: Array, height_m: float) -> Array:
 
 
 def _steering(position: Array, seen: Array, heading: Array) -> Rotation:
-    """Attitudes (n) that look at ground points (n, 3) with the row of detectors across a heading (3,)."""
+    """Attitudes (n) that look at ground points (n, 3), the row of detectors across a heading (3,)."""
     down = seen - position
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     up = seen / np.linalg.norm(seen, axis=1, keepdims=True)

@@ -1,0 +1,34 @@
+"""Reading a grid that repeats without end."""
+
+import numpy as np
+from numba import njit
+
+from services.types import Array, FloatImage
+
+
+@njit(inline="always")
+def bilinear(grid: FloatImage, x: float, y: float) -> float:
+    """Value between the nodes; x columns, y rows."""
+    rows, columns = grid.shape
+    x0 = int(np.floor(x))
+    y0 = int(np.floor(y))
+    fx = x - x0
+    fy = y - y0
+    if x0 < 0 or x0 >= columns:
+        x0 %= columns
+    if y0 < 0 or y0 >= rows:
+        y0 %= rows
+    x1 = x0 + 1 if x0 + 1 < columns else 0
+    y1 = y0 + 1 if y0 + 1 < rows else 0
+    top = grid[y0, x0] + fx * (np.float64(grid[y0, x1]) - grid[y0, x0])
+    bottom = grid[y1, x0] + fx * (np.float64(grid[y1, x1]) - grid[y1, x0])
+    return float(top + fy * (bottom - top))
+
+
+@njit(cache=True)
+def bilinear_values(grid: FloatImage, column_row: Array) -> Array:
+    """Values (n,) at positions (n, 2), columns first."""
+    out = np.empty(len(column_row))
+    for i in range(len(column_row)):
+        out[i] = bilinear(grid, column_row[i, 0], column_row[i, 1])
+    return out

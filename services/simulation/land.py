@@ -1,0 +1,273 @@
+"""What covers a simulated world: roads, fields, woods, villages and trees, cell by cell.
+
+The land is divided by a warped lattice of roads into blocks, a block into rectangles by repeated
+splitting, and everything about a block or a rectangle follows from a hash of where it is. A cell can
+therefore be computed without knowing any other, and the land repeats as the lattice does.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from services.simulation.grid import bilinear
+from services.types import Array, FloatImage
+
+NO_ROOF = np.float32(-np.inf)
+"""Height of the roof where there is none."""
+
+BLOCK_M = 260.0
+ROAD_HALF_WIDTH_M = 3.2
+TREE_LATTICE_M = 6.5
+
+FIELDS, WOOD, VILLAGE, WORKS = 0, 1, 2, 3
+_LOT_M = np.array([95.0, 400.0, 27.0, 75.0])
+_TREES = np.array([0.012, 0.85, 0.22, 0.03])
+_TEXTURE = np.array([0.09, 0.22, 0.16, 0.10])
+
+
+def cover_land(
+    terrain_m: FloatImage,
+    warp: FloatImage,
+    texture: FloatImage,
+    blotches: FloatImage,
+    posting_m: float,
+    seed: int,
+) -> tuple[FloatImage, FloatImage, npt.NDArray[np.uint16]]:
+    """Albedo, roofs and fields of a world.
+
+    Args:
+        terrain_m: (n, n) heights.
+        warp: (2, w, w) displacement of the lattice of roads, columns and rows, cells.
+        texture: (t, t) noise of unit spread, repeated; n is a multiple of t.
+        blotches: (b, b) coarse noise of unit spread, stretched over the world.
+        posting_m: size of a cell.
+        seed: what the hashes start from.
+
+    Returns:
+        Albedo (n, n), roof heights (n, n) with `NO_ROOF` on open ground, number of the field (n, n).
+    """
+    shape = terrain_m.shape
+    albedo = np.empty(shape, dtype=np.float32)
+    roof = np.full(shape, NO_ROOF, dtype=np.float32)
+    parcel = np.zeros(shape, dtype=np.uint16)
+    _cover(terrain_m, warp, texture, blotches, posting_m, np.uint64(seed), albedo, roof, parcel)
+    return albedo, roof, parcel
+
+
+@njit(inline="always")
+def _mix(seed: np.uint64, value: int) -> np.uint64:
+    """The next hash of a chain. Source: Steele et al. (2014), SplitMix64."""
+    h = seed + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(value) + np.uint64(1))
+    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return h ^ (h >> np.uint64(31))
+
+
+@njit(inline="always")
+def _part(h: np.uint64, k: int) -> float:
+    """The k-th (0 to 3) number between 0 and 1 of a hash."""
+    return float((h >> np.uint64(16 * k)) & np.uint64(0xFFFF)) / 65535.0
+
+
+@njit(cache=True)
+def _lattice(warp: FloatImage, x: float, y: float, n: int) -> tuple[float, float]:
+    """Position on the lattice of roads of a position on the grid, both in cells."""
+    scale = warp.shape[1] / n
+    return (
+        x + bilinear(warp[0], x * scale, y * scale),
+        y + bilinear(warp[1], x * scale, y * scale),
+    )
+
+
+@njit(cache=True)
+def _ground_below(terrain: FloatImage, warp: FloatImage, u: float, v: float) -> float:
+    """Height of the terrain at a position on the lattice of roads."""
+    n = len(terrain)
+    x, y = u, v
+    for _ in range(6):
+        du, dv = _lattice(warp, x, y, n)
+        x += u - du
+        y += v - dv
+    return bilinear(terrain, x, y)
+
+
+@njit(cache=True)
+def _highest_below(terrain: FloatImage, warp: FloatImage, u: float, v: float, walls: Array) -> float:
+    """Highest terrain below a building; walls in cells from the corner (u, v) of its block."""
+    top = -np.inf
+    for i in range(3):
+        for j in range(3):
+            p = walls[0] + 0.5 * i * (walls[1] - walls[0])
+            q = walls[2] + 0.5 * j * (walls[3] - walls[2])
+            top = max(top, _ground_below(terrain, warp, u + p, v + q))
+    return top
+
+
+@njit(cache=True)
+def _split(h: np.uint64, p: float, q: float, side: float, limit: float, box: Array) -> np.uint64:
+    """The rectangle of a block that holds (p, q), into `box` (p0, p1, q0, q1), and its hash; metres."""
+    box[0], box[1], box[2], box[3] = 0.0, side, 0.0, side
+    for _ in range(12):
+        width, height = box[1] - box[0], box[3] - box[2]
+        if max(width, height) < limit * (0.75 + 0.6 * _part(h, 0)):
+            break
+        at = 0.36 + 0.28 * _part(h, 1)
+        axis = 0 if width > height else 2
+        cut = box[axis] + at * (box[axis + 1] - box[axis])
+        if (p if axis == 0 else q) < cut:
+            box[axis + 1] = cut
+            h = _mix(h, 1)
+        else:
+            box[axis] = cut
+            h = _mix(h, 2)
+    return h
+
+
+@njit(cache=True)
+def _kind(h: np.uint64) -> int:
+    """What a block is."""
+    draw = _part(h, 3)
+    if draw < 0.50:
+        return FIELDS
+    if draw < 0.64:
+        return WOOD
+    return VILLAGE if draw < 0.92 else WORKS
+
+
+@njit(cache=True)
+def _tree(h: np.uint64, p: float, q: float, chance: float, side: float) -> float:
+    """How a tree changes the albedo: its factor, or 1 where there is none; a crown and its shadow."""
+    i = int(np.floor(p / TREE_LATTICE_M))
+    j = int(np.floor(q / TREE_LATTICE_M))
+    factor = 1.0
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            t = _mix(_mix(h, i + di + 100), j + dj + 100)
+            if _part(t, 0) > chance:
+                continue
+            a = (i + di + 0.15 + 0.7 * _part(t, 1)) * TREE_LATTICE_M
+            b = (j + dj + 0.15 + 0.7 * _part(t, 2)) * TREE_LATTICE_M
+            radius = 1.3 + 2.4 * _part(t, 3)
+            if min(a, side - a) < 6.0 or min(b, side - b) < 6.0:
+                continue
+            dp, dq = (p - a) / radius, (q - b) / radius
+            if dp * dp + dq * dq < 1.0:
+                return 0.42 + 0.22 * (dp + dq) + 0.25 * _part(t, 3)
+            dp, dq = dp + 0.75, dq + 0.75
+            if dp * dp + dq * dq < 1.0:
+                factor = 0.45
+    return factor
+
+
+@njit(cache=True)
+def _ground_albedo(h: np.uint64, kind: int, box: Array, p: float, q: float) -> float:
+    """Crops with rows along one side and a track or a hedge around; soil of woods; gardens and yards."""
+    edge = min(min(p - box[0], box[1] - p), min(q - box[2], box[3] - q))
+    if kind == WOOD:
+        return 0.13
+    if kind != FIELDS:
+        return 0.08 if edge < 0.7 else 0.12 + 0.16 * _part(h, 1)
+    if edge < 1.3:
+        return 0.30 if _part(h, 0) < 0.4 else 0.10
+    tone = 0.11 + 0.23 * _part(h, 2) ** 1.3
+    rows = 0.10 * _part(h, 1)
+    across = p if box[1] - box[0] < box[3] - box[2] else q
+    period = 3.5 + 5.0 * _part(h, 3)
+    return float(tone * (1.0 + rows * np.sin(2.0 * np.pi * across / period)))
+
+
+@njit(cache=True)
+def _building(h: np.uint64, kind: int, box: Array, walls: Array) -> float:
+    """Walls of the building of a lot (p0, p1, q0, q1), and its height above the ground; 0 for none."""
+    if kind in (WOOD, FIELDS) or _part(h, 2) < 0.16:
+        return 0.0
+    b = _mix(h, 7)
+    for axis in range(2):
+        size = box[2 * axis + 1] - box[2 * axis]
+        share = 0.38 + 0.27 * _part(b, axis)
+        if kind == WORKS:
+            share += 0.18
+        start = box[2 * axis] + (1.0 - share) * size * (0.3 + 0.4 * _part(b, axis + 2))
+        walls[2 * axis] = start
+        walls[2 * axis + 1] = start + share * size
+    if kind == WORKS:
+        return 6.0 + 6.0 * _part(h, 3)
+    return 4.0 + 5.0 * _part(h, 3) + (9.0 if _part(h, 0) < 0.12 else 0.0)
+
+
+@njit(cache=True)
+def _roof_albedo(h: np.uint64, kind: int, walls: Array, p: float, q: float) -> float:
+    """Tiles in two tones on either side of a ridge, or a flat roof with bands and a rim."""
+    width, depth = walls[1] - walls[0], walls[3] - walls[2]
+    edge = min(min(p - walls[0], walls[1] - p), min(q - walls[2], walls[3] - q))
+    tone = 0.17 + 0.22 * _part(h, 1)
+    if kind == WORKS:
+        tone = 0.26 + 0.32 * _part(h, 1)
+        along = (p if width > depth else q) / 6.0
+        band = 0.86 if along - np.floor(along) < 0.16 else 1.0
+        return tone * (0.65 if edge < 0.8 else band)
+    if width > depth:
+        side = 1.0 if q > walls[2] + depth * 0.5 else 0.0
+    else:
+        side = 1.0 if p > walls[0] + width * 0.5 else 0.0
+    chimney = edge > 1.5 and _part(_mix(h, int(p / 1.6) * 64 + int(q / 1.6)), 0) < 0.05
+    return (0.55 if chimney else 1.0) * tone * (0.78 + 0.5 * side)
+
+
+@njit(cache=True)
+def _cover(
+    terrain: FloatImage,
+    warp: FloatImage,
+    texture: FloatImage,
+    blotches: FloatImage,
+    posting: float,
+    seed: np.uint64,
+    albedo: FloatImage,
+    roof: FloatImage,
+    parcel: npt.NDArray[np.uint16],
+) -> None:
+    n = len(terrain)
+    blocks = max(2, int(np.round(n * posting / BLOCK_M)))
+    cells = n / blocks
+    side = cells * posting
+    tile = len(texture)
+    coarse = len(blotches) / n
+    box = np.empty(4)
+    walls = np.empty(4)
+    last_hash = np.uint64(0)
+    last_roof = 0.0
+    for r in range(n):
+        for c in range(n):
+            u, v = _lattice(warp, float(c), float(r), n)
+            bu, bv = int(np.floor(u / cells)), int(np.floor(v / cells))
+            p, q = (u - bu * cells) * posting, (v - bv * cells) * posting
+            block = _mix(_mix(seed, bu % blocks), bv % blocks)
+            kind = _kind(block)
+            grain = texture[r % tile, c % tile]
+            blotch = 1.0 + 0.12 * bilinear(blotches, c * coarse, r * coarse)
+            edge = min(min(p, side - p), min(q, side - q))
+            if edge < ROAD_HALF_WIDTH_M:
+                mark = 1.5 if edge < 0.25 else 1.0
+                albedo[r, c] = 0.20 * mark * (1.0 + 0.05 * grain)
+                continue
+            if edge < ROAD_HALF_WIDTH_M + 1.5:
+                albedo[r, c] = 0.15 * blotch * (1.0 + 0.15 * grain)
+                continue
+            h = _split(block, p, q, side, _LOT_M[kind], box)
+            height = _building(h, kind, box, walls)
+            if height > 0.0 and walls[0] <= p <= walls[1] and walls[2] <= q <= walls[3]:
+                if h != last_hash:
+                    origin_u, origin_v = bu * cells, bv * cells
+                    last_hash = h
+                    last_roof = height + _highest_below(
+                        terrain, warp, origin_u, origin_v, walls / posting
+                    )
+                roof[r, c] = last_roof
+                albedo[r, c] = _roof_albedo(h, kind, walls, p, q) * (1.0 + 0.05 * grain)
+                continue
+            ground = _ground_albedo(h, kind, box, p, q)
+            if kind == FIELDS:
+                parcel[r, c] = 1 + int(h % np.uint64(65535))
+            tree = _tree(block, p, q, _TREES[kind], side)
+            value = ground * tree * blotch * (1.0 + _TEXTURE[kind] * grain)
+            albedo[r, c] = min(max(value, 0.02), 0.8)

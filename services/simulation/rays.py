@@ -1,0 +1,236 @@
+"""Lines of sight that come down on a simulated world, and the light they meet there."""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from services.simulation.grid import bilinear
+from services.simulation.land import NO_ROOF
+from services.types import Array, BoolArray, FloatImage
+
+GROUND, ROOF, WALL_EAST_WEST, WALL_NORTH_SOUTH = 0, 1, 2, 3
+"""What a line of sight meets; a wall is named after the directions it may face."""
+
+WALL_ALBEDO = 0.22
+_GROUND_TOLERANCE_M = 1e-5
+_GROUND_STEPS = 60
+
+
+@njit(inline="always")
+def meet_ground(
+    terrain: FloatImage, x0: float, y0: float, by_h_x: float, by_h_y: float, h: float
+) -> float:
+    """Height where a line of sight meets the terrain.
+
+    The line is at `(x0 + h by_h_x, y0 + h by_h_y)` at height h. Fixed-point steps; they settle while
+    the slope of the ground times the tangent of the incidence is below one, and then there is only one
+    such place.
+    """
+    for _ in range(_GROUND_STEPS):
+        height = bilinear(terrain, x0 + h * by_h_x, y0 + h * by_h_y)
+        change = height - h
+        h = height
+        if abs(change) < _GROUND_TOLERANCE_M:
+            break
+    return h
+
+
+@njit(cache=True)
+def meet_building(
+    roof: FloatImage,
+    x0: float,
+    y0: float,
+    by_h_x: float,
+    by_h_y: float,
+    ground: float,
+    top: float,
+) -> tuple[int, float]:
+    """What a line of sight meets first on its way from one height down to the ground.
+
+    Source: Amanatides and Woo (1987), the cells of a grid along a line, in order.
+
+    Returns:
+        What is met and at which height.
+    """
+    rows, columns = roof.shape
+    x, y = x0 + top * by_h_x + 0.5, y0 + top * by_h_y + 0.5
+    column, row = math.floor(x), math.floor(y)
+    move_x, move_y = (-1 if by_h_x > 0.0 else 1), (-1 if by_h_y > 0.0 else 1)
+    per_x = 1.0 / abs(by_h_x) if by_h_x != 0.0 else np.inf
+    per_y = 1.0 / abs(by_h_y) if by_h_y != 0.0 else np.inf
+    next_x = ((x - column) if move_x < 0 else (column + 1 - x)) * per_x if by_h_x != 0.0 else np.inf
+    next_y = ((y - row) if move_y < 0 else (row + 1 - y)) * per_y if by_h_y != 0.0 else np.inf
+    depth, deepest = 0.0, top - ground
+    face = ROOF
+    while True:
+        leave = min(min(next_x, next_y), deepest)
+        height = roof[row % rows, column % columns]
+        if height > NO_ROOF:
+            if top - depth <= height and face != ROOF:
+                return face, top - depth
+            if top - leave <= height:
+                return ROOF, float(height)
+        if leave >= deepest:
+            return GROUND, ground
+        depth = leave
+        if next_x < next_y:
+            column += move_x
+            next_x += per_x
+            face = WALL_EAST_WEST
+        else:
+            row += move_y
+            next_y += per_y
+            face = WALL_NORTH_SOUTH
+
+
+@njit(inline="always")
+def _cubic_weights(f: float) -> tuple[float, float, float, float]:
+    """Catmull-Rom weights of the four nodes around a fraction. Source: Keys (1981), a = -1/2."""
+    return (
+        f * (-0.5 + f * (1.0 - 0.5 * f)),
+        1.0 + f * f * (-2.5 + 1.5 * f),
+        f * (0.5 + f * (2.0 - 1.5 * f)),
+        f * f * (-0.5 + 0.5 * f),
+    )
+
+
+@njit(inline="always")
+def _open_light(light: FloatImage, x: float, y: float) -> float:
+    """Light of open ground far from buildings, bicubic."""
+    rows, columns = light.shape
+    x0, y0 = math.floor(x), math.floor(y)
+    wx = _cubic_weights(x - x0)
+    wy = _cubic_weights(y - y0)
+    x0 = (x0 - 1) % columns
+    y0 = (y0 - 1) % rows
+    total = 0.0
+    if x0 + 3 < columns and y0 + 3 < rows:
+        for j in range(4):
+            total += wy[j] * (
+                wx[0] * light[y0 + j, x0]
+                + wx[1] * light[y0 + j, x0 + 1]
+                + wx[2] * light[y0 + j, x0 + 2]
+                + wx[3] * light[y0 + j, x0 + 3]
+            )
+    else:
+        for j in range(4):
+            for i in range(4):
+                total += wy[j] * wx[i] * light[(y0 + j) % rows, (x0 + i) % columns]
+    return total
+
+
+@njit(inline="always")
+def _kept_light(light: FloatImage, roof: FloatImage, x: float, y: float, on_roof: bool) -> float:
+    """Light of a roof, or of the ground beside one, bilinear over the cells of that kind."""
+    rows, columns = light.shape
+    x0, y0 = math.floor(x), math.floor(y)
+    fx, fy = x - x0, y - y0
+    total = 0.0
+    weight = 0.0
+    for j in range(2):
+        for i in range(2):
+            r, c = (y0 + j) % rows, (x0 + i) % columns
+            if (roof[r, c] > NO_ROOF) == on_roof:
+                w = (fx if i else 1.0 - fx) * (fy if j else 1.0 - fy) + 1e-9
+                total += w * light[r, c]
+                weight += w
+    return total / weight if weight > 0.0 else light[y0 % rows, x0 % columns]
+
+
+@njit(cache=True)
+def meet_surface(
+    terrain: FloatImage, roof: FloatImage, low: Array, high: Array, h_low: float, h_high: float
+) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Heights (n,) at which lines of sight meet the surface first, and what they meet.
+
+    Args:
+        terrain, roof: of the world.
+        low, high: (n, 2) column and row of each line at two heights.
+        h_low, h_high: those heights; nothing of the world is above the second.
+    """
+    height = np.empty(len(low))
+    met = np.empty(len(low), dtype=np.int64)
+    for i in range(len(low)):
+        gx = (high[i, 0] - low[i, 0]) / (h_high - h_low)
+        gy = (high[i, 1] - low[i, 1]) / (h_high - h_low)
+        x0, y0 = low[i, 0] - h_low * gx, low[i, 1] - h_low * gy
+        ground = meet_ground(terrain, x0, y0, gx, gy, h_low)
+        met[i], height[i] = meet_building(roof, x0, y0, gx, gy, ground, h_high)
+    return height, met
+
+
+@njit(cache=True)
+def render_lines(
+    terrain: FloatImage,
+    roof: FloatImage,
+    light: FloatImage,
+    near: BoolArray,
+    nodes_low: Array,
+    nodes_high: Array,
+    h_low: float,
+    h_high: float,
+    spacing: int,
+    clearance: float,
+    walls: Array,
+    out: FloatImage,
+) -> None:
+    """Light met by the pixels of some lines, one line of sight each, four beside buildings.
+
+    Args:
+        terrain, roof, light: of the world; the light averaged over pixels already.
+        near: squares of 16 cells where buildings may be met.
+        nodes_low, nodes_high: (3, lines, nodes, 2) column and row at two heights of every `spacing`-th
+            sample, from sample `-0.5` on; the first axis is a quarter line before, at and after.
+        h_low, h_high: those heights.
+        spacing: samples between nodes.
+        clearance: highest roof above the terrain, metres, and what the terrain may rise below a line.
+        walls: (4,) light of walls that face west, east, north, south.
+        out: (lines, samples) filled.
+    """
+    lines, samples = out.shape
+    rows, columns = terrain.shape
+    per_h = 1.0 / (h_high - h_low)
+    for r in range(lines):
+        h = 0.5 * (h_low + h_high)
+        for s in range(samples):
+            total = 0.0
+            rays = 1
+            k = 0
+            while k < rays:
+                version, at = 1, s + 0.5
+                if rays == 4:
+                    version, at = 2 * (k // 2), s + 0.25 + 0.5 * (k % 2)
+                node = int(at) // spacing
+                f = at / spacing - node
+                low, high = nodes_low[version, r, node], nodes_high[version, r, node]
+                low1, high1 = nodes_low[version, r, node + 1], nodes_high[version, r, node + 1]
+                xl = low[0] + f * (low1[0] - low[0])
+                yl = low[1] + f * (low1[1] - low[1])
+                gx = (high[0] + f * (high1[0] - high[0]) - xl) * per_h
+                gy = (high[1] + f * (high1[1] - high[1]) - yl) * per_h
+                x0, y0 = xl - h_low * gx, yl - h_low * gy
+                h = meet_ground(terrain, x0, y0, gx, gy, h)
+                x, y = x0 + h * gx, y0 + h * gy
+                block_x = (math.floor(x) % columns) // 16
+                block_y = (math.floor(y) % rows) // 16
+                if not near[block_y, block_x]:
+                    total += _open_light(light, x, y)
+                    k += 1
+                    if rays == 4:
+                        continue
+                    break
+                if rays == 1:
+                    rays = 4
+                    total = 0.0
+                    continue
+                met, height = meet_building(roof, x0, y0, gx, gy, h, h + clearance)
+                if met <= ROOF:
+                    total += _kept_light(light, roof, x0 + height * gx, y0 + height * gy, met == ROOF)
+                elif met == WALL_EAST_WEST:
+                    total += walls[1] if gx > 0.0 else walls[0]
+                else:
+                    total += walls[3] if gy > 0.0 else walls[2]
+                k += 1
+            out[r, s] = total / rays

@@ -1,0 +1,152 @@
+"""A piece of ground that is known exactly: heights, buildings and what covers them."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from services.geodesy import metres_per_degree
+from services.simulation.grid import bilinear_values
+from services.simulation.land import NO_ROOF, cover_land
+from services.types import Array, FloatImage
+
+Parcels = npt.NDArray[np.uint16]
+
+_TEXTURE_TILE = 2048
+_TERRAIN_NODES = 512
+_WARP_NODES = 256
+
+
+@dataclass(frozen=True)
+class World:
+    """Ground on a grid of longitudes and latitudes, repeated without end in both directions.
+
+    Row 0 is the northern one. The terrain is bilinear between the nodes of the grid, by definition. A
+    cell reaches half a step around its node and is either open ground or part of a building, with
+    vertical walls and a flat roof.
+
+    Attributes:
+        seed: what all that changes with the date is drawn from, together with the date.
+        origin_lon_lat: (2,) first node, in the north-west, degrees.
+        step_deg: (2,) from node to node, eastwards and southwards, degrees.
+        posting_m: the same in metres.
+        terrain_m: (rows, columns) metres above the ellipsoid.
+        roof_m: (rows, columns) metres above the ellipsoid, minus infinity on open ground.
+        albedo: (rows, columns) reflectance of what is seen from above, 0 to 1.
+        parcel: (rows, columns) number of the field a cell belongs to, 0 where nothing changes.
+    """
+
+    seed: int
+    origin_lon_lat: Array
+    step_deg: Array
+    posting_m: float
+    terrain_m: FloatImage
+    roof_m: FloatImage
+    albedo: FloatImage
+    parcel: Parcels
+
+    @property
+    def centre_lon_lat(self) -> Array:
+        """(2,) middle of the grid, degrees."""
+        rows, columns = self.terrain_m.shape
+        return self.lon_lat(np.array([[(columns - 1) / 2.0, (rows - 1) / 2.0]]))[0]
+
+    @property
+    def height_range_m(self) -> tuple[float, float]:
+        """Lowest ground and highest ground or roof, metres above the ellipsoid."""
+        low, high = float(self.terrain_m.min()), float(self.terrain_m.max())
+        return low, max(high, float(self.roof_m.max()))
+
+    def lon_lat(self, column_row: Array) -> Array:
+        """Longitude and latitude (n, 2) of grid positions (n, 2)."""
+        return np.asarray(self.origin_lon_lat + column_row * self.step_deg * [1.0, -1.0])
+
+    def column_row(self, lon_lat: Array) -> Array:
+        """Grid positions (n, 2), not wrapped, of longitudes and latitudes (n, 2)."""
+        offset = lon_lat - self.origin_lon_lat
+        offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+        return np.asarray(offset / self.step_deg * [1.0, -1.0])
+
+    def height_m(self, lon_lat: Array) -> Array:
+        """Height (n,) of the terrain at positions (n, 2), metres above the ellipsoid."""
+        return bilinear_values(self.terrain_m, self.column_row(lon_lat))
+
+    def surface_m(self, lon_lat: Array) -> Array:
+        """Height (n,) of the terrain or of the roof above it, metres above the ellipsoid."""
+        rows, columns = self.roof_m.shape
+        cell = np.floor(self.column_row(lon_lat) + 0.5).astype(np.int64)
+        roof = self.roof_m[cell[:, 1] % rows, cell[:, 0] % columns]
+        return np.asarray(np.where(roof > NO_ROOF, roof, self.height_m(lon_lat)))
+
+
+def make_world(
+    rng: np.random.Generator,
+    size_m: float = 1000.0,
+    posting_m: float = 0.5,
+    relief_m: float = 60.0,
+    centre_lon_lat: tuple[float, float] = (5.4, 43.6),
+    lowest_m: float = 150.0,
+) -> World:
+    """Draw a world: hills, fields between roads, woods, villages with buildings, trees.
+
+    Args:
+        rng: what it is drawn from.
+        size_m: side of the square, about; it repeats beyond.
+        posting_m: distance of the nodes.
+        relief_m: from the lowest to the highest ground.
+        centre_lon_lat: degrees.
+        lowest_m: height of the lowest ground above the ellipsoid.
+    """
+    tiles = max(1, round(size_m / posting_m / _TEXTURE_TILE))
+    tile = fft.next_fast_len(round(size_m / posting_m / tiles))
+    n = tiles * tile
+    seed = int(rng.integers(2**31))
+    terrain = _stretch(_natural_noise(rng, min(n, _TERRAIN_NODES), 2.6, 350.0 / size_m), n)
+    terrain -= terrain.min()
+    terrain *= relief_m / terrain.max()
+    terrain += np.float32(lowest_m)
+    warp_m = 40.0 * min(1.0, size_m / 2000.0 + 0.3)
+    warp = np.stack(
+        [warp_m / posting_m * _natural_noise(rng, _WARP_NODES, 3.0, 300.0 / size_m) for _ in range(2)]
+    )
+    texture = _natural_noise(rng, tile, 1.0, 0.0)
+    blotches = _natural_noise(rng, _WARP_NODES, 1.5, 0.0)
+    albedo, roof, parcel = cover_land(terrain, warp, texture, blotches, posting_m, seed)
+    east_m, north_m = metres_per_degree(centre_lon_lat[1], lowest_m + relief_m / 2.0)
+    step = np.array([posting_m / east_m, posting_m / north_m])
+    origin = np.array(centre_lon_lat) + (n - 1) / 2.0 * step * [-1.0, 1.0]
+    return World(seed, origin, step, posting_m, terrain, roof, albedo, parcel)
+
+
+def _natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: float) -> FloatImage:
+    """Periodic noise (n, n) of unit spread whose amplitudes fall with the frequency.
+
+    Args:
+        rng: phases and amplitudes.
+        n: side.
+        exponent: of the fall; 1 is that of natural images.
+        shortest: wavelength below which it fades out, as a fraction of the side.
+    """
+    white = rng.standard_normal((n, n), dtype=np.float32)
+    spectrum = fft.rfft2(white)
+    frequency = np.hypot(fft.fftfreq(n)[:, None], fft.rfftfreq(n)[None, :]) * n
+    frequency[0, 0] = 1.0
+    gain = frequency**-exponent * np.exp(-((frequency * shortest) ** 2) / 2.0)
+    gain[0, 0] = 0.0
+    noise = fft.irfft2(spectrum * gain.astype(np.float32), s=(n, n))
+    return np.asarray(noise / noise.std(), dtype=np.float32)
+
+
+def _stretch(noise: FloatImage, n: int) -> FloatImage:
+    """Periodic noise resampled to (n, n), smooth between its nodes."""
+    nodes = len(noise)
+    if n == nodes:
+        return noise
+    margin = 4
+    padded = np.pad(noise, margin, mode="wrap")
+    scale = nodes / n
+    affine = np.array([[scale, 0.0, margin], [0.0, scale, margin]])
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(padded, affine, (n, n), flags=flags))
