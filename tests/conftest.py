@@ -1,0 +1,22 @@
+"""What every test may ask for."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+# Read by the linear algebra when NumPy is first imported, which is after this file.
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real images named by AMERS_REAL_DATA; tests that ask for it are skipped without."""
+    named = os.environ.get("AMERS_REAL_DATA")
+    if not named:
+        pytest.skip("AMERS_REAL_DATA is not set: no real images to test on")
+    folder = Path(named)
+    if not folder.is_dir():
+        pytest.fail(f"AMERS_REAL_DATA names {named}, which is not a folder")
+    return folder
