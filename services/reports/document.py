@@ -1,0 +1,130 @@
+"""`report.json`: the report as a document, and the JSON Schema that describes it.
+
+Both follow the dataclasses of the report: a field is a member of the same name, what could not be
+computed is null, and the descriptions are those of the docstrings.
+"""
+
+import inspect
+import json
+import math
+import re
+import types
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from services.reports.report import REPORT_FORMAT, RegistrationReport
+
+Json = None | bool | int | float | str | list[Any] | dict[str, Any]
+
+
+def format_report(report: RegistrationReport) -> str:
+    """The text of `report.json`."""
+    return json.dumps(report_document(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def report_document(report: RegistrationReport) -> dict[str, Any]:
+    """The report as plain JSON values; numbers that are not finite become null."""
+    return {field.name: _plain(getattr(report, field.name)) for field in fields(report)}
+
+
+def _plain(value: Any) -> Json:
+    """Any value a report holds as JSON."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    raise TypeError(f"a report cannot hold a {type(value).__name__}")
+
+
+def report_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of `report.json`."""
+    definitions: dict[str, Any] = {
+        "Numbers": {
+            "description": "A number, null where it is unknown, or rows of them.",
+            "type": ["number", "null", "array"],
+            "items": {"$ref": "#/$defs/Numbers"},
+        }
+    }
+    document = _object_schema(RegistrationReport, definitions)
+    document["properties"]["format"]["const"] = REPORT_FORMAT
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Amers registration report",
+        **document,
+        "$defs": dict(sorted(definitions.items())),
+    }
+
+
+def _object_schema(kind: type, definitions: dict[str, Any]) -> dict[str, Any]:
+    """Schema of a dataclass; those inside it are added to the definitions."""
+    hints, described = get_type_hints(kind), _attribute_descriptions(kind)
+    properties = {}
+    for field in fields(kind):
+        schema = _value_schema(hints[field.name], definitions)
+        if field.name in described:
+            schema = {"description": described[field.name], **schema}
+        properties[field.name] = schema
+    return {
+        "description": (inspect.getdoc(kind) or kind.__name__).splitlines()[0],
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }
+
+
+_SCALARS: dict[Any, dict[str, Any]] = {
+    bool: {"type": "boolean"},
+    int: {"type": "integer"},
+    float: {"type": ["number", "null"]},
+    str: {"type": "string"},
+    datetime: {"type": "string", "format": "date-time"},
+    type(None): {"type": "null"},
+    Any: {"type": "object"},
+}
+
+
+def _value_schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    """Schema of one type of a report."""
+    if hint in _SCALARS:
+        return dict(_SCALARS[hint])
+    if is_dataclass(hint):
+        name = getattr(hint, "__name__", "")
+        if name not in definitions:
+            definitions[name] = {}
+            definitions[name] = _object_schema(hint, definitions)  # type: ignore[arg-type]
+        return {"$ref": f"#/$defs/{name}"}
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return {"enum": list(arguments)}
+    if origin is np.ndarray:
+        return {"type": "array", "items": {"$ref": "#/$defs/Numbers"}}
+    if origin is tuple:
+        return {"type": "array", "items": _value_schema(arguments[0], definitions)}
+    if origin in (Union, types.UnionType):
+        return {"anyOf": [_value_schema(argument, definitions) for argument in arguments]}
+    raise TypeError(f"no JSON Schema for {hint}")
+
+
+def _attribute_descriptions(kind: type) -> dict[str, str]:
+    """The `Attributes:` of a docstring, by name."""
+    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    described: dict[str, str] = {}
+    for entry in re.split(r"\n(?=    \w)", section.rstrip()):
+        names, colon, text = entry.partition(":")
+        if colon:
+            described.update(dict.fromkeys(re.findall(r"\w+", names), " ".join(text.split())))
+    return described

@@ -1,0 +1,146 @@
+"""The report as one HTML file that asks nothing of the network."""
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from services.quality.qualification import Criterion
+from services.reports import figures
+from services.reports.report import ChipPair, RegistrationReport, RegistrationSummary
+from services.reports.tables import ABSENT, criterion_words, number, percent, quantile
+from services.types import Array, ChipArray
+
+PAIRS_PER_GROUP = 4
+_VERDICTS = {
+    "good": "every criterion is met",
+    "usable": "usable, but not every criterion of a good registration is met",
+    "failed": "not to be used: a criterion that any registration must meet is not met",
+}
+
+
+@dataclass(frozen=True)
+class GalleryGroup:
+    """Chip pairs that are shown together.
+
+    Attributes:
+        title: of the group.
+        pairs: in order of falling score.
+    """
+
+    title: str
+    pairs: tuple[ChipPair, ...]
+
+
+def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str:
+    """The report as a self-contained page for screen, phone and paper.
+
+    Args:
+        report: the figures.
+        summary: what the report was made from; its arrays are drawn.
+    """
+    page = _environment().get_template("registration.html")
+    drawn = (
+        figures.ground_overview,
+        figures.residual_map,
+        figures.coverage_map,
+        figures.residual_histograms,
+        figures.funnel,
+        figures.residuals_along,
+        figures.predicted_map,
+    )
+    return page.render(
+        report=report,
+        verdict_words=_VERDICTS[report.verdict],
+        unmet=[criterion for criterion in report.criteria if not criterion.passed],
+        figures={draw.__name__: Markup(figures.svg(draw, summary)) for draw in drawn},
+        gallery=choose_pairs(summary.gallery),
+        options=list(flat_options(report.options)),
+        centre=_centre_words(report.scene.footprint_lon_lat),
+    )
+
+
+def _environment() -> Environment:
+    """Templates that escape everything and refuse unknown names."""
+    environment = Environment(
+        loader=PackageLoader("services.reports", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=number,
+        percent=percent,
+        quantile=quantile,
+        words=criterion_words,
+        margin=margin_words,
+        chip=chip_uri,
+        time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
+    )
+    return environment
+
+
+def choose_pairs(
+    gallery: tuple[ChipPair, ...], count: int = PAIRS_PER_GROUP
+) -> tuple[GalleryGroup, ...]:
+    """The best, middle and worst scores of a gallery, no pair twice.
+
+    Args:
+        gallery: any order; pairs without a score are the worst.
+        count: pairs in each group.
+    """
+    ordered = sorted(gallery, key=lambda pair: -np.nan_to_num(pair.score, nan=-2.0))
+    if len(ordered) <= 3 * count:
+        return (GalleryGroup("All pairs, best score first", tuple(ordered)),) if ordered else ()
+    middle = (len(ordered) - count) // 2
+    return (
+        GalleryGroup("Best scores", tuple(ordered[:count])),
+        GalleryGroup("Middle scores", tuple(ordered[middle : middle + count])),
+        GalleryGroup("Worst scores", tuple(ordered[-count:])),
+    )
+
+
+def chip_uri(chip: ChipArray) -> str:
+    """A chip as an image inside the page, stretched from its 1st to its 99th percentile."""
+    values = chip.astype(np.float32)
+    known = np.isfinite(values) & (values != 0.0)
+    grey = np.zeros(values.shape, dtype=np.uint8)
+    if known.any():
+        low, high = np.percentile(values[known], [1.0, 99.0])
+        stretched = (values[known] - low) / max(float(high - low), 1e-6) * 255.0
+        grey[known] = np.clip(stretched, 0.0, 255.0).astype(np.uint8)
+    _, encoded = cv2.imencode(".png", grey)
+    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+
+
+def margin_words(criterion: Criterion) -> str:
+    """Distance from a value to its limit in percent of the limit, positive where it is met."""
+    if criterion.limit == 0.0 or not np.isfinite(criterion.value):
+        return ABSENT
+    distance = (criterion.value - criterion.limit) / criterion.limit
+    return f"{100.0 * (distance if criterion.comparison == 'at least' else -distance):+.0f} %"
+
+
+def flat_options(options: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Options and the options inside them, with dotted names."""
+    for field in fields(options) if is_dataclass(options) else ():
+        value = getattr(options, field.name)
+        if is_dataclass(value):
+            yield from flat_options(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", str(value)
+
+
+def _centre_words(footprint: Array) -> str:
+    """Latitude and longitude of the middle of the scene, for people."""
+    if not len(footprint):
+        return ABSENT
+    lon, lat = footprint.mean(axis=0)
+    lon = (lon + 180.0) % 360.0 - 180.0
+    return f"{abs(lat):.4f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.4f}° {'E' if lon >= 0 else 'W'}"
