@@ -1,0 +1,92 @@
+"""Corrections in image space: undone exactly, folded exactly, refused where they cannot be."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.formats.rpc_text import parse_rpc_text
+from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
+
+MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
+SHAPE = (26000, 26500)
+
+a_nanopixel = 1e-9
+rounding_of_the_image_px = 1e-8
+"""Some hundred roundings of a coordinate of 26,000 px."""
+
+pixels = st.floats(-100.0, 100.0)
+
+
+def correction(rows: list[list[float]]) -> ImageCorrection:
+    return replace(no_correction(SHAPE), parameters=np.array(rows))
+
+
+def ground() -> np.ndarray:
+    axis = np.linspace(-1.0, 1.0, 5)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    return MODEL.ground_offset + grid * MODEL.ground_scale
+
+
+def test_a_displacement_is_what_its_parameters_say_at_the_edges_and_the_centre() -> None:
+    moved = correction([[3.0, 2.0, 0.5], [-1.0, 0.25, 4.0]])
+    centre = (np.array(SHAPE) - 1.0) / 2.0
+    bottom, right = centre + [SHAPE[0] / 2.0, 0.0], centre + [0.0, SHAPE[1] / 2.0]
+    at = np.array([centre, bottom, right])
+    expected = [[3.0, -1.0], [5.0, -0.75], [3.5, 3.0]]
+    np.testing.assert_allclose(moved.apply(at) - at, expected, rtol=0.0, atol=rounding_of_the_image_px)
+
+
+@given(st.lists(st.lists(pixels, min_size=3, max_size=3), min_size=2, max_size=2))
+def test_what_is_applied_is_undone(rows: list[list[float]]) -> None:
+    at = np.random.default_rng(3).uniform(0.0, 26000.0, (50, 2))
+    moved = correction(rows)
+    back = moved.invert(moved.apply(at))
+    np.testing.assert_allclose(back, at, rtol=0.0, atol=rounding_of_the_image_px)
+
+
+@given(pixels, pixels, pixels, pixels)
+def test_a_shift_and_a_drift_fold_into_the_rpc_exactly(a: float, b: float, c: float, d: float) -> None:
+    moved = correction([[a, b, 0.0], [c, 0.0, d]])
+    folded = fold_into_rpc(MODEL, moved)
+    expected = CorrectedModel(MODEL, moved).project(ground())
+    atol = rounding_of_the_image_px
+    np.testing.assert_allclose(folded.project(ground()), expected, rtol=0.0, atol=atol)
+    np.testing.assert_array_equal(folded.line_den, MODEL.line_den)
+    np.testing.assert_array_equal(folded.image_offset, MODEL.image_offset)
+
+
+@pytest.mark.parametrize("rows", [[[1, 0, 0.1], [1, 0, 0]], [[1, 0, 0], [1, -0.1, 0]]])
+def test_a_correction_that_mixes_lines_and_samples_does_not_fold(rows: list[list[float]]) -> None:
+    with pytest.raises(ValueError, match="each coordinate by itself"):
+        fold_into_rpc(MODEL, correction(rows))
+
+
+def test_a_corrected_model_is_consistent_with_itself() -> None:
+    model = CorrectedModel(MODEL, correction([[40.0, 2.0, 0.7], [-25.0, -0.4, 1.5]]))
+    at = ground()
+    line_sample = model.project(at)
+    located = model.locate(line_sample, at[:, 2])
+    atol = rounding_of_the_image_px
+    np.testing.assert_allclose(model.project(located), line_sample, rtol=0.0, atol=10 * atol)
+    assert model.height_range_m == MODEL.height_range_m
+    base_origin, base_direction = MODEL.line_of_sight(model.correction.invert(line_sample))
+    origin, direction = model.line_of_sight(line_sample)
+    np.testing.assert_array_equal(origin, base_origin)
+    np.testing.assert_array_equal(direction, base_direction)
+
+
+def test_the_derivative_of_a_corrected_model_is_that_of_small_steps() -> None:
+    model = CorrectedModel(MODEL, correction([[40.0, 900.0, 700.0], [-25.0, -400.0, 1500.0]]))
+    at = np.array([MODEL.ground_offset])
+    up = np.array([[0.0, 0.0, 1.0]])
+    by_steps = (model.project(at + up) - model.project(at - up))[0] / 2.0
+    np.testing.assert_allclose(model.project_derivative(at)[0, :, 2], by_steps, rtol=0.0, atol=1e-6)
+
+
+def test_no_correction_changes_nothing() -> None:
+    at = np.array([[0.0, 0.0], [123.0, 456.0]])
+    np.testing.assert_allclose(no_correction(SHAPE).apply(at), at, rtol=0.0, atol=a_nanopixel)
