@@ -1,0 +1,193 @@
+"""Images in files: what is read, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.errors import FormatError
+from services.formats.raster import copy_with_rpc, open_raster
+from services.formats.rpc_text import parse_rpc_text
+from services.imagery import ArrayImage, Window
+
+MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
+PIXELS = np.random.default_rng(5).integers(1, 4000, (90, 120)).astype(np.uint16)
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def write(path: Path, pixels: np.ndarray = PIXELS, driver: str = "GTiff", **options: object) -> Path:
+    bands = pixels if pixels.ndim == 3 else pixels[None]
+    count, height, width = bands.shape
+    with rasterio.open(
+        path, "w", driver=driver, count=count, height=height, width=width, dtype=pixels.dtype, **options
+    ) as file:
+        file.write(bands)
+    return path
+
+
+@given(st.integers(-100, 150), st.integers(-150, 200), st.integers(1, 200), st.integers(1, 200))
+def test_any_window_reads_as_from_memory(
+    tmp_path_factory: pytest.TempPathFactory, line: int, sample: int, lines: int, samples: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "windows.tif"
+    if not path.exists():
+        write(path)
+    image, window = open_raster(path), Window(line, sample, lines, samples)
+    read = image.read(window)
+    image.close()
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, ArrayImage(PIXELS.astype(np.float32)).read(window))
+
+
+@pytest.mark.parametrize(
+    ("name", "driver", "options"),
+    [
+        ("plain.tif", "GTiff", {}),
+        (
+            "tiled.tif",
+            "GTiff",
+            {"tiled": True, "compress": "deflate", "blockxsize": 32, "blockysize": 32},
+        ),
+        ("big.tif", "GTiff", {"BIGTIFF": "YES", "endianness": "big"}),
+        ("cloud.tif", "COG", {}),
+        ("image.jp2", "JP2OpenJPEG", {"QUALITY": "100", "REVERSIBLE": "YES"}),
+        ("image.ntf", "NITF", {}),
+    ],
+)
+def test_every_allowed_kind_of_file_is_read(
+    tmp_path: Path, name: str, driver: str, options: dict
+) -> None:
+    image = open_raster(write(tmp_path / name, driver=driver, **options))
+    assert image.shape == PIXELS.shape
+    np.testing.assert_array_equal(image.read(Window(0, 0, *PIXELS.shape)), PIXELS)
+
+
+def test_nodata_is_nan_and_nothing_else_is(tmp_path: Path) -> None:
+    image = open_raster(write(tmp_path / "a.tif", nodata=int(PIXELS[3, 4])))
+    read = image.read(Window(0, 0, *PIXELS.shape))
+    np.testing.assert_array_equal(np.isnan(read), PIXELS[3, 4] == PIXELS)
+
+
+def test_pixels_under_a_mask_are_nan(tmp_path: Path) -> None:
+    valid = np.zeros(PIXELS.shape, dtype=np.uint16)
+    valid[10:20, 30:50] = 65535
+    path = write(tmp_path / "a.tif", np.stack([PIXELS, valid]), photometric="MINISBLACK", ALPHA="YES")
+    read = open_raster(path).read(Window(0, 0, *PIXELS.shape))
+    np.testing.assert_array_equal(np.isfinite(read), valid > 0)
+
+
+def test_the_band_that_was_chosen_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", np.stack([PIXELS, PIXELS + 1]))
+    np.testing.assert_array_equal(open_raster(path, 2).read(Window(0, 0, *PIXELS.shape)), PIXELS + 1)
+    with pytest.raises(FormatError, match="expected a band 3, the image has 2"):
+        open_raster(path, 3)
+
+
+VRT = """<VRTDataset rasterXSize="10" rasterYSize="10"><VRTRasterBand dataType="Byte" band="1">
+<SimpleSource><SourceFilename>/etc/hostname</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"II", VRT.encode(), b"\x89PNG\r\n\x1a\n", b"hello world, hello"]
+)
+def test_other_kinds_of_files_are_refused_whatever_their_name(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(FormatError, match=r"a\.tif: expected a GeoTIFF, JPEG 2000 or NITF image"):
+        open_raster(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/vsicurl/http://localhost/a.tif",
+        "/vsizip/a.zip/a.tif",
+        "http://localhost/a.tif",
+        "missing.tif",
+        ".",
+    ],
+)
+def test_addresses_archives_and_folders_are_no_images(name: str) -> None:
+    with pytest.raises(FormatError, match="expected the name of an image file"):
+        open_raster(Path(name))
+
+
+@pytest.mark.parametrize("name", ["a#b.tif", "a?b.tif", "a!b.tif", "zip:a.tif", "GTIFF_DIR:1:a.tif"])
+def test_a_file_is_read_whatever_its_name(tmp_path: Path, name: str) -> None:
+    write(tmp_path / "plain.tif").rename(tmp_path / name)
+    assert open_raster(tmp_path / name).shape == PIXELS.shape
+
+
+def test_sidecars_are_not_looked_at(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif")
+    (tmp_path / "a.tif.aux.xml").write_text(
+        '<PAMDataset><PAMRasterBand band="1"><NoDataValue>0</NoDataValue></PAMRasterBand></PAMDataset>'
+    )
+    (tmp_path / "a_RPC.TXT").write_text(
+        (Path(__file__).parents[2] / "golden/invented_RPC.TXT").read_text()
+    )
+    image = open_raster(path)
+    assert image.dataset.nodata is None
+    assert not image.dataset.tags(ns="RPC")
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG", "JP2OpenJPEG", "NITF"])
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_image_is_told_when_it_is_opened(tmp_path: Path, driver: str, part: float) -> None:
+    data = write(tmp_path / "whole", np.tile(PIXELS, (5, 5)), driver=driver).read_bytes()
+    (tmp_path / "cut").write_bytes(data[: int(part * len(data))])
+    with pytest.raises(FormatError, match="cut: "):
+        open_raster(tmp_path / "cut")
+
+
+def test_a_hole_in_the_middle_is_a_format_error_when_it_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", np.tile(PIXELS, (8, 8)), compress="deflate")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 5000] = bytes(5000)
+    path.write_bytes(data)
+    image = open_raster(path)
+    with pytest.raises(FormatError, match=r"a\.tif: truncated or damaged, expected its pixels"):
+        image.read(Window(0, 0, *image.shape))
+
+
+def test_a_small_file_that_declares_an_enormous_image_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=100_000, height=100_000, count=1, dtype="uint8", SPARSE_OK=True
+    ):
+        pass
+    with pytest.raises(FormatError, match="declares 100000 lines of 100000 samples"):
+        open_raster(path)
+
+
+def test_complex_pixels_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif", PIXELS.astype(np.complex64))
+    with pytest.raises(FormatError, match="expected whole or real pixels, found complex64"):
+        open_raster(path)
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+def test_a_copy_has_the_new_tags_and_the_same_pixels(tmp_path: Path, driver: str) -> None:
+    path = write(tmp_path / "a.tif", driver=driver, nodata=7)
+    before = path.read_bytes()
+    copy_with_rpc(path, tmp_path / "b.tif", MODEL)
+    assert path.read_bytes() == before
+    with rasterio.open(tmp_path / "b.tif") as copy:
+        np.testing.assert_array_equal(copy.read(1), PIXELS)
+        assert copy.nodata == 7
+        assert copy.rpcs.line_off == MODEL.image_offset[0]
+        np.testing.assert_array_equal(copy.rpcs.samp_num_coeff, MODEL.sample_num)
+        assert copy.rpcs.err_bias == MODEL.error_bias_m
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.tif", "b.tif"]
+
+
+def test_a_copy_neither_replaces_a_file_nor_changes_the_kind_of_one(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tif")
+    with pytest.raises(FormatError, match="there is a file of that name already"):
+        copy_with_rpc(path, path, MODEL)
+    nitf = write(tmp_path / "a.ntf", driver="NITF")
+    with pytest.raises(FormatError, match="only a GeoTIFF can carry RPC tags, this is NITF"):
+        copy_with_rpc(nitf, tmp_path / "b.tif", MODEL)
