@@ -225,12 +225,12 @@ def _descriptor_pairs(
 ) -> IntArray:
     """Mutual best descriptors within the band, looked for cell by cell of the second image."""
     half_m = (band.high_m - band.low_m) / 2.0
-    usable = np.isfinite(lines.expected).all(axis=1)
+    usable: BoolArray = np.asarray(np.isfinite(lines.expected).all(axis=1))
     cell = np.floor(np.where(usable[:, None], lines.expected, 0.0) / options.cell_px).astype(np.int64)
     reach_px = half_m * np.abs(lines.per_metre) + band.end_px + band.gate_px + abs(band.across_px)
     found = [np.empty((0, 2), dtype=np.int64)]
     for key in np.unique(cell[usable], axis=0):
-        mine = np.flatnonzero(usable & (cell[:, 0] == key[0]) & (cell[:, 1] == key[1]))
+        mine = np.flatnonzero(usable & np.all(cell == key, axis=1))
         low = (lines.expected[mine] - reach_px[mine]).min(axis=0)
         high = (lines.expected[mine] + reach_px[mine]).max(axis=0)
         theirs = np.flatnonzero(
