@@ -1,0 +1,169 @@
+"""Scenes: the request to take one in, and what there is."""
+
+import re
+from base64 import b64decode
+from collections.abc import Iterator
+from email.message import Message
+from typing import Annotated, Any
+from uuid import UUID
+
+from anyio import from_thread
+from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
+
+from app.api.deps import DatabaseDep, ReadConnection, Registrar, SettingsDep, StorageDep, WriteConnection
+from app.db.scenes import SceneRow
+from app.errors import InputError
+from app.usecases import scenes
+from app.usecases.scenes import Upload
+
+router = APIRouter(tags=["scenes"])
+
+MOST_LISTED = 1000
+BINARY_BODY = {
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+}
+
+
+@router.post("/scenes", status_code=status.HTTP_201_CREATED, openapi_extra={"requestBody": BINARY_BODY})
+def upload_scene(
+    request: Request,
+    response: Response,
+    database: DatabaseDep,
+    storage: StorageDep,
+    settings: SettingsDep,
+    caller: Registrar,
+    name: Annotated[str | None, Query(description="Name of the file.")] = None,
+    sigma_m: Annotated[float | None, Query(gt=0, description="Accuracy of its model, metres.")] = None,
+) -> dict[str, Any]:
+    """Upload the image of a scene as the body of the request: GeoTIFF, JPEG 2000 or NITF.
+
+    The name comes from the query or from `Content-Disposition`; a checksum in `Repr-Digest` (sha-256) or
+    `X-Checksum` (sha256 in hexadecimal) is compared. Files with the model follow by
+    `PUT /scenes/{id}/files/{name}`.
+    """
+    upload = _upload(request, name or _disposition_name(request))
+    scene = scenes.upload_scene(database, storage, caller, upload, settings.upload_limit_bytes, sigma_m)
+    response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
+    return _scene(scene, [])
+
+
+@router.put("/scenes/{scene_id}/files/{name}", openapi_extra={"requestBody": BINARY_BODY})
+def upload_model(
+    scene_id: UUID,
+    name: str,
+    request: Request,
+    database: DatabaseDep,
+    storage: StorageDep,
+    caller: Registrar,
+) -> dict[str, Any]:
+    """Upload a file with the sensor model of a scene, to lie beside its image under that name."""
+    stored = scenes.upload_model(database, storage, caller, scene_id, _upload(request, name))
+    return {
+        "name": stored.key.rsplit("/", 1)[1],
+        "size_bytes": stored.size_bytes,
+        "sha256": stored.sha256,
+    }
+
+
+@router.get("/scenes")
+def list_scenes(
+    connection: ReadConnection,
+    storage: StorageDep,
+    caller: Registrar,
+    limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
+) -> dict[str, Any]:
+    """The caller's scenes, the newest first; everybody's for an administrator."""
+    found = scenes.list_scenes(connection, caller, limit)
+    return {"scenes": [_scene(scene, scenes.model_names(storage, scene)) for scene in found]}
+
+
+@router.get("/scenes/{scene_id}")
+def show_scene(
+    scene_id: UUID, connection: ReadConnection, storage: StorageDep, caller: Registrar
+) -> dict[str, Any]:
+    """One scene."""
+    scene = scenes.visible_scene(connection, caller, scene_id)
+    return _scene(scene, scenes.model_names(storage, scene))
+
+
+@router.delete("/scenes/{scene_id}", status_code=status.HTTP_204_NO_CONTENT)
+def remove_scene(
+    scene_id: UUID,
+    connection: WriteConnection,
+    storage: StorageDep,
+    caller: Registrar,
+    after_commit: BackgroundTasks,
+) -> None:
+    """Remove the files of a scene; its record, its jobs and their results stay."""
+    scenes.remove_scene(connection, caller, scene_id)
+    after_commit.add_task(scenes.delete_files, storage, scene_id)
+
+
+def _scene(scene: SceneRow, models: list[str]) -> dict[str, Any]:
+    return {
+        "id": scene.id,
+        "name": scene.name,
+        "state": scene.state,
+        "file": scene.file_name,
+        "models": models,
+        "size_bytes": scene.size_bytes,
+        "sha256": scene.sha256,
+        "sigma_m": scene.sigma_m,
+        "footprint": scene.footprint,
+        "created": scene.created_at,
+        "removed": scene.removed_at,
+    }
+
+
+def _upload(request: Request, name: str | None) -> Upload:
+    if not name:
+        raise InputError("the file has no name: send ?name= or Content-Disposition")
+    length = request.headers.get("content-length", "")
+    return Upload(
+        name=name,
+        chunks=_body(request),
+        size_bytes=int(length) if length.isdigit() else None,
+        sha256=_announced_sha256(request),
+    )
+
+
+def _body(request: Request) -> Iterator[bytes]:
+    """The body, chunk by chunk; endpoints run in threads, the body arrives in the event loop."""
+    stream = request.stream()
+
+    async def following() -> bytes | None:
+        return await anext(stream, None)
+
+    while (chunk := from_thread.run(following)) is not None:
+        yield chunk
+
+
+def _disposition_name(request: Request) -> str | None:
+    """The file name of `Content-Disposition`, plain or encoded (RFC 6266)."""
+    message = Message()
+    message["Content-Disposition"] = request.headers.get("content-disposition", "")
+    return message.get_filename()
+
+
+def _announced_sha256(request: Request) -> str | None:
+    """The checksum the sender announces, in hexadecimal.
+
+    Raises:
+        InputError: there is one, but not a SHA-256.
+    """
+    plain = request.headers.get("x-checksum")
+    if plain is not None:
+        if not re.fullmatch(r"[0-9a-fA-F]{64}", plain):
+            raise InputError("X-Checksum is not a SHA-256 in hexadecimal")
+        return plain.lower()
+    digest = request.headers.get("repr-digest", "")
+    found = re.search(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]*):", digest)
+    if found is None:
+        return None
+    try:
+        raw = b64decode(found[1], validate=True)
+    except ValueError:
+        raw = b""
+    if len(raw) != 32:
+        raise InputError("the sha-256 of Repr-Digest is not the base64 of 32 bytes")
+    return raw.hex()

@@ -1,0 +1,198 @@
+"""Uploading, showing and removing scenes."""
+
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from uuid import UUID
+
+from app.auth import Scope, allows
+from app.db import scenes
+from app.db.engine import Connection, Database
+from app.db.scenes import SceneRow
+from app.db.tokens import Token
+from app.errors import Conflict, InputError, NotFound, TooLarge
+from app.storage import Storage, StoredFile
+from services.errors import FormatError
+from services.formats.raster import DRIVER_OF_SIGNATURE
+
+LONGEST_NAME = 120
+LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
+MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc")
+MODEL_LIMIT_BYTES = 16 << 20
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A file on its way, as its sender announces it.
+
+    Attributes:
+        name: as the sender calls it; folders in it mean nothing.
+        chunks: the bytes.
+        size_bytes, sha256: None when not announced; checked when they are.
+    """
+
+    name: str
+    chunks: Iterable[bytes]
+    size_bytes: int | None = None
+    sha256: str | None = None
+
+
+def upload_scene(
+    database: Database,
+    storage: Storage,
+    owner: Token | None,
+    upload: Upload,
+    limit_bytes: int,
+    sigma_m: float | None = None,
+) -> SceneRow:
+    """Take in the image of a new scene; it is looked into by the job that uses it, not here.
+
+    No transaction is open while the bytes arrive. Whatever goes wrong, nothing is left behind.
+
+    Args:
+        sigma_m: accuracy of the scene's model as the sender states it, metres.
+
+    Raises:
+        TooLarge: more bytes than the limit, announced or sent.
+        FormatError: neither a TIFF, a JPEG 2000 nor a NITF by its first bytes.
+        InputError: the name is none, or size or checksum are not as announced.
+    """
+    file_name = clean_name(upload.name)
+    _refuse_too_large(upload, limit_bytes)
+    owner_id = owner.id if owner else None
+    with database.transaction() as connection:
+        scene_id = scenes.begin_upload(connection, owner_id, upload.name[-200:], file_name, sigma_m)
+    key = f"{folder_of(scene_id)}/{file_name}"
+    try:
+        image = _receive(storage, key, upload, _images_only(upload.chunks), limit_bytes)
+        with database.transaction() as connection:
+            row = scenes.finish_upload(connection, scene_id, key, image.size_bytes, image.sha256)
+        if row is None:
+            raise Conflict("the upload took so long that it was given up")
+        return row
+    except BaseException:
+        storage.delete(key)
+        with database.transaction() as connection:
+            scenes.give_up_upload(connection, scene_id)
+        raise
+
+
+def upload_model(
+    database: Database, storage: Storage, caller: Token, scene_id: UUID, upload: Upload
+) -> StoredFile:
+    """Lay a file with the geometry of a scene beside its image, in place of one of the same name.
+
+    Raises:
+        NotFound: no such scene, or not the caller's.
+        Conflict: the scene has no files any more, or not yet.
+        InputError: not a kind of file that holds a model.
+    """
+    with database.reading() as connection:
+        scene = visible_scene(connection, caller, scene_id)
+    file_name = clean_name(upload.name)
+    if scene.state != "uploaded":
+        raise Conflict(f"the files of scene {scene_id} are {scene.state}")
+    if not file_name.lower().endswith(MODEL_SUFFIXES):
+        raise InputError(f"a model file ends in {', '.join(MODEL_SUFFIXES)}; {file_name} does not")
+    if file_name == scene.file_name:
+        raise Conflict(f"{file_name} is the image of the scene")
+    _refuse_too_large(upload, MODEL_LIMIT_BYTES)
+    key = f"{folder_of(scene_id)}/{file_name}"
+    return _receive(storage, key, upload, upload.chunks, MODEL_LIMIT_BYTES)
+
+
+def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> SceneRow:
+    """The scene, for its owner or an administrator.
+
+    Raises:
+        NotFound: there is none, or it is somebody else's: strangers cannot tell which.
+    """
+    scene = scenes.find_scene(connection, scene_id)
+    if scene is None or not (scene.owner == caller.id or allows(caller, Scope.ADMIN)):
+        raise NotFound(f"no scene {scene_id}")
+    return scene
+
+
+def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
+    """The caller's newest scenes; everybody's for an administrator."""
+    return scenes.newest_scenes(connection, None if allows(caller, Scope.ADMIN) else caller.id, limit)
+
+
+def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
+    """Let go of the pixels of a scene; its record and what was made of it stay.
+
+    The files are deleted once this is committed: rows go before files.
+
+    Raises:
+        NotFound: no such scene, or not the caller's.
+        Conflict: its image is still arriving.
+    """
+    scene = visible_scene(connection, caller, scene_id)
+    if scene.state == "uploading":
+        raise Conflict(f"the image of scene {scene_id} is still arriving")
+    scenes.remove_scene(connection, scene_id)
+
+
+def delete_files(storage: Storage, scene_id: UUID) -> None:
+    """Delete the files of a scene that was removed."""
+    for key in storage.keys(folder_of(scene_id)):
+        storage.delete(key)
+
+
+def model_names(storage: Storage, scene: SceneRow) -> list[str]:
+    """The files beside the image of a scene."""
+    keys = storage.keys(folder_of(scene.id)) if scene.state == "uploaded" else []
+    return [name for key in keys if (name := key.rsplit("/", 1)[1]) != scene.file_name]
+
+
+def folder_of(scene_id: UUID) -> str:
+    """Where the storage has the files of a scene."""
+    return f"scenes/{scene_id}"
+
+
+def clean_name(name: str) -> str:
+    """A file name without folders, in letters that every file system and the storage accept.
+
+    Raises:
+        InputError: nothing of the name is left.
+    """
+    last = re.split(r"[/\\]", name)[-1]
+    plain = unicodedata.normalize("NFKD", last).encode("ascii", "ignore").decode()
+    clean = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain)[-LONGEST_NAME:].lstrip(".-")
+    if not clean.strip("_."):
+        raise InputError(f"{name[:LONGEST_NAME]!r} is not the name of a file")
+    return clean
+
+
+def _refuse_too_large(upload: Upload, limit_bytes: int) -> None:
+    if upload.size_bytes is not None and upload.size_bytes > limit_bytes:
+        raise TooLarge(f"{upload.size_bytes} bytes announced, at most {limit_bytes} are accepted")
+
+
+def _receive(
+    storage: Storage, key: str, upload: Upload, chunks: Iterable[bytes], limit_bytes: int
+) -> StoredFile:
+    """Store a file that is as announced, or nothing."""
+    with storage.writing(key, limit_bytes) as writing:
+        for chunk in chunks:
+            writing.write(chunk)
+        if upload.size_bytes not in (None, writing.size_bytes):
+            raise InputError(f"{upload.size_bytes} bytes announced, {writing.size_bytes} received")
+        if upload.sha256 not in (None, writing.sha256):
+            raise InputError(f"sha256 {upload.sha256} announced, {writing.sha256} received")
+    return StoredFile(key, writing.size_bytes, writing.sha256)
+
+
+def _images_only(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    """The same bytes, once the first of them are those of an image."""
+    head = b""
+    rest = iter(chunks)
+    for chunk in rest:
+        head += chunk
+        if len(head) >= LONGEST_SIGNATURE:
+            break
+    if not head.startswith(tuple(DRIVER_OF_SIGNATURE)):
+        raise FormatError(f"the file begins with {head[:8]!r}: neither TIFF, JPEG 2000 nor NITF")
+    yield head
+    yield from rest
