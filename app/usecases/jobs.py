@@ -1,0 +1,170 @@
+"""Asking for work, watching it, and doing it."""
+
+import logging
+import re
+import time
+from dataclasses import dataclass, field
+from typing import Any
+from uuid import UUID
+
+from psycopg import OperationalError
+
+from app.auth import Scope, allows, require
+from app.db import jobs
+from app.db.engine import Connection, Database
+from app.db.jobs import Job, LostJob
+from app.db.tokens import Token
+from app.errors import AmersError, Conflict, InputError, NotFound
+from app.storage import Storage
+from app.usecases.processes import Process, Work
+from app.usecases.registration import REGISTER_SCENE
+
+PROCESSES: dict[str, Process] = {process.id: process for process in (REGISTER_SCENE,)}
+LONGEST_KEY = 200
+REPORT_EVERY_S = 0.5
+
+log = logging.getLogger(__name__)
+
+
+def find_process(process_id: str) -> Process:
+    """The process of that name.
+
+    Raises:
+        NotFound: there is none.
+    """
+    process = PROCESSES.get(process_id)
+    if process is None:
+        raise NotFound(f"no process {process_id}: there are {', '.join(PROCESSES)}")
+    return process
+
+
+def execute(
+    connection: Connection,
+    caller: Token,
+    process_id: str,
+    given: dict[str, Any],
+    idempotency_key: str | None = None,
+) -> Job:
+    """Ask for work; the same request with the same key asks for it once.
+
+    Raises:
+        NotFound: no such process, or an input that is not there for this caller.
+        NotAllowed: the caller's token lacks the scope.
+        InputError: the inputs are not those of the process, or the key came with other ones before.
+    """
+    process = find_process(process_id)
+    require(caller, process.scope)
+    if idempotency_key is not None and not 0 < len(idempotency_key) <= LONGEST_KEY:
+        raise InputError(f"an idempotency key has 1 to {LONGEST_KEY} characters")
+    parsed = process.parse_inputs(given)
+    inputs = process.format_inputs(parsed)
+    if idempotency_key is not None:
+        known = jobs.find_by_key(connection, caller.id, idempotency_key)
+        if known is not None:
+            return _same_request(known, process_id, inputs)
+    process.check(connection, caller, parsed)
+    job = jobs.create(connection, process_id, inputs, caller.id, idempotency_key)
+    if job is not None:
+        return job
+    assert idempotency_key is not None
+    # Somebody else has just used the key: his job is visible now that the insert has waited for him.
+    known = jobs.find_by_key(connection, caller.id, idempotency_key)
+    assert known is not None
+    return _same_request(known, process_id, inputs)
+
+
+def _same_request(known: Job, process_id: str, inputs: dict[str, Any]) -> Job:
+    if (known.kind, known.inputs) != (process_id, inputs):
+        raise InputError(f"the idempotency key was used for job {known.id}, which was asked otherwise")
+    return known
+
+
+def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
+    """The job, for its owner or an administrator.
+
+    Raises:
+        NotFound: there is none, or it is somebody else's: strangers cannot tell which.
+    """
+    job = jobs.find(connection, job_id)
+    if job is None or not (job.owner == caller.id or allows(caller, Scope.ADMIN)):
+        raise NotFound(f"no job {job_id}")
+    return job
+
+
+def list_jobs(connection: Connection, caller: Token, limit: int) -> list[Job]:
+    """The caller's newest jobs; everybody's for an administrator."""
+    return jobs.newest(connection, None if allows(caller, Scope.ADMIN) else caller.id, limit)
+
+
+def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:
+    """End a job that nobody wants any more; work on it stops within seconds.
+
+    Raises:
+        NotFound: no such job, or not the caller's.
+        Conflict: it has ended; its record and its results are kept.
+    """
+    job = visible_job(connection, caller, job_id)
+    if not jobs.dismiss(connection, job_id):
+        job = visible_job(connection, caller, job_id)
+        if job.state != "dismissed":
+            raise Conflict(f"job {job_id} has ended ({job.state}); it is kept")
+    return visible_job(connection, caller, job_id)
+
+
+def do_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int) -> None:
+    """Do the work of a job and write its outcome, once.
+
+    An error that concerns the user ends the job; any other leaves it to the caller.
+
+    Raises:
+        LostJob: the job went on without this attempt; nothing was written.
+    """
+    with database.transaction() as connection:
+        job = jobs.find(connection, job_id)
+    if job is None or (job.attempt, job.state) != (attempt, "running"):
+        raise LostJob(f"attempt {attempt} of job {job_id} is over")
+    process = find_process(job.kind)
+    try:
+        inputs = process.parse_inputs(job.inputs)
+        commit = process.run(Work(job, inputs, database, storage, _ReportedProgress(database, job)))
+        with database.transaction() as connection:
+            results = commit(connection)
+            jobs.succeed(connection, job.id, attempt, results)
+    except AmersError as error:
+        log.info("job %s: %s: %s", job.id, type(error).__name__, error)
+        with database.transaction() as connection:
+            jobs.fail(connection, job.id, attempt, error_details(error))
+
+
+def error_details(error: AmersError) -> dict[str, Any]:
+    """Problem details (RFC 9457) of an error, with the numbers it carries."""
+    name = type(error).__name__
+    title = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
+    numbers = {key: value for key, value in vars(error).items() if isinstance(value, int | float | str)}
+    return {"type": "about:blank", "title": title, "detail": str(error), "error": name, **numbers}
+
+
+@dataclass
+class _ReportedProgress:
+    """Progress that is written into the job, not too often."""
+
+    database: Database
+    job: Job
+    written_at: float = field(default=float("-inf"))
+
+    def __call__(self, fraction: float, message: str) -> None:
+        """Report the fraction done.
+
+        Raises:
+            LostJob: nobody waits for this attempt any more.
+        """
+        now = time.monotonic()
+        if now - self.written_at < REPORT_EVERY_S:
+            return
+        self.written_at = now
+        percent = min(max(int(100.0 * fraction), 0), 99)
+        try:
+            with self.database.transaction() as connection:
+                jobs.report(connection, self.job.id, self.job.attempt, percent, message)
+        except OperationalError as outage:
+            log.warning("job %s: progress could not be written: %s", self.job.id, outage)

@@ -1,0 +1,234 @@
+"""Registering a scene: read its files, find points, call the science, write the outcome."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import shapely
+
+from app.auth import Scope
+from app.db import registrations, scenes
+from app.db.engine import Connection, Database
+from app.db.points import control_points
+from app.db.tokens import Token
+from app.errors import Conflict
+from app.storage import Storage, StoredChips
+from app.usecases.processes import Commit, Process, Work
+from app.usecases.registration_files import OUTPUTS, write_outputs
+from app.usecases.scenes import visible_scene
+from services.formats.block import FolderChips, read_block
+from services.formats.scenes import read_scene
+from services.registration import Registration, RegistrationOptions, register_scene
+from services.reports.document import report_document
+from services.reports.report import BlockUsed, RegistrationReport
+from services.scene import scene_footprint
+from services.types import Array, ChipSource, ControlPoints, Progress, no_progress
+
+METRES_PER_DEGREE = 111_320.0
+REACH_SIGMAS = 3.0
+"""A model may be wrong by this many of its standard deviations; points are looked for that far out."""
+
+
+@dataclass(frozen=True)
+class RegisterScene:
+    """What a user says to have a scene registered.
+
+    Attributes:
+        scene: id of an uploaded scene.
+        options: of the registration.
+    """
+
+    scene: UUID
+    options: RegistrationOptions = field(default_factory=RegistrationOptions)
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """A scene on the disk.
+
+    Attributes:
+        image: the image; what lies beside it is looked at for a model.
+        model: file of the model, if it is not found by itself.
+        sigma_m: accuracy of the model, metres; by default what the producer or the sensor says.
+    """
+
+    image: Path
+    model: Path | None = None
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True)
+class FoundPoints:
+    """Control points of a piece of ground.
+
+    Attributes:
+        chips: where the chips of the points are.
+        blocks: whose points they are.
+    """
+
+    points: ControlPoints
+    chips: ChipSource
+    blocks: tuple[BlockUsed, ...]
+
+
+FindPoints = Callable[[Array], FoundPoints]
+"""Points inside an outline (n, 2) of lon, lat."""
+
+
+@dataclass(frozen=True)
+class RegisteredScene:
+    """What a registration made.
+
+    Attributes:
+        footprint: (n, 2) lon, lat outline of the scene.
+        files: the outputs, by name.
+    """
+
+    registration: Registration
+    report: RegistrationReport
+    footprint: Array
+    files: dict[str, Path]
+
+
+def run_registration(
+    files: SceneFiles,
+    find_points: FindPoints,
+    options: RegistrationOptions,
+    folder: Path,
+    progress: Progress = no_progress,
+) -> RegisteredScene:
+    """Register one scene and write what came out of it into a folder.
+
+    Raises:
+        InputError: the scene cannot be used.
+        ComputationError: it cannot be registered.
+    """
+    started_at = datetime.now(UTC)
+    scene = read_scene(files.image, files.model, files.sigma_m)
+    footprint = scene_footprint(scene)
+    progress(0.0, "looking for points")
+    found = find_points(_grown(footprint, REACH_SIGMAS * scene.sigma_m))
+    registration = register_scene(
+        scene,
+        found.points,
+        found.chips,
+        options,
+        lambda fraction, message: progress(0.9 * fraction, message),
+    )
+    progress(0.9, "writing the report")
+    report, paths = write_outputs(
+        folder,
+        files.image,
+        files.model,
+        scene,
+        found.points,
+        found.chips,
+        found.blocks,
+        registration,
+        options,
+        started_at,
+    )
+    return RegisteredScene(registration, report, footprint, paths)
+
+
+def points_of_block(folder: Path) -> FindPoints:
+    """Points straight out of a block folder."""
+    contents = read_block(folder)
+    metadata = contents.document.metadata
+
+    def find(outline: Array) -> FoundPoints:
+        block = BlockUsed(metadata.id, metadata.version)
+        return FoundPoints(contents.points, FolderChips(folder), (block,))
+
+    return find
+
+
+def points_of_store(database: Database, storage: Storage) -> FindPoints:
+    """Points of the published blocks of the store."""
+
+    def find(outline: Array) -> FoundPoints:
+        with database.transaction() as connection:
+            found = control_points(connection, outline)
+        blocks = tuple(BlockUsed(block.id, block.version) for block in found.blocks)
+        return FoundPoints(found.points, StoredChips(storage), blocks)
+
+    return find
+
+
+def record(
+    connection: Connection,
+    registered: RegisteredScene,
+    *,
+    job_id: UUID | None = None,
+    scene_id: UUID | None = None,
+    keys: dict[str, str] | None = None,
+) -> UUID:
+    """Remember a registration and what happened to each point in it."""
+    report = report_document(registered.report)
+    registration_id = registrations.insert_registration(
+        connection,
+        job_id=job_id,
+        scene_id=scene_id,
+        block_versions=report["blocks"],
+        options=report["options"],
+        report=report,
+        verdict=registered.registration.qualification.verdict,
+        files=keys or {},
+    )
+    registrations.insert_measures(connection, registration_id, registered.registration.measures)
+    return registration_id
+
+
+def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None:
+    scene = visible_scene(connection, caller, inputs.scene)
+    if scene.state != "uploaded":
+        raise Conflict(f"scene {inputs.scene} cannot be registered: its image is {scene.state}")
+
+
+def _run(work: Work) -> Commit:
+    """Register an uploaded scene; the files are in the storage before the rows that name them."""
+    inputs: RegisterScene = work.inputs
+    with work.database.transaction() as connection:
+        scene = scenes.find_scene(connection, inputs.scene)
+    if scene is None or scene.file_key is None:
+        raise Conflict(f"scene {inputs.scene} has been removed")
+    files = SceneFiles(work.storage.path(scene.file_key), sigma_m=scene.sigma_m)
+    find_points = points_of_store(work.database, work.storage)
+    with TemporaryDirectory(prefix="amers-") as folder:
+        made = run_registration(files, find_points, inputs.options, Path(folder), work.progress)
+        keys = {
+            name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
+            for name, path in made.files.items()
+        }
+
+    def commit(connection: Connection) -> dict[str, Any]:
+        record(connection, made, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
+        scenes.set_footprint(connection, inputs.scene, made.footprint)
+        return {"verdict": made.report.verdict, "files": keys}
+
+    return commit
+
+
+def _grown(outline: Array, metres: float) -> Array:
+    """An outline (n, 2) of lon, lat with so many metres more on every side."""
+    centre = outline.mean(axis=0)
+    scale = METRES_PER_DEGREE * np.array([max(np.cos(np.radians(centre[1])), 0.01), 1.0])
+    grown = shapely.buffer(shapely.Polygon((outline - centre) * scale), metres, quad_segs=2)
+    return np.asarray(centre + np.array(grown.exterior.coords)[:-1] / scale)
+
+
+REGISTER_SCENE = Process(
+    id="register-scene",
+    title="Register a scene",
+    description="Refine the sensor model of an uploaded scene on the control points of its footprint.",
+    scope=Scope.REGISTER,
+    inputs=RegisterScene,
+    outputs=OUTPUTS,
+    check=_check,
+    run=_run,
+)

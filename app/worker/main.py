@@ -1,0 +1,97 @@
+"""A worker: takes job ids from the queue, one after the other, until it is told to stop."""
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from uuid import UUID
+
+import procrastinate
+import psycopg
+
+from app.config import Settings
+from app.db import engine, jobs
+from app.db.engine import Database
+from app.storage import Storage
+from app.worker.attempt import Attempts
+from app.worker.sweep import Sweeper
+
+LONGEST_POLL_S = 5.0
+"""The queue notifies its workers; this is how soon they find an entry that was put off until a time."""
+PAUSE_S = 2.0
+"""Before the queue is asked again after an outage of the database."""
+
+log = logging.getLogger(__name__)
+
+
+def run_worker(settings: Settings) -> None:
+    """Work until SIGTERM or SIGINT; a job under way then goes back to the queue."""
+    stop = threading.Event()
+    with engine.opened(settings) as database, _sweeping(database, settings, stop):
+        asyncio.run(_Worker(database, settings, stop).run())
+
+
+@contextmanager
+def _sweeping(database: Database, settings: Settings, stop: threading.Event) -> Iterator[None]:
+    storage = Storage(settings.data_folder / "storage")
+    sweeper = threading.Thread(target=Sweeper(database, storage, settings, stop).run, name="sweeper")
+    sweeper.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        sweeper.join()
+
+
+@dataclass
+class _Worker:
+    database: Database
+    settings: Settings
+    stop: threading.Event
+    name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
+
+    async def run(self) -> None:
+        """Fetch and do jobs; an outage of the database ends a round, not the worker."""
+        rounds = asyncio.create_task(self._rounds())
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._stop, rounds)
+        try:
+            await rounds
+        except asyncio.CancelledError:
+            log.info("worker %s stopped", self.name)
+
+    def _stop(self, rounds: "asyncio.Task[None]") -> None:
+        self.stop.set()
+        rounds.cancel()
+
+    async def _rounds(self) -> None:
+        while not self.stop.is_set():
+            try:
+                await self._work()
+            except (procrastinate.exceptions.ConnectorException, psycopg.Error) as outage:
+                log.warning("the queue does not answer: %s", outage)
+            await asyncio.sleep(PAUSE_S)
+
+    async def _work(self) -> None:
+        app = procrastinate.App(connector=procrastinate.PsycopgConnector(conninfo=self.database.dsn))
+        attempts = Attempts(self.database, self.settings, self.name, self.stop.is_set)
+
+        @app.task(name=jobs.TASK, queue=jobs.QUEUE)
+        def do_job(job_id: str) -> None:
+            attempts.do_job(UUID(job_id))
+
+        async with app.open_async():
+            log.info("worker %s waits for jobs", self.name)
+            await app.run_worker_async(
+                queues=[jobs.QUEUE],
+                name=self.name,
+                delete_jobs="always",
+                fetch_job_polling_interval=min(self.settings.lease_seconds, LONGEST_POLL_S),
+                install_signal_handlers=False,
+            )

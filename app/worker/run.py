@@ -1,0 +1,70 @@
+"""The process that does one attempt at a job.
+
+Started as `python -m app.worker.run JOB ATTEMPT WORKER_PID MEMORY_BYTES`.
+
+Exit codes: 0 the outcome is written or no longer wanted, 77 out of memory, anything else: it broke off.
+"""
+
+import ctypes
+import logging
+import os
+import resource
+import signal
+import sys
+from pathlib import Path
+from uuid import UUID
+
+import cv2
+
+from app.config import read_settings
+from app.db.engine import pooled
+from app.db.jobs import LostJob
+from app.storage import Storage
+from app.usecases.jobs import do_attempt
+from app.worker.attempt import OUT_OF_MEMORY
+
+PR_SET_PDEATHSIG = 1
+CV_NO_MEMORY = -4
+
+log = logging.getLogger(__name__)
+
+
+def main(arguments: list[str]) -> int:
+    """Do the attempt and return the exit code."""
+    job_id, attempt, worker_pid, memory_bytes = arguments
+    die_with(int(worker_pid))
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    limit_memory(int(memory_bytes))
+    settings = read_settings()
+    assert settings.database_url is not None, "the worker names its database"
+    try:
+        with pooled(settings.database_url.get_secret_value(), settings) as database:
+            do_attempt(database, Storage(settings.data_folder / "storage"), UUID(job_id), int(attempt))
+    except LostJob as lost:
+        log.info("%s", lost)
+    except MemoryError:
+        return OUT_OF_MEMORY
+    except cv2.error as error:
+        if error.code == CV_NO_MEMORY:
+            return OUT_OF_MEMORY
+        raise
+    return 0
+
+
+def die_with(worker_pid: int) -> None:
+    """Have the kernel end this process when its worker ends, however that ends."""
+    if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl")
+    if os.getppid() != worker_pid:
+        sys.exit("the worker is gone")
+
+
+def limit_memory(extra_bytes: int) -> None:
+    """Let this process allocate so much beyond what its libraries have reserved by now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + extra_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,75 @@
+"""What every worker puts right from time to time: jobs of dead workers, files that no row names.
+
+It runs in a thread of its own, not as a periodic task of the queue: such a task needs a free worker, and
+the workers may all be busy for an hour.
+"""
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+
+import psycopg
+
+from app.config import Settings
+from app.db import jobs, scenes
+from app.db.engine import Database
+from app.storage import Storage
+from app.usecases.cleaning import remove_unnamed_files
+from app.worker.attempt import FAILURES_ALLOWED
+
+SILENT_WORKER_S = 60.0
+"""A worker of the queue beats every ten seconds; after this long without, its entries are dead."""
+FILES_EVERY_S = 3600.0
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Sweeper:
+    """Puts things right until it is told to stop.
+
+    Attributes:
+        database, storage: of the installation.
+        settings: how long a lease is.
+        stop: ends the thread.
+    """
+
+    database: Database
+    storage: Storage
+    settings: Settings
+    stop: threading.Event
+
+    def run(self) -> None:
+        """Sweep jobs several times a lease, files every hour."""
+        files_at = time.monotonic()
+        while not self.stop.wait(self.settings.lease_seconds / 3.0):
+            try:
+                sweep_jobs(self.database, self.settings.lease_seconds)
+                if time.monotonic() > files_at:
+                    files_at += FILES_EVERY_S
+                    sweep_files(self.database, self.storage)
+            except psycopg.OperationalError as outage:
+                log.warning("could not sweep: %s", outage)
+            except Exception:
+                log.exception("could not sweep")
+
+
+def sweep_jobs(database: Database, lease_s: float) -> None:
+    """Take back the jobs of dead workers, and put into the queue what was lost from it."""
+    with database.transaction() as connection:
+        if not jobs.may_sweep(connection):
+            return
+        for job_id in jobs.take_back(connection, FAILURES_ALLOWED):
+            log.warning("job %s: taken back from a worker that gave no sign of life", job_id)
+        for job_id in jobs.enqueue_forgotten(connection, lease_s):
+            log.warning("job %s: was not in the queue any more", job_id)
+        jobs.forget_dead_entries(connection, SILENT_WORKER_S)
+
+
+def sweep_files(database: Database, storage: Storage) -> None:
+    """Remove the files of uploads and attempts that came to nothing."""
+    with database.transaction() as connection:
+        scenes.give_up_old_uploads(connection)
+    for key in remove_unnamed_files(database, storage):
+        log.info("removed %s, which nothing names", key)

@@ -1,0 +1,255 @@
+"""Uploading scenes: bounded, checked, private; and removing them."""
+
+import hashlib
+from base64 import b64encode
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.config import Settings
+from app.db import engine, scenes
+from app.errors import InputError
+from app.main import create_app
+from app.storage import KEY, Storage
+from app.usecases.scenes import clean_name, folder_of
+from app.worker.sweep import sweep_files
+
+TIFF = b"II*\0" + bytes(100_000)
+LIMIT_BYTES = 200_000
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+@pytest.fixture
+def settings(dsn: str, tmp_path: Path) -> Settings:
+    """An installation that takes small uploads only."""
+    return Settings(database_url=dsn, data_folder=tmp_path / "data", upload_limit_bytes=LIMIT_BYTES)
+
+
+def stored_files(storage: Storage) -> list[Path]:
+    """Every file of the storage, finished or not."""
+    return [path for path in storage.folder.rglob("*") if path.is_file()]
+
+
+def chunks(data: bytes) -> Iterator[bytes]:
+    """A body of unknown length."""
+    for start in range(0, len(data), 10_000):
+        yield data[start : start + 10_000]
+
+
+def test_an_uploaded_scene_is_stored_as_it_was_sent(
+    client: TestClient, bearer: Bearer, storage: Storage
+):
+    me = bearer("register")
+    reply = client.post("/scenes?name=IMG_1.TIF&sigma_m=12.5", content=TIFF, headers=me)
+    assert reply.status_code == 201, reply.text
+    scene = reply.json()
+    assert (scene["state"], scene["file"], scene["sigma_m"]) == ("uploaded", "IMG_1.TIF", 12.5)
+    assert (scene["size_bytes"], scene["sha256"]) == (len(TIFF), hashlib.sha256(TIFF).hexdigest())
+    assert client.get(reply.headers["location"], headers=me).json() == scene
+    assert client.get("/scenes", headers=me).json() == {"scenes": [scene]}
+    assert storage.path(f"scenes/{scene['id']}/IMG_1.TIF").read_bytes() == TIFF
+
+
+def test_the_name_may_come_from_the_content_disposition(client: TestClient, bearer: Bearer):
+    header = {"Content-Disposition": "attachment; filename*=UTF-8''sc%C3%A8ne%201.tif"}
+    reply = client.post("/scenes", content=TIFF, headers=bearer("register") | header)
+    assert (reply.json()["name"], reply.json()["file"]) == ("scène 1.tif", "scene_1.tif")
+
+
+def test_a_model_is_laid_beside_the_image(client: TestClient, bearer: Bearer, storage: Storage):
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
+    reply = client.put(f"/scenes/{scene['id']}/files/a_RPC.TXT", content=b"LINE_OFF: 1", headers=me)
+    assert reply.status_code == 200, reply.text
+    assert client.get(f"/scenes/{scene['id']}", headers=me).json()["models"] == ["a_RPC.TXT"]
+    assert storage.path(f"scenes/{scene['id']}/a_RPC.TXT").read_bytes() == b"LINE_OFF: 1"
+
+
+@pytest.mark.parametrize(
+    ("name", "status"), [("a.tif", 422), ("a.vrt", 422), ("a.aux.xml.sh", 422), ("...", 422)]
+)
+def test_only_models_are_laid_beside_an_image(
+    client: TestClient, bearer: Bearer, name: str, status: int
+):
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
+    reply = client.put(f"/scenes/{scene['id']}/files/{name}", content=b"x", headers=me)
+    assert reply.status_code == status, reply.text
+
+
+@pytest.mark.parametrize("body", [b"", b"II", b"<VRTDataset/>", b"\x89PNG\r\n\x1a\n", b"PK\3\4"])
+def test_a_file_that_is_no_image_is_refused_and_leaves_nothing(
+    client: TestClient, bearer: Bearer, storage: Storage, body: bytes
+):
+    me = bearer("register")
+    reply = client.post("/scenes?name=a.tif", content=body, headers=me)
+    assert reply.status_code == 422
+    assert "neither TIFF, JPEG 2000 nor NITF" in reply.json()["detail"]
+    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert stored_files(storage) == []
+
+
+def test_an_upload_announced_too_large_is_refused_before_it_is_read(
+    client: TestClient, bearer: Bearer, storage: Storage
+):
+    me = bearer("register")
+    size = {"Content-Length": str(LIMIT_BYTES + 1)}
+    reply = client.post("/scenes?name=a.tif", content=b"II*\0", headers=me | size)
+    assert reply.status_code == 413
+    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert stored_files(storage) == []
+
+
+def test_an_upload_that_turns_out_too_large_is_cut_off_and_leaves_nothing(
+    client: TestClient, bearer: Bearer, storage: Storage
+):
+    me = bearer("register")
+    body = chunks(TIFF + bytes(LIMIT_BYTES))
+    reply = client.post("/scenes?name=a.tif", content=body, headers=me)
+    assert reply.status_code == 413
+    assert str(LIMIT_BYTES) in reply.json()["detail"]
+    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert stored_files(storage) == []
+
+
+def test_an_upload_without_announced_length_arrives(client: TestClient, bearer: Bearer):
+    reply = client.post("/scenes?name=a.tif", content=chunks(TIFF), headers=bearer("register"))
+    assert reply.json()["size_bytes"] == len(TIFF)
+
+
+DIGEST = hashlib.sha256(TIFF).digest()
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"X-Checksum": DIGEST.hex()},
+        {"Repr-Digest": f"sha-256=:{b64encode(DIGEST).decode()}:"},
+        {"Repr-Digest": f"md5=:AAAA:, sha-256=:{b64encode(DIGEST).decode()}:"},
+    ],
+)
+def test_a_checksum_that_fits_is_accepted(client: TestClient, bearer: Bearer, header: dict[str, str]):
+    reply = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register") | header)
+    assert reply.status_code == 201, reply.text
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"X-Checksum": bytes(32).hex()},
+        {"X-Checksum": "abc"},
+        {"Repr-Digest": f"sha-256=:{b64encode(bytes(32)).decode()}:"},
+        {"Repr-Digest": "sha-256=:AAAA:"},
+    ],
+)
+def test_a_checksum_that_does_not_fit_refuses_the_upload(
+    client: TestClient, bearer: Bearer, storage: Storage, header: dict[str, str]
+):
+    reply = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register") | header)
+    assert reply.status_code == 422
+    assert stored_files(storage) == []
+
+
+def test_an_upload_without_a_name_is_refused(client: TestClient, bearer: Bearer):
+    reply = client.post("/scenes", content=TIFF, headers=bearer("register"))
+    assert reply.status_code == 422
+    assert "no name" in reply.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [({}, 401), ({"Authorization": "Bearer wrong"}, 401), ({"Authorization": "Basic x"}, 401)],
+)
+def test_uploading_needs_a_token(
+    client: TestClient, storage: Storage, headers: dict[str, str], status: int
+):
+    reply = client.post("/scenes?name=a.tif", content=TIFF, headers=headers)
+    assert reply.status_code == status
+    assert stored_files(storage) == []
+
+
+def test_a_token_to_read_does_not_upload(client: TestClient, bearer: Bearer):
+    assert client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("read")).status_code == 403
+
+
+def test_a_scene_of_somebody_else_does_not_exist(client: TestClient, bearer: Bearer, storage: Storage):
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
+    here = f"/scenes/{scene['id']}"
+    stranger = bearer("register")
+    replies = [
+        client.get(here, headers=stranger),
+        client.delete(here, headers=stranger),
+        client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=stranger),
+    ]
+    assert [reply.status_code for reply in replies] == [404, 404, 404]
+    assert client.get("/scenes", headers=stranger).json() == {"scenes": []}
+    assert storage.keys("scenes") == [f"scenes/{scene['id']}/a.tif"]
+    assert client.get(here, headers=bearer("admin")).status_code == 200
+
+
+def test_a_removed_scene_keeps_its_record_and_loses_its_files(
+    client: TestClient, bearer: Bearer, storage: Storage
+):
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()
+    here = f"/scenes/{scene['id']}"
+    client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=me)
+    assert client.delete(here, headers=me).status_code == 204
+    left = client.get(here, headers=me).json()
+    assert (left["state"], left["sha256"], left["models"]) == ("removed", scene["sha256"], [])
+    assert stored_files(storage) == []
+    late = client.put(f"{here}/files/a_RPC.TXT", content=b"x", headers=me)
+    assert late.status_code == 409
+
+
+def test_a_path_from_a_stranger_is_only_a_name(client: TestClient, bearer: Bearer, storage: Storage):
+    me = bearer("register")
+    for name in ("../../../etc/passwd.tif", "/etc/cron.d/x.tif", "..\\..\\x.tif", ".hidden.tif"):
+        reply = client.post("/scenes", params={"name": name}, content=TIFF, headers=me)
+        assert reply.status_code == 201, reply.text
+        key = f"scenes/{reply.json()['id']}/{reply.json()['file']}"
+        assert storage.path(key).resolve().is_relative_to(storage.folder.resolve())
+    assert len(stored_files(storage)) == 4
+
+
+@given(st.text(max_size=300))
+def test_any_text_becomes_a_name_the_storage_takes_or_is_refused(text: str):
+    try:
+        name = clean_name(text)
+    except InputError:
+        return
+    assert KEY.fullmatch(name)
+    assert "/" not in name
+    assert clean_name(name) == name
+
+
+def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, bearer: Bearer):
+    kept = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
+    app = client.app
+    database, storage = app.state.database, app.state.storage  # type: ignore[attr-defined]
+    with database.transaction() as connection:
+        arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", None)
+        cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", None)
+        connection.execute(
+            "update scene set created_at = now() - interval '2 days' where id = %s", [cut_off]
+        )
+    for scene_id, name in ((arriving, "b.tif"), (cut_off, "c.tif")):
+        storage.put(f"{folder_of(scene_id)}/{name}", [TIFF])
+    sweep_files(database, storage)
+    assert storage.keys("scenes") == sorted([f"scenes/{kept['id']}/a.tif", f"scenes/{arriving}/b.tif"])
+
+
+def test_an_upload_survives_no_failure_of_the_database(settings: Settings, bearer: Bearer, dsn: str):
+    me = bearer("register")
+    with engine.connect(dsn) as connection:
+        connection.execute("alter table scene add constraint test_only check (state <> 'uploaded')")
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
+        assert reply.status_code == 500
+        assert stored_files(Storage(settings.data_folder / "storage")) == []
+        assert client.get("/scenes", headers=me).json() == {"scenes": []}
