@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from services.quality.qualification import Criterion
 from services.reports import figures
+from services.reports.drawing import svg
 from services.reports.report import ChipPair, RegistrationReport, RegistrationSummary
 from services.reports.tables import ABSENT, criterion_words, number, percent, quantile
 from services.types import Array, ChipArray
@@ -19,7 +20,7 @@ from services.types import Array, ChipArray
 PAIRS_PER_GROUP = 4
 _VERDICTS = {
     "good": "every criterion is met",
-    "usable": "usable, but not every criterion of a good registration is met",
+    "usable": "fit for use, but not every criterion of a good registration is met",
     "failed": "not to be used: a criterion that any registration must meet is not met",
 }
 
@@ -57,8 +58,8 @@ def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str
     return page.render(
         report=report,
         verdict_words=_VERDICTS[report.verdict],
-        unmet=[criterion for criterion in report.criteria if not criterion.passed],
-        figures={draw.__name__: Markup(figures.svg(draw, summary)) for draw in drawn},
+        unmet=unmet_criteria(report),
+        figures={draw.__name__: Markup(svg(draw, summary)) for draw in drawn},
         gallery=choose_pairs(summary.gallery),
         options=list(flat_options(report.options)),
         centre=_centre_words(report.scene.footprint_lon_lat),
@@ -84,6 +85,12 @@ def _environment() -> Environment:
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
     )
     return environment
+
+
+def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
+    """Criteria that are not met, those that cost the most first."""
+    unmet = [criterion for criterion in report.criteria if not criterion.passed]
+    return sorted(unmet, key=lambda criterion: criterion.needed_for == "good")
 
 
 def choose_pairs(

@@ -27,7 +27,8 @@ def number(value: float, decimals: int = 2, unit: str = "") -> str:
     """A number for people; a dash when there is none."""
     if value != value:
         return ABSENT
-    return f"{value:.{decimals}f} {unit}".rstrip()
+    without_minus_zero = round(float(value), decimals) + 0.0
+    return f"{without_minus_zero:.{decimals}f} {unit}".rstrip()
 
 
 def percent(ratio: float) -> str:
@@ -37,9 +38,13 @@ def percent(ratio: float) -> str:
 
 def quantile(found: Quantile, unit: str = "m") -> str:
     """A quantile for people, with its interval."""
-    lower, upper = number(found.lower), number(found.upper)
-    interval = f"{100 * found.confidence:.0f} % interval {lower} to {upper} {unit}, n = {found.n}"
-    return f"{number(found.value, 2, unit)} ({interval})"
+    if found.lower != found.lower:
+        bounds = f"not bounded, n = {found.n}"
+    elif found.upper != found.upper:
+        bounds = f"at least {number(found.lower, 2, unit)}, n = {found.n}"
+    else:
+        bounds = f"{number(found.lower)} to {number(found.upper, 2, unit)}, n = {found.n}"
+    return f"{number(found.value, 2, unit)} ({100 * found.confidence:.0f} % interval: {bounds})"
 
 
 def criterion_words(criterion: Criterion) -> tuple[str, str, str]:

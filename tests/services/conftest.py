@@ -86,6 +86,7 @@ def register(
     corrected = CorrectedModel(model, adjustment.correction)
     residual_px = seen - corrected.project(lon_lat_h)
     reason = np.where(adjustment.active, "", np.where(matched, "beyond 2.7 sigma", "score under 0.8"))
+    reason = reason.astype("<U32")
     reason[: lost // 2] = np.where(matched[: lost // 2], reason[: lost // 2], "second peak too close")
     measures = Measures(
         point_id=np.arange(n),

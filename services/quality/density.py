@@ -1,0 +1,92 @@
+"""How densely control points cover the ground, in cells of a tenth of a degree."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from services.geodesy import WGS84_B, WGS84_E2
+from services.types import Array, IntArray
+
+CELLS_PER_DEGREE = 10
+
+
+@dataclass(frozen=True)
+class DensityCells:
+    """Cells of 0.1 x 0.1 degree that an outline meets.
+
+    Attributes:
+        lon_lat: (n, 2) south-west corners; longitudes are those of the outline.
+        area_km2: (n,) part of the cell's area inside the outline.
+        points: (n,) int64, how many points lie in the cell.
+    """
+
+    lon_lat: Array
+    area_km2: Array
+    points: IntArray
+
+    @property
+    def points_per_km2(self) -> Array:
+        """(n,) density of each cell."""
+        return self.points / self.area_km2
+
+
+def density_cells(lon_lat: Array, outline: Array) -> DensityCells:
+    """Count points in the cells an outline meets.
+
+    Args:
+        lon_lat: (m, 2) points, degrees.
+        outline: (k, 2) lon, lat, not closed, longitudes continuous (beyond 180 degrees where it crosses
+            the antimeridian).
+    """
+    low = np.floor(outline.min(axis=0) * CELLS_PER_DEGREE).astype(np.int64)
+    shape = np.ceil(outline.max(axis=0) * CELLS_PER_DEGREE).astype(np.int64) - low
+    shape = np.maximum(shape, 1)
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 2)
+    corner = (grid + low) / CELLS_PER_DEGREE
+    opposite = (grid + low + 1) / CELLS_PER_DEGREE
+    area_km2 = _area_inside_km2(corner, opposite, outline)
+    lon = lon_lat[:, 0] + 360.0 * np.ceil((outline[:, 0].min() - lon_lat[:, 0]) / 360.0)
+    # Points on the last edge of the outline belong to its last cell.
+    cell = np.floor(np.column_stack([lon, lon_lat[:, 1]]) * CELLS_PER_DEGREE).astype(np.int64) - low
+    cell = np.clip(cell, 0, shape - 1)
+    count = np.bincount(cell[:, 0] * shape[1] + cell[:, 1], minlength=len(grid)).astype(np.int64)
+    kept = area_km2 > 0.0
+    return DensityCells(corner[kept], area_km2[kept], count[kept])
+
+
+def share_reaching(cells: DensityCells, points_per_km2: float) -> float:
+    """Part of the cells, 0 to 1, that have a density or more.
+
+    A cell counts by its area inside the outline, so that slivers along the outline do not weigh as much
+    as whole cells do.
+    """
+    reached = cells.points_per_km2 >= points_per_km2
+    return float(cells.area_km2[reached].sum() / cells.area_km2.sum())
+
+
+def _area_inside_km2(corner: Array, opposite: Array, outline: Array) -> Array:
+    """Area of cells inside an outline: that of the whole cell on the ellipsoid, by the part inside."""
+    area_km2 = box_area_km2(corner, opposite)
+    polygon = shapely.Polygon(outline)
+    boxes = shapely.box(corner[:, 0], corner[:, 1], opposite[:, 0], opposite[:, 1])
+    shapely.prepare(polygon)
+    part = np.ones(len(boxes))
+    edge = ~shapely.contains_properly(polygon, boxes)
+    part[edge] = shapely.area(shapely.intersection(polygon, boxes[edge])) * CELLS_PER_DEGREE**2
+    return np.where(part > 1e-9, area_km2 * part, 0.0)
+
+
+def box_area_km2(corner: Array, opposite: Array) -> npt.NDArray[np.float64]:
+    """Area on the WGS 84 ellipsoid of boxes (n, 2), (n, 2) of longitude and latitude.
+
+    Source: Snyder (1987), Map projections: a working manual, equation 3-12 for the authalic latitude.
+    """
+
+    def zone(lat_deg: Array) -> Array:
+        s, e = np.sin(np.radians(lat_deg)), np.sqrt(WGS84_E2)
+        return s / (1.0 - WGS84_E2 * s * s) + np.arctanh(e * s) / e
+
+    strip = WGS84_B**2 / 2.0 * (zone(opposite[:, 1]) - zone(corner[:, 1]))
+    return strip * np.radians(opposite[:, 0] - corner[:, 0]) * 1e-6

@@ -1,0 +1,241 @@
+"""The page: whole, closed to the network, safe with hostile names, and sound on poor registrations."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from services.quality.qualification import Criterion
+from services.reports import figures
+from services.reports.drawing import round_number, svg
+from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
+from services.reports.report import Quicklook, build_report
+
+HOSTILE = "<script>alert('x')</script>\"&$\\frac"
+DRAWN = [
+    figures.ground_overview,
+    figures.residual_map,
+    figures.coverage_map,
+    figures.residual_histograms,
+    figures.funnel,
+    figures.residuals_along,
+    figures.predicted_map,
+]
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Tags and texts of a page; complains about tags that are not closed."""
+
+    def __init__(self, markup):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.texts = [], set(), [], []
+        self.feed(markup)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes.extend(attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes.extend(attrs)
+
+    def handle_data(self, data):
+        self.texts.append(data.strip())
+
+
+def page(summary):
+    return format_html(build_report(summary), summary)
+
+
+def without_points(summary):
+    """The summary of a registration that saw no point at all."""
+    measures = summary.measures
+    none = np.zeros(0, dtype=int)
+    empty = replace(
+        measures, **{name: getattr(measures, name)[none] for name in measures.__dataclass_fields__}
+    )
+    return replace(summary, measures=empty, quicklook=None, gallery=(), footprint=np.empty((0, 2)))
+
+
+def nothing_active(summary):
+    """The summary of a registration whose measures were all deactivated, scores unknown."""
+    measures = summary.measures
+    n = len(measures.score)
+    return replace(
+        summary,
+        measures=replace(measures, active=np.zeros(n, bool), score=np.full(n, np.nan)),
+        quicklook=Quicklook(np.full((20, 25), np.nan, dtype=np.float32), 200.0),
+    )
+
+
+def one_active(summary):
+    """The summary of a registration with a single active point."""
+    active = np.zeros(len(summary.measures.score), bool)
+    active[-1] = True
+    return replace(summary, measures=replace(summary.measures, active=active))
+
+
+def test_the_page_asks_nothing_of_the_network(summarised):
+    markup = page(summarised())
+    assert "://" not in markup
+    assert "@import" not in markup
+    found = Page(markup)
+    addresses = [value for name, value in found.attributes if name in ("src", "href", "xlink:href")]
+    assert addresses
+    assert [a for a in addresses if not a.startswith(("data:image/png;base64,", "#"))] == []
+    assert re.findall(r"url\((?!#|&quot;#|'#)", markup) == []
+    assert found.tags.isdisjoint({"script", "link", "iframe", "object", "embed"})
+
+
+def test_the_verdict_comes_first_with_the_numbers_that_cost_it(summarised):
+    summary = summarised(n=12, lost=0, wrong=0)
+    texts = [text for text in Page(page(summary)).texts if text]
+    verdict = texts.index(summary.qualification.verdict)
+    active = int(summary.measures.active.sum())
+    assert verdict < texts.index(f"Active points: {active}") < texts.index("The scene")
+
+
+def test_a_good_page_lists_no_unmet_criterion(summarised):
+    markup = page(summarised())
+    assert 'class="unmet"' not in markup
+    assert "every criterion is met" in markup
+
+
+def test_the_page_shows_the_figures_of_the_report(summarised):
+    summary = summarised()
+    found = build_report(summary)
+    texts = Page(page(summary)).texts
+    for shown in (
+        str(found.equipment.active),
+        f"{found.coverage.percent:.0f} %",
+        f"{found.predicted.worst_m:.2f} m",
+        f"{found.image_residuals_px.x.std:.2f}",
+        "calanques 1",
+    ):
+        assert shown in texts
+
+
+def test_hostile_names_are_shown_and_not_run(summarised):
+    summary = summarised(name=HOSTILE)
+    measures = summary.measures
+    reason = np.where(measures.active, "", HOSTILE)
+    pairs = tuple(replace(pair, status=HOSTILE) for pair in summary.gallery)
+    acquisition = replace(summary.acquisition, sensor=HOSTILE)
+    checks = tuple(replace(check, against=HOSTILE) for check in summary.checks)
+    found = Page(
+        page(
+            replace(
+                summary,
+                measures=replace(measures, reason=reason),
+                gallery=pairs,
+                acquisition=acquisition,
+                checks=checks,
+                order_reason=HOSTILE,
+                software_version=HOSTILE,
+                model_kind=HOSTILE,
+            )
+        )
+    )
+    assert "script" not in found.tags
+    assert HOSTILE in found.texts
+
+
+@pytest.mark.parametrize("poor", [without_points, nothing_active, one_active])
+def test_a_page_is_made_of_any_registration(summarised, poor):
+    found = Page(page(poor(summarised())))
+    assert "Registration report" in found.texts
+    assert [name for name, _ in found.attributes].count("aria-label") == len(DRAWN) + 2
+
+
+def test_the_same_registration_gives_the_same_figure(summarised):
+    assert svg(figures.residual_map, summarised()) == svg(figures.residual_map, summarised())
+
+
+def test_figures_on_one_page_share_no_identifier(summarised):
+    summary = summarised()
+    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, summary))) for draw in DRAWN]
+    assert sum(map(len, seen)) == len(set.union(*seen))
+
+
+def test_the_residual_arrows_point_where_the_residuals_do(summarised):
+    """A residual of +1 px in line points down the page, of +1 px in sample to the right."""
+    summary = summarised()
+    residual = np.tile([1.0, 2.0], (60, 1))
+    measures = replace(summary.measures, residual_px=residual)
+    axes = figures.residual_map(replace(summary, measures=measures)).axes[0]
+    arrows = axes.collections[0]
+    assert axes.yaxis_inverted()
+    assert (arrows.U > 0).all()
+    np.testing.assert_allclose(arrows.U, 2.0 * arrows.V)
+
+
+def test_the_funnel_ends_where_the_equipment_says(summarised):
+    summary = summarised()
+    axes = figures.funnel(summary).axes[0]
+    widths = dict(zip([label.get_text() for label in axes.get_yticklabels()], axes.patches, strict=True))
+    equipment = summary.qualification.equipment
+    assert widths["visible"].get_width() == equipment.visible
+    assert widths["matched"].get_width() == equipment.matched
+    assert widths["active"].get_width() == equipment.active
+    assert widths["beyond 2.7 sigma"].get_x() == equipment.active
+
+
+def test_the_gallery_shows_best_middle_and_worst_and_no_pair_twice(summarised):
+    pairs = summarised(pairs=21).gallery
+    groups = choose_pairs(pairs[::-1])
+    shown = [pair.point_id for group in groups for pair in group.pairs]
+    assert [len(group.pairs) for group in groups] == [4, 4, 4]
+    assert shown == [0, 1, 2, 3, 8, 9, 10, 11, 17, 18, 19, 20]
+
+
+def test_a_pair_without_a_score_is_the_worst(summarised):
+    pairs = summarised(pairs=20).gallery
+    unknown = replace(pairs[0], score=float("nan"))
+    assert choose_pairs((unknown, *pairs[1:]))[-1].pairs[-1] is unknown
+
+
+def test_an_empty_gallery_takes_no_room(summarised):
+    assert choose_pairs(()) == ()
+    assert "Chips and what was found" not in page(summarised(pairs=0))
+
+
+@pytest.mark.parametrize("chip", [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan)])
+def test_a_chip_without_data_is_still_an_image(chip):
+    assert chip_uri(chip).startswith("data:image/png;base64,")
+
+
+@pytest.mark.parametrize(
+    ("value", "comparison", "limit", "words"),
+    [
+        (30.0, "at least", 20.0, "+50 %"),
+        (10.0, "at least", 20.0, "-50 %"),
+        (0.25, "at most", 1.0, "+75 %"),
+        (2.0, "at most", 1.0, "-100 %"),
+        (float("nan"), "at most", 1.0, "–"),  # noqa: RUF001
+        (1.0, "at least", 0.0, "–"),  # noqa: RUF001
+    ],
+)
+def test_a_margin_is_positive_where_the_criterion_is_met(value, comparison, limit, words):
+    assert margin_words(Criterion("x", value, comparison, limit, "good", True)) == words
+
+
+def test_options_inside_options_are_listed_by_dotted_names(summarised):
+    listed = dict(flat_options(summarised().options))
+    assert listed["min_score"] == "0.8"
+    assert listed["qualification.good_active_points"] == "20"
+
+
+@pytest.mark.parametrize(
+    ("value", "rounded"), [(0.0, 1.0), (0.37, 0.5), (1.4, 1.0), (8.0, 10.0), (23.0, 20.0)]
+)
+def test_the_scale_arrow_has_a_round_length(value, rounded):
+    assert round_number(value) == pytest.approx(rounded)

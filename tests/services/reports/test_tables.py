@@ -1,0 +1,79 @@
+"""The published tables, as a terminal shows them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.quality.accuracy import sample_quantile
+from services.reports.report import build_report
+from services.reports.tables import format_tables, number, quantile
+
+
+def row(text, start):
+    """The cells of the first table row whose first cell is `start`."""
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("│┃").replace("┃", "│").split("│")]
+        if cells[0] == start:
+            return cells
+    raise AssertionError(f"no row {start!r} in\n{text}")
+
+
+def test_the_equipment_table_has_the_published_columns_and_the_counts(summarised):
+    summary = summarised(name="scene A")
+    active = int(summary.measures.active.sum())
+    text = format_tables(build_report(summary))
+    assert row(text, "Scene")[1:] == ["Popini", "Spatio", "Actif", "Actif/Spatio", "Actif/Popini"]
+    assert row(text, "scene A")[1:] == [
+        "60",
+        "52",
+        str(active),
+        f"{100 * active / 52:.0f} %",
+        f"{100 * active / 60:.0f} %",
+    ]
+
+
+def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(summarised):
+    summary = summarised()
+    residual = summary.measures.residual_px[summary.measures.active]
+    text = format_tables(build_report(summary))
+    assert row(text, "x (sample)")[1] == str(len(residual))
+    assert row(text, "x (sample)")[3] == f"{residual[:, 1].std(ddof=1):.2f}"
+    assert row(text, "y (line)")[3] == f"{residual[:, 0].std(ddof=1):.2f}"
+    assert row(text, "xy")[2] == f"{np.hypot(*residual.T).mean():.2f}"
+    assert row(text, "east")[5] == "m"
+    assert "Z" not in text
+
+
+def test_the_stability_table_says_what_it_does_not_show(report):
+    text = " ".join(format_tables(report).split())
+    assert "Shows stability, not absolute accuracy." in text
+    assert "top left" in text
+
+
+def test_an_unmet_criterion_stands_out_with_its_value_and_limit(summarised):
+    text = format_tables(build_report(summarised(n=12, lost=0, wrong=0)))
+    assert row(text, "Active points")[2:] == ["at least 20", "good", "NO"]
+    assert int(row(text, "Active points")[1]) <= 12
+    assert "Verdict: usable" in text or "Verdict: failed" in text
+
+
+def test_names_with_brackets_are_shown_as_they_are(report):
+    scene = replace(report.scene, name="[bold]x[/bold]")
+    assert "[bold]x[/bold]: good" in format_tables(replace(report, scene=scene))
+    assert row(format_tables(replace(report, scene=scene)), "[bold]x[/bold]")[1] == "60"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(1.234, "1.23 m"), (-0.001, "0.00 m"), (float("nan"), "–")],  # noqa: RUF001
+)
+def test_numbers_are_written_for_people(value, shown):
+    assert number(value, 2, "m") == shown
+
+
+def test_a_quantile_is_written_with_what_its_sample_allows_to_say():
+    values = np.arange(1.0, 101.0)
+    assert quantile(sample_quantile(values)) == "90.63 m (90 % interval: 85.00 to 96.00 m, n = 100)"
+    assert quantile(sample_quantile(values[:20])).endswith("interval: at least 16.00 m, n = 20)")
+    assert quantile(sample_quantile(values[:1])).endswith("interval: not bounded, n = 1)")
