@@ -7,7 +7,7 @@ from importlib.metadata import version
 from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from app.api import jobs, processes, replies, scenes, system
+from app.api import blocks, collections, jobs, points, processes, replies, scenes, system
 from app.api.body import BodyLimit
 from app.config import Settings, read_settings
 from app.db import engine
@@ -17,7 +17,15 @@ DESCRIPTION = (
     "An open base of 3D ground control points with image chips, "
     "and the service that registers satellite scenes on them."
 )
-ROUTERS: tuple[APIRouter, ...] = (system.router, scenes.router, processes.router, jobs.router)
+ROUTERS: tuple[APIRouter, ...] = (
+    system.router,
+    collections.router,
+    points.router,
+    blocks.router,
+    scenes.router,
+    processes.router,
+    jobs.router,
+)
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
