@@ -223,7 +223,7 @@ def test_the_two_images_of_a_pair_meet_on_sensible_ground(
     epipolar_error_px: float,
     heights_m: tuple[float, float],
 ) -> None:
-    """The rays of a detail pass each other at the distance known of the pair, at the height of the place."""
+    """Rays of a detail pass at the distance known of the pair, at heights of the place."""
     a, b = (read_scene(real_data / folder / name) for name in names)
     in_a, in_b = matched(a, b)
     low, high = (
