@@ -37,7 +37,7 @@ def svg(draw: Callable[[RegistrationSummary], Figure], summary: RegistrationSumm
         figure = draw(summary)
         figure.patch.set_alpha(0.0)
         figure.savefig(
-            text, format="svg", dpi=160, metadata=nothing, bbox_inches="tight", pad_inches=0.03
+            text, format="svg", dpi=120, metadata=nothing, bbox_inches="tight", pad_inches=0.03
         )
     markup = text.getvalue()
     markup = markup[markup.index("<svg") :]

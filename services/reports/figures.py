@@ -25,7 +25,7 @@ from services.reports.drawing import (
     style,
 )
 from services.reports.report import RegistrationSummary, count_reasons
-from services.reports.tables import number
+from services.reports.tables import number, reason_words
 from services.types import Array, BoolArray
 
 _REASON_MARKERS = ("x", "+", "^", "s", "d")
@@ -138,7 +138,7 @@ def residual_histograms(summary: RegistrationSummary) -> Figure:
         axes.hist(finite, bins=bins, color=ACTIVE, alpha=0.85)
         found = statistics(finite)
         axes.axvline(found.mean, color=INK, linewidth=1.0)
-        axes.set_title(f"{number(found.mean)} ± {number(found.std)}", color=INK, fontsize=TEXT_PT)
+        axes.set_title(f"{number(found.mean, 3)} ± {number(found.std, 3)}", color=INK, fontsize=TEXT_PT)
     panels[0].set_ylabel("points")
     panels[0].yaxis.get_major_locator().set_params(integer=True)
     return figure
@@ -156,7 +156,7 @@ def funnel(summary: RegistrationSummary) -> Figure:
     ):
         for reason in (r for r in reasons if r.stage == stage):
             left -= reason.count
-            bars.append((shortened(reason.reason), left, reason.count, NOT_MATCHED))
+            bars.append((shortened(reason_words(reason.reason)), left, reason.count, NOT_MATCHED))
         bars.append(("matched" if stage == "not matched" else "active", 0, total, colour))
     figure, axes = plain_axes(height_in=0.5 + 0.26 * len(bars))
     for row, (_, start, width, colour) in enumerate(bars):
@@ -274,7 +274,7 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
                 marker=_REASON_MARKERS[min(k, len(_REASON_MARKERS) - 1)],
                 color="#c9ced4" if colour == NOT_MATCHED and summary.quicklook is not None else colour,
                 linewidths=1.0,
-                label=f"{shortened(reason.reason)} ({reason.count})",
+                label=f"{shortened(reason_words(reason.reason))} ({reason.count})",
                 rasterized=many,
             )
     active = measures.active

@@ -130,14 +130,14 @@ class RegistrationSummary:
         blocks: those whose points were used.
         options: the dataclass of options of the registration.
         passes: in the order they were run.
-        order_reason: why the order of the correction was chosen.
+        order_reason: the order of the correction and why it was chosen, in words.
         measures: what was done with each point.
         adjustment: the final one.
         qualification: of the registration.
         quicklook: the scene reduced; None when there is none.
         gallery: chips beside what was found; the report picks the best, middle and worst scores.
-        refit_error_px: largest difference between the corrected model and the delivered one; NaN when no
-            model was fitted.
+        refit_error_px: largest difference between the corrected model and the delivered one; NaN when
+            the delivered one carries the correction exactly.
         software_version: of Amers.
         started_at, finished_at: UTC, given by the caller; None when unknown.
         checks: against independent points, if there are any.
@@ -196,7 +196,7 @@ class CorrectionRecord:
 
     Attributes:
         order: "shift", "drift" or "affine".
-        order_reason: why this order.
+        order_reason: the order and why it was chosen, in words.
         order_scores: of the orders that were compared.
         parameters_px: rows line and sample; constant, along lines, along samples (at the image's edge).
         std_px: one standard deviation of each parameter.
@@ -205,7 +205,8 @@ class CorrectionRecord:
         shift_m: length of that displacement on the ground, by the ground sampling of the image.
         words: the parameters as sentences.
         sigma0: a posteriori standard deviation of unit weight.
-        refit_error_px: largest difference between the corrected model and the delivered one.
+        refit_error_px: largest difference between the corrected model and the one fitted to it; NaN when
+            the delivered model carries the correction exactly.
     """
 
     order: str

@@ -22,6 +22,24 @@ CRITERION_NAMES = {
     "predicted_ce90_px": ("Predicted CE90, worst place", "px", 2),
 }
 
+REASON_WORDS = {
+    "not_tried": "not tried: others stand for it",
+    "no_chip": "no chip at this sampling",
+    "nodata": "no data there",
+    "flat": "nothing to correlate",
+    "low_score": "low score",
+    "border_peak": "at the edge of the search",
+    "ambiguous": "a second place as likely",
+    "views_disagree": "views disagree",
+    "deactivated": "does not fit the others",
+}
+"""What the codes of matching and adjustment mean, for people."""
+
+
+def reason_words(reason: str) -> str:
+    """Why a point is not active, for people."""
+    return REASON_WORDS.get(reason, reason)
+
 
 def number(value: float, decimals: int = 2, unit: str = "") -> str:
     """A number for people; a dash when there is none."""
@@ -108,7 +126,10 @@ def residual_table(report: RegistrationReport) -> Table:
     return _table(
         "Residuals of the active points",
         ["Coordinate", "n", "Mean", "Std", "Rms", "Unit"],
-        [[name, str(s.n), number(s.mean), number(s.std), number(s.rms), unit] for name, s, unit in rows],
+        [
+            [name, str(s.n), number(s.mean, 3), number(s.std, 3), number(s.rms, 3), unit]
+            for name, s, unit in rows
+        ],
     )
 
 
@@ -116,8 +137,8 @@ def stability_table(report: RegistrationReport) -> Table:
     """The adjustment redone with fewer points, and the residuals of those held out."""
     stability = report.stability
     rows = [
-        [place.place, number(place.median_px), number(place.max_px)]
-        + [number(place.median_m), number(place.max_m)]
+        [place.place, number(place.median_px, 3), number(place.max_px, 3)]
+        + [number(place.median_m, 3), number(place.max_m, 3)]
         for place in stability.displacements
     ]
     held_px, held_m = stability.held_out_px.xy, stability.held_out_m.xy

@@ -80,7 +80,7 @@ def summarised(registered) -> Callable[..., RegistrationSummary]:
                 PassSummary(2.0, 60.0, 50, 44, 41),
                 PassSummary(0.5, 6.0, len(scene.measures.score), 52, 48),
             ),
-            order_reason="lowest cross-validated residual",
+            order_reason="drift: lowest cross-validated residual",
             measures=scene.measures,
             adjustment=scene.adjustment,
             qualification=qualify(

@@ -38,9 +38,9 @@ def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(summarise
     residual = summary.measures.residual_px[summary.measures.active]
     text = format_tables(build_report(summary))
     assert row(text, "x (sample)")[1] == str(len(residual))
-    assert row(text, "x (sample)")[3] == f"{residual[:, 1].std(ddof=1):.2f}"
-    assert row(text, "y (line)")[3] == f"{residual[:, 0].std(ddof=1):.2f}"
-    assert row(text, "xy")[2] == f"{np.hypot(*residual.T).mean():.2f}"
+    assert row(text, "x (sample)")[3] == f"{residual[:, 1].std(ddof=1):.3f}"
+    assert row(text, "y (line)")[3] == f"{residual[:, 0].std(ddof=1):.3f}"
+    assert row(text, "xy")[2] == f"{np.hypot(*residual.T).mean():.3f}"
     assert row(text, "east")[5] == "m"
     assert "Z" not in text
 
