@@ -23,6 +23,7 @@ from services.formats.chip_files import ChipFile, read_chip_file
 from services.types import Array, BoolArray, IntArray, Progress, no_progress
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
+SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 1e6
 OUTLINE_MARGIN_DEG = 1e-9
 LISTED = 20
 ROWS_OF_ONE_KIND = 3
@@ -219,10 +220,11 @@ def _check_positions(report: _Report, lon_lat_h: Array, outline: Array) -> None:
 
 
 def _check_spread(report: _Report, points: PointRows) -> None:
-    finite = np.isfinite(points.sigma_m) & (points.sigma_m > 0.0)
+    finite = (points.sigma_m >= SMALLEST_SIGMA_M) & (points.sigma_m <= LARGEST_SIGMA_M)
+    expected = f"{SMALLEST_SIGMA_M:g} to {LARGEST_SIGMA_M:g} metres"
     for column, name in enumerate(("sigma_east_m", "sigma_north_m", "sigma_up_m")):
         values = points.sigma_m[:, column]
-        report.rows((POINTS_PARQUET, name), ~finite[:, column], values, "finite metres above 0")
+        report.rows((POINTS_PARQUET, name), ~finite[:, column], values, expected)
     good = np.abs(points.correlation) <= 1.0
     for column, name in enumerate(("corr_east_north", "corr_east_up", "corr_north_up")):
         values = points.correlation[:, column]

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,9 @@ from services.errors import FormatError
 from services.types import ChipArray
 
 CHIP_DTYPES = (np.dtype(np.uint8), np.dtype("<u2"))
+
+# What NumPy lets through when a header is garbled: it evaluates a literal, then tokenizes it.
+_HEADER_ERRORS = (ValueError, TypeError, KeyError, SyntaxError, MemoryError, RecursionError, TokenError)
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ def read_chip_file(path: Path, name: str) -> ChipFile:
                 raise ValueError(f"version {version} of the NumPy format, (1, 0) expected")
             shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
             offset, size = file.tell(), os.fstat(file.fileno()).st_size
-    except (ValueError, OSError) as error:
+    except (*_HEADER_ERRORS, OSError) as error:
         raise FormatError(f"{name}: cannot be read as a NumPy array: {error}") from error
     if len(shape) != 3 or shape[1:] != (CHIP_SIZE, CHIP_SIZE) or fortran:
         order = ", column by column" if fortran else ""

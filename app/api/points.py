@@ -1,0 +1,128 @@
+"""Control points: pages of a box, one point, its chips."""
+
+import json
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.encoders import jsonable_encoder
+
+from app.api.deps import ChipsDep, PointsReader, ReadConnection
+from app.db.points import PointDetail
+from app.usecases import points
+from services.formats.chip_images import (
+    format_chip_png,
+    format_chip_tiff,
+    format_chips_npz,
+    format_sheet_png,
+)
+
+router = APIRouter(prefix="/collections/points/items", tags=["points"])
+
+GEOJSON = "application/geo+json"
+PNG = "image/png"
+TIFF = "image/tiff; application=geotiff"
+NPZ = "application/x-npz"
+CHIPS_NEVER_CHANGE = {"Cache-Control": "private, max-age=86400"}
+NOT_PROPERTIES = {"id", "lon_deg", "lat_deg", "height_m", "chip_key", "chip_row", "chip_count"}
+
+PointId = int
+Bbox = Annotated[
+    str | None,
+    Query(description="W,S,E,N in degrees; W greater than E crosses the antimeridian."),
+]
+Limit = Annotated[int, Query(ge=1, description="Most points on the page; 10,000 at most are given.")]
+PageToken = Annotated[str | None, Query(description="From the link `next` of the page before.")]
+
+
+@router.get("", response_class=Response, responses={200: {"content": {GEOJSON: {}}}})
+def items(
+    request: Request,
+    connection: ReadConnection,
+    caller: PointsReader,
+    bbox: Bbox = None,
+    limit: Limit = points.DEFAULT_LIMIT,
+    token: PageToken = None,
+) -> Response:
+    """A page of published points, as GeoJSON built by the database."""
+    box = None if bbox is None else points.parse_bbox(bbox)
+    page = points.query_points(connection, box, limit, token)
+    links = [{"rel": "self", "href": str(request.url), "type": GEOJSON}]
+    if page.next_token is not None:
+        following = str(request.url.include_query_params(token=page.next_token))
+        links.append({"rel": "next", "href": following, "type": GEOJSON})
+    rest = {
+        "numberMatched": page.matched.number,
+        "numberReturned": page.returned,
+        "amers:numberMatchedIsExact": page.matched.exact,
+        "links": links,
+    }
+    return Response(
+        f'{{"type":"FeatureCollection","features":[{page.features}],{json.dumps(rest)[1:]}',
+        media_type=GEOJSON,
+    )
+
+
+@router.get("/{point_id}")
+def item(
+    point_id: PointId, request: Request, connection: ReadConnection, caller: PointsReader
+) -> Response:
+    """One point, its views and the images they were cut from."""
+    point = points.find_point(connection, point_id)
+    return Response(json.dumps(_feature(point, str(request.url))), media_type=GEOJSON)
+
+
+@router.get("/{point_id}/chips", response_class=Response)
+def chips(
+    point_id: PointId,
+    connection: ReadConnection,
+    stored: ChipsDep,
+    caller: PointsReader,
+    f: Annotated[Literal["npz", "png"], Query(description="png: all chips on one sheet.")] = "npz",
+) -> Response:
+    """All chips of a point: raw values with what they show, or a sheet to look at."""
+    labelled = points.read_chips(stored, points.find_point(connection, point_id))
+    if f == "png":
+        return Response(format_sheet_png(labelled), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
+    return _download(format_chips_npz(labelled), NPZ, f"{point_id}.npz")
+
+
+@router.get("/{point_id}/chips/{view}", response_class=Response)
+def chip(
+    point_id: PointId,
+    view: int,
+    connection: ReadConnection,
+    stored: ChipsDep,
+    caller: PointsReader,
+    f: Annotated[Literal["png", "tif", "npz"], Query(description="tif: GeoTIFF of raw values.")] = "png",
+) -> Response:
+    """One chip: stretched to look at, or its raw values."""
+    labelled = points.read_chip(stored, points.find_point(connection, point_id), view)
+    if f == "png":
+        return Response(format_chip_png(labelled.chips[0]), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
+    if f == "npz":
+        return _download(format_chips_npz(labelled), NPZ, f"{point_id}_{view}.npz")
+    tiff = format_chip_tiff(labelled.chips[0], labelled.lon_lat_h, float(labelled.gsd_m[0]))
+    return _download(tiff, TIFF, f"{point_id}_{view}.tif")
+
+
+def _download(content: bytes, kind: str, name: str) -> Response:
+    disposition = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=kind, headers={**CHIPS_NEVER_CHANGE, **disposition})
+
+
+def _feature(point: PointDetail, url: str) -> dict[str, Any]:
+    properties = {k: v for k, v in asdict(point).items() if k not in NOT_PROPERTIES}
+    feature: dict[str, Any] = jsonable_encoder(
+        {
+            "type": "Feature",
+            "id": point.id,
+            "geometry": {"type": "Point", "coordinates": [point.lon_deg, point.lat_deg, point.height_m]},
+            "properties": properties,
+            "links": [
+                {"rel": "self", "href": url, "type": GEOJSON},
+                {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": "application/json"},
+            ],
+        }
+    )
+    return feature

@@ -1,0 +1,73 @@
+"""`amers points`: control points of published blocks."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import typer
+
+from app.cli.output import AsJson, print_json
+from app.cli.store import transaction
+from app.usecases import points
+
+app = typer.Typer(help="Control points of published blocks.", no_args_is_help=True)
+
+
+class PointFormat(StrEnum):
+    """What points are written as."""
+
+    GEOJSON = "geojson"
+    CSV = "csv"
+
+
+@app.callback()
+def group() -> None:
+    """Control points of published blocks."""
+
+
+@app.command()
+def query(
+    bbox: Annotated[
+        str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
+    ],
+    form: Annotated[PointFormat, typer.Option("--format", help="What to write.")] = PointFormat.GEOJSON,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="File; standard output if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write all points of a box; --json tells their number instead of writing to standard output."""
+    box = points.parse_bbox(bbox)
+    with transaction() as connection:
+        if as_json and output is None:
+            count = points.count_points(connection, box)
+            print_json({"points": count.number, "exact": count.exact, "file": None})
+            return
+        with _written(output) as file:
+            pieces = (
+                points.geojson(connection, box)
+                if form is PointFormat.GEOJSON
+                else points.csv(connection, box)
+            )
+            size = sum(file.write(piece) for piece in pieces)
+    if as_json:
+        print_json({"file": output, "size_bytes": size})
+
+
+@contextmanager
+def _written(path: Path | None) -> Iterator[BinaryIO]:
+    """A file that is there when it is complete, or standard output."""
+    if path is None:
+        yield sys.stdout.buffer
+        sys.stdout.buffer.flush()
+        return
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            yield file
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

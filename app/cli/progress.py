@@ -1,0 +1,41 @@
+"""How commands show long work, on standard error: a bar on a terminal, else a line for every tenth."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+from services.types import Progress
+
+
+@contextmanager
+def shown_progress() -> Iterator[Progress]:
+    """Progress that people can follow."""
+    if not sys.stderr.isatty():
+        yield _lines()
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def report(fraction: float, message: str) -> None:
+            bar.update(task, completed=fraction, description=message)
+
+        yield report
+
+
+def _lines() -> Progress:
+    told = -1
+
+    def report(fraction: float, message: str) -> None:
+        nonlocal told
+        tenth = int(fraction * 10.0)
+        if tenth > told:
+            told = tenth
+            typer.echo(f"{10 * tenth:3d} % {message}", err=True)
+
+    return report

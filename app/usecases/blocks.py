@@ -1,0 +1,235 @@
+"""The life of a block: ingested and checked, staged, published, withdrawn."""
+
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from app.db import blocks
+from app.db.blocks import Block, BlockState
+from app.db.engine import Connection
+from app.db.ingestion import StoredChipFile, load_contents
+from app.errors import Conflict, InputError, NotFound
+from app.storage import Storage, chips_key
+from services.errors import FormatError
+from services.formats.block import BlockContents, block_member
+from services.formats.block_check import check_block
+from services.formats.block_json import BLOCK_JSON
+from services.formats.chip_files import read_chip_file
+from services.quality.block import BlockQuality, block_quality
+from services.types import Progress, no_progress
+
+MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
+    "staged": ("published",),
+    "published": ("withdrawn",),
+    "withdrawn": ("published",),
+}
+CHIPS = "chips"
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What an ingestion left in the store."""
+
+    block: Block
+    quality: BlockQuality
+
+
+@dataclass(frozen=True)
+class Published:
+    """A block that became visible.
+
+    Attributes:
+        superseded: the version of the same block that was visible before and no longer is.
+    """
+
+    block: Block
+    superseded: Block | None
+
+
+def ingest_block(
+    connection: Connection, storage: Storage, folder: Path, progress: Progress = no_progress
+) -> Ingested:
+    """Check a block folder, put its chips into the storage and its rows into the store, staged.
+
+    Nothing is visible before the transaction of the connection is committed. Files that a broken
+    ingestion leaves in the storage belong to no row; `sweep_storage` removes them.
+
+    Args:
+        connection: no transaction is opened before the block is checked.
+        storage: where the chips go.
+        folder: of the block.
+        progress: told on the way.
+
+    Raises:
+        FormatError: the block is not what it should be; nothing is changed.
+        Conflict: that version of the block is in the store already.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    contents = check_block(folder, _part(progress, 0.0, 0.3))
+    document = (folder / BLOCK_JSON).read_bytes()
+    metadata = contents.document.metadata
+    quality = block_quality(contents.points, contents.n_views, metadata.extent)
+    blocks.lock_ingestion(connection)
+    block = blocks.insert_block(
+        connection, contents, document.decode(), sha256(document).hexdigest(), quality
+    )
+    if block is None:
+        raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
+    files = _store_chips(storage, folder, contents, _part(progress, 0.3, 0.6))
+    load_contents(connection, block.number, contents, files, _part(progress, 0.6, 1.0))
+    return Ingested(block, quality)
+
+
+def publish_block(connection: Connection, reference: str) -> Published:
+    """Make a block visible, and the version of it that was visible before no longer, in one step.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: it is published already, or the reference means several versions.
+    """
+    block = find_block(connection, reference)
+    versions = blocks.lock_versions(connection, block.id)
+    before = next((v for v in versions if v.state == "published" and v.number != block.number), None)
+    current = next(v for v in versions if v.number == block.number)
+    published = _change(connection, current, "published")
+    superseded = None if before is None else _change(connection, before, "withdrawn")
+    return Published(published, superseded)
+
+
+def withdraw_block(connection: Connection, reference: str) -> Block:
+    """Make a block invisible; it can be published again.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: it is not published, or the reference means several versions.
+    """
+    block = find_block(connection, reference)
+    versions = blocks.lock_versions(connection, block.id)
+    return _change(connection, next(v for v in versions if v.number == block.number), "withdrawn")
+
+
+def find_block(connection: Connection, reference: str) -> Block:
+    """The block that a number, ID or ID@VERSION means.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: an ID has several versions.
+    """
+    found = blocks.find_blocks(connection, reference)
+    if not found:
+        raise NotFound(f"no block {reference:.100}")
+    if len(found) > 1:
+        versions = ", ".join(f"{block.id}@{block.version}" for block in found)
+        raise Conflict(f"block {reference} has {len(found)} versions, name one: {versions}")
+    return found[0]
+
+
+def find_published(connection: Connection, reference: str) -> Block:
+    """The published block that a number, ID or ID@VERSION means; an ID never has two published versions.
+
+    Raises:
+        NotFound: there is no such block, or it is not published.
+    """
+    found = [block for block in blocks.find_blocks(connection, reference) if block.state == "published"]
+    if not found:
+        raise NotFound(f"no block {reference:.100}")
+    return found[0]
+
+
+def published_bounds(connection: Connection) -> tuple[float, ...] | None:
+    """West, south, east, north of all published blocks, None without any."""
+    outlines = [block.outline for block in blocks.list_blocks(connection, ("published",))]
+    if not outlines:
+        return None
+    corners = np.concatenate(outlines)
+    if np.abs(corners[:, 0]).max() > 180.0:
+        corners[:, 0] = np.clip(corners[:, 0], -180.0, 180.0)
+        corners = np.concatenate([corners, [[-180.0, corners[0, 1]], [180.0, corners[0, 1]]]])
+    return (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+
+
+def list_blocks(
+    connection: Connection, states: tuple[BlockState, ...] = ("staged", "published", "withdrawn")
+) -> list[Block]:
+    """The blocks in some states, the newest first."""
+    return blocks.list_blocks(connection, states)
+
+
+def find_quality(connection: Connection, reference: str) -> BlockQuality:
+    """The quality figures of a block.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: the reference means several versions.
+    """
+    block = find_block(connection, reference)
+    return blocks.find_quality(connection, block.number)
+
+
+def folder_to_ingest(allowed: Path | None, name: str) -> Path:
+    """A folder on the server that may be ingested by request.
+
+    Args:
+        allowed: the folder that holds such folders, None when there is none.
+        name: path below it.
+
+    Raises:
+        InputError: the path is not below the allowed folder.
+    """
+    if allowed is None:
+        raise InputError("this server ingests no folders by request: AMERS_INGEST_FOLDER is not set")
+    try:
+        folder = block_member(allowed, name)
+    except FormatError as error:
+        raise InputError(f"path: {error}, below AMERS_INGEST_FOLDER") from error
+    if not folder.is_dir():
+        raise InputError(f"path: {name!r:.200}: no such folder below AMERS_INGEST_FOLDER")
+    return folder
+
+
+def sweep_storage(connection: Connection, storage: Storage) -> list[str]:
+    """Remove files of chips that no row names, left by broken ingestions; returns their keys.
+
+    Waits for the ingestions under way.
+    """
+    blocks.lock_sweep(connection)
+    unnamed = sorted(set(storage.keys(CHIPS)) - blocks.storage_keys(connection))
+    for key in unnamed:
+        storage.delete(key)
+    return unnamed
+
+
+def _change(connection: Connection, block: Block, state: BlockState) -> Block:
+    if state not in MAY_BECOME[block.state]:
+        raise Conflict(f"block {block.id}@{block.version} is {block.state}: it cannot become {state}")
+    return blocks.set_state(connection, block.number, state)
+
+
+def _store_chips(
+    storage: Storage, folder: Path, contents: BlockContents, progress: Progress
+) -> list[StoredChipFile]:
+    """Copy the files of chips; what arrives must be what was checked."""
+    stored = []
+    names = contents.points.chip_files
+    for i, name in enumerate(names):
+        progress(i / len(names), "storing chips")
+        path = block_member(folder, name)
+        layout = read_chip_file(path, name)
+        key = storage.put_chips(path).key
+        if key != chips_key(contents.document.checksums[name].lower()):
+            raise FormatError(f"{name}: changed while it was ingested")
+        stored.append(StoredChipFile(name, key, np.dtype(layout.dtype).name, layout.count))
+    return stored
+
+
+def _part(progress: Progress, start: float, end: float) -> Progress:
+    """Progress of a part of the work, as progress of the whole."""
+
+    def report(fraction: float, message: str) -> None:
+        progress(start + (end - start) * fraction, message)
+
+    return report
