@@ -1,0 +1,314 @@
+"""The life of a block, ingested to withdrawn, by use case, over HTTP and by command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from numpy.testing import assert_allclose
+from pyproj import Geod
+from shapely import Polygon
+from typer.testing import CliRunner
+
+from app.cli.main import app as commands
+from app.db import points as point_store
+from app.errors import Conflict, InputError, NotFound
+from app.main import create_app
+from app.storage import StoredChips
+from app.usecases import blocks
+from services.types import point_chips
+from tests.factories import BOX, make_block
+
+float32_rounding = 1e-6
+
+
+@pytest.fixture
+def ingested(connection, storage, tmp_path):
+    """A staged block of 40 points, committed."""
+    made = make_block(tmp_path / "block")
+    result = blocks.ingest_block(connection, storage, made.folder)
+    connection.commit()
+    return made, result
+
+
+def visible(connection) -> int:
+    connection.commit()
+    return point_store.point_features(connection, None, -1, 1000).returned
+
+
+def test_an_ingested_block_is_staged_and_invisible(connection, ingested):
+    _, result = ingested
+    assert result.block.state == "staged"
+    assert (result.block.n_points, result.block.n_views) == (40, 240)
+    assert visible(connection) == 0
+    assert blocks.find_block(connection, "calanques").number == result.block.number
+
+
+def test_publishing_and_withdrawing_flip_all_points_at_once(connection, ingested):
+    assert blocks.publish_block(connection, "calanques").block.state == "published"
+    assert visible(connection) == 40
+    assert blocks.withdraw_block(connection, "calanques").state == "withdrawn"
+    assert visible(connection) == 0
+    blocks.publish_block(connection, "calanques@1")
+    assert visible(connection) == 40
+
+
+def test_wrong_steps_are_conflicts_that_say_the_state(connection, ingested):
+    with pytest.raises(Conflict, match="is staged: it cannot become withdrawn"):
+        blocks.withdraw_block(connection, "calanques")
+    blocks.publish_block(connection, "calanques")
+    with pytest.raises(Conflict, match="is published: it cannot become published"):
+        blocks.publish_block(connection, "calanques")
+
+
+def test_the_same_version_twice_is_a_conflict_and_changes_nothing(connection, storage, ingested):
+    made, result = ingested
+    with pytest.raises(Conflict, match="calanques version 1 is in the store already"):
+        blocks.ingest_block(connection, storage, made.folder)
+    connection.rollback()
+    assert [block.number for block in blocks.list_blocks(connection)] == [result.block.number]
+
+
+def test_publishing_a_new_version_withdraws_the_old_one_in_the_same_step(
+    connection, storage, tmp_path, ingested
+):
+    blocks.publish_block(connection, "calanques")
+    newer = make_block(tmp_path / "newer", count=25, seed=2, version="2")
+    blocks.ingest_block(connection, storage, newer.folder)
+    assert visible(connection) == 40
+
+    published = blocks.publish_block(connection, "calanques@2")
+
+    assert published.superseded is not None
+    assert (published.superseded.version, published.superseded.state) == ("1", "withdrawn")
+    assert visible(connection) == 25
+
+
+def test_an_id_of_several_versions_must_be_made_precise(connection, storage, tmp_path, ingested):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "two", seed=2, version="2").folder)
+    with pytest.raises(Conflict, match="calanques@1, calanques@2"):
+        blocks.find_block(connection, "calanques")
+    assert blocks.find_block(connection, "calanques@2").version == "2"
+    assert blocks.find_block(connection, "1").version == "1"
+    with pytest.raises(NotFound):
+        blocks.find_block(connection, "calanques@3")
+
+
+def test_the_store_gives_back_the_points_of_the_block(connection, storage, ingested):
+    made, result = ingested
+    blocks.publish_block(connection, "calanques")
+
+    stored = point_store.control_points(connection, made.metadata.extent)
+
+    points, expected = stored.points, made.points
+    assert [(b.id, b.version) for b in stored.blocks] == [("calanques", "1")]
+    assert (points.id == result.block.number * 2**26 + expected.id).all()
+    assert (points.lon_lat_h == expected.lon_lat_h).all()
+    assert_allclose(
+        points.covariance_m2, expected.covariance_m2, rtol=float32_rounding, atol=float32_rounding
+    )
+    assert (points.saliency == expected.saliency).all()
+    assert (points.views.start == expected.views.start).all()
+    assert (points.views.gsd_m == expected.views.gsd_m).all()
+    assert (points.views.image == expected.views.image).all()
+    assert_allclose(points.views.azimuth_deg, expected.views.azimuth_deg, rtol=float32_rounding)
+    assert repr(points.views.images) == repr(expected.views.images)
+    chips = StoredChips(storage)
+    for row in range(len(points)):
+        assert (point_chips(points, chips, row) == made.chips(row)).all()
+    chips.close()
+
+
+def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection, storage, tmp_path):
+    made = [
+        make_block(tmp_path / "a", count=15, seed=3, name="a", n_images=3),
+        make_block(
+            tmp_path / "b", count=20, seed=4, name="b", n_images=5, gsds_m=(0.7,), dtype=np.uint16
+        ),
+    ]
+    for block in made:
+        blocks.ingest_block(connection, storage, block.folder)
+        blocks.publish_block(connection, block.metadata.id)
+
+    points = point_store.control_points(connection, made[0].metadata.extent).points
+
+    assert len(points) == 35
+    assert len(points.views.images) == 8
+    chips = StoredChips(storage)
+    for row in range(35):
+        of, own = (made[0], row) if row < 15 else (made[1], row - 15)
+        assert (point_chips(points, chips, row) == of.chips(own)).all()
+        views = slice(points.views.start[row], points.views.start[row + 1])
+        names = [points.views.images[i].image_id for i in points.views.image[views]]
+        assert names == [f"IMG_{i:02d}" for i in range(3)] * 2 if row < 15 else names
+        assert set(points.views.gsd_m[views]) == ({0.5, 2.0} if row < 15 else {0.7})
+    chips.close()
+
+
+def test_points_are_asked_for_by_an_outline_and_thinned_evenly(connection, storage, tmp_path):
+    made = make_block(tmp_path / "many", count=600)
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    triangle = np.array([[BOX[0], BOX[1]], [BOX[2], BOX[1]], [BOX[0], BOX[3]]])
+    inside = (made.points.lon_lat_h[:, :2] - [BOX[0], BOX[1]]).sum(axis=1) < 0.1
+
+    stored = point_store.control_points(connection, triangle)
+    assert (stored.points.lon_lat_h == made.points.lon_lat_h[inside]).all()
+
+    some = point_store.control_points(connection, made.metadata.extent, limit=60).points
+    assert len(some) == 60
+    quarter = np.floor((some.lon_lat_h[:, :2] - [BOX[0], BOX[1]]) / 0.05).astype(int) @ [1, 2]
+    assert np.bincount(quarter, minlength=4).min() >= 10
+    assert len(point_store.control_points(connection, made.metadata.extent, limit=600).points) == 600
+    assert len(point_store.control_points(connection, made.metadata.extent, limit=10_000).points) == 600
+    assert len(point_store.control_points(connection, made.metadata.extent, limit=1).points) == 1
+
+
+def test_no_published_points_is_an_empty_answer(connection, ingested):
+    made, _ = ingested
+    stored = point_store.control_points(connection, made.metadata.extent)
+    assert len(stored.points) == 0
+    assert stored.blocks == ()
+    assert stored.points.views.start.tolist() == [0]
+
+
+def test_an_outline_across_the_antimeridian_finds_both_sides(connection, storage, tmp_path):
+    made = make_block(tmp_path / "far", count=30, box=(179.9, -17.0, -179.9, -16.9))
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    east = point_store.control_points(connection, made.metadata.extent)
+    west = point_store.control_points(connection, made.metadata.extent - [360.0, 0.0])
+    assert len(east.points) == len(west.points) == 30
+
+
+def test_quality_figures_are_those_of_the_points(connection, ingested):
+    made, result = ingested
+    quality = blocks.find_quality(connection, "calanques")
+    variance = np.diagonal(made.points.covariance_m2, axis1=1, axis2=2)
+    assert quality.points == 40
+    assert quality.points_per_km2 == pytest.approx(40 / quality.area_km2)
+    geodesic_m2, _ = Geod(ellps="WGS84").geometry_area_perimeter(Polygon(made.metadata.extent))
+    assert quality.area_km2 == pytest.approx(geodesic_m2 * 1e-6, rel=1e-4)
+    assert quality.share_reaching_quarter == 1.0
+    assert quality.share_reaching_half == 0.0
+    assert quality.views_per_point.minimum == 6
+    assert quality.images_per_point.maximum == 3
+    assert quality.sigma_up_m.median == pytest.approx(np.median(np.sqrt(variance[:, 2])))
+    assert quality.cells.points.sum() == 40
+    assert repr(quality) == repr(result.quality)
+
+
+def test_files_no_row_names_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
+    orphan = make_block(tmp_path / "orphan", count=3, seed=9).folder / "chips/0000.npy"
+    key = storage.put_chips(orphan).key
+    assert blocks.sweep_storage(connection, storage) == [key]
+    assert not storage.exists(key)
+    assert len(storage.keys("chips")) == 1
+
+
+def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_path):
+    folder = tmp_path / "incoming"
+    folder.mkdir()
+    made = make_block(folder / "calanques_v1")
+    admin, reader = bearer("admin"), bearer("read")
+    with TestClient(create_app(settings.model_copy(update={"ingest_folder": folder}))) as client:
+        made_reply = client.post("/blocks", json={"path": "calanques_v1"}, headers=admin)
+        assert made_reply.status_code == 201, made_reply.text
+        assert made_reply.json()["block"]["state"] == "staged"
+        assert made_reply.json()["quality"]["points"] == len(made.points)
+        location = made_reply.headers["Location"]
+        assert client.get(location, headers=admin).json()["properties"]["id"] == "calanques"
+        assert client.get(location, headers=reader).status_code == 404
+        assert client.get("/blocks/calanques/quality", headers=reader).status_code == 404
+        assert client.post("/blocks/calanques/publish", headers=reader).status_code == 403
+
+        again = client.post("/blocks", json={"path": "calanques_v1"}, headers=admin)
+        assert again.status_code == 409
+
+        assert (
+            client.post("/blocks/calanques/publish", headers=admin).json()["block"]["state"]
+            == "published"
+        )
+        listed = client.get("/collections/blocks/items", headers=reader).json()
+        assert [feature["properties"]["state"] for feature in listed["features"]] == ["published"]
+        quality = client.get("/blocks/calanques/quality", headers=reader).json()
+        assert quality["cells"][0][3] + sum(cell[3] for cell in quality["cells"][1:]) == 40
+        extent = client.get("/collections/points", headers=reader).json()["extent"]["spatial"]["bbox"][0]
+        assert_allclose(extent, BOX)
+
+        assert client.post("/blocks/calanques/publish", headers=admin).status_code == 409
+        assert (
+            client.post("/blocks/calanques/withdraw", headers=admin).json()["block"]["state"]
+            == "withdrawn"
+        )
+        assert client.get("/collections/blocks/items", headers=reader).json()["features"] == []
+        assert client.post("/blocks/nothing/publish", headers=admin).status_code == 404
+
+
+@pytest.mark.parametrize("path", ["../outside", "/etc", "", "a/../..", "link", "missing", "a\\b"])
+def test_only_folders_below_the_allowed_one_are_ingested_by_request(tmp_path, path):
+    allowed = tmp_path / "incoming"
+    (allowed / "good").mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    (allowed / "link").symlink_to(tmp_path / "outside")
+    assert blocks.folder_to_ingest(allowed, "good") == allowed / "good"
+    with pytest.raises(InputError, match="path"):
+        blocks.folder_to_ingest(allowed, path)
+
+
+def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client, bearer):
+    reply = client.post("/blocks", json={"path": "x"}, headers=bearer("admin"))
+    assert reply.status_code == 422
+    assert "AMERS_INGEST_FOLDER" in reply.json()["detail"]
+
+
+@pytest.fixture
+def run(settings, monkeypatch):
+    """Runs a command on the test's database; returns what it printed, as JSON."""
+    monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
+
+    def run(*arguments: str):
+        result = CliRunner().invoke(commands, [*arguments, "--json"], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)
+
+    return run
+
+
+def test_the_whole_life_runs_from_the_command_line(run, tmp_path):
+    made = make_block(tmp_path / "block")
+    assert run("block", "ingest", str(made.folder))["block"]["state"] == "staged"
+    assert run("block", "list")[0]["id"] == "calanques"
+    assert run("block", "publish", "calanques")["state"] == "published"
+    assert run("block", "show", "calanques@1")["points"] == 40
+    assert run("block", "quality", "calanques")["points"] == 40
+    newer = make_block(tmp_path / "newer", count=5, seed=2, version="2")
+    assert run("block", "ingest", str(newer.folder), "--publish")["block"]["state"] == "published"
+    assert {(row["version"], row["state"]) for row in run("block", "list")} == {
+        ("1", "withdrawn"),
+        ("2", "published"),
+    }
+    assert run("block", "withdraw", "calanques@2")["state"] == "withdrawn"
+
+
+def test_commands_speak_plainly_without_json(run, tmp_path):
+    made = make_block(tmp_path / "block")
+    runner = CliRunner()
+    result = runner.invoke(commands, ["block", "ingest", str(made.folder)], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "staged" in result.stdout
+    assert "points/km2" in result.stdout
+    assert "100 %" in result.stderr
+    for command in (["list"], ["show", "calanques"], ["quality", "calanques"], ["publish", "calanques"]):
+        assert runner.invoke(commands, ["block", *command], catch_exceptions=False).exit_code == 0
+
+
+def test_a_broken_block_is_refused_by_the_command_and_nothing_stays(run, tmp_path):
+    made = make_block(tmp_path / "block")
+    (Path(made.folder) / "views.parquet").unlink()
+    result = CliRunner().invoke(commands, ["block", "ingest", str(made.folder)])
+    assert result.exit_code != 0
+    assert "views.parquet" in str(result.exception)
+    assert run("block", "list") == []

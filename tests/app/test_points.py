@@ -1,0 +1,318 @@
+"""Asking for control points over HTTP and by command."""
+
+import csv
+import io
+import json
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pyproj import Transformer
+from rasterio.io import MemoryFile
+from typer.testing import CliRunner
+
+from app.cli.main import app as commands
+from app.db import points as store
+from app.errors import InputError
+from app.usecases import blocks, points
+from services.geodesy import east_north_up
+from tests.factories import make_block
+
+ITEMS = "/collections/points/items"
+a_tenth_of_a_millimetre_deg = 1e-9
+a_millimetre = 1e-3
+
+
+@pytest.fixture
+def made(connection, storage, tmp_path):
+    """A published block of 60 points; a staged one of 10 lies in the same place."""
+    made = make_block(tmp_path / "block", count=60)
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    blocks.ingest_block(
+        connection, storage, make_block(tmp_path / "b", count=10, seed=5, name="staged").folder
+    )
+    connection.commit()
+    return made
+
+
+@pytest.fixture
+def get(client, bearer):
+    """GET as a reader; returns the reply."""
+    headers = bearer("read")
+    return lambda path: client.get(path, headers=headers)
+
+
+def test_points_of_a_box_are_a_valid_feature_collection(made, get):
+    reply = get(f"{ITEMS}?bbox=5.2,43.2,5.25,43.3")
+
+    assert reply.status_code == 200
+    assert reply.headers["content-type"] == "application/geo+json"
+    page = reply.json()
+    lon = made.points.lon_lat_h[:, 0]
+    expected = np.flatnonzero(lon <= 5.25)
+    assert [feature["id"] for feature in page["features"]] == (2**26 + expected).tolist()
+    assert page["numberReturned"] == page["numberMatched"] == len(expected)
+    assert page["amers:numberMatchedIsExact"] is True
+    coordinates = [feature["geometry"]["coordinates"] for feature in page["features"]]
+    assert_allclose(coordinates, made.points.lon_lat_h[expected], atol=a_tenth_of_a_millimetre_deg)
+    properties = page["features"][0]["properties"]
+    sigma_m = np.sqrt(made.points.covariance_m2[expected[0], 2, 2])
+    assert properties["sigma_up_m"] == pytest.approx(sigma_m, rel=1e-6)
+    assert properties["first_view"] == "2023-03-01"
+    kinds = {feature["properties"]["typology"] for feature in page["features"]}
+    assert kinds == {"crossroads", "building corner", 'a "rare" kind', None}
+
+
+def test_pages_follow_each_other_without_gap_or_repetition(made, get):
+    seen, url, pages = [], f"{ITEMS}?limit=17", 0
+    while url:
+        page = get(url).json()
+        seen += [feature["id"] for feature in page["features"]]
+        url = next((link["href"] for link in page["links"] if link["rel"] == "next"), None)
+        pages += 1
+        assert page["numberMatched"] == 60
+    assert pages == 4
+    assert seen == (2**26 + np.arange(60)).tolist()
+
+
+def test_a_page_that_holds_exactly_all_has_no_next(made, get):
+    for query in ("limit=60", "limit=60&bbox=5,43,6,44"):
+        page = get(f"{ITEMS}?{query}").json()
+        assert page["numberReturned"] == 60
+        assert [link["rel"] for link in page["links"]] == ["self"]
+
+
+def test_a_limit_beyond_the_most_is_taken_as_the_most(made, get):
+    assert get(f"{ITEMS}?limit=1000000").json()["numberReturned"] == 60
+
+
+@pytest.mark.parametrize("limit", ["0", "-1", "many"])
+def test_a_limit_that_is_none_is_refused(made, get, limit):
+    reply = get(f"{ITEMS}?limit={limit}")
+    assert reply.status_code == 422
+    assert "limit" in reply.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("bbox", "named"),
+    [
+        ("1,2,3", "'1,2,3'"),
+        ("1,2,3,4,5,6", "'1,2,3,4,5,6'"),
+        ("a,2,3,4", "'a,2,3,4'"),
+        ("nan,2,3,4", "nan"),
+        ("1,2,inf,4", "inf"),
+        ("-181,0,3,4", "west -181"),
+        ("1,2,180.5,4", "east 180.5"),
+        ("1,-91,3,4", "south -91"),
+        ("1,2,3,90.1", "north 90.1"),
+        ("1,5,3,4", "south 5 is above north 4"),
+        ("", "''"),
+    ],
+)
+def test_a_wrong_box_is_refused_naming_the_value(made, get, bbox, named):
+    reply = get(f"{ITEMS}?bbox={bbox}")
+    assert reply.status_code == 422
+    assert reply.headers["content-type"] == "application/problem+json"
+    assert named in reply.json()["detail"]
+
+
+def test_a_box_across_the_antimeridian_holds_both_sides_and_nothing_between(
+    connection, storage, tmp_path, get
+):
+    made = make_block(tmp_path / "far", count=50, box=(179.9, -17.0, -179.9, -16.9))
+    near = make_block(tmp_path / "near", count=9, name="near")
+    for block in (made, near):
+        blocks.ingest_block(connection, storage, block.folder)
+        blocks.publish_block(connection, block.metadata.id)
+    connection.commit()
+    page = get(f"{ITEMS}?bbox=179.95,-17,-179.95,-16.9").json()
+    lon = made.points.lon_lat_h[:, 0]
+    assert 0 < page["numberReturned"] == (np.abs(lon) >= 179.95).sum() < 50
+    assert get(f"{ITEMS}?bbox=179.9,-20,-179.9,-10").json()["numberReturned"] == 50
+    assert get(f"{ITEMS}?bbox=-179.9,-20,179.9,-10").json()["numberReturned"] == 0
+
+
+@pytest.mark.parametrize(
+    "token", ["", "x", "AAAA", "a" * 32, "é" * 8, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
+)
+def test_a_token_that_was_not_given_is_refused(made, get, page_token):
+    reply = get(f"{ITEMS}?token={page_token}")
+    assert reply.status_code == 422
+    assert "token" in reply.json()["detail"]
+
+
+def test_a_token_of_another_query_is_refused(made, connection):
+    token = points.query_points(connection, store.Box(5, 43, 6, 44), 10).next_token
+    with pytest.raises(InputError, match="not of this query"):
+        points.query_points(connection, store.Box(5, 43, 6, 45), 10, token)
+    with pytest.raises(InputError, match="not of this query"):
+        points.query_points(connection, None, 10, token)
+
+
+def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
+    connection, storage, tmp_path
+):
+    many = make_block(tmp_path / "many", count=10_050, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
+    blocks.ingest_block(connection, storage, many.folder)
+    blocks.publish_block(connection, "calanques")
+    connection.execute("analyze point")
+    lon = np.sort(many.points.lon_lat_h[:, 0])
+    few, all_of_them = (5.0, 43.0, (lon[9_999] + lon[10_000]) / 2, 44.0), (5.0, 43.0, 6.0, 44.0)
+    assert store.count_points(connection, store.Box(*few)) == store.Count(10_000, exact=True)
+    estimate = store.count_points(connection, store.Box(*all_of_them))
+    assert not estimate.exact
+    assert estimate.number == pytest.approx(10_050, rel=0.2)
+    assert store.count_points(connection, None) == store.Count(10_050, exact=True)
+
+
+def test_one_point_comes_with_its_views_and_their_images(made, get):
+    reply = get(f"{ITEMS}/{2**26 + 7}")
+    feature = reply.json()
+    assert reply.headers["content-type"] == "application/geo+json"
+    assert_allclose(feature["geometry"]["coordinates"], made.points.lon_lat_h[7], rtol=0)
+    assert feature["properties"]["block"] == "calanques"
+    views = feature["properties"]["views"]
+    assert [view["gsd_m"] for view in views] == [0.5] * 3 + [2.0] * 3
+    assert [view["image_id"] for view in views] == ["IMG_00", "IMG_01", "IMG_02"] * 2
+    assert views[0]["acquired_at"].startswith("2023-03-01T10:30:00")
+    assert views[2]["acquired_at"] is None
+    assert views[2]["sun_elevation_deg"] is None
+    assert "chip_key" not in feature["properties"]
+
+
+@pytest.mark.parametrize("point_id", [0, 2**26 + 60, 2 * 2**26, -1, 2**63, 10**30])
+def test_a_point_that_is_not_there_or_not_published_is_not_found(made, get, point_id):
+    for path in ("", "/chips", "/chips/0"):
+        assert get(f"{ITEMS}/{point_id}{path}").status_code == 404
+
+
+def test_chips_as_npz_are_the_raw_values_with_what_they_show(made, get):
+    with np.load(io.BytesIO(get(f"{ITEMS}/{2**26 + 7}/chips").content), allow_pickle=False) as archive:
+        assert (archive["chips"] == made.chips(7)).all()
+        assert archive["gsd_m"].tolist() == [0.5] * 3 + [2.0] * 3
+        assert archive["image_id"].tolist() == ["IMG_00", "IMG_01", "IMG_02"] * 2
+        assert archive["acquired_at"][0] == np.datetime64("2023-03-01T10:30:00")
+        assert np.isnat(archive["acquired_at"][2])
+        assert_allclose(archive["lon_lat_h"], made.points.lon_lat_h[7], rtol=0)
+
+
+def test_a_chip_as_png_is_the_same_picture_stretched_to_8_bits(made, get):
+    reply = get(f"{ITEMS}/{2**26 + 7}/chips/4")
+    assert reply.headers["content-type"] == "image/png"
+    picture = cv2.imdecode(np.frombuffer(reply.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    raw = made.chips(7)[4].astype(float)
+    assert picture.shape == (101, 101)
+    assert np.corrcoef(picture.ravel(), raw.ravel())[0, 1] > 0.999
+    assert (picture.min(), picture.max()) == (1, 255)
+
+
+def test_all_chips_as_png_are_one_sheet_with_a_row_for_each_ground_sampling(made, get):
+    reply = get(f"{ITEMS}/{2**26 + 7}/chips?f=png")
+    sheet = cv2.imdecode(np.frombuffer(reply.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    one = get(f"{ITEMS}/{2**26 + 7}/chips/4?f=png").content
+    picture = cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert sheet.shape == (202, 303)
+    assert (sheet[101:, 101:202] == picture).all()
+
+
+def test_a_chip_as_geotiff_lies_where_the_conventions_put_its_pixels(made, get):
+    point = made.points.lon_lat_h[7]
+    reply = get(f"{ITEMS}/{2**26 + 7}/chips/4?f=tif")
+    assert reply.headers["content-type"].startswith("image/tiff")
+    with MemoryFile(reply.content) as memory, memory.open() as file:
+        assert (file.read(1) == made.chips(7)[4]).all()
+        assert file.nodata == 0
+        to_lon_lat = Transformer.from_crs(file.crs, "EPSG:4326", always_xy=True)
+        for row, column in ((50, 50), (0, 0), (100, 20)):
+            lon, lat = to_lon_lat.transform(*file.xy(row, column))
+            enu = east_north_up(np.array([[lon, lat, point[2]]]), point)[0]
+            assert_allclose(enu[:2], [(column - 50) * 2.0, (50 - row) * 2.0], atol=a_millimetre)
+
+
+def test_a_view_that_is_not_there_and_a_format_nobody_knows_are_refused(made, get):
+    reply = get(f"{ITEMS}/{2**26 + 7}/chips/6")
+    assert reply.status_code == 404
+    assert "0 to 5" in reply.json()["detail"]
+    assert get(f"{ITEMS}/{2**26 + 7}/chips/-1").status_code == 404
+    assert get(f"{ITEMS}/{2**26 + 7}/chips?f=tif").status_code == 422
+    assert get(f"{ITEMS}/{2**26 + 7}/chips/0?f=gif").status_code == 422
+
+
+def test_points_are_closed_without_a_token(made, client):
+    for path in (
+        "/collections",
+        "/collections/points",
+        ITEMS,
+        f"{ITEMS}/{2**26}",
+        f"{ITEMS}/{2**26}/chips",
+    ):
+        assert client.get(path).status_code == 401
+        assert client.get(path, headers={"Authorization": "Bearer wrong"}).status_code == 401
+
+
+def test_the_collections_say_what_they_hold_and_where(made, get):
+    listed = get("/collections").json()["collections"]
+    assert [collection["id"] for collection in listed] == ["points", "blocks"]
+    for collection in listed:
+        assert_allclose(collection["extent"]["spatial"]["bbox"], [[5.2, 43.2, 5.3, 43.3]])
+        for link in collection["links"]:
+            assert get(link["href"]).status_code == 200
+    assert get("/collections/roads").status_code == 404
+
+
+def test_collections_of_an_empty_store_have_no_extent(get):
+    assert "extent" not in get("/collections/points").json()
+    empty = get(ITEMS).json()
+    assert (empty["features"], empty["numberMatched"], empty["numberReturned"]) == ([], 0, 0)
+
+
+@pytest.fixture
+def run(settings, monkeypatch, made):
+    """Runs `amers points query` on the test's database; returns what it printed."""
+    monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
+
+    def run(*arguments: str) -> str:
+        result = CliRunner().invoke(commands, ["points", "query", *arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    return run
+
+
+def test_the_command_writes_geojson_or_csv_to_a_file_or_standard_output(
+    run, made, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(points, "MOST_POINTS", 7)
+    collection = json.loads(run("--bbox", "5,43,6,44"))
+    assert len(collection["features"]) == 60
+    file = tmp_path / "points.geojson"
+    run("--bbox", "5,43,6,44", "-o", str(file))
+    assert json.loads(file.read_text()) == collection
+
+    rows = list(csv.DictReader(io.StringIO(run("--bbox", "5,43,6,44", "--format", "csv"))))
+    assert [int(row["id"]) for row in rows] == [feature["id"] for feature in collection["features"]]
+    lon_lat_h = [[float(row[name]) for name in ("lon_deg", "lat_deg", "height_m")] for row in rows]
+    assert_allclose(lon_lat_h, made.points.lon_lat_h, rtol=0)
+    assert {row["block"] for row in rows} == {"calanques"}
+
+
+def test_the_command_tells_how_many_points_there_are_as_json(run):
+    assert json.loads(run("--bbox", "5,43,6,44", "--json")) == {
+        "points": 60,
+        "exact": True,
+        "file": None,
+    }
+
+
+def test_the_command_on_an_empty_box_writes_an_empty_collection(run):
+    assert json.loads(run("--bbox", "0,0,1,1"))["features"] == []
+    assert run("--bbox", "0,0,1,1", "--format", "csv").startswith("id,lon_deg")
+
+
+def test_the_command_refuses_a_wrong_box_naming_it(run):
+    result = CliRunner().invoke(commands, ["points", "query", "--bbox", "1,2,3"])
+    assert isinstance(result.exception, InputError)
+    assert "'1,2,3'" in str(result.exception)
