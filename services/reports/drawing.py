@@ -118,6 +118,11 @@ def _show_quicklook(axes: Axes, quicklook: Quicklook, darkness: float) -> None:
     )
 
 
+def crowding(n: int, roomy: int = 300) -> float:
+    """How much smaller n marks are drawn than few of them, 1 and less."""
+    return float(np.sqrt(min(1.0, roomy / max(n, 1))))
+
+
 def round_number(value: float) -> float:
     """The nearest of 1, 2, 5 times a power of ten; 1 for nothing."""
     if not value > 0.0:

@@ -17,6 +17,7 @@ from services.reports.drawing import (
     QUIET,
     TEXT_PT,
     WIDTH_IN,
+    crowding,
     image_axes,
     image_height_in,
     plain_axes,
@@ -66,7 +67,8 @@ def residual_map(summary: RegistrationSummary) -> Figure:
         return figure
     length_px = np.hypot(*residual.T)
     key_px = round_number(float(np.quantile(length_px, 0.9)))
-    enlarged = 0.06 * float(np.hypot(*summary.shape)) / key_px
+    crowd = crowding(len(residual))
+    enlarged = 0.06 * crowd * float(np.hypot(*summary.shape)) / key_px
     arrows = axes.quiver(
         place[:, 1],
         place[:, 0],
@@ -76,8 +78,7 @@ def residual_map(summary: RegistrationSummary) -> Figure:
         scale_units="xy",
         scale=1.0,
         color=ARROW if summary.quicklook is not None else ACTIVE,
-        width=0.0035,
-        rasterized=len(residual) > MANY_POINTS,
+        width=0.0035 * crowd,
     )
     axes.quiverkey(
         arrows,
@@ -116,6 +117,7 @@ def coverage_map(summary: RegistrationSummary) -> Figure:
             fontsize=TEXT_PT - 1,
             labelcolor=INK,
             handletextpad=0.3,
+            markerscale=crowding(len(summary.measures.point_id)) ** -0.5,
         )
     return figure
 
@@ -256,7 +258,7 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
     """Points where the refined model sees them: active ones as discs, others by reason."""
     measures = summary.measures
     place = summary.adjustment.correction.apply(measures.predicted)
-    many = len(place) > MANY_POINTS
+    many, crowd = len(place) > MANY_POINTS, crowding(len(place))
     kinds = [
         (~measures.matched, NOT_MATCHED, "not matched"),
         (measures.matched & ~measures.active, DEACTIVATED, "deactivated"),
@@ -270,7 +272,7 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
             axes.scatter(
                 place[shown, 1],
                 place[shown, 0],
-                s=18,
+                s=18 * crowd,
                 marker=_REASON_MARKERS[min(k, len(_REASON_MARKERS) - 1)],
                 color="#c9ced4" if colour == NOT_MATCHED and summary.quicklook is not None else colour,
                 linewidths=1.0,
@@ -282,7 +284,7 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
         axes.scatter(
             place[active, 1],
             place[active, 0],
-            s=16,
+            s=16 * crowd,
             color=ACTIVE,
             edgecolors="white",
             linewidths=0.4,

@@ -156,6 +156,12 @@ def test_a_page_is_made_of_any_registration(summarised, poor):
     assert [name for name, _ in found.attributes].count("aria-label") == len(DRAWN) + 2
 
 
+def test_a_page_of_thousands_of_points_stays_light(summarised):
+    """A large scene has 1,800 points (SPOT 6/7); a mail takes 10 MB."""
+    megabyte = 1_000_000
+    assert len(page(summarised(n=1800, lost=100, wrong=60))) < 3 * megabyte
+
+
 def test_the_same_registration_gives_the_same_figure(summarised):
     assert svg(figures.residual_map, summarised()) == svg(figures.residual_map, summarised())
 
