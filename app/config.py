@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from pydantic import Field, SecretStr, ValidationError
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.errors import InputError
@@ -35,6 +35,7 @@ class Settings(BaseSettings):
         read_timeout_seconds: longest time the database may spend on one statement of a reading request.
         job_memory_bytes, job_seconds: what one job may use before it is stopped.
         lease_seconds: how long a job waits for a silent worker before another takes it over.
+        ingest_folder: holds the block folders that may be ingested through the API; none: not at all.
     """
 
     model_config = SettingsConfigDict(env_prefix="AMERS_", frozen=True)
@@ -48,9 +49,15 @@ class Settings(BaseSettings):
     public_points: bool = False
     pool_size: int = Field(default=8, ge=1, le=100)
     read_timeout_seconds: float = Field(default=10.0, gt=0)
-    job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=GIBIBYTE // 2)
+    job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
     lease_seconds: float = Field(default=30.0, gt=0)
+    ingest_folder: Path | None = None
+
+    @field_validator("data_folder")
+    @classmethod
+    def _absolute(cls, folder: Path) -> Path:
+        return folder.expanduser().absolute()
 
 
 def read_settings() -> Settings:

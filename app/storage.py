@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -156,10 +157,20 @@ class Storage:
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""
-        top = self._locate(prefix)
-        return sorted(
-            path.relative_to(self.folder).as_posix() for path in top.rglob("*") if path.is_file()
+        found = (
+            path for path in self._locate(prefix).rglob("*") if path.is_file() and not path.is_symlink()
         )
+        return sorted(path.relative_to(self.folder).as_posix() for path in found)
+
+    def sweep_unfinished(self, older_than_s: float) -> int:
+        """Remove what writers that were killed left behind; returns how many files."""
+        swept = 0
+        for path in (self.folder / UNFINISHED).glob("*"):
+            with suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime >= older_than_s:
+                    path.unlink()
+                    swept += 1
+        return swept
 
     def _locate(self, key: str) -> Path:
         if not KEY.fullmatch(key) or key.split("/")[0] == UNFINISHED:

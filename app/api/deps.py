@@ -57,7 +57,7 @@ WriteConnection = Annotated[Connection, Depends(_transaction, scope="function")]
 def _caller(
     database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
 ) -> Token | None:
-    """The caller's token, None when none was sent; one that is sent but wrong is refused, never ignored."""
+    """The caller's token, None when none was sent; one that is sent but wrong is refused."""
     if authorization is None:
         return None
     kind, _, secret = authorization.partition(" ")

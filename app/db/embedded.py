@@ -1,10 +1,10 @@
 """A private PostgreSQL cluster in the data folder, shared by the commands that need it.
 
-Every command that uses the cluster holds a shared lock on the file `lease`; the kernel lets go of it when
-the command ends, however it ends. The server is started by whoever finds none, under the exclusive lock
-`turn`, and stopped by the last to leave: the one whose lease can be made exclusive. After a kill of all
-commands the server stays, and the next command uses it and stops it. After a kill of the server the next
-command starts it, and PostgreSQL recovers by itself.
+Every command that uses the cluster holds a shared lock on the file `lease`; the kernel lets go of it
+when the command ends, however it ends. The server is started by whoever finds none, under the exclusive
+lock `turn`, and stopped by the last to leave: the one whose lease can be made exclusive. After a kill of
+all commands the server stays, and the next command uses it and stops it. After a kill of the server the
+next command starts it, and PostgreSQL recovers by itself.
 """
 
 import fcntl
@@ -32,6 +32,7 @@ DATABASE = "amers"
 SOCKET_NAME = ".s.PGSQL.5432"
 LONGEST_SOCKET_PATH = 107
 START_SECONDS = 120.0
+LEAVING_SECONDS = 10.0
 
 CONFIGURATION = """\
 listen_addresses = ''
@@ -49,7 +50,7 @@ log_timezone = 'UTC'
 log_min_messages = warning
 log_checkpoints = off
 """
-FORGETFUL = "fsync = off\nsynchronous_commit = off\nfull_page_writes = off\n"
+FORGETFUL = "fsync = off\nfull_page_writes = off\n"
 
 
 @contextmanager
@@ -62,8 +63,17 @@ def database(settings: Settings) -> Iterator[str]:
     if settings.database_url is not None:
         yield settings.database_url.get_secret_value()
         return
-    with Cluster(settings.data_folder / "postgres").lease() as dsn:
+    with _cluster(settings).lease() as dsn:
         yield dsn
+
+
+def revive(settings: Settings) -> None:
+    """Start the private cluster again if it was killed; nothing for a database of your own.
+
+    To be called by a process that holds a lease and lives long.
+    """
+    if settings.database_url is None:
+        _cluster(settings).revive()
 
 
 class ServerFailure(RuntimeError):
@@ -76,7 +86,7 @@ class Cluster:
 
     Attributes:
         folder: everything of it: `data`, `server.log`, the locks and, if its path is short, the socket.
-        durable: whether a commit survives a power cut; only tests do without.
+        durable: whether a commit survives a power cut, not only a kill; only tests do without.
     """
 
     folder: Path
@@ -107,6 +117,11 @@ class Cluster:
                     self._stop(user)
                 finally:
                     os.close(lease)
+
+    def revive(self) -> None:
+        """Start the server again if it was killed, for those who hold a lease and go on."""
+        with self._turn():
+            self._make_running(server_user(self.folder))
 
     @property
     def data(self) -> Path:
@@ -252,12 +267,12 @@ class Cluster:
         log = self.folder / "server.log"
         command = [str(find_binaries(version).folder / "pg_ctl"), "start", "--wait", "--silent"]
         command += ["--pgdata", str(self.data), "--log", str(log), "--timeout", str(int(START_SECONDS))]
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + LEAVING_SECONDS
         while run_as(user, command, timeout_s=2 * START_SECONDS).returncode != 0:
+            said = " / ".join(log.read_text(errors="replace").splitlines()[-4:]) if log.exists() else ""
             # Processes of a killed server need a moment to notice and leave the shared memory.
-            if time.monotonic() > deadline:
-                lines = log.read_text(errors="replace").splitlines() if log.exists() else []
-                raise ServerFailure(f"PostgreSQL did not start ({log}): {' / '.join(lines[-3:])}")
+            if "shared memory" not in said or time.monotonic() > deadline:
+                raise ServerFailure(f"PostgreSQL did not start ({log}): {said}")
             time.sleep(0.2)
 
     def _stop(self, user: ServerUser) -> None:
@@ -267,8 +282,16 @@ class Cluster:
         for mode in ("fast", "immediate"):
             command = [pg_ctl, "stop", "--wait", "--silent", "--mode", mode, "--pgdata", str(self.data)]
             if run_as(user, command).returncode == 0 or not self.is_running():
-                return
-        raise ServerFailure(f"PostgreSQL in {self.folder} does not stop")
+                break
+        else:
+            raise ServerFailure(f"PostgreSQL in {self.folder} does not stop")
+        if self.sockets.parent != self.folder:
+            with suppress(OSError):
+                self.sockets.rmdir()
+
+
+def _cluster(settings: Settings) -> Cluster:
+    return Cluster(settings.data_folder / "postgres")
 
 
 def _works_in(number: int, folder: Path) -> bool:

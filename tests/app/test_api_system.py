@@ -1,4 +1,76 @@
-"""The landing page, health, and the replies to requests that cannot be served."""
+"""The landing page, health, access, and the replies to requests that cannot be served."""
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from app.api import replies
+from app.api.deps import Admin, PointsReader, ReadConnection, Reader, Registrar, WriteConnection
+from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
+from app.main import create_app
+from app.usecases.tokens import create_token, list_tokens
+from services.errors import NotEnoughPoints
+
+DOORS = {"read": Reader, "register": Registrar, "admin": Admin}
+
+
+@pytest.fixture
+def app(settings):
+    """The application with doors of the tests' own beside those it has."""
+    app = create_app(settings)
+    for name, caller in DOORS.items():
+        app.add_api_route(f"/door/{name}", door(caller))
+    app.add_api_route("/door/points", door(PointsReader))
+
+    @app.get("/number/{number}")
+    def number(number: int, connection: ReadConnection) -> int:
+        return connection.execute("select %s / nullif(%s, 0) as it", [10, number]).fetchone()["it"]
+
+    @app.post("/echo")
+    def echo(body: dict) -> dict:
+        return body
+
+    @app.post("/scenes/echo")
+    def upload(body: dict) -> dict:
+        return body
+
+    @app.post("/token/{name}")
+    def keep(name: str, connection: WriteConnection) -> str:
+        create_token(connection, name, ["read"])
+        if name == "spoiled":
+            raise Conflict("spoiled")
+        return name
+
+    @app.get("/slow")
+    def slow(connection: ReadConnection) -> None:
+        connection.execute("select pg_sleep(20)")
+
+    return app
+
+
+def door(caller: type) -> object:
+    def enter(caller: caller) -> str:
+        return caller.name if caller else "anybody"
+
+    return enter
+
+
+@pytest.fixture
+def client(app):
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield client
+
+
+def refused(reply, status: int) -> dict:
+    """The problem details of a reply, after a check that they are what RFC 9457 says."""
+    assert reply.status_code == status, reply.text
+    assert reply.headers["content-type"] == replies.PROBLEM_JSON
+    problem = reply.json()
+    assert problem["status"] == status
+    assert problem["type"] == "about:blank"
+    assert problem["title"]
+    assert problem["detail"]
+    return problem
 
 
 def test_the_landing_page_links_to_what_there_is(client):
@@ -10,3 +82,124 @@ def test_the_landing_page_links_to_what_there_is(client):
 def test_a_ready_service_has_a_database_that_answers(client):
     assert client.get("/healthz").json() == {"status": "alive"}
     assert client.get("/readyz").json() == {"status": "ready"}
+
+
+def test_the_description_of_the_api_is_openapi_3_1(client):
+    assert client.get("/api").json()["openapi"].startswith("3.1")
+
+
+@pytest.mark.parametrize("path", ["/door/read", "/door/register", "/door/admin", "/door/points"])
+def test_a_door_is_closed_to_callers_without_a_token(client, path):
+    reply = client.get(path)
+    refused(reply, 401)
+    assert reply.headers["www-authenticate"].startswith("Bearer")
+
+
+@pytest.mark.parametrize("header", ["Bearer wrong", "Bearer ", "Basic dTpw", "nonsense", "Bearer \x00"])
+@pytest.mark.parametrize("path", ["/door/read", "/door/points"])
+def test_a_wrong_token_is_refused_and_never_taken_for_none(client, settings, path, header):
+    public = TestClient(client.app)
+    client.app.state.settings = settings.model_copy(update={"public_points": True})
+    refused(public.get(path, headers={"Authorization": header}), 401)
+
+
+@pytest.mark.parametrize(
+    ("scope", "opened"),
+    [
+        ("read", {"read", "points"}),
+        ("register", {"read", "register", "points"}),
+        ("admin", {*DOORS, "points"}),
+    ],
+)
+def test_a_token_opens_the_doors_of_its_scope(client, bearer, scope, opened):
+    headers = bearer(scope)
+    for name in (*DOORS, "points"):
+        reply = client.get(f"/door/{name}", headers=headers)
+        if name in opened:
+            assert reply.json() == f"a token to {scope}"
+        else:
+            assert "scope" in refused(reply, 403)["detail"]
+
+
+def test_points_are_open_to_anybody_only_where_the_setting_says_so(client, settings):
+    refused(client.get("/door/points"), 401)
+    client.app.state.settings = settings.model_copy(update={"public_points": True})
+    assert client.get("/door/points").json() == "anybody"
+    refused(client.get("/door/read"), 401)
+
+
+def test_a_wrong_parameter_is_named(client):
+    problem = refused(client.get("/number/seven"), 422)
+    assert problem["errors"][0]["field"] == "path.number"
+    assert "path.number" in problem["detail"]
+
+
+def test_an_unknown_path_is_a_problem_too(client):
+    refused(client.get("/nothing/here"), 404)
+    refused(client.delete("/healthz"), 405)
+
+
+def test_a_body_that_is_not_json_is_refused(client):
+    refused(client.post("/echo", content=b"{", headers={"Content-Type": "application/json"}), 422)
+
+
+def test_a_body_over_the_limit_is_refused_announced_or_not(client, settings):
+    body = b'{"x": "' + b"x" * settings.body_limit_bytes + b'"}'
+    json = {"Content-Type": "application/json"}
+    assert (
+        str(settings.body_limit_bytes)
+        in refused(client.post("/echo", content=body, headers=json), 413)["detail"]
+    )
+    refused(client.post("/echo", content=iter([body[:1000], body[1000:]]), headers=json), 413)
+    assert client.post("/scenes/echo", content=body, headers=json).status_code == 200
+
+
+def test_an_unexpected_error_says_nothing_of_the_inside(client):
+    @client.app.get("/broken")
+    def broken() -> None:
+        raise KeyError("the inside")
+
+    problem = refused(client.get("/broken"), 500)
+    assert "inside" not in str(problem)
+
+
+def test_a_request_that_takes_the_database_too_long_is_stopped(app, settings, dsn):
+    quick = create_app(settings.model_copy(update={"read_timeout_seconds": 0.1}))
+    quick.router.routes.extend(route for route in app.routes if getattr(route, "path", "") == "/slow")
+    with TestClient(quick, raise_server_exceptions=False) as client:
+        assert "too long" in refused(client.get("/slow"), 503)["detail"]
+
+
+def test_a_request_is_kept_whole_or_not_at_all(client, connection):
+    assert client.post("/token/whole").status_code == 200
+    assert [token.name for token in list_tokens(connection)] == ["whole"]
+    refused(client.post("/token/spoiled"), 409)
+    assert [token.name for token in list_tokens(connection)] == ["whole"]
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (InputError("x"), 422),
+        (NotEnoughPoints(found=3, needed=6), 409),
+        (ComputationError("x"), 409),
+        (Conflict("x"), 409),
+        (NotFound("x"), 404),
+        (TooLarge("x"), 413),
+        (NotAllowed("x", known=False), 401),
+        (NotAllowed("x", known=True), 403),
+        (AmersError("x"), 500),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)
+def test_every_error_has_its_status(error, status):
+    app = FastAPI()
+    replies.install(app)
+
+    @app.get("/")
+    def fail() -> None:
+        raise error
+
+    problem = refused(TestClient(app).get("/"), status)
+    assert problem["detail"] == str(error)
+    assert problem["error"] == type(error).__name__

@@ -1,0 +1,74 @@
+"""What a command prints: JSON when asked for, a table on a terminal, plain lines elsewhere."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import UUID
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+Row = Mapping[str, object]
+
+
+def show(rows: Sequence[Row], *, as_json: bool) -> None:
+    """Print records that have the same fields: a JSON array, a table, or tab-separated lines."""
+    if as_json:
+        print_json(rows)
+    elif sys.stdout.isatty():
+        table = Table(*(rows[0] if rows else ()))
+        for row in rows:
+            table.add_row(*map(as_text, row.values()))
+        Console().print(table if rows else "none")
+    else:
+        for row in rows:
+            typer.echo("\t".join(map(as_text, row.values())))
+
+
+def show_one(record: Row, *, as_json: bool) -> None:
+    """Print one record: a JSON object, or one line a field."""
+    if as_json:
+        print_json(record)
+        return
+    width = max(map(len, record), default=0)
+    for name, value in record.items():
+        typer.echo(f"{name:<{width}}  {as_text(value)}")
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON; dataclasses become objects, dates ISO 8601."""
+    typer.echo(json.dumps(value, indent=2, default=_plain, allow_nan=False))
+
+
+def as_text(value: object) -> str:
+    """A value as people read it."""
+    if value is None:
+        return "-"
+    if isinstance(value, datetime):
+        return value.isoformat(sep=" ", timespec="seconds")
+    if isinstance(value, list | tuple | set | frozenset):
+        return ", ".join(map(as_text, value))
+    return str(value)
+
+
+def _plain(value: object) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    conversions: dict[type, Callable[[Any], Any]] = {
+        datetime: lambda moment: moment.isoformat(),
+        UUID: str,
+        Path: str,
+        frozenset: sorted,
+        set: sorted,
+    }
+    for kind, convert in conversions.items():
+        if isinstance(value, kind):
+            return convert(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")

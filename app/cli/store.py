@@ -1,0 +1,22 @@
+"""How commands reach the store: one command is one transaction, committed at its end."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from app.config import Settings, read_settings
+from app.db import embedded, engine
+from app.db.engine import Connection
+
+
+@contextmanager
+def transaction(settings: Settings | None = None) -> Iterator[Connection]:
+    """A transaction on the installation's database; the private one is started and upgraded.
+
+    Raises:
+        InputError: the database cannot be used; the message says what to do.
+    """
+    chosen = settings or read_settings()
+    with embedded.database(chosen) as dsn:
+        engine.ensure_schema(dsn, upgradable=chosen.database_url is None)
+        with engine.connect(dsn) as connection:
+            yield connection

@@ -1,0 +1,64 @@
+"""`amers token`: who may call the API."""
+
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, Row, show, show_one
+from app.cli.store import transaction
+from app.db.tokens import Token
+from app.usecases import tokens
+
+app = typer.Typer(help="Who may call the API.", no_args_is_help=True)
+
+
+@app.command()
+def create(
+    name: Annotated[str, typer.Argument(help="What the token is called, for people.")],
+    scope: Annotated[
+        list[str], typer.Option(help="read, register or admin; may be given several times.")
+    ],
+    days: Annotated[
+        int | None, typer.Option(help="How long it is valid; for ever if not given.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a token and print its secret, this once."""
+    with transaction() as connection:
+        new = tokens.create_token(connection, name, scope, days)
+    record = {**_record(new.token), "secret": new.secret}
+    if as_json:
+        show_one(record, as_json=True)
+        return
+    typer.echo("Keep this secret; it is not shown again.", err=True)
+    typer.echo(new.secret)
+
+
+@app.command("list")
+def list_tokens(as_json: AsJson = False) -> None:
+    """List all tokens, the newest first."""
+    with transaction() as connection:
+        found = tokens.list_tokens(connection)
+    show([_record(token) for token in found], as_json=as_json)
+
+
+@app.command()
+def revoke(
+    name_or_id: Annotated[str, typer.Argument(help="Id of the token, or its name if no other has it.")],
+    as_json: AsJson = False,
+) -> None:
+    """Refuse a token from now on."""
+    with transaction() as connection:
+        revoked = tokens.revoke_token(connection, name_or_id)
+    show_one(_record(revoked), as_json=as_json)
+
+
+def _record(token: Token) -> Row:
+    return {
+        "id": token.id,
+        "name": token.name,
+        "scopes": token.scopes,
+        "created_at": token.created_at,
+        "expires_at": token.expires_at,
+        "revoked_at": token.revoked_at,
+    }

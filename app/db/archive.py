@@ -1,0 +1,71 @@
+"""Backup and restore of the database, by PostgreSQL's own programs."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import psycopg
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
+
+from app.db.binaries import find_binaries
+from app.errors import Conflict, InputError
+
+
+def dump(dsn: str, file: Path) -> None:
+    """Write the database into an archive: one moment of it, while others go on.
+
+    Raises:
+        Conflict: the file exists.
+        InputError: the file cannot be written, or pg_dump refuses.
+    """
+    if file.exists():
+        raise Conflict(f"{file} exists")
+    unfinished = file.with_name(f".{file.name}.unfinished")
+    try:
+        _run(dsn, "pg_dump", "--format=custom", "--no-owner", f"--file={unfinished}")
+        unfinished.replace(file)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def restore(dsn: str, file: Path) -> None:
+    """Read an archive into a database without tables, wholly or not at all.
+
+    Raises:
+        Conflict: the database has tables of Amers.
+        InputError: the file is not an archive, or pg_restore refuses.
+    """
+    if not file.is_file():
+        raise InputError(f"no file {file}")
+    with psycopg.connect(dsn) as connection:
+        if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
+            raise Conflict(
+                "the database has tables already: restore into an empty one (another AMERS_DATA_FOLDER)"
+            )
+    _run(dsn, "pg_restore", "--single-transaction", "--exit-on-error", "--no-owner", str(file))
+
+
+def _program(dsn: str, name: str) -> Path:
+    """A program that is not older than the server: beside the server's own, or the one on the path."""
+    with psycopg.connect(dsn) as connection:
+        version = connection.info.server_version // 10_000
+    try:
+        own = find_binaries(version).folder / name
+    except InputError:
+        own = Path("/nonexistent")
+    found = own if own.is_file() else shutil.which(name)
+    if found is None:
+        raise InputError(f"{name} was not found: install the client programs of PostgreSQL {version}")
+    return Path(found)
+
+
+def _run(dsn: str, name: str, *arguments: str) -> None:
+    """The password travels in the environment, which other users of the machine cannot see."""
+    address = conninfo_to_dict(dsn)
+    password = str(address.pop("password", ""))
+    bare_dsn = make_conninfo(**{key: str(value) for key, value in address.items()})
+    command = [str(_program(dsn, name)), f"--dbname={bare_dsn}", *arguments]
+    environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "PGPASSWORD": password}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise InputError(f"{name}: {done.stderr.strip()}")

@@ -1,0 +1,154 @@
+"""The schema: made by migrations, once, in order, and back."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import psycopg
+import pytest
+from alembic import command
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from pydantic import SecretStr
+
+from app.config import Settings
+from app.db import archive, engine
+from app.db.engine import SchemaStatus
+from app.errors import Conflict, InputError
+from app.usecases.tokens import create_token, list_tokens
+
+TABLES = "select tablename from pg_tables where schemaname = 'public'"
+OURS = {
+    "token",
+    "block",
+    "image",
+    "chip_file",
+    "point",
+    "view",
+    "scene",
+    "job",
+    "registration",
+    "measure",
+}
+
+
+def tables(dsn: str) -> set[str]:
+    with psycopg.connect(dsn) as connection:
+        return {name for (name,) in connection.execute(TABLES)}
+
+
+def alembic(dsn: str) -> Config:
+    config = Config()
+    config.set_main_option("script_location", str(engine.migrations_folder()))
+    config.attributes["dsn"] = dsn
+    return config
+
+
+def test_an_empty_database_gets_the_tables_of_the_store_and_the_queue(empty_dsn):
+    assert engine.status(empty_dsn) == SchemaStatus(found=None, needed=engine.newest_revision())
+    engine.upgrade(empty_dsn)
+    assert engine.status(empty_dsn).current
+    assert tables(empty_dsn) >= OURS | {"procrastinate_jobs", "spatial_ref_sys"}
+
+
+def test_two_upgrades_at_once_do_the_work_of_one(empty_dsn):
+    with ThreadPoolExecutor(2) as pool:
+        done = [
+            pool.submit(
+                subprocess.run,
+                [sys.executable, "-m", "app.cli.main", "db", "upgrade"],
+                env=env,
+                check=True,
+            )
+            for env in [{**os.environ, "AMERS_DATABASE_URL": empty_dsn}] * 2
+        ]
+    assert [future.result().returncode for future in done] == [0, 0]
+    assert engine.status(empty_dsn).current
+
+
+def test_every_migration_can_be_undone(empty_dsn):
+    engine.upgrade(empty_dsn)
+    command.downgrade(alembic(empty_dsn), "base")
+    assert tables(empty_dsn) <= {"alembic_version", "spatial_ref_sys"}
+    engine.upgrade(empty_dsn)
+    assert engine.status(empty_dsn).current
+
+
+def test_the_names_of_the_files_give_the_order_that_alembic_keeps(empty_dsn):
+    scripts = ScriptDirectory.from_config(alembic(empty_dsn))
+    assert scripts.get_current_head() == engine.newest_revision()
+    assert scripts.get_heads() == [engine.newest_revision()]
+
+
+def test_a_database_of_your_own_is_not_upgraded_behind_your_back(empty_dsn, tmp_path):
+    settings = Settings(database_url=SecretStr(empty_dsn), data_folder=tmp_path)
+    with pytest.raises(InputError, match="amers db upgrade"), engine.opened(settings):
+        pass
+    assert tables(empty_dsn) <= {"spatial_ref_sys"}
+
+
+def test_a_database_of_a_newer_amers_is_left_alone(dsn):
+    with engine.connect(dsn) as connection:
+        connection.execute("update alembic_version set version_num = '9999'")
+    with pytest.raises(InputError, match="newer than this Amers"):
+        engine.upgrade(dsn)
+
+
+def test_a_database_that_does_not_answer_is_an_error_of_one_line(tmp_path):
+    with pytest.raises(InputError, match="cannot be reached"):
+        engine.status(f"host={tmp_path} dbname=amers connect_timeout=1")
+
+
+def test_reading_connections_can_neither_write_nor_take_too_long(dsn, tmp_path):
+    settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path, read_timeout_seconds=0.1)
+    with engine.opened(settings) as database:
+        with pytest.raises(psycopg.errors.ReadOnlySqlTransaction), database.reading() as connection:
+            connection.execute("delete from token")
+        with pytest.raises(psycopg.errors.QueryCanceled), database.reading() as connection:
+            connection.execute("select pg_sleep(5)")
+
+
+def test_a_transaction_is_kept_whole_or_not_at_all(dsn, tmp_path):
+    settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path)
+    with engine.opened(settings) as database:
+        with pytest.raises(InputError), database.transaction() as connection:
+            [create_token(connection, name, ["read"]) for name in ("half", "")]
+        with database.transaction() as connection:
+            create_token(connection, "whole", ["read"])
+        with database.reading() as connection:
+            assert [token.name for token in list_tokens(connection)] == ["whole"]
+
+
+def test_a_point_lies_in_the_range_of_its_block(connection):
+    with pytest.raises(psycopg.errors.CheckViolation, match="point"):
+        connection.execute(
+            "insert into point values (5, 1, st_setsrid(st_makepoint(0, 0, 0), 4979),"
+            " 1, 1, 1, 0, 0, 0, 2, 1, null, null, null, 1, 0, 2)"
+        )
+
+
+def test_a_backup_restores_into_an_empty_database(dsn, empty_dsn, tmp_path):
+    with engine.connect(dsn) as connection:
+        create_token(connection, "kept", ["read"])
+    archive.dump(dsn, tmp_path / "amers.dump")
+    archive.restore(empty_dsn, tmp_path / "amers.dump")
+    assert engine.status(empty_dsn).current
+    with engine.connect(empty_dsn) as connection:
+        assert [token.name for token in list_tokens(connection)] == ["kept"]
+
+
+def test_a_backup_overwrites_nothing_and_a_restore_neither(dsn, tmp_path):
+    file = tmp_path / "amers.dump"
+    archive.dump(dsn, file)
+    with pytest.raises(Conflict, match="exists"):
+        archive.dump(dsn, file)
+    with pytest.raises(Conflict, match="has tables already"):
+        archive.restore(dsn, file)
+
+
+def test_a_file_that_is_no_backup_restores_nothing(empty_dsn, tmp_path):
+    (tmp_path / "noise").write_bytes(b"\x00noise" * 100)
+    with pytest.raises(InputError, match="pg_restore"):
+        archive.restore(empty_dsn, tmp_path / "noise")
+    assert tables(empty_dsn) <= {"spatial_ref_sys"}

@@ -1,0 +1,219 @@
+"""Files by key: whole or not at all, bounded, and never outside the folder."""
+
+import hashlib
+import io
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.errors import InputError, NotFound, TooLarge
+from app.storage import Storage, StoredChips, chips_key
+from services.conventions import CHIP_SIZE
+from services.errors import FormatError
+
+
+@pytest.fixture
+def storage(tmp_path):
+    return Storage(tmp_path / "storage")
+
+
+@pytest.fixture
+def stored_chips(storage):
+    chips = StoredChips(storage)
+    yield chips
+    chips.close()
+
+
+def files(storage: Storage) -> list[str]:
+    return sorted(
+        str(path.relative_to(storage.folder)) for path in storage.folder.rglob("*") if path.is_file()
+    )
+
+
+def numbered(count: int, dtype: str = "uint8") -> np.ndarray:
+    """Chips that are filled with their row number."""
+    return np.broadcast_to(
+        np.arange(count, dtype=dtype)[:, None, None], (count, CHIP_SIZE, CHIP_SIZE)
+    ).copy()
+
+
+def test_a_file_is_found_as_it_was_put(storage):
+    stored = storage.put("scenes/a/scene.tif", [b"one", b"", b"two"])
+    assert (stored.key, stored.size_bytes) == ("scenes/a/scene.tif", 6)
+    assert stored.sha256 == hashlib.sha256(b"onetwo").hexdigest()
+    with storage.open("scenes/a/scene.tif") as file:
+        assert file.read() == b"onetwo"
+    assert storage.keys("scenes") == ["scenes/a/scene.tif"]
+
+
+def test_a_file_over_the_limit_leaves_nothing(storage):
+    with pytest.raises(TooLarge, match="10 bytes"):
+        storage.put("scenes/a", [b"x" * 8, b"x" * 3], limit_bytes=10)
+    assert files(storage) == []
+    assert storage.put("scenes/a", [b"x" * 10], limit_bytes=10).size_bytes == 10
+
+
+def test_an_upload_that_breaks_off_leaves_the_former_file(storage):
+    storage.put("scenes/a", [b"former"])
+
+    def chunks():
+        yield b"lat"
+        raise ConnectionError
+
+    with pytest.raises(ConnectionError):
+        storage.put("scenes/a", chunks())
+    with storage.open("scenes/a") as file:
+        assert file.read() == b"former"
+    assert files(storage) == ["scenes/a"]
+
+
+def test_a_kill_while_writing_shows_no_part_of_the_file(storage):
+    program = (
+        "import os, sys; from pathlib import Path; from app.storage import Storage\n"
+        "with Storage(Path(sys.argv[1])).writing('scenes/a') as writing:\n"
+        "    writing.write(b'x' * 100000); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", program, storage.folder], check=False)
+    assert not storage.exists("scenes/a")
+    assert storage.keys("scenes") == []
+    assert storage.sweep_unfinished(older_than_s=0.0) == 1
+    assert files(storage) == []
+
+
+def test_a_deleted_file_is_gone_with_its_empty_folders(storage):
+    storage.put("scenes/a/b/c", [b"x"])
+    storage.put("scenes/d", [b"x"])
+    storage.delete("scenes/a/b/c")
+    storage.delete("scenes/a/b/c")
+    assert not storage.exists("scenes/a/b/c")
+    assert [path.name for path in (storage.folder / "scenes").iterdir()] == ["d"]
+    with pytest.raises(NotFound):
+        storage.path("scenes/a/b/c")
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "/etc/passwd",
+        "../x",
+        "a/../../x",
+        "a//b",
+        "a/",
+        "./a",
+        ".a",
+        "a/.b",
+        "a\\b",
+        "a\0b",
+        "a\n",
+        "é",
+        "unfinished/x",
+    ],
+)
+def test_a_key_that_could_lead_elsewhere_is_refused(storage, key):
+    with pytest.raises(InputError):
+        storage.put(key, [b"x"])
+    with pytest.raises(InputError):
+        storage.path(key)
+
+
+@given(st.text())
+def test_whatever_the_key_nothing_is_named_outside_the_folder(key):
+    storage = Storage(Path("/nonexistent/storage"))
+    try:
+        found = storage.path(key)
+    except (InputError, NotFound):
+        return
+    raise AssertionError(found)
+
+
+def test_a_link_is_not_followed_out_of_the_folder(storage, tmp_path):
+    storage.put("scenes/a", [b"x"])
+    (tmp_path / "secret").write_bytes(b"secret")
+    os.symlink(tmp_path / "secret", storage.folder / "scenes" / "file")
+    os.symlink(tmp_path, storage.folder / "scenes" / "folder")
+    for key in ("scenes/file", "scenes/folder/secret"):
+        with pytest.raises(InputError, match="link"):
+            storage.path(key)
+    with pytest.raises(InputError, match="link"):
+        storage.put("scenes/folder/new", [b"x"])
+    assert storage.keys("scenes") == ["scenes/a"]
+
+
+def test_a_chip_file_is_stored_once_under_its_checksum(storage, tmp_path):
+    np.save(tmp_path / "0000.npy", numbered(3))
+    first, second = storage.put_chips(tmp_path / "0000.npy"), storage.put_chips(tmp_path / "0000.npy")
+    assert first == second
+    assert first.key == chips_key(hashlib.sha256((tmp_path / "0000.npy").read_bytes()).hexdigest())
+    assert files(storage) == [first.key]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_chips_are_read_by_row(storage, stored_chips, tmp_path, dtype):
+    np.save(tmp_path / "0000.npy", numbered(9, dtype))
+    key = storage.put_chips(tmp_path / "0000.npy").key
+    read = stored_chips.read(key, 4, 3)
+    assert read.dtype == dtype
+    np.testing.assert_array_equal(read, numbered(9, dtype)[4:7])
+    assert stored_chips.read(key, 9, 0).shape == (0, CHIP_SIZE, CHIP_SIZE)
+
+
+@pytest.mark.parametrize(("row", "count"), [(-1, 1), (0, 10), (9, 1), (8, 2), (3, -1)])
+def test_rows_that_a_chip_file_does_not_have_are_refused(storage, stored_chips, tmp_path, row, count):
+    np.save(tmp_path / "0000.npy", numbered(9))
+    with pytest.raises(FormatError, match="9 chips"):
+        stored_chips.read(storage.put_chips(tmp_path / "0000.npy").key, row, count)
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not a NumPy file",
+        npy(numbered(2))[:20],
+        npy(numbered(2).astype("float32")),
+        npy(numbered(2)[:, :100]),
+        npy(numbered(2, "uint16").astype(">u2")),
+        npy(np.asfortranarray(numbered(2))),
+        npy(numbered(2))[:-1],
+    ],
+    ids=[
+        "empty",
+        "noise",
+        "cut header",
+        "floats",
+        "wrong size",
+        "big endian",
+        "Fortran order",
+        "cut data",
+    ],
+)
+def test_a_file_that_is_not_of_chips_is_refused(storage, stored_chips, content):
+    storage.put("chips/x.npy", [content])
+    with pytest.raises(FormatError):
+        stored_chips.read("chips/x.npy", 0, 2)
+
+
+def test_more_files_than_may_be_open_are_read_by_many_threads(storage, stored_chips, monkeypatch):
+    monkeypatch.setattr("app.storage.OPEN_CHIP_FILES", 2)
+    for number in range(6):
+        storage.put(f"chips/{number}.npy", [npy(np.full((4, CHIP_SIZE, CHIP_SIZE), number, np.uint8))])
+
+    def read(number: int) -> set[int]:
+        return set(np.unique(stored_chips.read(f"chips/{number % 6}.npy", 1, 2)))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(read, range(120))) == [{number % 6} for number in range(120)]
