@@ -4,6 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("amers", deadline=None)
+settings.load_profile("amers")
 
 # Read by the linear algebra when NumPy is first imported, which is after this file.
 for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):

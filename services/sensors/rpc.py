@@ -247,11 +247,14 @@ def _normalised_lon(lon: float, offset: float, scale: float) -> float:
     return d / scale
 
 
+_FAST = {"contract", "arcp", "nsz", "reassoc"}
+"""What the compiler may do to compute a batch in vectors; NaN must keep its meaning."""
+
 _BATCH = 256
 """Points a kernel handles at once: their coordinates, side by side, stay in the nearest cache."""
 
 
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
 def _project(packed: Array, ground: Array) -> Array:
     n = len(ground)
     out = np.empty((n, 2))
@@ -300,57 +303,94 @@ def _value_and_gradient(
     )
 
 
-@njit(cache=True, error_model="numpy")
-def _project_derivative(c: Array, ground: Array) -> Array:
-    out = np.empty((len(ground), 2, 3))
-    for i in range(len(ground)):
-        x = _normalised_lon(ground[i, 0], c[84], c[87])
-        y = (ground[i, 1] - c[85]) / c[88]
-        z = (ground[i, 2] - c[86]) / c[89]
-        if not max(abs(x), max(abs(y), abs(z))) <= VALIDITY:
-            out[i] = np.nan
-            continue
-        east, north = metres_per_degree(ground[i, 1], ground[i, 2])
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _project_derivative(packed: Array, ground: Array) -> Array:
+    n = len(ground)
+    out = np.empty((n, 2, 3))
+    c = packed.copy()
+    x = np.empty(_BATCH)
+    y = np.empty(_BATCH)
+    z = np.empty(_BATCH)
+    gradient = np.empty((3, _BATCH))
+    for first in range(0, n, _BATCH):
+        size = min(_BATCH, n - first)
+        for i in range(size):
+            x[i] = _normalised_lon(ground[first + i, 0], c[84], c[87])
+            y[i] = (ground[first + i, 1] - c[85]) / c[88]
+            z[i] = (ground[first + i, 2] - c[86]) / c[89]
         for k in range(2):
-            _, gx, gy, gz = _value_and_gradient(c, 40 * k, x, y, z)
-            scale = c[82 + k]
-            out[i, k, 0] = scale * gx / (c[87] * east)
-            out[i, k, 1] = scale * gy / (c[88] * north)
-            out[i, k, 2] = scale * gz / c[89]
+            for i in range(size):
+                _, gx, gy, gz = _value_and_gradient(c, 40 * k, x[i], y[i], z[i])
+                gradient[0, i] = c[82 + k] / c[87] * gx
+                gradient[1, i] = c[82 + k] / c[88] * gy
+                gradient[2, i] = c[82 + k] / c[89] * gz
+            for i in range(size):
+                inside = abs(x[i]) <= VALIDITY and abs(y[i]) <= VALIDITY and abs(z[i]) <= VALIDITY
+                for axis in range(3):
+                    out[first + i, k, axis] = gradient[axis, i] if inside else np.nan
+        for i in range(size):
+            east, north = metres_per_degree(ground[first + i, 1], ground[first + i, 2])
+            for k in range(2):
+                out[first + i, k, 0] /= east
+                out[first + i, k, 1] /= north
     return out
 
 
-@njit(cache=True, error_model="numpy")
-def _locate(c: Array, image: Array, height: Array) -> Array:
-    out = np.empty((len(image), 3))
-    for i in range(len(image)):
-        u = (image[i, 0] - c[80]) / c[82]
-        v = (image[i, 1] - c[81]) / c[83]
-        z = (height[i] - c[86]) / c[89]
-        x = 0.0
-        y = 0.0
-        found = False
-        if abs(z) <= VALIDITY:
-            for _ in range(_LOCATE_ITERATIONS):
-                line, lx, ly, _lz = _value_and_gradient(c, 0, x, y, z)
-                sample, sx, sy, _sz = _value_and_gradient(c, 40, x, y, z)
-                du = u - line
-                dv = v - sample
-                determinant = lx * sy - ly * sx
-                if determinant == 0.0:
-                    break
-                x += (du * sy - dv * ly) / determinant
-                y += (dv * lx - du * sx) / determinant
-                if not (abs(x) <= 2.0 * VALIDITY and abs(y) <= 2.0 * VALIDITY):
-                    break
-                if abs(du) * c[82] < _LOCATE_TOLERANCE_PX and abs(dv) * c[83] < _LOCATE_TOLERANCE_PX:
-                    found = abs(x) <= VALIDITY and abs(y) <= VALIDITY
-                    break
-        if found:
-            lon = c[84] + x * c[87]
-            out[i, 0] = lon - 360.0 if lon > 180.0 else (lon + 360.0 if lon < -180.0 else lon)
-            out[i, 1] = c[85] + y * c[88]
-            out[i, 2] = height[i]
-        else:
-            out[i] = np.nan
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _newton_step(
+    c: Array, u: Array, v: Array, z: Array, x: Array, y: Array, miss: Array, size: int
+) -> int:
+    """Move a batch of points by one step; how many were not there yet.
+
+    Points that leave become NaN. `miss` is the distance before the step, 1 at the tolerance.
+    """
+    per_line = c[82] / _LOCATE_TOLERANCE_PX
+    per_sample = c[83] / _LOCATE_TOLERANCE_PX
+    left = 0
+    for i in range(size):
+        line, lx, ly, _lz = _value_and_gradient(c, 0, x[i], y[i], z[i])
+        sample, sx, sy, _sz = _value_and_gradient(c, 40, x[i], y[i], z[i])
+        du = u[i] - line
+        dv = v[i] - sample
+        inverse = 1.0 / (lx * sy - ly * sx)
+        moved_x = x[i] + (du * sy - dv * ly) * inverse
+        moved_y = y[i] + (dv * lx - du * sx) * inverse
+        kept = abs(moved_x) <= 2.0 * VALIDITY and abs(moved_y) <= 2.0 * VALIDITY
+        x[i] = moved_x if kept else np.nan
+        y[i] = moved_y
+        miss[i] = max(abs(du) * per_line, abs(dv) * per_sample)
+        left += 1 if kept and miss[i] > 1.0 else 0
+    return left
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _locate(packed: Array, image: Array, height: Array) -> Array:
+    n = len(image)
+    out = np.empty((n, 3))
+    c = packed.copy()
+    u = np.empty(_BATCH)
+    v = np.empty(_BATCH)
+    z = np.empty(_BATCH)
+    x = np.empty(_BATCH)
+    y = np.empty(_BATCH)
+    miss = np.empty(_BATCH)
+    for first in range(0, n, _BATCH):
+        size = min(_BATCH, n - first)
+        for i in range(size):
+            u[i] = (image[first + i, 0] - c[80]) / c[82]
+            v[i] = (image[first + i, 1] - c[81]) / c[83]
+            normalised = (height[first + i] - c[86]) / c[89]
+            z[i] = normalised if abs(normalised) <= VALIDITY else np.nan
+        x[:size] = 0.0
+        y[:size] = 0.0
+        for _ in range(_LOCATE_ITERATIONS):
+            if _newton_step(c, u, v, z, x, y, miss, size) == 0:
+                break
+        for i in range(size):
+            found = abs(x[i]) <= VALIDITY and abs(y[i]) <= VALIDITY and miss[i] <= 1.0
+            lon = c[84] + x[i] * c[87]
+            lon -= 360.0 if lon > 180.0 else (-360.0 if lon < -180.0 else 0.0)
+            out[first + i, 0] = lon if found else np.nan
+            out[first + i, 1] = c[85] + y[i] * c[88] if found else np.nan
+            out[first + i, 2] = height[first + i] if found else np.nan
     return out

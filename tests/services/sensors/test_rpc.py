@@ -84,12 +84,21 @@ def test_positions_far_away_are_nan_and_leave_the_others_alone(far: float) -> No
 
 @pytest.mark.parametrize("rows", [0, 1, 255, 256, 257, 1000])
 def test_any_number_of_rows_gives_the_same_result_as_one_by_one(rows: int) -> None:
-    ground = ground_of(MODEL, rows)
-    together = MODEL.project(ground)
-    assert together.shape == (rows, 2)
-    one_by_one = [MODEL.project(ground[i : i + 1])[0] for i in range(rows)]
-    if rows:
-        np.testing.assert_allclose(together, one_by_one, rtol=0.0, atol=a_nanopixel)
+    ground = ground_of(MODEL, rows, extent=2.5)
+    projected, derivative = MODEL.project(ground), MODEL.project_derivative(ground)
+    line_sample = np.random.default_rng(8).uniform(-60_000.0, 90_000.0, (rows, 2))
+    located = MODEL.locate(line_sample, ground[:, 2])
+    assert (projected.shape, derivative.shape, located.shape) == ((rows, 2), (rows, 2, 3), (rows, 3))
+    assert rows < 255 or 0 < np.isnan(projected[:, 0]).sum() < rows
+    assert rows < 255 or 0 < np.isnan(located[:, 0]).sum() < rows
+    for i in range(rows):
+        one = slice(i, i + 1)
+        for together, alone in (
+            (projected[i], MODEL.project(ground[one])[0]),
+            (derivative[i], MODEL.project_derivative(ground[one])[0]),
+            (located[i], MODEL.locate(line_sample[one], ground[one, 2])[0]),
+        ):
+            np.testing.assert_allclose(together, alone, rtol=1e-12, atol=a_nanopixel)
 
 
 def test_rows_in_any_layout_are_taken() -> None:
