@@ -25,8 +25,8 @@ class RpcFit:
 
     Attributes:
         model: the rational polynomials.
-        max_error_px, rms_error_px: distance in the image, over a grid of points that were not used by
-            the fit and lie between those that were.
+        max_error_px, rms_error_px: distance in the image, over a finer grid of points that were not
+            used by the fit; infinite where the fitted model says nothing.
     """
 
     model: RpcModel
@@ -57,13 +57,14 @@ def fit_rpc(
     Raises:
         CoverageError: when the model cannot locate the whole image over the range of heights.
     """
-    between = (nodes[0] - 1, nodes[1] - 1, nodes[2] - 1)
+    between = (2 * nodes[0] + 5, 2 * nodes[1] + 5, nodes[2] - 1)
     image, ground = _grid(model, shape, height_range_m, nodes, _MARGIN)
     check_image, check_ground = _grid(model, shape, height_range_m, between, _CHECK_MARGIN)
     fits = []
     for ridge in RIDGES:
         fitted = _fit(image, ground, shape, height_range_m, ridge)
         error_px = np.linalg.norm(fitted.project(check_ground) - check_image, axis=1)
+        error_px[np.isnan(error_px)] = np.inf
         rms_px = float(np.sqrt(np.mean(error_px**2)))
         fits.append(RpcFit(fitted, float(error_px.max()), rms_px))
     return min(fits, key=lambda fit: fit.max_error_px)

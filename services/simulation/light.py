@@ -67,11 +67,9 @@ def radiance_of_day(
 
 
 def roof_clearance_m(world: World) -> float:
-    """How far the highest roof stands above the terrain."""
-    return max(
-        float((world.roof_m[r : r + _STRIP_ROWS] - world.terrain_m[r : r + _STRIP_ROWS]).max())
-        for r in range(0, len(world.roof_m), _STRIP_ROWS)
-    )
+    """How far a roof stands above the terrain at most; zero without buildings."""
+    strips = (slice(r, r + _STRIP_ROWS) for r in range(0, len(world.roof_m), _STRIP_ROWS))
+    return max(0.0, *(float((world.roof_m[s] - world.terrain_m[s]).max()) for s in strips))
 
 
 def near_buildings(roof_m: FloatImage, reach: int, block: int = 16) -> BoolArray:

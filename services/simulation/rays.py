@@ -54,6 +54,8 @@ def meet_building(
     Returns:
         What is met and at which height.
     """
+    if not top > ground:
+        return GROUND, ground
     rows, columns = roof.shape
     x, y = x0 + top * by_h_x + 0.5, y0 + top * by_h_y + 0.5
     column, row = math.floor(x), math.floor(y)
@@ -144,6 +146,8 @@ def meet_surface(
     terrain: FloatImage, roof: FloatImage, low: Array, high: Array, h_low: float, h_high: float
 ) -> tuple[Array, npt.NDArray[np.int64]]:
     """Heights (n,) at which lines of sight meet the surface first, and what they meet.
+
+    The height of a line that is not a number is none.
 
     Args:
         terrain, roof: of the world.

@@ -136,7 +136,7 @@ def _sight(world: World, incidence_deg: float) -> _Sight:
             f"a view under {incidence_deg:g} degrees of slopes up to {steepness / tangent:.2f} m/m "
             "would need terrain that hides itself, which is not simulated"
         )
-    clearance_m = max(roof_clearance_m(world), 0.0) / (1.0 - steepness) + 0.1
+    clearance_m = roof_clearance_m(world) / (1.0 - steepness) + 0.1
     low, high = world.height_range_m
     return _Sight(
         near=near_buildings(world.roof_m, math.ceil(clearance_m * tangent / world.posting_m) + 2),

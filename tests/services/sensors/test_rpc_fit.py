@@ -1,0 +1,87 @@
+"""An RPC follows a smooth model within a hundredth of a pixel, and says so honestly when it cannot."""
+
+import numpy as np
+import pytest
+
+from services.errors import CoverageError
+from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
+from services.sensors.pushbroom import PushbroomModel
+from services.sensors.rpc import check_rpc
+from services.sensors.rpc_fit import fit_rpc
+from services.simulation.orbit import pushbroom_over
+
+HEIGHTS_M = (50.0, 850.0)
+a_hundredth_of_a_pixel = 0.01
+a_thousandth_of_a_pixel = 0.001
+
+
+def a_pushbroom(shape: tuple[int, int], jitter_px: float = 0.0, lon: float = 5.4) -> PushbroomModel:
+    """A pushbroom that looks 25 degrees to the side."""
+    target = np.array([lon, 43.6, 300.0])
+    return pushbroom_over(target, shape, 0.5, 25.0, 110.0, HEIGHTS_M, jitter_px=jitter_px)
+
+
+def error_px(model, fitted, shape: tuple[int, int]) -> np.ndarray:
+    """Distance between two models at random places of the image and heights."""
+    rng = np.random.default_rng(6)
+    image = rng.uniform(0.0, 1.0, (3000, 2)) * (np.array(shape) - 1.0)
+    ground = model.locate(image, rng.uniform(*HEIGHTS_M, len(image)))
+    return np.linalg.norm(fitted.project(ground) - image, axis=1)
+
+
+@pytest.mark.parametrize("shape", [(300, 400), (3000, 3000), (20_000, 20_000)])
+def test_an_rpc_follows_a_pushbroom_within_a_thousandth_of_a_pixel(shape: tuple[int, int]) -> None:
+    model = a_pushbroom(shape)
+    fit = fit_rpc(model, shape, HEIGHTS_M)
+    check_rpc(fit.model, "the fit")
+    assert fit.max_error_px < a_thousandth_of_a_pixel
+    assert error_px(model, fit.model, shape).max() < a_thousandth_of_a_pixel
+
+
+def test_the_range_of_heights_is_that_of_the_fit() -> None:
+    fit = fit_rpc(a_pushbroom((300, 400)), (300, 400), HEIGHTS_M)
+    assert fit.model.height_range_m == pytest.approx(HEIGHTS_M)
+
+
+def test_an_rpc_is_fitted_across_the_antimeridian() -> None:
+    shape = (2000, 2000)
+    assert fit_rpc(a_pushbroom(shape, lon=180.0), shape, HEIGHTS_M).max_error_px < 0.001
+
+
+def test_what_no_rpc_can_follow_is_reported_as_large_as_it_is() -> None:
+    shape = (40_000, 2000)
+    model = a_pushbroom(shape, jitter_px=3.0)
+    fit = fit_rpc(model, shape, HEIGHTS_M)
+    found = error_px(model, fit.model, shape)
+    assert fit.max_error_px > 0.5
+    assert fit.rms_error_px == pytest.approx(np.sqrt((found**2).mean()), rel=0.2)
+    assert fit.max_error_px >= 0.8 * found.max()
+
+
+def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
+    shape = (5000, 4000)
+    rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
+    plain = no_correction(shape)
+    affine = ImageCorrection(
+        np.array([[40.0, 3.0, -2.0], [-25.0, 1.5, 4.0]]), plain.centre, plain.half_size
+    )
+    corrected = CorrectedModel(rpc, affine)
+    fit = fit_rpc(corrected, shape, HEIGHTS_M)
+    assert fit.max_error_px < a_hundredth_of_a_pixel
+    assert error_px(corrected, fit.model, shape).max() < a_hundredth_of_a_pixel
+
+
+def test_a_drift_is_refitted_to_what_folding_gives_exactly() -> None:
+    shape = (3000, 3000)
+    rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
+    plain = no_correction(shape)
+    drift = ImageCorrection(
+        np.array([[10.0, 2.0, 0.0], [-5.0, 0.0, -1.0]]), plain.centre, plain.half_size
+    )
+    refitted = fit_rpc(CorrectedModel(rpc, drift), shape, HEIGHTS_M).model
+    assert error_px(fold_into_rpc(rpc, drift), refitted, shape).max() < a_hundredth_of_a_pixel
+
+
+def test_a_model_that_does_not_reach_the_heights_is_refused_with_numbers() -> None:
+    with pytest.raises(CoverageError, match=r"only \d+ of 2048 points"):
+        fit_rpc(a_pushbroom((300, 400)), (300, 400), (-6.4e6, 100.0))
