@@ -8,7 +8,7 @@ READY := .venv/ready
 
 .PHONY: demo test check serve bench postgis
 
-demo: $(READY) postgis
+demo: postgis
 	$(BIN)/amers demo
 
 test: check postgis
@@ -20,13 +20,13 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-serve: $(READY) postgis
+serve: postgis
 	$(BIN)/amers serve
 
-bench: $(READY) postgis
+bench: postgis
 	set -e; for script in benchmarks/[a-z]*.py; do $(BIN)/python $$script; done
 
-postgis:
+postgis: $(READY)
 	@scripts/ensure-postgis
 
 $(READY): pyproject.toml constraints.txt scripts/make-venv
