@@ -2,22 +2,28 @@
 
 import os
 import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import rasterio
 import rasterio.rpc
 from rasterio.enums import MaskFlags
-from rasterio.errors import RasterioError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
 from services.imagery import Window
 from services.sensors.rpc import RpcModel
 from services.types import FloatImage
+
+# An image that has not been rectified has a sensor model instead: nothing to warn of.
+warnings.simplefilter("ignore", NotGeoreferencedWarning)
 
 DRIVER_OF_SIGNATURE = {
     b"II*\0": "GTiff",
@@ -131,19 +137,19 @@ def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:
 
     Args:
         path_in: the image as delivered; never written to.
-        path_out: the copy; must not be there yet.
+        path_out: the copy; a file of that name is replaced.
         model: in pixels from the centre of the first one.
 
     Raises:
-        FormatError: when the image is not a GeoTIFF, or the copy is there already.
+        FormatError: when the image is not a GeoTIFF, or the copy would be the image itself.
     """
     image = open_raster(path_in)
     driver = image.dataset.driver
     image.close()
     if driver != "GTiff":
         raise FormatError(f"{path_in}: only a GeoTIFF can carry RPC tags, this is {driver}")
-    if path_out.exists():
-        raise FormatError(f"{path_out}: there is a file of that name already")
+    if path_out.resolve() == path_in.resolve():
+        raise FormatError(f"{path_out}: the delivered image would be written over")
     shutil.copyfile(path_in, path_out)
     with (
         _as_format_error(path_out, "a GeoTIFF whose tags can be written"),
@@ -151,6 +157,36 @@ def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:
         rasterio.open(path_out.resolve(), "r+", driver="GTiff", IGNORE_COG_LAYOUT_BREAK="YES") as copy,
     ):
         copy.rpcs = gdal_rpc(model)
+
+
+def write_raster(path: Path, pixels: npt.NDArray[Any], model: RpcModel | None = None) -> None:
+    """Write one band as a tiled, compressed GeoTIFF.
+
+    Args:
+        path: a file of that name is replaced.
+        pixels: (lines, samples) uint8, uint16 or float32.
+        model: goes into RPC tags, in pixels from the centre of the first one.
+    """
+    lines, samples = pixels.shape
+    with (
+        rasterio.Env(**_OPTIONS),
+        rasterio.open(
+            path.resolve(),
+            "w",
+            driver="GTiff",
+            height=lines,
+            width=samples,
+            count=1,
+            dtype=pixels.dtype,
+            tiled=True,
+            compress="deflate",
+            predictor=3 if pixels.dtype.kind == "f" else 2,
+            BIGTIFF="IF_SAFER",
+        ) as file,
+    ):
+        file.write(pixels, 1)
+        if model is not None:
+            file.rpcs = gdal_rpc(model)
 
 
 def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:

@@ -22,16 +22,16 @@ CE90_TO_SIGMA = 1.0 / math.sqrt(2.0 * math.log(10.0))
 CE90_M = (
     ("PHR", 8.5),
     ("PNEO", 5.0),
-    ("SPOT6", 35.0),
-    ("SPOT7", 35.0),
+    ("SPOT6", 10.0),
+    ("SPOT7", 10.0),
     ("WV", 5.0),
     ("GE01", 5.0),
     ("QB02", 21.0),
 )
 """Horizontal accuracy without control, by the start of the sensor's name.
 
-Sources: Pléiades, Pléiades Neo and SPOT 6/7, the imagery user guides of Airbus Defence and Space
-(primary products, incidence to 30 degrees); WorldView and GeoEye, "better than 5 m CE90" of their
+Sources: Pléiades and Pléiades Neo, imagery user guides of Airbus Defence and Space (incidence to 30
+degrees); SPOT 6/7, their technical sheet; WorldView and GeoEye, "better than 5 m CE90" of their
 operator; QuickBird, Smiley (2009), the worst quarter of two years.
 """
 

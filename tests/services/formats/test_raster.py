@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import FormatError
-from services.formats.raster import copy_with_rpc, open_raster
+from services.formats.raster import copy_with_rpc, open_raster, write_raster
 from services.formats.rpc_text import parse_rpc_text
 from services.imagery import ArrayImage, Window
 
@@ -184,10 +184,25 @@ def test_a_copy_has_the_new_tags_and_the_same_pixels(tmp_path: Path, driver: str
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.tif", "b.tif"]
 
 
-def test_a_copy_neither_replaces_a_file_nor_changes_the_kind_of_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_what_is_written_is_read(tmp_path: Path, dtype: str) -> None:
+    pixels = np.tile(PIXELS, (4, 4)).astype(dtype)
+    write_raster(tmp_path / "a.tif", pixels, MODEL)
+    image = open_raster(tmp_path / "a.tif")
+    np.testing.assert_array_equal(image.read(Window(0, 0, *image.shape)), pixels)
+    assert image.dataset.rpcs.samp_off == MODEL.image_offset[1]
+
+
+def test_a_copy_replaces_an_older_one_but_never_the_image_itself(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif")
-    with pytest.raises(FormatError, match="there is a file of that name already"):
+    (tmp_path / "b.tif").write_bytes(b"half a copy")
+    copy_with_rpc(path, tmp_path / "b.tif", MODEL)
+    assert open_raster(tmp_path / "b.tif").shape == PIXELS.shape
+    with pytest.raises(FormatError, match="the delivered image would be written over"):
         copy_with_rpc(path, path, MODEL)
+
+
+def test_only_a_geotiff_takes_rpc_tags(tmp_path: Path) -> None:
     nitf = write(tmp_path / "a.ntf", driver="NITF")
     with pytest.raises(FormatError, match="only a GeoTIFF can carry RPC tags, this is NITF"):
         copy_with_rpc(nitf, tmp_path / "b.tif", MODEL)
