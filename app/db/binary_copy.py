@@ -66,13 +66,15 @@ def points_z(lon_lat_h: Array) -> Column:
     return Column(data, np.full(len(lon_lat_h), 33))
 
 
-def copy_bytes(columns: Sequence[Column]) -> Iterator[bytes]:
-    """The bytes of a COPY FROM of these columns, in pieces."""
-    yield HEADER
-    for start in range(0, len(columns[0].length), ROWS_AT_ONCE):
+def copy_pieces(columns: Sequence[Column]) -> Iterator[tuple[bytes, int]]:
+    """The bytes of a COPY FROM of these columns, in pieces, and how many rows each piece holds."""
+    total = len(columns[0].length)
+    yield HEADER, 0
+    for start in range(0, total, ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
-        yield _rows([Column(column.data[part], column.length[part]) for column in columns])
-    yield TRAILER
+        rows = [Column(column.data[part], column.length[part]) for column in columns]
+        yield _rows(rows), len(rows[0].length)
+    yield TRAILER, 0
 
 
 def _rows(columns: Sequence[Column]) -> bytes:

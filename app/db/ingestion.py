@@ -51,19 +51,15 @@ def load_contents(
     """
     _insert_images(connection, number, contents)
     file_ids = _insert_chip_files(connection, number, files)
-    _copy(connection, f"point ({POINT_COLUMNS})", _point_columns(number, contents, file_ids), progress)
-    _copy(connection, f"view ({VIEW_COLUMNS})", _view_columns(number, contents), progress)
-
-
-def _copy(
-    connection: Connection, table: str, columns: Sequence[binary.Column], progress: Progress
-) -> None:
-    name, rows, sent = table.split(" ")[0], len(columns[0].length), 0
-    with connection.cursor() as cursor, cursor.copy(f"copy {table} from stdin (format binary)") as copy:
-        for piece in binary.copy_bytes(columns):
-            copy.write(piece)
-            progress(min(1.0, sent / rows), f"loading rows of table {name}")
-            sent += binary.ROWS_AT_ONCE
+    points, views = _point_columns(number, contents, file_ids), _view_columns(number, contents)
+    total, sent = len(points[0].length) + len(views[0].length), 0
+    for table, names, columns in (("point", POINT_COLUMNS, points), ("view", VIEW_COLUMNS, views)):
+        statement = f"copy {table} ({names}) from stdin (format binary)"
+        with connection.cursor() as cursor, cursor.copy(statement) as copy:
+            for piece, rows in binary.copy_pieces(columns):
+                copy.write(piece)
+                sent += rows
+                progress(sent / total, f"loading rows of table {table}")
 
 
 def _point_columns(number: int, contents: BlockContents, file_ids: IntArray) -> list[binary.Column]:

@@ -135,7 +135,7 @@ def test_a_box_across_the_antimeridian_holds_both_sides_and_nothing_between(
 
 
 @pytest.mark.parametrize(
-    "token", ["", "x", "AAAA", "a" * 32, "é" * 8, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
+    "page_token", ["", "x", "AAAA", "a" * 32, "é" * 8, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
 )
 def test_a_token_that_was_not_given_is_refused(made, get, page_token):
     reply = get(f"{ITEMS}?token={page_token}")
