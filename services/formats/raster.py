@@ -120,15 +120,16 @@ def open_raster(path: Path, band: int = 1) -> RasterImage:
     if "://" in str(path) or str(path).startswith("/vsi") or not resolved.is_file():
         raise FormatError(f"{path}: expected the name of an image file")
     driver = _driver(path)
-    with _as_format_error(path, f"the image as {driver}"), rasterio.Env(**_OPTIONS):
-        dataset = rasterio.open(resolved, driver=driver)
-    image = RasterImage(path, dataset, band)
-    try:
-        _check_declaration(image)
-        image.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
-    except FormatError:
-        dataset.close()
-        raise
+    with rasterio.Env(**_OPTIONS):
+        with _as_format_error(path, f"the image as {driver}"):
+            dataset = rasterio.open(resolved, driver=driver)
+        image = RasterImage(path, dataset, band)
+        try:
+            _check_declaration(image)
+            image.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
+        except FormatError:
+            dataset.close()
+            raise
     return image
 
 
