@@ -28,8 +28,8 @@ class BlockOptions:
 
     cauchy: float = 2.385
     tolerance: float = 4.0
-    max_iterations: int = 50
-    converged_px: float = 1e-4
+    max_iterations: int = 100
+    converged_px: float = 1e-3
     min_points: int = 6
 
 

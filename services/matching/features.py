@@ -23,13 +23,15 @@ class FeatureOptions:
     """How tie points are found.
 
     Attributes:
-        per_megapixel: features kept for every million pixels of an image, the strongest of each tile.
+        per_image: features aimed at in an image, the strongest of each tile.
+        per_megapixel: most features kept for a million pixels; small images reach it first.
         max_ratio: largest ratio between the distances to the best and the second best descriptor.
         tolerance_px: how far matches may scatter across the rays round their common offset.
         sigma_px: of a feature's position, one standard deviation a coordinate.
         cell_px: features are compared within squares of this size, pixels of the second image.
     """
 
+    per_image: int = 12_000
     per_megapixel: int = 10_000
     max_ratio: float = 0.8
     tolerance_px: float = 1.5
@@ -79,6 +81,7 @@ def tie_points(
 def find_features(image: ImageSource, options: FeatureOptions) -> Features:
     """SIFT features of an image, tile by tile, the strongest of every tile."""
     positions, descriptors = [], []
+    per_pixel = min(options.per_megapixel / 1e6, options.per_image / (image.shape[0] * image.shape[1]))
     for line in range(0, image.shape[0], _TILE_PX):
         for sample in range(0, image.shape[1], _TILE_PX):
             lines = min(_TILE_PX, image.shape[0] - line)
@@ -89,9 +92,7 @@ def find_features(image: ImageSource, options: FeatureOptions) -> Features:
                 lines + 2 * _TILE_MARGIN_PX,
                 samples + 2 * _TILE_MARGIN_PX,
             )
-            found = _tile_features(
-                image.read(window), options.per_megapixel * lines * samples // 1_000_000
-            )
+            found = _tile_features(image.read(window), int(per_pixel * lines * samples))
             own = found.line_sample - _TILE_MARGIN_PX
             kept = ((own >= -0.5) & (own < [lines - 0.5, samples - 0.5])).all(axis=1)
             positions.append(own[kept] + [line, sample])
