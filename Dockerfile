@@ -1,0 +1,37 @@
+# The API and the worker: one image, two commands. Without AMERS_DATABASE_URL it would need PostgreSQL's
+# binaries, which it does not have: see docker-compose.yml.
+FROM python:3.12-slim-bookworm AS build
+
+WORKDIR /build
+RUN python -m venv /opt/amers
+COPY constraints.txt ./
+COPY pyproject.toml README.md LICENSE ./
+COPY app app
+COPY migrations migrations
+COPY services services
+RUN --mount=type=cache,target=/root/.cache/pip /opt/amers/bin/pip install -c constraints.txt .
+
+FROM python:3.12-slim-bookworm
+
+# libexpat1: a system library of the raster driver's wheel. postgresql-client: amers db backup and restore;
+# its version is not older than the server of docker-compose.yml.
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends libexpat1 postgresql-client \
+    && rm -rf /var/lib/apt/lists/* \
+    && useradd --system --uid 10001 --home-dir /var/lib/amers --create-home amers
+
+COPY --from=build /opt/amers /opt/amers
+
+ENV PATH=/opt/amers/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    OPENBLAS_NUM_THREADS=1 \
+    OMP_NUM_THREADS=1 \
+    NUMBA_CACHE_DIR=/var/lib/amers/numba \
+    AMERS_DATA_FOLDER=/var/lib/amers \
+    AMERS_HOST=0.0.0.0
+
+USER amers
+VOLUME /var/lib/amers
+EXPOSE 8000
+STOPSIGNAL SIGTERM
+CMD ["amers", "serve", "--no-worker"]
