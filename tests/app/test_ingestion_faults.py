@@ -141,7 +141,7 @@ def test_a_block_that_changes_while_it_is_ingested_is_refused(connection, storag
 
 @pytest.fixture
 def own(open_folder):
-    """A cluster of this test alone. What a killed process wrote survives without being forced to the disk."""
+    """A cluster of this test alone; what a killed process wrote survives without a sync."""
     return Cluster(open_folder / uuid4().hex[:8], durable=False)
 
 
