@@ -41,10 +41,11 @@ MAX_PIXELS = 40_000_000_000
 MAX_EXPANSION = 5_000
 """Bytes of pixels a byte of file may declare: Deflate reaches 1,032 on a constant image."""
 
-_OPTIONS = {
+# GDAL falls back to a twentieth of the machine's memory outside the environment that says otherwise.
+_CACHE = {"GDAL_CACHEMAX": 256_000_000}
+_OPTIONS = _CACHE | {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-    "GDAL_CACHEMAX": 256_000_000,
     "GDAL_NUM_THREADS": 1,
     "OPJ_NUM_THREADS": 1,
 }
@@ -94,7 +95,7 @@ class RasterImage:
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
         flags = self.dataset.mask_flag_enums[self.band - 1]
         nodata = self.dataset.nodatavals[self.band - 1]
-        with _as_format_error(self.path, "its pixels"):
+        with _as_format_error(self.path, "its pixels"), rasterio.Env(**_CACHE):
             pixels = self.dataset.read(self.band, window=window)
             out[:] = pixels
             if MaskFlags.nodata in flags:
