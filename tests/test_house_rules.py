@@ -1,0 +1,117 @@
+"""What holds the house together: imports, the tour, and documents that name everything there is."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+from typer.main import get_command
+
+from app.cli.main import app
+from app.config import Settings
+
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+OPERATIONS = ROOT / "docs" / "operations.md"
+TOUR = (
+    "app/api/scenes.py",
+    "app/usecases/registration.py",
+    "services/registration.py",
+    "services/matching/correlate.py",
+    "services/adjustment/scene.py",
+    "services/sensors/rpc.py",
+)
+NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}
+LONGEST_FILE = 450
+
+
+def modules() -> Iterator[Path]:
+    for package in ("app", "services", "migrations"):
+        yield from sorted((ROOT / package).rglob("*.py"))
+
+
+def commands() -> list[str]:
+    """Every command in words, such as `amers db upgrade`."""
+
+    def below(command: object, words: str) -> Iterator[str]:
+        inner = getattr(command, "commands", None)
+        if inner is None:
+            yield words
+        else:
+            for name, child in inner.items():
+                yield from below(child, f"{words} {name}")
+
+    assert isinstance(app, typer.Typer)
+    return sorted(below(get_command(app), "amers"))
+
+
+def test_imports_keep_to_their_layers():
+    program = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("path", TOUR)
+def test_a_stop_of_the_tour_exists_and_the_readme_leads_to_it(path):
+    assert (ROOT / path).is_file()
+    assert f"`{path}`" in README.read_text()
+
+
+def test_every_file_that_the_readme_names_exists():
+    named = re.findall(r"\]\((?!https?:|#)([^)#]+)", README.read_text())
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("name", Settings.model_fields)
+def test_a_setting_is_documented(name):
+    assert f"AMERS_{name.upper()}" in OPERATIONS.read_text()
+
+
+@pytest.mark.parametrize("words", commands())
+def test_a_command_is_documented_and_explains_itself(words):
+    assert words in README.read_text() + OPERATIONS.read_text()
+    command = get_command(app)
+    for word in words.split()[1:]:
+        command = command.commands[word]
+    assert command.help
+
+
+def test_only_the_settings_read_the_environment():
+    reading = re.compile(r"os\.(getenv|environ(\.get|\[))")
+    assert [path for path in modules() if reading.search(path.read_text())] == [
+        ROOT / "app" / "config.py"
+    ]
+
+
+def test_every_module_says_what_it_is_for_and_has_a_name_that_means_something():
+    for path in modules():
+        assert path.read_text()[:4].startswith(('"""', 'r"""')) or path.name == "__init__.py", path
+        assert path.stem not in NAMELESS, path
+
+
+def test_no_file_has_grown_out_of_one_sentence():
+    long = {
+        str(path): lines
+        for path in modules()
+        if (lines := len(path.read_text().splitlines())) > LONGEST_FILE
+    }
+    assert long == {}
+
+
+def test_what_is_installed_beside_each_other_has_exact_versions_without_addresses():
+    lines = (ROOT / "constraints.txt").read_text().split()
+    assert lines == [
+        line for line in lines if re.fullmatch(r"[A-Za-z0-9_.\-]+==[0-9][A-Za-z0-9.+]*", line)
+    ]
+
+
+def test_a_real_image_is_asked_for_by_its_marker():
+    for path in (ROOT / "tests").rglob("test_*.py"):
+        text = path.read_text()
+        if re.search(r"\breal_data\b[,)]", text.replace("mark.real_data", "")):
+            assert "mark.real_data" in text, path
