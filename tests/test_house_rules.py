@@ -25,7 +25,7 @@ TOUR = (
     "services/sensors/rpc.py",
 )
 NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}
-LONGEST_FILE = 450
+LONGEST_FILE = 500
 
 
 def modules() -> Iterator[Path]:
