@@ -4,22 +4,25 @@ import logging
 import re
 import time
 from dataclasses import dataclass, field
+from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
 
 from psycopg import OperationalError
 
 from app.auth import Scope, allows, require
+from app.config import Settings
 from app.db import jobs
 from app.db.engine import Connection, Database
 from app.db.jobs import Job, LostJob
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NotFound
 from app.storage import Storage
+from app.usecases.block_ingestion import INGEST_BLOCK
 from app.usecases.processes import Process, Work
 from app.usecases.registration import REGISTER_SCENE
 
-PROCESSES: dict[str, Process] = {process.id: process for process in (REGISTER_SCENE,)}
+PROCESSES: dict[str, Process] = {process.id: process for process in (REGISTER_SCENE, INGEST_BLOCK)}
 LONGEST_KEY = 200
 REPORT_EVERY_S = 0.5
 
@@ -111,7 +114,7 @@ def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:
     return visible_job(connection, caller, job_id)
 
 
-def do_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int) -> None:
+def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: int) -> None:
     """Do the work of a job and write its outcome, once.
 
     An error that concerns the user ends the job; any other leaves it to the caller.
@@ -124,24 +127,28 @@ def do_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int)
     if job is None or (job.attempt, job.state) != (attempt, "running"):
         raise LostJob(f"attempt {attempt} of job {job_id} is over")
     process = find_process(job.kind)
+    storage = Storage(settings.data_folder / "storage")
     try:
         inputs = process.parse_inputs(job.inputs)
-        commit = process.run(Work(job, inputs, database, storage, _ReportedProgress(database, job)))
+        progress = _ReportedProgress(database, job)
+        commit = process.run(Work(job, inputs, database, storage, settings, progress))
         with database.transaction() as connection:
             results = commit(connection)
             jobs.succeed(connection, job.id, attempt, results)
     except AmersError as error:
         log.info("job %s: %s: %s", job.id, type(error).__name__, error)
         with database.transaction() as connection:
-            jobs.fail(connection, job.id, attempt, error_details(error))
+            jobs.fail(connection, job.id, attempt, error_details(error, storage))
 
 
-def error_details(error: AmersError) -> dict[str, Any]:
-    """Problem details (RFC 9457) of an error, with the numbers it carries."""
+def error_details(error: AmersError, storage: Storage) -> dict[str, Any]:
+    """Problem details (RFC 9457) of an error: the numbers it carries, no folder of this machine."""
+    folder = rf"{re.escape(str(storage.folder))}/(scenes|results)/[^/\s]+/"
+    detail = re.sub(rf"{folder}|{re.escape(gettempdir())}/(amers-\w+/)?", "", str(error))
     name = type(error).__name__
     title = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
     numbers = {key: value for key, value in vars(error).items() if isinstance(value, int | float | str)}
-    return {"type": "about:blank", "title": title, "detail": str(error), "error": name, **numbers}
+    return {"type": "about:blank", "title": title, "detail": detail, "error": name, **numbers}
 
 
 @dataclass

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from app.auth import Scope
+from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.jobs import Job
 from app.db.tokens import Token
@@ -24,7 +25,6 @@ class Work:
 
     Attributes:
         inputs: of the process's own type.
-        attempt_folder: where the storage keeps files of this attempt and of no other.
         progress: to be called often; it also notices that the job was dismissed.
     """
 
@@ -32,6 +32,7 @@ class Work:
     inputs: Any
     database: Database
     storage: Storage
+    settings: Settings
     progress: Progress
 
     @property

@@ -16,11 +16,11 @@ from app.db import registrations, scenes
 from app.db.engine import Connection, Database
 from app.db.points import control_points
 from app.db.tokens import Token
-from app.errors import Conflict
+from app.errors import Conflict, InputError
 from app.storage import Storage, StoredChips
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.registration_files import OUTPUTS, write_outputs
-from app.usecases.scenes import visible_scene
+from app.usecases.scenes import clean_name, folder_of, visible_scene
 from services.formats.block import FolderChips, read_block
 from services.formats.scenes import read_scene
 from services.registration import Registration, RegistrationOptions, register_scene
@@ -40,10 +40,12 @@ class RegisterScene:
 
     Attributes:
         scene: id of an uploaded scene.
+        model: name of the uploaded file that holds its model; by default it is found.
         options: of the registration.
     """
 
     scene: UUID
+    model: str | None = None
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
 
@@ -188,6 +190,8 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
     scene = visible_scene(connection, caller, inputs.scene)
     if scene.state != "uploaded":
         raise Conflict(f"scene {inputs.scene} cannot be registered: its image is {scene.state}")
+    if inputs.model is not None and inputs.model != clean_name(inputs.model):
+        raise InputError(f"model: {inputs.model!r} is not the name of an uploaded file")
 
 
 def _run(work: Work) -> Commit:
@@ -197,7 +201,8 @@ def _run(work: Work) -> Commit:
         scene = scenes.find_scene(connection, inputs.scene)
     if scene is None or scene.file_key is None:
         raise Conflict(f"scene {inputs.scene} has been removed")
-    files = SceneFiles(work.storage.path(scene.file_key), sigma_m=scene.sigma_m)
+    model = inputs.model and work.storage.path(f"{folder_of(scene.id)}/{inputs.model}")
+    files = SceneFiles(work.storage.path(scene.file_key), model or None, scene.sigma_m)
     find_points = points_of_store(work.database, work.storage)
     with TemporaryDirectory(prefix="amers-") as folder:
         made = run_registration(files, find_points, inputs.options, Path(folder), work.progress)

@@ -140,9 +140,11 @@ class Attempts:
 
     def _installation(self) -> dict[str, str]:
         """Where the process finds the database, which this worker keeps running, and the files."""
+        ingest = self.settings.ingest_folder
         return {
             "AMERS_DATABASE_URL": self.database.dsn,
             "AMERS_DATA_FOLDER": str(self.settings.data_folder),
+            **({} if ingest is None else {"AMERS_INGEST_FOLDER": str(ingest)}),
         }
 
     def _watch(self, job: Job, process: "subprocess.Popen[bytes]") -> int:

@@ -19,7 +19,6 @@ import cv2
 from app.config import read_settings
 from app.db.engine import pooled
 from app.db.jobs import LostJob
-from app.storage import Storage
 from app.usecases.jobs import do_attempt
 from app.worker.attempt import OUT_OF_MEMORY
 
@@ -34,12 +33,12 @@ def main(arguments: list[str]) -> int:
     job_id, attempt, worker_pid, memory_bytes = arguments
     die_with(int(worker_pid))
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    limit_memory(int(memory_bytes))
     settings = read_settings()
     assert settings.database_url is not None, "the worker names its database"
     try:
         with pooled(settings.database_url.get_secret_value(), settings) as database:
-            do_attempt(database, Storage(settings.data_folder / "storage"), UUID(job_id), int(attempt))
+            limit_memory(int(memory_bytes))
+            do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:
         log.info("%s", lost)
     except MemoryError:

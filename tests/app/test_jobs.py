@@ -355,7 +355,8 @@ def test_entries_of_the_queue_that_died_with_their_worker_are_forgotten(database
             "insert into procrastinate_workers (last_heartbeat) values (now() - interval '1 h')"
         )
         connection.execute(
-            "update procrastinate_jobs set status = 'doing', worker_id = (select id from procrastinate_workers)"
+            "update procrastinate_jobs set status = 'doing',"
+            " worker_id = (select id from procrastinate_workers)"
         )
     sweep_jobs(database, LEASE_S)
     with database.transaction() as connection:

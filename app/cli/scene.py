@@ -1,0 +1,176 @@
+"""`amers scene`: scenes and their registration."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli.output import AsJson, print_json, show_one
+from app.cli.progress import shown_progress
+from app.cli.remote import Service, ServiceFailure
+from app.config import read_settings
+from app.db import engine
+from app.errors import AmersError, ComputationError, InputError
+from app.storage import Storage
+from app.usecases.registration import (
+    SceneFiles,
+    points_of_block,
+    points_of_store,
+    record,
+    run_registration,
+)
+from services.registration import RegistrationOptions
+from services.reports.document import report_document
+from services.types import Progress
+
+app = typer.Typer(help="Scenes and their registration.", no_args_is_help=True)
+
+Register = Callable[[SceneFiles, Path, Progress], dict[str, Any]]
+"""Registers one scene, writes what came out of it into a folder, returns the report as a document."""
+
+
+@app.callback()
+def group() -> None:
+    """Scenes and their registration."""
+
+
+@app.command()
+def register(
+    scenes: Annotated[list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    block: Annotated[
+        Path | None, typer.Option(help="Take the points from this block folder; no database.")
+    ] = None,
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the model, metres.", min=0.0)
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="File of the model, if it is not found by itself.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder; one inside it for each of several scenes.")
+    ] = Path("registered"),
+    server: Annotated[str | None, typer.Option(help="Let this service do it.")] = None,
+    token: Annotated[str | None, typer.Option(help="For the service.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Refine the model of scenes on control points: report, points and refined model go into a folder.
+
+    Points come from the store unless --block or --server says otherwise.
+    """
+    if block is not None and server is not None:
+        raise InputError("--block and --server exclude each other")
+    if model is not None and len(scenes) > 1:
+        raise InputError("--model is the model of one scene")
+    names = [scene.stem for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError("several scenes of the same name would write into the same folder")
+    try:
+        with _registrar(block, server, token) as do:
+            outcomes = [
+                _one(do, SceneFiles(scene, model, sigma_m or None), folder)
+                for scene, folder in _folders(scenes, output)
+            ]
+    except ServiceFailure as failure:
+        typer.echo(f"amers: {failure}", err=True)
+        raise typer.Exit(1) from failure
+    _show([outcome for outcome in outcomes if isinstance(outcome, dict)], as_json, len(scenes))
+    _raise_worst([outcome for outcome in outcomes if isinstance(outcome, AmersError)])
+
+
+def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
+    for scene in scenes:
+        yield scene, output if len(scenes) == 1 else output / scene.stem
+
+
+@contextmanager
+def _registrar(block: Path | None, server: str | None, token: str | None) -> Iterator[Register]:
+    """How scenes are registered: on a block folder, on the store, or by a service."""
+    if block is not None:
+        yield _on_block(block)
+    elif server is not None:
+        with Service(server, token or "") as service:
+            yield service.register
+    else:
+        with _on_store() as do:
+            yield do
+
+
+def _on_block(block: Path) -> Register:
+    find_points = points_of_block(block)
+
+    def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
+        made = run_registration(files, find_points, RegistrationOptions(), folder, progress)
+        return report_document(made.report)
+
+    return do
+
+
+@contextmanager
+def _on_store() -> Iterator[Register]:
+    """Registers with the points of the store, which remembers the registration and its measures."""
+    settings = read_settings()
+    storage = Storage(settings.data_folder / "storage")
+    with engine.opened(settings) as database:
+
+        def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
+            find_points = points_of_store(database, storage)
+            made = run_registration(files, find_points, RegistrationOptions(), folder, progress)
+            with database.transaction() as connection:
+                record(connection, made)
+            return report_document(made.report)
+
+        yield do
+
+
+def _one(do: Register, files: SceneFiles, folder: Path) -> dict[str, Any] | AmersError:
+    """What is shown of one registered scene, or why it was not registered."""
+    try:
+        with shown_progress() as progress:
+            report = do(files, folder, progress)
+    except AmersError as error:
+        return error
+    if report["verdict"] == "failed":
+        return ComputationError(
+            f"{files.image}: registered, but not to be trusted: see {folder / 'report.html'}"
+        )
+    equipment, correction = report["equipment"], report["correction"]
+    return {
+        "scene": files.image,
+        "verdict": report["verdict"],
+        "visible": equipment["visible"],
+        "matched": equipment["matched"],
+        "active": equipment["active"],
+        "correction": correction["order"],
+        "shift_px": correction["shift_px"],
+        "shift_m": correction["shift_m"],
+        "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
+        "ce90_predicted_px": report["predicted"]["worst_px"],
+        "output": folder,
+    }
+
+
+def _show(records: list[dict[str, Any]], as_json: bool, asked: int) -> None:
+    if as_json:
+        print_json(records[0] if asked == 1 and records else records)
+        return
+    for found in records:
+        show_one({name: _rounded(value) for name, value in found.items()}, as_json=False)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    if isinstance(value, list):
+        return ", ".join(f"{number:+.3f}" for number in value)
+    return value
+
+
+def _raise_worst(errors: list[AmersError]) -> None:
+    """Tell every error; the last one told ends the command, one of the input before one of the data."""
+    ordered = sorted(errors, key=lambda error: not isinstance(error, ComputationError))
+    for error in ordered[:-1]:
+        typer.echo(f"amers: {error}", err=True)
+    if ordered:
+        raise ordered[-1]

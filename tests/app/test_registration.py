@@ -1,0 +1,286 @@
+"""From an image and a block to a refined model: by HTTP with a worker, and by the command line."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from jsonschema import validate
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.registration import SceneFiles, points_of_block, points_of_store, run_registration
+from services.formats.rpc_files import read_rpc
+from services.registration import RegistrationOptions
+from services.reports.document import report_schema
+from services.sensors.rpc import RpcModel
+from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
+from tests.app.workers import ended, running_worker, wait_until
+
+A_TENTH_OF_A_PIXEL = 0.1
+COMMON_FILES = {"report.json", "report.html", "control_points.geojson", "refined_RPC.TXT"}
+
+Bearer = Callable[[str], dict[str, str]]
+Amers = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    """A block and a scene whose model is wrong by a known shift."""
+    return make_flat_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture
+def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
+    """The points of the world, in the store and visible."""
+    with engine.connect(dsn) as connection:
+        block = ingest_block(connection, storage, world.block).block
+        publish_block(connection, str(block.number))
+
+
+@pytest.fixture
+def amers(settings: Settings, tmp_path: Path) -> Amers:
+    """Runs the command `amers` on the installation of the test."""
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+
+    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
+            [sys.executable, "-m", "app.cli.main", *map(str, arguments)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    return run
+
+
+def largest_error_px(found: RpcModel, truth: RpcModel) -> float:
+    """Largest distance in the image between two models, over the ground of the scene."""
+    step = np.linspace(-0.003, 0.003, 5)
+    lon, lat, h = np.meshgrid(
+        step + CENTRE[0], step + CENTRE[1], GROUND_H + np.array([-50.0, 0.0, 50.0])
+    )
+    ground = np.column_stack([lon.ravel(), lat.ravel(), h.ravel()])
+    return float(np.linalg.norm(found.project(ground) - truth.project(ground), axis=1).max())
+
+
+def assert_registered(folder: Path, world: FlatWorld) -> None:
+    """The folder holds a report that keeps its schema and a model that is right."""
+    report = json.loads((folder / "report.json").read_text())
+    validate(report, report_schema())
+    assert report["blocks"] == [{"id": "flat", "version": "1"}]
+    refined = read_rpc(world.image, folder / "refined_RPC.TXT").model
+    assert largest_error_px(refined, world.true_model) < A_TENTH_OF_A_PIXEL
+    points = json.loads((folder / "control_points.geojson").read_text())["features"]
+    active = [point for point in points if point["properties"]["status"] == "active"]
+    assert len(active) == report["equipment"]["active"]
+    assert "<html" in (folder / "report.html").read_text()
+
+
+def test_the_delivered_model_is_wrong_before(world: FlatWorld):
+    delivered = read_rpc(world.tagged).model
+    assert largest_error_px(delivered, world.true_model) > 10.0
+
+
+def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
+    client: TestClient,
+    bearer: Bearer,
+    settings: Settings,
+    published: None,
+    world: FlatWorld,
+    tmp_path: Path,
+    dsn: str,
+):
+    me = bearer("register")
+    upload = client.post(
+        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.image.read_bytes(), headers=me
+    )
+    scene = upload.json()["id"]
+    client.put(f"/scenes/{scene}/files/scene_RPC.TXT", content=world.rpc_text.read_bytes(), headers=me)
+    body = {"inputs": {"scene": scene, "options": {"max_points": 30}}}
+    asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+    with running_worker(settings, tmp_path / "log"):
+        done = ended(client, asked.headers["location"], me)
+    assert (done["status"], done["progress"]) == ("successful", 100), done
+    results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
+    assert results.pop("verdict") in ("good", "usable")
+    assert set(results) == COMMON_FILES
+    folder = tmp_path / "downloaded"
+    folder.mkdir()
+    for name, link in results.items():
+        reply = client.get(link["href"], headers=me)
+        assert reply.headers["content-type"].startswith(link["type"])
+        (folder / name).write_bytes(reply.content)
+        assert client.get(link["href"], headers=bearer("register")).status_code == 404
+    assert_registered(folder, world)
+    page = client.get(results["report.html"]["href"], headers=me)
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    for name in ("..%2Freport.json", "nothing.json", "%2e%2e"):
+        assert client.get(f"/jobs/{done['jobID']}/results/{name}", headers=me).status_code == 404
+    assert client.get(f"/scenes/{scene}", headers=me).json()["footprint"]["type"] == "Polygon"
+    report = json.loads((folder / "report.json").read_text())
+    with engine.connect(dsn) as connection:
+        counts = connection.execute(
+            "select count(*) as tried, count(*) filter (where active) as active from measure"
+        ).fetchone()
+        used = connection.execute("select block_versions, options from registration").fetchone()
+    assert counts == {"tried": report["equipment"]["visible"], "active": report["equipment"]["active"]}
+    assert used is not None
+    assert used["block_versions"] == [{"id": "flat", "version": "1"}]
+    assert used["options"]["max_points"] == 30
+
+
+def test_a_block_is_ingested_by_a_job_of_an_administrator(
+    client: TestClient,
+    bearer: Bearer,
+    settings: Settings,
+    world: FlatWorld,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setenv("AMERS_INGEST_FOLDER", str(world.block.parent))
+    execution, admin = "/processes/ingest-block/execution", bearer("admin")
+    body = {"inputs": {"path": "block", "publish": True}}
+    assert client.post(execution, json=body, headers=bearer("register")).status_code == 403
+    first = client.post(execution, json=body, headers=admin).headers["location"]
+    again = client.post(execution, json=body, headers=admin).headers["location"]
+    bad = {"inputs": {"path": "../world0"}}
+    outside = client.post(execution, json=bad, headers=admin).headers["location"]
+    with running_worker(settings, tmp_path / "log"):
+        done = [ended(client, job, admin) for job in (first, again, outside)]
+    assert [job["status"] for job in done] == ["successful", "failed", "failed"]
+    assert [job.get("error", {}).get("error") for job in done] == [None, "Conflict", "InputError"]
+    results = client.get(f"{first}/results", headers=admin).json()
+    assert (results["id"], results["state"], results["points"]) == ("flat", "published", 40)
+
+
+def test_block_folder_and_store_give_the_same_registration(
+    world: FlatWorld, published: None, settings: Settings, storage: Storage, tmp_path: Path
+):
+    assert settings.database_url is not None
+    files, options = SceneFiles(world.tagged, sigma_m=SIGMA_M), RegistrationOptions()
+    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
+        stored = run_registration(files, points_of_store(database, storage), options, tmp_path / "a")
+    folder = run_registration(files, points_of_block(world.block), options, tmp_path / "b")
+    assert np.array_equal(stored.registration.measures.active, folder.registration.measures.active)
+    difference_px = np.abs(
+        stored.registration.adjustment.correction.parameters
+        - folder.registration.adjustment.correction.parameters
+    ).max()
+    stored_as_real_px = 1e-3
+    assert difference_px < stored_as_real_px
+
+
+def test_the_command_registers_straight_from_a_block_folder(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    folder = tmp_path / "out"
+    done = amers(
+        "scene",
+        "register",
+        world.tagged,
+        "--block",
+        world.block,
+        "--sigma-m",
+        SIGMA_M,
+        "-o",
+        folder,
+        "--json",
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["verdict"] in ("good", "usable")
+    assert np.allclose(told["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
+    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged.tif"}
+    assert_registered(folder, world)
+    copy = read_rpc(folder / "tagged.tif").model
+    assert largest_error_px(copy, world.true_model) < A_TENTH_OF_A_PIXEL
+
+
+def test_the_command_registers_with_the_store_and_remembers_the_measures(
+    amers: Amers, world: FlatWorld, published: None, tmp_path: Path, dsn: str
+):
+    folder = tmp_path / "out"
+    command = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
+    done = amers(*command, "--model", world.rpc_text)
+    assert done.returncode == 0, done.stderr
+    assert "verdict" in done.stdout
+    assert_registered(folder, world)
+    with engine.connect(dsn) as connection:
+        rows = connection.execute(
+            "select count(*) as n from registration join measure on registration_id = registration.id"
+        ).fetchone()
+    assert rows == {"n": 40}
+
+
+def test_the_command_says_by_its_exit_code_what_went_wrong(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    def register(*arguments: object) -> tuple[int, str]:
+        done = amers("scene", "register", *arguments, "--block", world.block, "-o", tmp_path / "out")
+        assert "Traceback" not in done.stderr
+        return done.returncode, done.stderr
+
+    half = tmp_path / "half.tif"
+    half.write_bytes(world.tagged.read_bytes()[:100_000])
+    assert register(half)[0] == 2
+    assert register(tmp_path / "missing.tif")[0] == 2
+    bare = tmp_path / "bare.tif"
+    bare.write_bytes(world.image.read_bytes())
+    code, told = register(bare)
+    assert code == 2
+    assert "no sensor model" in told
+    # The points are 8 m from where a model that claims a tenth of a metre expects them.
+    code, told = register(world.tagged, "--sigma-m", 0.1)
+    assert code == 3
+    assert "found" in told
+
+
+def test_the_command_lets_a_service_register(
+    amers: Amers,
+    token: Callable[[str], str],
+    world: FlatWorld,
+    published: None,
+    settings: Settings,
+    tmp_path: Path,
+):
+    assert settings.database_url is not None
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+    command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)]
+    log = tmp_path / "serve.log"
+    with log.open("wb") as output:
+        service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
+    try:
+        wait_until(lambda: "running on" in log.read_text(), "the service answers")
+        url, folder = f"http://127.0.0.1:{port}", tmp_path / "out"
+        scene = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
+        refused = amers(*scene, "--server", url, "--token", "wrong")
+        assert (refused.returncode, "token" in refused.stderr) == (2, True), refused.stderr
+        done = amers(*scene, "--server", url, "--token", token("register"), "--json")
+        assert done.returncode == 0, done.stderr + log.read_text()
+        assert_registered(folder, world)
+    finally:
+        service.terminate()
+        service.wait(30)
+    gone = amers(*scene, "--server", url, "--token", "any")
+    assert (gone.returncode, "Traceback" in gone.stderr) == (1, False)
