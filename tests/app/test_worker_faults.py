@@ -1,0 +1,279 @@
+"""Workers that die, hang, are stopped or run out of memory in the middle of a real registration."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine, jobs
+from app.main import create_app
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+from tests.app.workers import alive, children, ended, kill, running_worker, wait_until
+
+LEASE_S = 2.0
+MEBIBYTE = 1 << 20
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    """A block, and a scene that takes some seconds to register on it."""
+    return make_flat_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture
+def settings(dsn: str, tmp_path: Path) -> Settings:
+    """An installation that notices a dead worker soon."""
+    return Settings(database_url=dsn, data_folder=tmp_path / "data", lease_seconds=LEASE_S)
+
+
+@pytest.fixture
+def me(bearer: Bearer) -> dict[str, str]:
+    """Headers of a caller who may register."""
+    return bearer("register")
+
+
+@pytest.fixture
+def ask(
+    client: TestClient, me: dict[str, str], world: FlatWorld, storage: Storage, dsn: str
+) -> Callable[[], str]:
+    """Asks for the registration of the scene, whose points are published; returns the URL of the job."""
+    with engine.connect(dsn) as connection:
+        block = ingest_block(connection, storage, world.block).block
+        publish_block(connection, str(block.number))
+    upload = client.post(
+        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=me
+    )
+    scene = upload.json()["id"]
+
+    def execute() -> str:
+        body = {"inputs": {"scene": scene}}
+        reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+        return str(reply.headers["location"])
+
+    return execute
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[Path]:
+    """Where the workers of a test write; shown when the test fails."""
+    path = tmp_path / "worker.log"
+    path.touch()
+    yield path
+    print(path.read_text())
+
+
+def attempt_of(dsn: str, job_url: str) -> int:
+    """How often the job was claimed."""
+    with engine.connect(dsn) as connection:
+        job = jobs.find(connection, UUID(job_url.rsplit("/", 1)[1]))
+    assert job is not None
+    return job.attempt
+
+
+def results_of(dsn: str, job_url: str) -> int:
+    """How many results the job has."""
+    with engine.connect(dsn) as connection:
+        row = connection.execute(
+            "select count(*) as n from registration where job_id = %s", [job_url.rsplit("/", 1)[1]]
+        ).fetchone()
+    assert row is not None
+    return int(row["n"])
+
+
+def in_the_middle(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str, Any]:
+    """The job, once its work is really under way; an error if it ends before."""
+
+    def told() -> dict[str, Any] | None:
+        job: dict[str, Any] = client.get(job_url, headers=headers).json()
+        assert job["status"] in ("accepted", "running"), job
+        return job if job["progress"] > 0 else None
+
+    job: dict[str, Any] = wait_until(told, "the work is under way")
+    return job
+
+
+def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    storage: Storage,
+    log: Path,
+):
+    job = ask()
+    with running_worker(settings, log) as first:
+        in_the_middle(client, job, me)
+        (process,) = children(first.pid)
+        kill(first.pid)
+        first.wait()
+        wait_until(lambda: not alive(process), "the job's process dies with its worker", 5.0)
+    assert client.get(job, headers=me).json()["status"] == "running", "nobody has noticed yet"
+    with running_worker(settings, log):
+        done = ended(client, job, me)
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+    attempts = {key.split("/")[2] for key in storage.keys("results")}
+    assert attempts == {"2"}
+
+
+def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    job = ask()
+    with running_worker(settings, log) as worker:
+        in_the_middle(client, job, me)
+        (process,) = children(worker.pid)
+        kill(process)
+        done = ended(client, job, me)
+        assert worker.poll() is None
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+
+
+def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    job = ask()
+    with running_worker(settings, log) as worker:
+        in_the_middle(client, job, me)
+        (process,) = children(worker.pid)
+        assert client.delete(job, headers=me).json()["status"] == "dismissed"
+        wait_until(lambda: not alive(process), "the work stops", 5.0)
+        other = ended(client, ask(), me)
+    assert other["status"] == "successful", "the worker lives on"
+    assert client.get(job, headers=me).json()["status"] == "dismissed"
+    assert results_of(dsn, job) == 0
+
+
+def test_a_worker_told_to_stop_gives_its_job_back_at_once(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    patient = settings.model_copy(update={"lease_seconds": 600.0})
+    job = ask()
+    with running_worker(patient, log) as worker:
+        in_the_middle(client, job, me)
+        (process,) = children(worker.pid)
+        started = time.monotonic()
+        worker.send_signal(signal.SIGTERM)
+        worker.wait(10.0)
+        assert time.monotonic() - started < 10.0
+        assert not alive(process)
+    assert client.get(job, headers=me).json()["status"] == "accepted"
+    with running_worker(patient, log):
+        done = ended(client, job, me)
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+    with engine.connect(dsn) as connection:
+        stopped = jobs.find(connection, UUID(done["jobID"]))
+    assert stopped is not None
+    assert stopped.failures == 0
+
+
+def test_a_job_over_its_memory_limit_fails_cleanly_and_the_worker_lives_on(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    narrow = settings.model_copy(update={"job_memory_bytes": 64 * MEBIBYTE})
+    job = ask()
+    with running_worker(narrow, log) as worker:
+        done = ended(client, job, me)
+        assert worker.poll() is None
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
+    assert "64 MiB" in done["message"]
+
+
+def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    hasty = settings.model_copy(update={"job_seconds": 1.0})
+    job = ask()
+    with running_worker(hasty, log) as worker:
+        done = ended(client, job, me)
+        assert worker.poll() is None
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
+    assert "1 s" in done["message"]
+
+
+def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    job = ask()
+    with running_worker(settings, log) as sleeper:
+        in_the_middle(client, job, me)
+        (process,) = children(sleeper.pid)
+        sleeper.send_signal(signal.SIGSTOP)
+        os.kill(process, signal.SIGSTOP)
+        with running_worker(settings, log):
+            done = ended(client, job, me)
+            os.kill(process, signal.SIGCONT)
+            sleeper.send_signal(signal.SIGCONT)
+            wait_until(lambda: not alive(process), "the late process ends", 30.0)
+    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+    assert client.get(job, headers=me).json() == done
+
+
+def test_a_scene_without_points_fails_for_good_at_the_first_attempt(
+    settings: Settings, bearer: Bearer, world: FlatWorld, dsn: str, log: Path
+):
+    me = bearer("register")
+    with TestClient(create_app(settings)) as client, running_worker(settings, log):
+        upload = client.post(
+            "/scenes?name=scene.tif", content=world.tagged.read_bytes(), headers=me
+        ).json()
+        body = {"inputs": {"scene": upload["id"]}}
+        asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+        done = ended(client, asked.headers["location"], me)
+    assert (done["status"], done["error"]["error"]) == ("failed", "CoverageError")
+    assert attempt_of(dsn, asked.headers["location"]) == 1
+
+
+def test_a_truncated_scene_fails_for_good_and_says_so(
+    settings: Settings, bearer: Bearer, world: FlatWorld, log: Path
+):
+    me = bearer("register")
+    with TestClient(create_app(settings)) as client, running_worker(settings, log):
+        half = world.tagged.read_bytes()[: world.tagged.stat().st_size // 2]
+        upload = client.post("/scenes?name=scene.tif", content=half, headers=me).json()
+        body = {"inputs": {"scene": upload["id"]}}
+        asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+        done = ended(client, asked.headers["location"], me)
+    assert (done["status"], done["error"]["error"]) == ("failed", "FormatError")
+    assert str(settings.data_folder) not in done["message"], "no path of the server is told"

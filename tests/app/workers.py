@@ -1,0 +1,97 @@
+"""Real workers on the database of a test, and what a caller of the API sees of their jobs."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+
+PATIENCE_S = 90.0
+ENDED = ("successful", "failed", "dismissed")
+
+
+@contextmanager
+def running_worker(settings: Settings, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """`amers worker` as a process of its own; killed at the end with all it started."""
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+        "AMERS_LEASE_SECONDS": str(settings.lease_seconds),
+        "AMERS_JOB_SECONDS": str(settings.job_seconds),
+        "AMERS_JOB_MEMORY_BYTES": str(settings.job_memory_bytes),
+    }
+    with log.open("ab") as output:
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "app.cli.main", "worker"],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+        )
+    try:
+        yield worker
+    finally:
+        if worker.poll() is None:
+            worker.kill()
+        worker.wait()
+
+
+def children(pid: int) -> list[int]:
+    """The processes a process has started and that still live."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+        except OSError:
+            continue
+        if int(parent) == pid and state != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Whether a process still runs."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S) -> Any:
+    """The first true value of a condition.
+
+    Raises:
+        AssertionError: it did not become true in time.
+    """
+    deadline = time.monotonic() + patience_s
+    while time.monotonic() < deadline:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"not within {patience_s:g} s: {what}")
+
+
+def ended(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str, Any]:
+    """The job, once it has ended."""
+
+    def told() -> dict[str, Any] | None:
+        job: dict[str, Any] = client.get(job_url, headers=headers).json()
+        return job if job["status"] in ENDED else None
+
+    result: dict[str, Any] = wait_until(told, f"{job_url} ends")
+    return result
+
+
+def kill(pid: int) -> None:
+    """End a process at once."""
+    os.kill(pid, signal.SIGKILL)
