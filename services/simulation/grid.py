@@ -6,7 +6,7 @@ from numba import njit
 from services.types import Array, FloatImage
 
 
-@njit(inline="always")
+@njit(cache=True)
 def bilinear(grid: FloatImage, x: float, y: float) -> float:
     """Value between the nodes; x columns, y rows."""
     rows, columns = grid.shape

@@ -18,7 +18,7 @@ _GROUND_TOLERANCE_M = 1e-5
 _GROUND_STEPS = 60
 
 
-@njit(inline="always")
+@njit(cache=True)
 def meet_ground(
     terrain: FloatImage, x0: float, y0: float, by_h_x: float, by_h_y: float, h: float
 ) -> float:
@@ -87,7 +87,7 @@ def meet_building(
             face = WALL_NORTH_SOUTH
 
 
-@njit(inline="always")
+@njit(cache=True)
 def _cubic_weights(f: float) -> tuple[float, float, float, float]:
     """Catmull-Rom weights of the four nodes around a fraction. Source: Keys (1981), a = -1/2."""
     return (
@@ -98,7 +98,7 @@ def _cubic_weights(f: float) -> tuple[float, float, float, float]:
     )
 
 
-@njit(inline="always")
+@njit(cache=True)
 def _open_light(light: FloatImage, x: float, y: float) -> float:
     """Light of open ground far from buildings, bicubic."""
     rows, columns = light.shape
@@ -123,7 +123,7 @@ def _open_light(light: FloatImage, x: float, y: float) -> float:
     return total
 
 
-@njit(inline="always")
+@njit(cache=True)
 def _kept_light(light: FloatImage, roof: FloatImage, x: float, y: float, on_roof: bool) -> float:
     """Light of a roof, or of the ground beside one, bilinear over the cells of that kind."""
     rows, columns = light.shape

@@ -1,7 +1,7 @@
 """Simulated images whose geometry is known, and the spoiled models that would be delivered with them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -117,7 +117,8 @@ def plan_geometry(
         world: the ground.
         plan: what is asked.
         rng: phases of the jitter.
-        ground_error_m: east and north, how far on the ground the delivered model is wrong.
+        ground_error_m: east and north; a place is found in the image by the delivered model where the
+            true model has what lies that far from it, at the centre of the image.
         error_px: (2, 3) more error, `ImageCorrection.parameters`: shift, drift, affine.
 
     Raises:
@@ -139,13 +140,12 @@ def plan_geometry(
         rng,
     )
     rpc = _fitted(true_model, plan.shape, heights_m)
-    error = no_correction(plan.shape)
-    if error_px is not None:
-        error.parameters[:] = error_px
+    parameters = np.zeros((2, 3)) if error_px is None else np.array(error_px, dtype=np.float64)
     derivative = true_model.project_derivative(ground[None, :])[0]
-    error.parameters[:, 0] += derivative[:, :2] @ np.array(ground_error_m)
+    parameters[:, 0] += derivative[:, :2] @ np.array(ground_error_m)
+    error = replace(no_correction(plan.shape), parameters=parameters)
     delivered = rpc
-    if error.parameters.any():
+    if parameters.any():
         delivered = _fitted(CorrectedModel(rpc, error), plan.shape, heights_m)
     sun = sun_direction(lon_lat, plan.acquired_at)
     acquisition = Acquisition(
@@ -168,9 +168,8 @@ def render_view(
         First line and pixels (lines, samples) of each strip.
     """
     plan, acquisition = geometry.plan, geometry.acquisition
-    assert acquisition.acquired_at is not None
     sun = acquisition.sun_elevation_deg, acquisition.sun_azimuth_deg
-    radiance = radiance_of_day(world, acquisition.acquired_at.date(), *sun)
+    radiance = radiance_of_day(world, plan.acquired_at.date(), *sun)
     yield from render(
         world,
         geometry.true_model,
