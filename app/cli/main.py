@@ -9,7 +9,7 @@ from types import FrameType
 
 import typer
 
-from app.cli import block, db, points, serve, token, worker
+from app.cli import block, db, points, scene, serve, token, worker
 from app.errors import AmersError, ComputationError
 
 EXIT_REFUSED = 2
@@ -24,6 +24,7 @@ app = typer.Typer(
 )
 app.add_typer(block.app, name="block")
 app.add_typer(points.app, name="points")
+app.add_typer(scene.app, name="scene")
 app.add_typer(db.app, name="db")
 app.add_typer(token.app, name="token")
 app.command("serve")(serve.serve)
