@@ -22,6 +22,7 @@ from app.config import Settings
 from app.db import jobs
 from app.db.engine import Database
 from app.db.jobs import Job, LostJob
+from app.storage import UNFINISHED
 
 FAILURES_ALLOWED = 3
 """A job fails when so many attempts at it have ended without an outcome."""
@@ -126,7 +127,9 @@ class Attempts:
             Stopped, TooLong, LostJob
         """
         arguments = (job.id, job.attempt, os.getpid(), self.settings.job_memory_bytes)
-        with TemporaryDirectory(prefix="amers-job-") as folder:
+        unfinished = self.settings.data_folder / "storage" / UNFINISHED
+        unfinished.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f"job-{job.id}-", dir=unfinished) as folder:
             process = subprocess.Popen(
                 [sys.executable, "-m", "app.worker.run", *map(str, arguments)],
                 env=os.environ | LIMITED_LIBRARIES | self._installation() | {"TMPDIR": folder},

@@ -15,12 +15,16 @@ from app.config import Settings
 from app.db import jobs, scenes
 from app.db.engine import Database
 from app.storage import Storage
-from app.usecases.cleaning import remove_unnamed_files
+from app.usecases.blocks import sweep_storage
+from app.usecases.cleaning import remove_unfinished_files, remove_unnamed_files
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
 """A worker of the queue beats every ten seconds; after this long without, its entries are dead."""
 FILES_EVERY_S = 3600.0
+LONGEST_UPLOAD_S = 3600.0 * scenes.LONGEST_UPLOAD_HOURS
+LONGEST_WAIT_S = 5
+"""For ingestions to end: meanwhile this thread takes no job back, and new ingestions queue behind it."""
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +52,7 @@ class Sweeper:
                 sweep_jobs(self.database, self.settings.lease_seconds)
                 if time.monotonic() > files_at:
                     files_at += FILES_EVERY_S
-                    sweep_files(self.database, self.storage)
+                    sweep_files(self.database, self.storage, self.settings.job_seconds)
             except psycopg.OperationalError as outage:
                 log.warning("could not sweep: %s", outage)
             except Exception:
@@ -67,9 +71,18 @@ def sweep_jobs(database: Database, lease_s: float) -> None:
         jobs.forget_dead_entries(connection, SILENT_WORKER_S)
 
 
-def sweep_files(database: Database, storage: Storage) -> None:
-    """Remove the files of uploads and attempts that came to nothing."""
+def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> None:
+    """Remove the files of uploads, attempts and ingestions that came to nothing.
+
+    Raises:
+        psycopg.errors.LockNotAvailable: an ingestion is under way; its files are swept another time.
+    """
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
-    for key in remove_unnamed_files(database, storage):
-        log.info("removed %s, which nothing names", key)
+    removed = remove_unnamed_files(database, storage)
+    removed += remove_unfinished_files(storage, LONGEST_UPLOAD_S + longest_job_s)
+    with database.transaction() as connection:
+        connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
+        removed += sweep_storage(connection, storage)
+    for name in removed:
+        log.info("removed %s, which nothing names", name)

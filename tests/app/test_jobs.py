@@ -377,7 +377,7 @@ def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Dat
     for job in (done, running, dead):
         for attempt in (1, 2):
             storage.put(f"results/{job.id}/{attempt}/report.json", [b"{}"])
-    sweep_files(database, storage)
+    sweep_files(database, storage, LEASE_S)
     assert storage.keys("results") == sorted(
         f"results/{job.id}/2/report.json" for job in (done, running)
     )

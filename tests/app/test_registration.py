@@ -5,7 +5,8 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -258,6 +259,21 @@ def test_the_command_lets_a_service_register(
     settings: Settings,
     tmp_path: Path,
 ):
+    log, folder = tmp_path / "serve.log", tmp_path / "out"
+    scene = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
+    with running_service(settings, log) as url:
+        refused = amers(*scene, "--server", url, "--token", "wrong")
+        assert (refused.returncode, "token" in refused.stderr) == (2, True), refused.stderr
+        done = amers(*scene, "--server", url, "--token", token("register"), "--json")
+        assert done.returncode == 0, done.stderr + log.read_text()
+        assert_registered(folder, world)
+    gone = amers(*scene, "--server", url, "--token", "any")
+    assert (gone.returncode, "Traceback" in gone.stderr) == (1, False)
+
+
+@contextmanager
+def running_service(settings: Settings, log: Path) -> Iterator[str]:
+    """`amers serve` on the installation of a test; yields its address."""
     assert settings.database_url is not None
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -267,20 +283,34 @@ def test_the_command_lets_a_service_register(
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
     command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)]
-    log = tmp_path / "serve.log"
     with log.open("wb") as output:
         service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
     try:
         wait_until(lambda: "running on" in log.read_text(), "the service answers")
-        url, folder = f"http://127.0.0.1:{port}", tmp_path / "out"
-        scene = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
-        refused = amers(*scene, "--server", url, "--token", "wrong")
-        assert (refused.returncode, "token" in refused.stderr) == (2, True), refused.stderr
-        done = amers(*scene, "--server", url, "--token", token("register"), "--json")
-        assert done.returncode == 0, done.stderr + log.read_text()
-        assert_registered(folder, world)
+        yield f"http://127.0.0.1:{port}"
     finally:
         service.terminate()
         service.wait(30)
-    gone = amers(*scene, "--server", url, "--token", "any")
-    assert (gone.returncode, "Traceback" in gone.stderr) == (1, False)
+
+
+def test_an_upload_cut_off_by_its_sender_leaves_nothing(
+    token: Callable[[str], str], settings: Settings, storage: Storage, tmp_path: Path, dsn: str
+):
+    with running_service(settings, tmp_path / "serve.log") as url:
+        port = int(url.rsplit(":", 1)[1])
+        head = (
+            "POST /scenes?name=a.tif HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10000000\r\n"
+            f"Authorization: Bearer {token('register')}\r\n\r\n"
+        )
+        with socket.create_connection(("127.0.0.1", port)) as sender:
+            sender.sendall(head.encode() + b"II*\0" + bytes(1_000_000))
+            unfinished = storage.folder / "unfinished"
+            wait_until(lambda: list(unfinished.glob("*")), "the upload has begun", 20.0)
+
+        def forgotten() -> bool:
+            with engine.connect(dsn) as connection:
+                row = connection.execute("select count(*) as n from scene").fetchone()
+            return row == {"n": 0}
+
+        wait_until(forgotten, "the scene is forgotten", 20.0)
+        assert [path for path in storage.folder.rglob("*") if path.is_file()] == []

@@ -1,6 +1,7 @@
 """Uploading scenes: bounded, checked, private; and removing them."""
 
 import hashlib
+import os
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -240,7 +241,12 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
         )
     for scene_id, name in ((arriving, "b.tif"), (cut_off, "c.tif")):
         storage.put(f"{folder_of(scene_id)}/{name}", [TIFF])
-    sweep_files(database, storage)
+    old, new = (storage.folder / "unfinished" / name for name in ("old", "new"))
+    for path in (old, new):
+        path.write_bytes(b"II*")
+    os.utime(old, (0, 0))
+    sweep_files(database, storage, longest_job_s=3600.0)
+    assert (old.exists(), new.exists()) == (False, True)
     assert storage.keys("scenes") == sorted([f"scenes/{kept['id']}/a.tif", f"scenes/{arriving}/b.tif"])
 
 

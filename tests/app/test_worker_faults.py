@@ -277,3 +277,27 @@ def test_a_truncated_scene_fails_for_good_and_says_so(
         done = ended(client, asked.headers["location"], me)
     assert (done["status"], done["error"]["error"]) == ("failed", "FormatError")
     assert str(settings.data_folder) not in done["message"], "no path of the server is told"
+
+
+def test_a_worker_outlives_the_loss_of_all_its_connections(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[[], str],
+    settings: Settings,
+    dsn: str,
+    log: Path,
+):
+    patient = settings.model_copy(update={"lease_seconds": 15.0})
+    job = ask()
+    with running_worker(patient, log) as worker:
+        in_the_middle(client, job, me)
+        with engine.connect(dsn) as connection:
+            connection.execute(
+                "select pg_terminate_backend(pid) from pg_stat_activity"
+                " where datname = current_database() and pid <> pg_backend_pid()"
+            )
+        done = ended(client, job, me)
+        other = ended(client, ask(), me)
+        assert worker.poll() is None
+    assert (done["status"], results_of(dsn, job)) == ("successful", 1)
+    assert other["status"] == "successful", "the worker still hears of new jobs"
