@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,12 @@ from app.db import engine
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.registration import SceneFiles, points_of_block, points_of_store, run_registration
+from app.usecases.registration_files import refined_rpc
 from services.formats.rpc_files import read_rpc
 from services.registration import RegistrationOptions
 from services.reports.document import report_schema
+from services.sensors.base import SensorModel
+from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.rpc import RpcModel
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.workers import ended, running_worker, wait_until
@@ -69,7 +73,7 @@ def amers(settings: Settings, tmp_path: Path) -> Amers:
     return run
 
 
-def largest_error_px(found: RpcModel, truth: RpcModel) -> float:
+def largest_error_px(found: RpcModel, truth: SensorModel) -> float:
     """Largest distance in the image between two models, over the ground of the scene."""
     step = np.linspace(-0.003, 0.003, 5)
     lon, lat, h = np.meshgrid(
@@ -95,6 +99,20 @@ def assert_registered(folder: Path, world: FlatWorld) -> None:
 def test_the_delivered_model_is_wrong_before(world: FlatWorld):
     delivered = read_rpc(world.tagged).model
     assert largest_error_px(delivered, world.true_model) > 10.0
+
+
+def test_a_correction_that_mixes_lines_and_samples_is_carried_by_a_fitted_rpc(world: FlatWorld):
+    shape = (1200, 1200)
+    affine = replace(no_correction(shape), parameters=np.array([[9.0, 1.0, -2.0], [-7.0, 1.5, 0.5]]))
+    corrected = CorrectedModel(world.true_model, affine)
+    refined, refit_error_px = refined_rpc(corrected, shape)
+    a_hundredth_of_a_pixel = 0.01
+    assert 0.0 <= refit_error_px < a_hundredth_of_a_pixel
+    assert largest_error_px(refined, corrected) < a_hundredth_of_a_pixel
+    drift = replace(affine, parameters=np.array([[9.0, 1.0, 0.0], [-7.0, 0.0, 0.5]]))
+    folded, none = refined_rpc(CorrectedModel(world.true_model, drift), shape)
+    assert np.isnan(none)
+    assert largest_error_px(folded, CorrectedModel(world.true_model, drift)) < 1e-6
 
 
 def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
