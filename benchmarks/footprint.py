@@ -2,7 +2,7 @@
 
 A private cluster is filled with a million points in Hilbert order, one for 2 km2 on average. Boxes that
 hold about 1,000 and 2,000 points are asked for in turn by both ways, on one connection, warm; both give
-the same features. Run: python benchmarks/footprint.py
+the same features. Run: python -m benchmarks.footprint
 """
 
 import argparse

@@ -49,6 +49,7 @@ def load_contents(
         files: one for each of `contents.points.chip_files`, in their order.
         progress: told while rows are sent.
     """
+    progress(0.0, "loading images and files of chips")
     _insert_images(connection, number, contents)
     file_ids = _insert_chip_files(connection, number, files)
     points, views = _point_columns(number, contents, file_ids), _view_columns(number, contents)

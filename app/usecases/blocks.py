@@ -1,5 +1,6 @@
 """The life of a block: ingested and checked, staged, published, withdrawn."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -26,6 +27,7 @@ MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "withdrawn": ("published",),
 }
 CHIPS = "chips"
+FILES_AT_ONCE = 4
 
 
 @dataclass(frozen=True)
@@ -212,17 +214,23 @@ def _change(connection: Connection, block: Block, state: BlockState) -> Block:
 def _store_chips(
     storage: Storage, folder: Path, contents: BlockContents, progress: Progress
 ) -> list[StoredChipFile]:
-    """Copy the files of chips; what arrives must be what was checked."""
-    stored = []
+    """Copy the files of chips, some at once; what arrives must be what was checked."""
     names = contents.points.chip_files
-    for i, name in enumerate(names):
-        progress(i / len(names), "storing chips")
+
+    def store(name: str) -> StoredChipFile:
         path = block_member(folder, name)
         layout = read_chip_file(path, name)
         key = storage.put_chips(path).key
         if key != chips_key(contents.document.checksums[name].lower()):
             raise FormatError(f"{name}: changed while it was ingested")
-        stored.append(StoredChipFile(name, key, np.dtype(layout.dtype).name, layout.count))
+        return StoredChipFile(name, key, np.dtype(layout.dtype).name, layout.count)
+
+    progress(0.0, "storing chips")
+    stored = []
+    with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
+        for file in pool.map(store, names):
+            stored.append(file)
+            progress(len(stored) / len(names), "storing chips")
     return stored
 
 

@@ -1,5 +1,6 @@
 """Everything an Amers block promises, checked before anything of it is used."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 1e6
 OUTLINE_MARGIN_DEG = 1e-9
 LISTED = 20
+FILES_AT_ONCE = 4
 ROWS_OF_ONE_KIND = 3
 
 
@@ -86,6 +88,7 @@ def check_block(folder: Path, progress: Progress = no_progress) -> BlockContents
     """
     document = read_document(folder)
     _check_files(folder, document, progress).raise_if_any()
+    progress(1.0, "checking points and views")
     points, views = read_points(folder / POINTS_PARQUET), read_views(folder / VIEWS_PARQUET)
     report = _Report()
     _check_points(report, points, document)
@@ -131,22 +134,31 @@ def _check_files(folder: Path, document: BlockDocument, progress: Progress) -> _
         report.add(BLOCK_JSON, "amers:checksums", f"no checksum of {name!r:.200}", "one of every file")
     for name in sorted(present - listed - {BLOCK_JSON}):
         report.add(name, "", "a file without a checksum", "only files listed in amers:checksums")
-    for i, name in enumerate(sorted(listed)):
-        progress(i / len(listed), "checking checksums")
-        _check_file(report, folder, name, document.checksums[name])
+    names = sorted(listed)
+    progress(0.0, "checking checksums")
+    with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
+        for i, found in enumerate(pool.map(lambda name: _checksum(folder, name), names)):
+            progress((i + 1) / len(names), "checking checksums")
+            _check_checksum(report, names[i], found, document.checksums[names[i]])
     return report
 
 
-def _check_file(report: _Report, folder: Path, name: str, checksum: str) -> None:
+def _checksum(folder: Path, name: str) -> str | FormatError | None:
+    """The checksum of a file of the block; None without the file, an error without a right to it."""
     try:
         path = block_member(folder, name)
     except FormatError as error:
-        report.add(BLOCK_JSON, "amers:checksums", str(error), "a path inside the block")
-        return
-    if not path.is_file():
+        return error
+    return file_sha256(path) if path.is_file() else None
+
+
+def _check_checksum(report: _Report, name: str, found: str | FormatError | None, expected: str) -> None:
+    if isinstance(found, FormatError):
+        report.add(BLOCK_JSON, "amers:checksums", str(found), "a path inside the block")
+    elif found is None:
         report.add(name, "", "no file", "the file listed in amers:checksums")
-    elif (found := file_sha256(path)) != checksum.lower():
-        report.add(name, "", f"sha256 {found}", f"{checksum:.80}")
+    elif found != expected.lower():
+        report.add(name, "", f"sha256 {found}", f"{expected:.80}")
 
 
 def _files(folder: Path, report: _Report) -> set[str]:
