@@ -105,6 +105,7 @@ def register_scene(
     chips: ChipSource,
     options: RegistrationOptions = RegistrationOptions(),
     progress: Progress = no_progress,
+    frame_sigma_m: float = math.nan,
 ) -> Registration:
     """Refine the model of a scene on control points.
 
@@ -114,6 +115,8 @@ def register_scene(
         chips: of the points.
         options: thresholds.
         progress: told where the work stands.
+        frame_sigma_m: how well the frame of the points is known on the Earth, one standard deviation a
+            coordinate; it is reported beside the accuracy in that frame, never mixed into it.
 
     Raises:
         CoverageError: no point lies in the scene.
@@ -168,6 +171,7 @@ def register_scene(
         scene_gsd_m(scene),
         options.qualification,
         np.random.default_rng(options.seed),
+        frame_sigma_m,
     )
     progress(1.0, "registered")
     return Registration(model, adjustment, measures, tuple(passes), qualification)
@@ -347,6 +351,7 @@ def _adjust(
         points.covariance_m2,
         options.adjustment,
         candidates,
+        matches.common_sigma_m / scene_gsd_m(scene),
     )
 
 

@@ -80,6 +80,7 @@ def adjust_scene(
     covariance_m2: Array,
     options: AdjustmentOptions = AdjustmentOptions(),
     candidates: BoolArray | None = None,
+    common_sigma_px: float = 0.0,
 ) -> SceneAdjustment:
     """Find the correction of a model that best explains where control points were seen.
 
@@ -96,6 +97,8 @@ def adjust_scene(
         covariance_m2: (n, 3, 3) of the points, east, north, up.
         options: thresholds.
         candidates: (n,) measures that may be used; all that are finite when None.
+        common_sigma_px: standard deviation a coordinate of an error that all measures share; it adds to
+            the covariance of the shift.
 
     Raises:
         NotEnoughPoints: when fewer than `min_points` measures are usable, before or after deactivation.
@@ -132,12 +135,14 @@ def adjust_scene(
     freedom = 2 * int(active.sum()) - int(free.sum())
     chi2 = float((residual[active] ** 2 / variance[active]).sum())
     sigma0 = float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
+    # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
+    covariance = cofactor * max(sigma0, 1.0) ** 2
+    covariance[[0, 3], [0, 3]] += common_sigma_px**2
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,
         validation_px=validation,
-        # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
-        covariance=cofactor * max(sigma0, 1.0) ** 2,
+        covariance=covariance,
         residual_px=np.where(usable[:, None], residual, np.nan),
         active=active,
         sigma0=sigma0,
