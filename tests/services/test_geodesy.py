@@ -1,0 +1,119 @@
+"""Coordinates agree with PROJ everywhere on the globe, and come back from every frame."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyproj import Geod, Transformer
+
+from services.geodesy import (
+    east_north_up,
+    ecef_from_east_north_up,
+    ecef_from_lon_lat_h,
+    lon_lat_h_from_east_north_up,
+    lon_lat_h_from_ecef,
+    metres_per_degree,
+)
+from services.types import Array
+
+a_micrometre = 1e-6
+a_micrometre_deg = a_micrometre / 111_000.0
+a_millimetre = 1e-3
+
+GEODETIC, GEOCENTRIC = "EPSG:4979", "EPSG:4978"
+LONGITUDES = [-180.0, -179.999_999, -123.4, -1e-9, 0.0, 90.0, 179.999_999, 180.0]
+LATITUDES = [-90.0, -89.999_999, -45.0, -1e-9, 0.0, 60.0, 89.999_999, 90.0]
+HEIGHTS = [-11_000.0, 0.0, 8_848.0, 700e3]
+
+longitudes = st.floats(-180.0, 180.0)
+latitudes = st.floats(-89.9, 89.9)
+heights = st.floats(-500.0, 9000.0)
+metres = st.floats(-50e3, 50e3)
+
+
+@pytest.fixture(scope="module")
+def globe() -> Array:
+    """Positions of all latitudes and longitudes, poles and antimeridian among them."""
+    rng = np.random.default_rng(0)
+    corners = np.stack(np.meshgrid(LONGITUDES, LATITUDES, HEIGHTS), axis=-1).reshape(-1, 3)
+    anywhere = np.column_stack(
+        [rng.uniform(-180, 180, 2000), rng.uniform(-90, 90, 2000), rng.uniform(-500, 9000, 2000)]
+    )
+    return np.concatenate([corners, anywhere])
+
+
+def test_ecef_agrees_with_proj_over_the_globe(globe: Array) -> None:
+    proj = np.column_stack(
+        Transformer.from_crs(GEODETIC, GEOCENTRIC, always_xy=True).transform(*globe.T)
+    )
+    np.testing.assert_allclose(ecef_from_lon_lat_h(globe), proj, rtol=0.0, atol=a_micrometre)
+
+
+def test_positions_come_back_from_proj_s_ecef_over_the_globe(globe: Array) -> None:
+    ecef = np.column_stack(
+        Transformer.from_crs(GEODETIC, GEOCENTRIC, always_xy=True).transform(*globe.T)
+    )
+    found = lon_lat_h_from_ecef(ecef)
+    np.testing.assert_allclose(found[:, 1], globe[:, 1], rtol=0.0, atol=a_micrometre_deg)
+    np.testing.assert_allclose(found[:, 2], globe[:, 2], rtol=0.0, atol=a_micrometre)
+    turn = (found[:, 0] - globe[:, 0] + 180.0) % 360.0 - 180.0
+    assert np.abs(turn * np.cos(np.radians(globe[:, 1]))).max() < a_micrometre_deg
+    assert np.abs(found[:, 0]).max() <= 180.0
+
+
+def test_the_poles_have_a_latitude_and_a_height() -> None:
+    polar_radius = 6_356_752.314_245
+    found = lon_lat_h_from_ecef(np.array([[0.0, 0.0, polar_radius + 5.0], [0.0, 0.0, -polar_radius]]))
+    np.testing.assert_allclose(found[:, 1:], [[90.0, 5.0], [-90.0, 0.0]], atol=a_micrometre)
+
+
+@given(longitudes, st.floats(-90.0, 90.0), st.floats(-11e3, 800e3))
+def test_geodetic_and_ecef_are_each_other_s_inverse(lon: float, lat: float, h: float) -> None:
+    ecef = ecef_from_lon_lat_h(np.array([[lon, lat, h]]))
+    again = ecef_from_lon_lat_h(lon_lat_h_from_ecef(ecef))
+    np.testing.assert_allclose(again, ecef, rtol=0.0, atol=a_micrometre)
+
+
+@given(longitudes, latitudes, heights, metres, metres, st.floats(-5e3, 5e3))
+def test_east_north_up_comes_back(
+    lon: float, lat: float, h: float, east: float, north: float, up: float
+) -> None:
+    origin, enu = np.array([lon, lat, h]), np.array([[east, north, up]])
+    again = east_north_up(lon_lat_h_from_east_north_up(enu, origin), origin)
+    np.testing.assert_allclose(again, enu, rtol=0.0, atol=a_micrometre)
+
+
+@given(longitudes, latitudes)
+def test_axes_are_orthonormal_and_right_handed(lon: float, lat: float) -> None:
+    axes = ecef_from_east_north_up(np.array([lon, lat, 0.0]))
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(np.cross(axes[:, 0], axes[:, 1]), axes[:, 2], atol=1e-15)
+
+
+def test_axes_point_east_north_and_up() -> None:
+    origin = np.array([179.999_99, 43.0, 100.0])
+    one_m = a_micrometre_deg * 1e6
+    moved = np.array(
+        [[-179.999_99, 43.0, 100.0], [179.999_99, 43.0 + one_m, 100.0], [179.999_99, 43.0, 101.0]]
+    )
+    east, north, up = east_north_up(moved, origin)
+    east_m = Geod(ellps="WGS84").inv(origin[0], 43.0, moved[0, 0], 43.0)[2]
+    assert east[0] == pytest.approx(east_m, abs=a_millimetre)  # across the antimeridian
+    assert np.abs(east[1:]).max() < a_millimetre
+    assert north[1] == pytest.approx(np.linalg.norm(north), abs=a_millimetre)
+    assert up[2] == pytest.approx(1.0, abs=a_micrometre)
+
+
+@pytest.mark.parametrize("lat", [-70.0, 0.0, 43.6, 85.0])
+def test_a_degree_is_as_long_as_the_geodesic_says(lat: float) -> None:
+    geod, step = Geod(ellps="WGS84"), 1e-4
+    east_m, north_m = metres_per_degree(lat, 0.0)
+    assert geod.inv(5.0, lat, 5.0 + step, lat)[2] == pytest.approx(east_m * step, abs=a_micrometre)
+    along = geod.inv(5.0, lat - step / 2.0, 5.0, lat + step / 2.0)[2]
+    assert along == pytest.approx(north_m * step, abs=a_micrometre)
+
+
+def test_a_degree_grows_with_the_height() -> None:
+    above = ecef_from_lon_lat_h(np.array([[5.0, 43.0, 3000.0], [5.000_1, 43.0, 3000.0]]))
+    east_m, _ = metres_per_degree(43.0, 3000.0)
+    assert np.linalg.norm(above[1] - above[0]) == pytest.approx(east_m * 1e-4, abs=a_micrometre)

@@ -1,0 +1,84 @@
+"""What is taken out of points and observations is what was there, in the order asked."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.types import Acquisition, ControlPoints, IntArray, Observations, Views
+
+view_counts = st.lists(st.integers(0, 4), min_size=1, max_size=8)
+
+
+def points_with(counts: list[int]) -> ControlPoints:
+    """Points with the given numbers of views; every value tells where it comes from."""
+    n, m = len(counts), sum(counts)
+    return ControlPoints(
+        id=100 + np.arange(n),
+        lon_lat_h=np.arange(3.0 * n).reshape(n, 3),
+        covariance_m2=np.arange(9.0 * n).reshape(n, 3, 3),
+        saliency=np.arange(float(n)) / n,
+        views=Views(
+            start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+            gsd_m=1.0 + np.arange(m),
+            image=np.arange(m) % 2,
+            incidence_deg=10.0 + np.arange(m),
+            azimuth_deg=20.0 + np.arange(m),
+            images=(Acquisition("a"), Acquisition("b")),
+        ),
+        chip_file=np.arange(n) % 3,
+        chip_row=7 * np.arange(n),
+        chip_files=("x", "y", "z"),
+    )
+
+
+def rows_of(data: st.DataObject, n: int) -> IntArray:
+    return np.array(data.draw(st.lists(st.integers(0, n - 1), max_size=12)), dtype=np.int64)
+
+
+@given(view_counts, st.data())
+def test_taken_points_keep_everything_that_was_theirs(counts: list[int], data: st.DataObject) -> None:
+    points = points_with(counts)
+    rows = rows_of(data, len(counts))
+    taken = points.take(rows)
+    assert len(taken) == len(rows)
+    assert taken.chip_files == points.chip_files
+    assert taken.views.images == points.views.images
+    assert taken.views.start[0] == 0
+    assert taken.views.start[-1] == len(taken.views.gsd_m) == len(taken.views.image)
+    for new, old in enumerate(rows):
+        for name in ("id", "lon_lat_h", "covariance_m2", "saliency", "chip_file", "chip_row"):
+            np.testing.assert_array_equal(getattr(taken, name)[new], getattr(points, name)[old])
+        mine = slice(*taken.views.start[new : new + 2])
+        theirs = slice(*points.views.start[old : old + 2])
+        for name in ("gsd_m", "image", "incidence_deg", "azimuth_deg"):
+            np.testing.assert_array_equal(
+                getattr(taken.views, name)[mine], getattr(points.views, name)[theirs]
+            )
+
+
+@given(view_counts, st.data())
+def test_taking_twice_is_taking_the_rows_of_the_rows(counts: list[int], data: st.DataObject) -> None:
+    points = points_with(counts)
+    first = np.array(data.draw(st.permutations(range(len(counts)))), dtype=np.int64)
+    second = rows_of(data, len(counts))
+    twice, once = points.take(first).take(second), points.take(first[second])
+    np.testing.assert_array_equal(twice.id, once.id)
+    np.testing.assert_array_equal(twice.views.start, once.views.start)
+    np.testing.assert_array_equal(twice.views.gsd_m, once.views.gsd_m)
+
+
+@given(st.integers(1, 20), st.data())
+def test_taken_observations_are_the_rows_asked_for(m: int, data: st.DataObject) -> None:
+    numbers = np.arange(m)
+    observations = Observations(
+        numbers // 2, numbers % 2, np.column_stack([numbers, -numbers]) * 1.0, 1.0 + numbers
+    )
+    rows = rows_of(data, m)
+    kept = np.array(data.draw(st.lists(st.booleans(), min_size=m, max_size=m)), dtype=bool)
+    for chosen, expected in ((rows, rows), (kept, np.flatnonzero(kept))):
+        taken = observations.take(chosen)
+        assert len(taken) == len(expected)
+        np.testing.assert_array_equal(taken.point, expected // 2)
+        np.testing.assert_array_equal(taken.image, expected % 2)
+        np.testing.assert_array_equal(taken.line_sample, np.column_stack([expected, -expected]))
+        np.testing.assert_array_equal(taken.sigma_px, 1.0 + expected)
