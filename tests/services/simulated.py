@@ -1,0 +1,115 @@
+"""Small simulated worlds and what was made of them, each made once for all tests that read it."""
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cache
+
+import numpy as np
+
+from services.production import Production, ProductionOptions, produce_points
+from services.scene import Scene
+from services.simulation.view import (
+    SimulatedView,
+    ViewGeometry,
+    ViewPlan,
+    plan_geometry,
+    simulate_block,
+    simulate_view,
+)
+from services.simulation.world import World, make_world
+from services.types import Array, ChipArray, ControlPoints
+
+SHAPE = (700, 700)
+GSD_M = 1.0
+BLOCK_SIGMA_M = 3.0
+OPTIONS = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=4.0, points=60)
+
+
+@cache
+def world(seed: int = 1) -> World:
+    """A square kilometre."""
+    return make_world(np.random.default_rng(seed), size_m=1000.0, posting_m=1.0)
+
+
+@cache
+def block_views() -> tuple[SimulatedView, ...]:
+    """Three views of the middle of the world, each some 3 m wrong."""
+    rng = np.random.default_rng(2)
+    return tuple(simulate_block(world(), rng, 3, SHAPE, GSD_M, BLOCK_SIGMA_M, 20.0))
+
+
+@cache
+def production() -> Production:
+    """The points of the three views."""
+    return produce_points([view.as_scene(BLOCK_SIGMA_M) for view in block_views()], OPTIONS)
+
+
+@dataclass(frozen=True)
+class MemoryChips:
+    """Chips of a production, row after row as in one file."""
+
+    chips: ChipArray
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        return self.chips[row : row + count]
+
+
+@cache
+def block() -> tuple[ControlPoints, MemoryChips]:
+    """The points and their chips as a registration meets them."""
+    made = production()
+    chips = np.concatenate([made.chips(row) for row in range(len(made.points))])
+    return made.points, MemoryChips(chips)
+
+
+def plan(name: str = "scene", **changes: object) -> ViewPlan:
+    """A view of the middle of the world from where none of the block's was taken."""
+    lon, lat = (float(v) for v in world().centre_lon_lat)
+    base = ViewPlan(
+        name,
+        (lon, lat),
+        SHAPE,
+        GSD_M,
+        incidence_deg=11.0,
+        azimuth_deg=200.0,
+        acquired_at=datetime(2024, 7, 3, 10, 30, tzinfo=UTC),
+    )
+    return replace(base, **changes)  # type: ignore[arg-type]
+
+
+@cache
+def spoiled_view(
+    ground_error_m: tuple[float, float] = (31.0, -24.0),
+    skew_px: float = 1.5,
+    seed: int = 11,
+    world_seed: int = 1,
+) -> SimulatedView:
+    """A later view, delivered with an error on the ground and a skew at the edge of the image."""
+    error_px = np.array([[0.0, 0.8, skew_px], [0.0, -0.5 * skew_px, -0.6]]) if skew_px else None
+    return simulate_view(
+        world(world_seed), plan(), np.random.default_rng(seed), ground_error_m, error_px
+    )
+
+
+def with_pixels(scene: Scene, pixels: Array) -> Scene:
+    """The scene with other pixels."""
+    return replace(scene, image=replace(scene.image, pixels=pixels.astype(np.float32)))  # type: ignore[type-var]
+
+
+def ring_of_geometries(
+    count: int, incidence_deg: float = 15.0, shape: tuple[int, int] = (4000, 4000)
+) -> list[ViewGeometry]:
+    """Views of one place from all sides, without pixels and without error."""
+    return [
+        plan_geometry(
+            world(),
+            plan(
+                f"ring_{k}",
+                shape=shape,
+                incidence_deg=incidence_deg,
+                azimuth_deg=30.0 + 360.0 * k / count,
+            ),
+            np.random.default_rng(k),
+        )
+        for k in range(count)
+    ]
