@@ -142,13 +142,21 @@ class PointDetail:
     views: tuple[PointView, ...]
 
 
+_FRAME_SIGMA = '$."amers:accuracy"."absolute"[*] ? (@.name == "frame_sigma_m").value'
+
+
 @dataclass(frozen=True)
 class BlockVersion:
-    """A version of a block that points came from."""
+    """A version of a block that points came from.
+
+    Attributes:
+        frame_sigma_m: how well its frame is known, standard deviation a coordinate; None if unsaid.
+    """
 
     number: int
     id: str
     version: str
+    frame_sigma_m: float | None
 
 
 @dataclass(frozen=True)
@@ -361,8 +369,9 @@ def _chip_files(connection: Connection, file: IntArray) -> tuple[IntArray, tuple
 
 def _versions(connection: Connection, numbers: IntArray) -> tuple[BlockVersion, ...]:
     rows = connection.execute(
-        "select number, id, version from block where number = any(%s) order by number",
-        [numbers.tolist()],
+        "select number, id, version, jsonb_path_query_first(metadata, %s)::float8 as frame_sigma_m"
+        " from block where number = any(%s) order by number",
+        [_FRAME_SIGMA, numbers.tolist()],
     ).fetchall()
     return tuple(BlockVersion(**row) for row in rows)
 

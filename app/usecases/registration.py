@@ -1,6 +1,7 @@
 """Registering a scene: read its files, find points, call the science, write the outcome."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -71,11 +72,14 @@ class FoundPoints:
     Attributes:
         chips: where the chips of the points are.
         blocks: whose points they are.
+        frame_sigma_m: how well the frame of the worst of them is known, one standard deviation a
+            coordinate; NaN when a block does not say.
     """
 
     points: ControlPoints
     chips: ChipSource
     blocks: tuple[BlockUsed, ...]
+    frame_sigma_m: float
 
 
 FindPoints = Callable[[Array], FoundPoints]
@@ -121,6 +125,7 @@ def run_registration(
         found.chips,
         options,
         lambda fraction, message: progress(0.9 * fraction, message),
+        found.frame_sigma_m,
     )
     progress(0.9, "writing the report")
     report, paths = write_outputs(
@@ -142,10 +147,11 @@ def points_of_block(folder: Path) -> FindPoints:
     """Points straight out of a block folder."""
     contents = read_block(folder)
     metadata = contents.document.metadata
+    said = next((figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m"), None)
 
     def find(outline: Array) -> FoundPoints:
         block = BlockUsed(metadata.id, metadata.version)
-        return FoundPoints(contents.points, FolderChips(folder), (block,))
+        return FoundPoints(contents.points, FolderChips(folder), (block,), _frame_sigma_m([said]))
 
     return find
 
@@ -157,7 +163,8 @@ def points_of_store(database: Database, storage: Storage) -> FindPoints:
         with database.transaction() as connection:
             found = control_points(connection, outline)
         blocks = tuple(BlockUsed(block.id, block.version) for block in found.blocks)
-        return FoundPoints(found.points, StoredChips(storage), blocks)
+        frame_sigma_m = _frame_sigma_m([block.frame_sigma_m for block in found.blocks])
+        return FoundPoints(found.points, StoredChips(storage), blocks, frame_sigma_m)
 
     return find
 
@@ -217,6 +224,11 @@ def _run(work: Work) -> Commit:
         return {"verdict": made.report.verdict, "files": keys}
 
     return commit
+
+
+def _frame_sigma_m(said: Sequence[float | None]) -> float:
+    """The worst of what blocks say of their frames; NaN when one says nothing."""
+    return math.nan if None in said or not said else max(value for value in said if value is not None)
 
 
 def _grown(outline: Array, metres: float) -> Array:

@@ -1,0 +1,89 @@
+"""`amers demo`: the main job on a simulated world, with nothing to configure."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, Row, show, show_one
+from app.cli.progress import shown_progress
+from app.config import Settings
+from app.errors import InputError
+from app.usecases.demo import DemoOptions, DemoOutcome, run_demo
+from services.types import Array
+
+MARK = ".amers-demo"
+
+
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of its own, made anew.")] = Path(
+        "demo-output"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    """Run the main job on a simulated world: images, block, store, registration, report."""
+    folder = _emptied(output)
+    with _private_store() as settings, shown_progress() as progress:
+        outcome = run_demo(folder, settings, DemoOptions(), progress)
+    if as_json:
+        show_one(_record(outcome), as_json=True)
+        return
+    show(_rows(outcome), as_json=False)
+    typer.echo(f"\nThe report: {outcome.report.absolute()}")
+
+
+def _emptied(folder: Path) -> Path:
+    """The folder, empty; only what an earlier demonstration left is deleted."""
+    if folder.exists() and any(folder.iterdir()):
+        if not (folder / MARK).is_file():
+            raise InputError(f"{folder}: holds something else than an earlier demonstration")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / MARK).touch()
+    return folder
+
+
+@contextmanager
+def _private_store() -> Iterator[Settings]:
+    """A store for the demonstration alone: simulated points must not meet real ones."""
+    folder = Path(tempfile.mkdtemp(prefix="amers-demo-"))
+    # The database server of an administrator runs as another user, who has to pass.
+    folder.chmod(0o711)
+    try:
+        yield Settings(database_url=None, data_folder=folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _record(outcome: DemoOutcome) -> Row:
+    equipment = outcome.registration.qualification.equipment
+    return {
+        "points produced": outcome.produced,
+        "points ingested": outcome.ingested,
+        "points served in the footprint": outcome.served,
+        "points visible": equipment.visible,
+        "points matched": equipment.matched,
+        "points active": equipment.active,
+        "injected error at the centre, east, north (m)": _metres(outcome.injected_m),
+        "the same in the block's frame (m)": _metres(outcome.to_recover_m),
+        "recovered error (m)": _metres(outcome.recovered_m),
+        "CE90 as delivered, on the Earth (m)": round(outcome.before_m.value, 2),
+        "CE90 registered, in the block's frame (px)": round(outcome.in_frame_px.value, 3),
+        "CE90 registered, on the Earth (m)": round(outcome.absolute_m.value, 2),
+        "error of the block's frame, east, north, up (m)": _metres(outcome.frame_error_m),
+        "verdict": outcome.registration.qualification.verdict,
+        "report": str(outcome.report.absolute()),
+    }
+
+
+def _rows(outcome: DemoOutcome) -> list[Row]:
+    record = {name: value for name, value in _record(outcome).items() if name != "report"}
+    return [{"what": name, "figure": value} for name, value in record.items()]
+
+
+def _metres(values: Array) -> str:
+    return ", ".join(f"{value:+.2f}" for value in values)

@@ -1,0 +1,85 @@
+"""`amers production`: new blocks of points out of images."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, show_one
+from app.cli.progress import shown_progress
+from app.errors import InputError
+from app.usecases.production import BlockIdentity, run_production
+from services.production import ProductionOptions
+
+app = typer.Typer(help="New blocks of points out of images.", no_args_is_help=True)
+
+_DEFAULT = ProductionOptions()
+
+
+@app.callback()
+def group() -> None:
+    """New blocks of points out of images."""
+
+
+@app.command()
+def run(
+    images: Annotated[
+        list[Path], typer.Option("--images", help="Image with its model; repeat for each.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the block; must not exist.")],
+    block_id: Annotated[
+        str | None, typer.Option("--id", help="Of the block; else the folder's.")
+    ] = None,
+    version: Annotated[str, typer.Option(help="Of the block.")] = "1",
+    title: Annotated[str, typer.Option(help="For people.")] = "",
+    license_name: Annotated[str, typer.Option("--license", help="SPDX identifier.")] = "proprietary",
+    gsd_m: Annotated[str, typer.Option(help="Ground samplings of the chips: FINE,COARSE in metres.")] = (
+        f"{_DEFAULT.fine_gsd_m:g},{_DEFAULT.coarse_gsd_m:g}"
+    ),
+    points: Annotated[int, typer.Option(help="How many to aim at, without --spacing-m.", min=6)] = (
+        _DEFAULT.points
+    ),
+    spacing_m: Annotated[
+        float | None, typer.Option(help="One point a square of this side.", min=1.0)
+    ] = None,
+    min_views: Annotated[
+        int, typer.Option(help="Images that must see a point.", min=2)
+    ] = _DEFAULT.min_views,
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the models, metres.", min=0.01)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make control points with chips out of two or more overlapping images."""
+    fine_m, coarse_m = _pair(gsd_m)
+    options = ProductionOptions(
+        fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views
+    )
+    identity = BlockIdentity(block_id or output.name, version, title, license_name)
+    with shown_progress() as progress:
+        made = run_production(images, output, identity, options, sigma_m, progress)
+    relative = made.relative
+    show_one(
+        {
+            "block": output,
+            "points": len(made.points),
+            "views": int(made.points.views.start[-1]),
+            "tie_points": relative.tie_points,
+            "ray_residual_delivered_px": round(relative.before_px, 3),
+            "ray_residual_adjusted_px": round(relative.after_px, 3),
+            "ray_residual_points_px": round(relative.refined_px, 3),
+            "frame_sigma_m": round(relative.frame_sigma_m, 2),
+        },
+        as_json=as_json,
+    )
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Two ground samplings, the finer first."""
+    try:
+        fine_m, coarse_m = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--gsd-m: {text!r} is not FINE,COARSE, as 2,20") from None
+    if not 0.0 < fine_m < coarse_m:
+        raise InputError(f"--gsd-m: {text!r}: two lengths are expected, the finer first")
+    return fine_m, coarse_m

@@ -1,0 +1,253 @@
+"""The main job on a simulated world, where the truth is known: images, block, store, scene, report."""
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases import blocks
+from app.usecases.production import BlockIdentity, run_production
+from app.usecases.registration import SceneFiles, points_of_store, record, run_registration
+from services.formats.raster import write_raster
+from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from services.intersection import intersect
+from services.production import Production, ProductionOptions
+from services.quality.accuracy import Quantile, sample_quantile
+from services.registration import Registration, RegistrationOptions
+from services.simulation.view import (
+    SimulatedView,
+    ViewPlan,
+    simulate_block,
+    simulate_view,
+    true_ground,
+    true_line_sample,
+)
+from services.simulation.world import World, make_world
+from services.types import Array, Observations, Progress
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """The simulated world and what happens in it.
+
+    Attributes:
+        seed: of everything random.
+        size_m, posting_m, relief_m: of the world.
+        views: images the block is made from.
+        shape: lines and samples of all images.
+        gsd_m: their ground sampling.
+        block_error_m: how far the models of the block's images are wrong, each in its own direction.
+        scene_error_m: east and north, how far the model of the scene is wrong.
+        scene_skew_px: how much it is wrong by more at the edges of the image.
+        production: of the block.
+    """
+
+    seed: int = 1
+    size_m: float = 2600.0
+    posting_m: float = 1.0
+    relief_m: float = 120.0
+    views: int = 4
+    shape: tuple[int, int] = (2200, 2200)
+    gsd_m: float = 1.0
+    block_error_m: float = 4.0
+    scene_error_m: tuple[float, float] = (40.0, -30.0)
+    scene_skew_px: float = 1.0
+    production: ProductionOptions = field(
+        default_factory=lambda: ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=10.0, points=250)
+    )
+
+
+@dataclass(frozen=True)
+class DemoOutcome:
+    """What the demonstration found, beside what is true.
+
+    Attributes:
+        produced, ingested, served: points made, loaded, and returned for the footprint of the scene.
+        registration: of the scene.
+        before_m: CE90 of the scene's model as delivered against the truth.
+        in_frame_px: CE90 of the registered model against the truth moved into the block's frame.
+        absolute_m: CE90 of the registered model against the truth.
+        injected_m: east and north error of the scene's model at its centre.
+        to_recover_m: the same seen from the frame of the block.
+        recovered_m: east and north error the registration found there.
+        frame_error_m: east, north, up error of the frame of the block.
+        report: path of the page.
+    """
+
+    produced: int
+    ingested: int
+    served: int
+    registration: Registration
+    before_m: Quantile
+    in_frame_px: Quantile
+    absolute_m: Quantile
+    injected_m: Array
+    to_recover_m: Array
+    recovered_m: Array
+    frame_error_m: Array
+    report: Path
+
+
+def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: Progress) -> DemoOutcome:
+    """Simulate, produce, ingest, publish, query, register, compare with the truth.
+
+    Args:
+        folder: for images, block and report; must be empty.
+        settings: of a store for the demonstration alone.
+        options: of the world.
+        progress: told where the work stands.
+    """
+    rng = np.random.default_rng(options.seed)
+    progress(0.0, "simulating a world")
+    world = make_world(rng, options.size_m, options.posting_m, options.relief_m)
+    progress(0.05, f"simulating {options.views} images for the block")
+    sources = simulate_block(
+        world, rng, options.views, options.shape, options.gsd_m, options.block_error_m
+    )
+    progress(0.25, "simulating the scene")
+    scene = _scene(world, options, rng)
+    images = [_written(view, folder / "images") for view in sources]
+    image = _written(scene, folder / "images")
+
+    produced = run_production(
+        images,
+        folder / "block",
+        BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),
+        options.production,
+        sigma_m=options.block_error_m,
+        progress=_part_of(progress, 0.3, 0.4),
+    )
+    storage = Storage(settings.data_folder / "storage")
+    with engine.opened(settings) as database:
+        progress(0.7, "ingesting the block")
+        with database.transaction() as connection:
+            ingested = blocks.ingest_block(connection, storage, folder / "block")
+            blocks.publish_block(connection, str(ingested.block.number))
+        sigma_m = float(np.hypot(*options.scene_error_m))
+        registered = run_registration(
+            SceneFiles(image, sigma_m=sigma_m),
+            points_of_store(database, storage),
+            RegistrationOptions(),
+            folder / "registered",
+            _part_of(progress, 0.75, 0.25),
+        )
+        with database.transaction() as connection:
+            record(connection, registered)
+            served = len(points_of_store(database, storage)(registered.footprint).points)
+    return _compared(
+        world, sources, scene, produced, registered.registration, folder, ingested.block.n_points, served
+    )
+
+
+def _scene(world: World, options: DemoOptions, rng: np.random.Generator) -> SimulatedView:
+    lon, lat = (float(v) for v in world.centre_lon_lat)
+    plan = ViewPlan(
+        image_id="scene",
+        lon_lat=(lon, lat),
+        shape=options.shape,
+        gsd_m=options.gsd_m,
+        incidence_deg=12.0,
+        azimuth_deg=100.0,
+        acquired_at=datetime(2024, 8, 20, 10, 30, tzinfo=UTC),
+    )
+    skew_px = np.array([[0.0, 0.0, options.scene_skew_px], [0.0, options.scene_skew_px, 0.0]])
+    return simulate_view(world, plan, rng, options.scene_error_m, skew_px)
+
+
+def _written(view: SimulatedView, folder: Path) -> Path:
+    """The image with its delivered model, as a file like any other."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{view.geometry.plan.image_id}.tif"
+    write_raster(path, view.pixels, view.geometry.delivered)
+    return path
+
+
+def _compared(
+    world: World,
+    sources: list[SimulatedView],
+    scene: SimulatedView,
+    produced: Production,
+    registration: Registration,
+    folder: Path,
+    ingested: int,
+    served: int,
+) -> DemoOutcome:
+    """The outcome beside the truth, over a grid of the ground that the scene shows."""
+    origin = np.append(world.centre_lon_lat, np.mean(world.height_range_m))
+    frame_m = _frame_error_m(sources, produced, origin)
+    ground = _grid(scene, world)
+    moved = lon_lat_h_from_east_north_up(east_north_up(ground, origin) + frame_m, origin)
+    true_px = true_line_sample(scene, ground)
+    gsd_m = scene.geometry.plan.gsd_m
+    model = registration.model
+    delivered = scene.geometry.delivered
+    centre = _centre(scene, world)
+    centre_moved = lon_lat_h_from_east_north_up(east_north_up(centre, origin) + frame_m, origin)
+    true_centre = true_line_sample(scene, centre)
+
+    def metres(error_px: Array) -> Array:
+        derivative = delivered.project_derivative(centre)[0, :, :2]
+        return np.asarray(np.linalg.solve(derivative, error_px[0]), dtype=np.float64)
+
+    return DemoOutcome(
+        produced=len(produced.points),
+        ingested=ingested,
+        served=served,
+        registration=registration,
+        before_m=_ce90((delivered.project(ground) - true_px) * gsd_m),
+        in_frame_px=_ce90(model.project(moved) - true_px),
+        absolute_m=_ce90((model.project(ground) - true_px) * gsd_m),
+        injected_m=metres(delivered.project(centre) - true_centre),
+        to_recover_m=metres(delivered.project(centre_moved) - true_centre),
+        recovered_m=metres(delivered.project(centre_moved) - model.project(centre_moved)),
+        frame_error_m=frame_m,
+        report=folder / "registered" / "report.html",
+    )
+
+
+def _frame_error_m(sources: list[SimulatedView], produced: Production, origin: Array) -> Array:
+    """East, north, up (3,) from where the block's points really are to where the block says.
+
+    What an image shows at a position is the same whatever its model: the rays of the true models through
+    the positions the adjusted ones give meet where the point really is.
+    """
+    points = produced.points.lon_lat_h
+    n, views = len(points), len(sources)
+    seen = np.stack([model.project(points) for model in produced.adjustment.models], axis=1)
+    rays = Observations(
+        np.repeat(np.arange(n), views),
+        np.tile(np.arange(views), n),
+        seen.reshape(-1, 2),
+        np.ones(n * views),
+    )
+    true = intersect([view.geometry.true_model for view in sources], rays, n)
+    return np.asarray(
+        np.median(east_north_up(points, origin) - east_north_up(true.lon_lat_h, origin), axis=0)
+    )
+
+
+def _grid(scene: SimulatedView, world: World, per_side: int = 21) -> Array:
+    """Ground points (n, 3) that the scene shows, evenly over the image."""
+    lines, samples = scene.pixels.shape
+    axes = np.linspace(0.0, lines - 1.0, per_side), np.linspace(0.0, samples - 1.0, per_side)
+    line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    ground = true_ground(scene, world, line_sample)
+    return np.asarray(ground[np.isfinite(ground).all(axis=1)])
+
+
+def _centre(scene: SimulatedView, world: World) -> Array:
+    """Ground point (1, 3) at the centre of the scene."""
+    return true_ground(scene, world, (np.array([scene.pixels.shape]) - 1.0) / 2.0)
+
+
+def _ce90(error: Array) -> Quantile:
+    return sample_quantile(np.hypot(error[:, 0], error[:, 1]))
+
+
+def _part_of(progress: Progress, start: float, share: float) -> Progress:
+    """Progress of a part, as progress of the whole."""
+    return lambda fraction, message: progress(start + share * fraction, message)
