@@ -1,0 +1,222 @@
+"""A chip is found to a fraction of a pixel with a sigma to believe, or not at all and for a reason."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from services.matching.correlate import FOUND, CorrelationOptions, Peak, correlation_map, find_chip
+from services.types import Array, FloatImage
+from tests.services.textures import as_pixels, moved, texture
+
+a_twentieth_of_a_pixel = 0.05
+a_millipixel = 1e-3
+
+OPTIONS = CorrelationOptions()
+RADIUS_PX = 6
+SIDE = 101
+PERIOD = 128
+
+
+def chip_of(ground: Array) -> FloatImage:
+    return as_pixels(ground[RADIUS_PX : RADIUS_PX + SIDE, RADIUS_PX : RADIUS_PX + SIDE])
+
+
+def patch_of(ground: Array) -> FloatImage:
+    side = SIDE + 2 * RADIUS_PX
+    return as_pixels(ground[:side, :side])
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What became of many chips that were looked for in moved and noisy patches."""
+
+    error_px: Array
+    sigma_px: Array
+    lost: int
+
+    @property
+    def normalised_square(self) -> float:
+        """Mean square of the errors in units of their stated sigmas: one when these are true."""
+        return float(((self.error_px / self.sigma_px[:, None]) ** 2).mean())
+
+
+def trials(smoothness_px: float, noise: float, noise_smoothness_px: float | None, seed: int) -> Trials:
+    """Look for 150 chips; a noise without smoothness is white."""
+    rng = np.random.default_rng(seed)
+    error, sigma, lost = [], [], 0
+    for _ in range(150):
+        ground = texture(rng, PERIOD, smoothness_px)
+        shift = rng.uniform(-3.0, 3.0, 2)
+        other = (
+            rng.standard_normal(ground.shape)
+            if noise_smoothness_px is None
+            else texture(rng, PERIOD, noise_smoothness_px)
+        )
+        peak = find_chip(patch_of(moved(ground, *shift) + noise * other), chip_of(ground), OPTIONS)
+        if peak.reason == FOUND:
+            error.append(peak.row_col - shift)
+            sigma.append(peak.sigma_px)
+        else:
+            lost += 1
+    return Trials(np.array(error), np.array(sigma), lost)
+
+
+def found_at(peak: Peak, row: float, col: float, tolerance_px: float = a_twentieth_of_a_pixel) -> bool:
+    return peak.reason == FOUND and bool(np.abs(peak.row_col - [row, col]).max() < tolerance_px)
+
+
+@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
+def test_a_shift_is_recovered_to_a_twentieth_of_a_pixel(smoothness_px: float) -> None:
+    clean = trials(smoothness_px, 0.0, None, 1)
+    assert clean.lost == 0
+    assert np.abs(clean.error_px).max() < a_twentieth_of_a_pixel
+
+
+@pytest.mark.parametrize("smoothness_px", [1.5, 2.5])
+def test_white_noise_does_not_cost_a_twentieth_of_a_pixel(smoothness_px: float) -> None:
+    noisy = trials(smoothness_px, 0.3, None, 2)
+    assert noisy.lost == 0
+    assert np.abs(noisy.error_px).max() < a_twentieth_of_a_pixel
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.45])
+@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
+def test_measures_have_no_bias(smoothness_px: float, noise: float) -> None:
+    for noise_smoothness in (None, smoothness_px):
+        found = trials(smoothness_px, noise, noise_smoothness, 3)
+        standard_error = found.error_px.std(axis=0) / np.sqrt(len(found.error_px))
+        assert np.abs(found.error_px.mean(axis=0) / standard_error).max() < 4.0
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.45])
+@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
+def test_a_stated_sigma_is_true_for_noise_as_smooth_as_the_texture(
+    smoothness_px: float, noise: float
+) -> None:
+    found = trials(smoothness_px, noise, smoothness_px, 4)
+    assert found.lost == 0
+    assert 0.2 < found.normalised_square < 2.0
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.45])
+@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
+def test_a_stated_sigma_is_not_too_small_for_white_noise(smoothness_px: float, noise: float) -> None:
+    assert trials(smoothness_px, noise, None, 5).normalised_square < 2.0
+
+
+def test_a_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
+    def sigma(smoothness_px: float, noise: float) -> float:
+        return float(np.median(trials(smoothness_px, noise, smoothness_px, 6).sigma_px))
+
+    assert sigma(1.5, 0.2) < sigma(1.5, 0.45) < sigma(3.0, 0.45)
+
+
+def test_brightness_and_contrast_do_not_move_a_chip() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    patch, chip = patch_of(moved(ground, 1.3, -2.4)), chip_of(ground)
+    plain, changed = find_chip(patch, chip, OPTIONS), find_chip(3.0 * patch + 700.0, chip, OPTIONS)
+    assert found_at(plain, 1.3, -2.4)
+    np.testing.assert_allclose(changed.row_col, plain.row_col, atol=a_millipixel)
+    assert changed.score == pytest.approx(plain.score, abs=1e-4)
+
+
+def test_a_positive_displacement_is_down_and_to_the_right() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    peak = find_chip(patch_of(np.roll(ground, (4, -2), (0, 1))), chip_of(ground), OPTIONS)
+    assert found_at(peak, 4.0, -2.0)
+
+
+def test_a_chip_without_contrast_is_flat() -> None:
+    rng = np.random.default_rng(0)
+    patch = patch_of(texture(rng, PERIOD, 1.5))
+    for contrast in (0.0, 0.009):
+        grey = 500.0 * (1.0 + contrast * texture(rng, PERIOD, 1.5)[:SIDE, :SIDE])
+        assert find_chip(patch, grey.astype(np.float32), OPTIONS).reason == "flat"
+
+
+def test_a_chip_with_a_hole_has_nodata() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    chip = chip_of(ground)
+    chip[3, 90] = np.nan
+    assert find_chip(patch_of(ground), chip, OPTIONS).reason == "nodata"
+
+
+def test_a_patch_that_leaves_no_room_for_the_chip_has_nodata() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    for hole in (np.s_[:, :], np.s_[:, :60], np.s_[56:57, 56:57]):
+        patch = patch_of(ground)
+        patch[hole] = np.nan
+        assert find_chip(patch, chip_of(ground), OPTIONS).reason == "nodata"
+
+
+def test_something_else_has_a_low_score() -> None:
+    rng = np.random.default_rng(0)
+    peak = find_chip(patch_of(texture(rng, PERIOD, 1.5)), chip_of(texture(rng, PERIOD, 1.5)), OPTIONS)
+    assert peak.reason == "low_score"
+    assert 0.0 < peak.score < 0.5
+    assert np.isnan(peak.sigma_px)
+    assert np.isnan(peak.row_col).all()
+
+
+def test_the_negative_of_a_chip_has_a_low_score() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    assert find_chip(patch_of(-ground), chip_of(ground), OPTIONS).reason == "low_score"
+
+
+@pytest.mark.parametrize("shift", [(7.0, 0.0), (0.0, -7.5), (-7.0, 7.0)])
+def test_what_lies_beyond_the_search_peaks_on_its_border(shift: tuple[float, float]) -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 5.0)
+    assert find_chip(patch_of(moved(ground, *shift)), chip_of(ground), OPTIONS).reason == "border_peak"
+
+
+def test_a_pattern_that_repeats_is_ambiguous() -> None:
+    rng = np.random.default_rng(0)
+    side = SIDE + 40
+    repeated = np.tile(texture(rng, 16, 1.5), (10, 10))[:side, :side] + 0.1 * rng.standard_normal(
+        (side, side)
+    )
+    chip = as_pixels(repeated[20 : 20 + SIDE, 20 : 20 + SIDE])
+    assert find_chip(as_pixels(repeated), chip, OPTIONS).reason == "ambiguous"
+
+
+def test_a_straight_edge_is_ambiguous() -> None:
+    rng = np.random.default_rng(0)
+    side = SIDE + 40
+    edge = np.broadcast_to(np.tanh((np.arange(side) - 70.0) / 2.0), (side, side))
+    seen, cut = (edge + 0.02 * rng.standard_normal((side, side)) for _ in range(2))
+    chip = as_pixels(cut[20 : 20 + SIDE, 20 : 20 + SIDE])
+    assert find_chip(as_pixels(seen), chip, OPTIONS).reason == "ambiguous"
+
+
+def test_missing_pixels_never_win() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        ground = texture(rng, PERIOD, 1.5)
+        shift = rng.integers(-4, 5, 2)
+        patch = patch_of(np.roll(ground, shift, (0, 1)))
+        row, col = rng.integers(0, len(patch)), rng.integers(SIDE + 1, len(patch))
+        patch[row, col] = np.nan
+        scores = correlation_map(patch, chip_of(ground))
+        assert scores is not None
+        for i, j in np.argwhere(scores > -1.0):
+            assert not (i <= row < i + SIDE and j <= col < j + SIDE)
+
+
+def test_a_chip_half_under_nodata_is_not_found_elsewhere() -> None:
+    rng = np.random.default_rng(0)
+    ground = texture(rng, PERIOD, 1.5)
+    patch = patch_of(np.roll(ground, (0, 5), (0, 1)))
+    patch[:, 108:] = np.nan  # the chip's true place reaches to column 112
+    peak = find_chip(patch, chip_of(ground), OPTIONS)
+    assert peak.reason == "low_score"
+
+
+def test_nodata_away_from_a_chip_does_not_move_it() -> None:
+    ground = texture(np.random.default_rng(0), PERIOD, 1.5)
+    patch = patch_of(moved(ground, -2.3, -1.6))
+    whole = find_chip(patch, chip_of(ground), OPTIONS)
+    patch[:, 110:] = np.nan
+    beside = find_chip(patch, chip_of(ground), OPTIONS)
+    assert beside.reason == FOUND
+    np.testing.assert_allclose(beside.row_col, whole.row_col, atol=a_millipixel)
