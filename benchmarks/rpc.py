@@ -1,0 +1,229 @@
+"""Ground to image and back by the RPC: Amers, rpcfast and GDAL (through rasterio) on the same points.
+
+CPU time of one thread, medians of runs taken in turn. Beside the speed, the largest difference from
+Amers in pixels, and for `locate` from the position that was asked for. A ground position becomes pixels
+by projecting it. Amers and rpcfast take the centre of the first pixel for (0, 0), GDAL for (0.5, 0.5):
+half a pixel is taken off what GDAL projects and added to what it locates. Each locates to its own
+default tolerance (rpcfast 1e-8 px, Amers 1e-7 px, GDAL 0.1 px), and GDAL once more to 1e-6 px. GDAL is
+given fewer points. Run: python -m benchmarks.rpc
+"""
+
+import os
+
+# Read by Numba when it is first imported.
+os.environ["NUMBA_NUM_THREADS"] = "1"
+
+import argparse
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import rpcfast
+from rasterio.transform import RPCTransformer
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks._measuring import cpu_medians_s, keep
+from services.formats.raster import gdal_rpc
+from services.formats.rpc_text import parse_rpc_text
+from services.sensors.rpc import RpcModel
+from services.types import Array
+
+MODEL = Path(__file__).parents[1] / "tests" / "golden" / "invented_RPC.TXT"
+GDAL_FIRST_PIXEL = 0.5
+STRICT = {"RPC_PIXEL_ERROR_THRESHOLD": "1e-6", "RPC_MAX_ITERATIONS": "40"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One implementation, one direction."""
+
+    direction: str
+    implementation: str
+    points: int
+    cpu_s: float
+    points_per_s: float
+    amers_is_faster: float
+    largest_difference_px: float
+    round_trip_px: float | None
+
+
+@dataclass(frozen=True)
+class Way:
+    """An implementation's way in one direction: what is run, and what it gives as Amers would say it."""
+
+    points: int
+    run: Callable[[], object]
+    result: Callable[[], Array]
+
+
+def main() -> None:
+    """Measure, print, keep."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=int, default=1_000_000)
+    parser.add_argument("--gdal-points", type=int, default=200_000)
+    parser.add_argument("--repeats", type=int, default=15)
+    arguments = parser.parse_args()
+    model = parse_rpc_text(MODEL.read_text())
+    rng = np.random.default_rng(1)
+    ground = model.ground_offset + rng.uniform(-1.0, 1.0, (arguments.points, 3)) * model.ground_scale
+    line_sample = model.image_offset + rng.uniform(-1.0, 1.0, (arguments.points, 2)) * model.image_scale
+    with ExitStack() as stack:
+        gdal = stack.enter_context(RPCTransformer(gdal_rpc(model)))
+        strict = stack.enter_context(RPCTransformer(gdal_rpc(model), **STRICT))
+        few = ground[: arguments.gdal_points]
+        projecting = {
+            "Amers": amers_project(model, ground),
+            "rpcfast": rpcfast_project(model, ground),
+            "GDAL": gdal_project(gdal, few),
+        }
+        outcomes = compared("project", projecting, arguments.repeats, lambda way: way.result())
+        few_px = line_sample[: arguments.gdal_points]
+        locating = {
+            "Amers": amers_locate(model, line_sample, ground[:, 2]),
+            "rpcfast": rpcfast_locate(model, line_sample, ground[:, 2]),
+            "GDAL": gdal_locate(gdal, few_px, few[:, 2]),
+            "GDAL to 1e-6 px": gdal_locate(strict, few_px, few[:, 2]),
+        }
+        outcomes += compared(
+            "locate", locating, arguments.repeats, lambda way: model.project(way.result()), line_sample
+        )
+    show(outcomes)
+    keep("rpc", [asdict(outcome) for outcome in outcomes])
+
+
+def compared(
+    direction: str,
+    ways: dict[str, Way],
+    repeats: int,
+    in_pixels: Callable[[Way], Array],
+    asked: Array | None = None,
+) -> list[Outcome]:
+    """Times and largest differences of some ways; the first is the one the others are held against."""
+    taken_s = cpu_medians_s({name: way.run for name, way in ways.items()}, repeats)
+    pixels = {name: in_pixels(way) for name, way in ways.items()}
+    reference = next(iter(ways))
+    outcomes = []
+    for name, way in ways.items():
+        speed = way.points / taken_s[name]
+        faster = ways[reference].points / taken_s[reference] / speed
+        difference_px = largest(pixels[name] - pixels[reference][: way.points])
+        round_trip_px = None if asked is None else largest(pixels[name] - asked[: way.points])
+        outcomes.append(
+            Outcome(
+                direction, name, way.points, taken_s[name], speed, faster, difference_px, round_trip_px
+            )
+        )
+    return outcomes
+
+
+def largest(difference: Array) -> float:
+    """Largest absolute value; a position that was not found counts as infinitely far."""
+    return float(np.nan_to_num(np.abs(difference), nan=np.inf).max())
+
+
+def amers_project(model: RpcModel, ground: Array) -> Way:
+    """The way of the service."""
+    return Way(len(ground), lambda: model.project(ground), lambda: model.project(ground))
+
+
+def amers_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Way:
+    """The way of the service."""
+    return Way(
+        len(height_m),
+        lambda: model.locate(line_sample, height_m),
+        lambda: model.locate(line_sample, height_m),
+    )
+
+
+def rpcfast_project(model: RpcModel, ground: Array) -> Way:
+    """Coordinates are given apart and contiguous, as rpcfast wants them."""
+    other, coordinates = fast(model), [np.ascontiguousarray(column) for column in ground.T]
+
+    def result() -> Array:
+        sample, line = rpcfast.project(other, *coordinates)
+        return np.column_stack([line, sample])
+
+    return Way(len(ground), lambda: rpcfast.project(other, *coordinates), result)
+
+
+def rpcfast_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Way:
+    """Coordinates are given apart and contiguous, as rpcfast wants them."""
+    other = fast(model)
+    sample_line_h = [np.ascontiguousarray(c) for c in (line_sample[:, 1], line_sample[:, 0], height_m)]
+
+    def result() -> Array:
+        lon, lat, _ = rpcfast.localize(other, *sample_line_h)
+        return np.column_stack([lon, lat, height_m])
+
+    return Way(len(height_m), lambda: rpcfast.localize(other, *sample_line_h), result)
+
+
+def gdal_project(gdal: RPCTransformer, ground: Array) -> Way:
+    """Positions are not rounded to whole pixels."""
+    coordinates = [np.ascontiguousarray(column) for column in ground.T]
+
+    def run() -> tuple[Array, Array]:
+        line, sample = gdal.rowcol(*coordinates, op=as_it_is)
+        return line, sample
+
+    return Way(len(ground), run, lambda: np.column_stack(run()) - GDAL_FIRST_PIXEL)
+
+
+def gdal_locate(gdal: RPCTransformer, line_sample: Array, height_m: Array) -> Way:
+    """Positions are counted from the corner of the first pixel ("ul"), as GDAL does."""
+    line, sample = (np.ascontiguousarray(column) for column in line_sample.T + GDAL_FIRST_PIXEL)
+
+    def run() -> tuple[Array, Array]:
+        lon, lat = gdal.xy(line, sample, zs=height_m, offset="ul")
+        return lon, lat
+
+    return Way(len(height_m), run, lambda: np.column_stack([*run(), height_m]))
+
+
+def as_it_is(position: Array) -> Array:
+    """What rasterio may do with a position before it gives it."""
+    return position
+
+
+def fast(model: RpcModel) -> rpcfast.RPCModel:
+    """The model as rpcfast holds it."""
+    rpc = gdal_rpc(model)
+    names = [
+        f"{axis}_{what}"
+        for axis in ("line", "samp", "lat", "long", "height")
+        for what in ("off", "scale")
+    ]
+    names += [f"{axis}_{part}_coeff" for axis in ("line", "samp") for part in ("num", "den")]
+    return rpcfast.RPCModel(**{name: np.asarray(getattr(rpc, name)) for name in names})
+
+
+def show(outcomes: list[Outcome]) -> None:
+    """Print the table."""
+    table = Table(
+        "",
+        "implementation",
+        "points",
+        "M points/s",
+        "Amers is faster",
+        "from Amers",
+        "from what was asked",
+        title="RPC, one thread; largest differences",
+    )
+    for o in outcomes:
+        table.add_row(
+            o.direction,
+            o.implementation,
+            f"{o.points:,}",
+            f"{o.points_per_s / 1e6:.1f}",
+            f"{o.amers_is_faster:.1f} x",
+            f"{o.largest_difference_px:.1e} px",
+            "" if o.round_trip_px is None else f"{o.round_trip_px:.1e} px",
+        )
+    Console(width=105).print(table)
+
+
+if __name__ == "__main__":
+    main()
