@@ -25,6 +25,7 @@ class FeatureOptions:
     Attributes:
         per_image: features aimed at in an image, the strongest of each tile.
         per_megapixel: most features kept for a million pixels; small images reach it first.
+        largest_px: diameter beyond which a feature is too vague to be placed.
         max_ratio: largest ratio between the distances to the best and the second best descriptor.
         tolerance_px: how far matches may scatter across the rays round their common offset.
         sigma_px: of a feature's position, one standard deviation a coordinate.
@@ -33,7 +34,8 @@ class FeatureOptions:
 
     per_image: int = 12_000
     per_megapixel: int = 10_000
-    max_ratio: float = 0.8
+    largest_px: float = 5.0
+    max_ratio: float = 0.75
     tolerance_px: float = 1.5
     sigma_px: float = 0.3
     cell_px: int = 256
@@ -92,7 +94,8 @@ def find_features(image: ImageSource, options: FeatureOptions) -> Features:
                 lines + 2 * _TILE_MARGIN_PX,
                 samples + 2 * _TILE_MARGIN_PX,
             )
-            found = _tile_features(image.read(window), int(per_pixel * lines * samples))
+            count = int(per_pixel * lines * samples)
+            found = _tile_features(image.read(window), count, options.largest_px)
             own = found.line_sample - _TILE_MARGIN_PX
             kept = ((own >= -0.5) & (own < [lines - 0.5, samples - 0.5])).all(axis=1)
             positions.append(own[kept] + [line, sample])
@@ -100,7 +103,7 @@ def find_features(image: ImageSource, options: FeatureOptions) -> Features:
     return Features(np.concatenate(positions), np.concatenate(descriptors))
 
 
-def _tile_features(pixels: FloatImage, count: int) -> Features:
+def _tile_features(pixels: FloatImage, count: int, largest_px: float) -> Features:
     """SIFT features of one tile, away from what is missing."""
     missing = ~np.isfinite(pixels)
     if missing.all():
@@ -110,7 +113,8 @@ def _tile_features(pixels: FloatImage, count: int) -> Features:
     mask = cv2.erode((~missing).astype(np.uint8) * 255, np.ones((9, 9), np.uint8))
     sift = cv2.SIFT.create(nfeatures=max(count, 50), contrastThreshold=0.01)
     image8 = np.where(missing, 0.0, stretched).astype(np.uint8)
-    keypoints, descriptor = sift.detectAndCompute(image8, mask)
+    sharp = [keypoint for keypoint in sift.detect(image8, mask) if keypoint.size <= largest_px]
+    keypoints, descriptor = sift.compute(image8, sharp)
     if descriptor is None:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     sample_line = np.array(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
