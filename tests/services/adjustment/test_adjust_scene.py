@@ -1,0 +1,266 @@
+"""A correction is found with the precision it states, in the right order, whatever a few points say."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.scene import AdjustmentOptions, Order, SceneAdjustment, adjust_scene
+from services.errors import NotEnoughPoints
+from services.sensors.correction import ImageCorrection, no_correction
+from services.types import Array, BoolArray
+from tests.services.conftest import GSD_M, SHAPE, FlatModel
+
+DEFAULTS = AdjustmentOptions()
+NOISE_PX = 0.2
+TRIALS = 200
+a_millipixel = 1e-3
+
+TRUTH: dict[Order, Array] = {
+    "shift": np.array([[12.0, 0.0, 0.0], [-7.0, 0.0, 0.0]]),
+    "drift": np.array([[12.0, 1.5, 0.0], [-7.0, 0.0, -2.0]]),
+    "affine": np.array([[12.0, 1.5, 2.0], [-7.0, -1.0, -2.0]]),
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Points seen in an image whose model is wrong by a known correction."""
+
+    lon_lat_h: Array
+    line_sample: Array
+    sigma_px: Array
+    covariance_m2: Array
+    truth: ImageCorrection
+
+    def adjust(
+        self, options: AdjustmentOptions = DEFAULTS, candidates: BoolArray | None = None
+    ) -> SceneAdjustment:
+        return adjust_scene(
+            FlatModel(),
+            SHAPE,
+            self.lon_lat_h,
+            self.line_sample,
+            self.sigma_px,
+            self.covariance_m2,
+            options,
+            candidates,
+        )
+
+
+def seen(parameters: Array, rng: np.random.Generator, n: int = 40, noise_px: float = NOISE_PX) -> Seen:
+    model, frame = FlatModel(), no_correction(SHAPE)
+    truth = replace(frame, parameters=parameters)
+    predicted = rng.uniform(0.0, 1.0, (n, 2)) * (np.array(SHAPE) - 1.0)
+    line_sample = truth.apply(predicted) + rng.normal(0.0, 1.0, (n, 2)) * noise_px
+    ground = model.locate(predicted, np.zeros(n))
+    return Seen(ground, line_sample, np.full(n, noise_px), np.zeros((n, 3, 3)), truth)
+
+
+def with_blunders(points: Seen, count: int, rng: np.random.Generator, size_px: float = 5.0) -> Seen:
+    """The first `count` points are seen `size_px` to four times that away, in any direction."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    length = rng.uniform(size_px, 4.0 * size_px, count)
+    line_sample = points.line_sample.copy()
+    line_sample[:count] += length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return replace(points, line_sample=line_sample)
+
+
+def normalised_square(found: SceneAdjustment, truth: Array) -> float:
+    """Mean square of the errors of the free parameters, whitened by their covariance."""
+    free = np.flatnonzero(np.diag(found.covariance) > 0.0)
+    error = (found.correction.parameters - truth).ravel()[free]
+    return float(error @ np.linalg.solve(found.covariance[np.ix_(free, free)], error) / len(free))
+
+
+@pytest.mark.parametrize("order", ["shift", "drift", "affine"])
+def test_a_correction_is_recovered_within_its_stated_covariance(order: Order) -> None:
+    rng = np.random.default_rng(0)
+    options = AdjustmentOptions(order=order)
+    squares = [
+        normalised_square(seen(TRUTH[order], rng).adjust(options), TRUTH[order]) for _ in range(TRIALS)
+    ]
+    assert 0.75 < np.mean(squares) < 1.25
+
+
+def test_without_noise_the_correction_is_exact() -> None:
+    for order, parameters in TRUTH.items():
+        points = seen(parameters, np.random.default_rng(0), noise_px=0.0)
+        points = replace(points, sigma_px=np.full(40, NOISE_PX))
+        found = points.adjust(AdjustmentOptions(order=order))
+        np.testing.assert_allclose(found.correction.parameters, parameters, atol=a_millipixel)
+        np.testing.assert_allclose(found.residual_px, 0.0, atol=a_millipixel)
+        assert found.active.all()
+
+
+@pytest.mark.parametrize("order", ["shift", "drift", "affine"])
+def test_the_order_is_that_of_the_truth_and_the_covariance_holds_with_it(order: Order) -> None:
+    rng = np.random.default_rng(2)
+    found = [seen(TRUTH[order], rng).adjust() for _ in range(TRIALS // 2)]
+    right = [f for f in found if f.order == order]
+    assert len(right) >= 0.9 * len(found)
+    assert 0.75 < np.mean([normalised_square(f, TRUTH[order]) for f in right]) < 1.25
+
+
+def test_a_skew_of_two_pixels_asks_for_an_affine() -> None:
+    rng = np.random.default_rng(3)
+    skewed = np.array([[5.0, 0.0, 2.0], [5.0, -2.0, 0.0]])
+    assert all(seen(skewed, rng).adjust().order == "affine" for _ in range(TRIALS // 4))
+
+
+def test_every_order_that_was_tried_is_told_with_its_validation() -> None:
+    found = seen(TRUTH["affine"], np.random.default_rng(0)).adjust()
+    validation = dict(found.validation_px)
+    assert list(validation) == ["shift", "drift", "affine"]
+    assert validation["affine"] < validation["drift"] < validation["shift"]
+    # Four fifths of the nearest: a normal law in two dimensions leaves 0.77 of its rms of sqrt(2) sigma.
+    assert validation["affine"] == pytest.approx(0.77 * np.sqrt(2.0) * NOISE_PX, rel=0.25)
+
+
+def test_points_in_a_corner_carry_a_shift_only() -> None:
+    rng = np.random.default_rng(0)
+    points = seen(TRUTH["shift"], rng, 40)
+    corner = FlatModel().project(points.lon_lat_h) / 10.0
+    crowded = replace(
+        points,
+        lon_lat_h=FlatModel().locate(corner, np.zeros(40)),
+        line_sample=points.truth.apply(corner) + rng.normal(0.0, NOISE_PX, (40, 2)),
+    )
+    assert [order for order, _ in crowded.adjust().validation_px] == ["shift"]
+
+
+def test_few_points_do_not_carry_an_affine() -> None:
+    found = seen(TRUTH["affine"], np.random.default_rng(0), n=10).adjust()
+    assert [order for order, _ in found.validation_px] == ["shift", "drift"]
+
+
+@pytest.mark.parametrize("order", ["shift", "drift", "affine"])
+def test_three_points_in_ten_may_be_wrong(order: Order) -> None:
+    rng = np.random.default_rng(4)
+    squares, kept_wrong, lost_right = [], 0, 0
+    for _ in range(TRIALS // 4):
+        found = with_blunders(seen(TRUTH[order], rng), 12, rng).adjust(AdjustmentOptions(order=order))
+        squares.append(normalised_square(found, TRUTH[order]))
+        kept_wrong += int(found.active[:12].sum())
+        lost_right += int((~found.active[12:]).sum())
+    assert np.mean(squares) < 1.4
+    assert kept_wrong == 0
+    assert lost_right < 0.02 * 28 * TRIALS / 4
+
+
+def test_two_points_in_ten_may_be_wrong_when_the_order_is_chosen_too() -> None:
+    rng = np.random.default_rng(5)
+    found = [with_blunders(seen(TRUTH["affine"], rng), 8, rng).adjust() for _ in range(TRIALS // 4)]
+    assert all(f.order == "affine" for f in found)
+    assert not any(f.active[:8].any() for f in found)
+    assert np.mean([normalised_square(f, TRUTH["affine"]) for f in found]) < 1.4
+
+
+def test_a_measure_that_left_still_has_its_residual() -> None:
+    rng = np.random.default_rng(6)
+    points = with_blunders(seen(TRUTH["shift"], rng), 3, rng)
+    found = points.adjust(AdjustmentOptions(order="shift"))
+    expected = points.line_sample - found.correction.apply(FlatModel().project(points.lon_lat_h))
+    np.testing.assert_allclose(found.residual_px, expected, atol=a_millipixel)
+    assert np.hypot(*found.residual_px[:3].T).min() > 4.0
+
+
+def test_measures_without_a_position_and_those_held_out_are_not_used() -> None:
+    rng = np.random.default_rng(7)
+    points = seen(TRUTH["shift"], rng)
+    line_sample = points.line_sample.copy()
+    line_sample[:5] = np.nan
+    line_sample[30:] += 50.0
+    found = replace(points, line_sample=line_sample).adjust(candidates=np.arange(40) < 30)
+    assert not found.active[:5].any()
+    assert not found.active[30:].any()
+    np.testing.assert_allclose(found.correction.parameters[:, 0], [12.0, -7.0], atol=3.0 * NOISE_PX)
+
+
+def test_sigmas_that_were_too_small_are_made_good() -> None:
+    rng = np.random.default_rng(8)
+    squares = []
+    for _ in range(TRIALS):
+        points = seen(TRUTH["shift"], rng)
+        found = replace(points, sigma_px=points.sigma_px / 4.0).adjust(AdjustmentOptions(order="shift"))
+        squares.append(normalised_square(found, TRUTH["shift"]))
+        assert found.sigma0 == pytest.approx(4.0, rel=0.5)
+    assert 0.75 < np.mean(squares) < 1.4
+
+
+def test_sigmas_that_were_too_large_are_not_made_smaller() -> None:
+    points = seen(TRUTH["shift"], np.random.default_rng(9))
+    stated = points.adjust(AdjustmentOptions(order="shift"))
+    wide = replace(points, sigma_px=points.sigma_px * 4.0).adjust(AdjustmentOptions(order="shift"))
+    assert wide.sigma0 < 0.4
+    np.testing.assert_allclose(np.diag(wide.covariance)[[0, 3]], (4.0 * NOISE_PX) ** 2 / 40.0, rtol=0.01)
+    np.testing.assert_allclose(
+        wide.correction.parameters, stated.correction.parameters, atol=0.1 * NOISE_PX
+    )
+
+
+def test_points_known_badly_weigh_little() -> None:
+    rng = np.random.default_rng(10)
+    sigma_m = np.where(np.arange(40) < 20, 5.0, 0.05)
+    squares, errors = [], []
+    for _ in range(TRIALS):
+        points = seen(TRUTH["shift"], rng)
+        moved_m = rng.normal(0.0, 1.0, (40, 2)) * sigma_m[:, None]
+        line_sample = points.line_sample + np.column_stack([-moved_m[:, 1], moved_m[:, 0]]) / GSD_M
+        covariance = sigma_m[:, None, None] ** 2 * np.diag([1.0, 1.0, 0.0])
+        found = replace(points, line_sample=line_sample, covariance_m2=covariance).adjust(
+            AdjustmentOptions(order="shift")
+        )
+        squares.append(normalised_square(found, TRUTH["shift"]))
+        errors.append(found.correction.parameters[:, 0] - [12.0, -7.0])
+    assert 0.75 < np.mean(squares) < 1.3
+    good_only_px = np.hypot(NOISE_PX, 0.05 / GSD_M) / np.sqrt(20.0)
+    assert np.std(errors) < 1.2 * good_only_px
+
+
+def test_a_point_s_covariance_is_seen_along_its_own_direction() -> None:
+    rng = np.random.default_rng(11)
+    points = seen(TRUTH["shift"], rng)
+    line_sample = points.line_sample + rng.normal(0.0, 2.0, (40, 1)) / GSD_M * [0.0, 1.0]
+    east_only = np.tile(np.diag([4.0, 0.0, 0.0]), (40, 1, 1))
+    moved = replace(points, line_sample=line_sample, covariance_m2=east_only)
+    found = moved.adjust(AdjustmentOptions(order="shift"))
+    std_px = np.sqrt(np.diag(found.covariance)[[0, 3]]) / max(found.sigma0, 1.0)
+    expected = np.array([NOISE_PX, np.hypot(NOISE_PX, 2.0 / GSD_M)]) / np.sqrt(found.active.sum())
+    assert found.active.sum() >= 38
+    np.testing.assert_allclose(std_px, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize(("usable", "minimum"), [(0, 4), (3, 4), (5, 6)])
+def test_too_few_measures_are_refused_with_their_numbers(usable: int, minimum: int) -> None:
+    points = seen(TRUTH["shift"], np.random.default_rng(12), n=20)
+    line_sample = points.line_sample.copy()
+    line_sample[usable:] = np.nan
+    with pytest.raises(
+        NotEnoughPoints, match=rf"^{usable} usable points found, {minimum} needed"
+    ) as caught:
+        replace(points, line_sample=line_sample).adjust(AdjustmentOptions(min_points=minimum))
+    assert (caught.value.found, caught.value.needed) == (usable, minimum)
+
+
+def test_the_same_measures_give_the_same_adjustment() -> None:
+    rng = np.random.default_rng(13)
+    points = with_blunders(seen(TRUTH["affine"], rng), 6, rng)
+    first, again = points.adjust(), points.adjust()
+    np.testing.assert_array_equal(first.correction.parameters, again.correction.parameters)
+    np.testing.assert_array_equal(first.active, again.active)
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    rng = np.random.default_rng(14)
+    points = with_blunders(seen(TRUTH["shift"], rng), 6, rng)
+    order = rng.permutation(40)
+    shuffled = Seen(
+        *(getattr(points, f)[order] for f in ("lon_lat_h", "line_sample", "sigma_px", "covariance_m2")),
+        points.truth,
+    )
+    first, other = points.adjust(), shuffled.adjust()
+    np.testing.assert_allclose(
+        other.correction.parameters, first.correction.parameters, atol=a_millipixel
+    )
+    np.testing.assert_array_equal(other.active, first.active[order])
