@@ -1,0 +1,247 @@
+"""Images are brought together by tie points alone, and the block says how well."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.block import BlockAdjustment, BlockOptions, adjust_block
+from services.errors import NoConvergence, NotEnoughPoints
+from services.intersection import intersect
+from services.simulation.view import ViewGeometry
+from services.types import Array, Observations
+from tests.services.simulated import ring_of_geometries
+from tests.services.ties import Ties, difference_m, make_ties, whitened_square
+
+NOISE_PX = 0.2
+PRIOR_PX = 4.0
+TRIALS = 40
+a_centimetre = 0.01
+a_millipixel = 1e-3
+a_tenth_of_a_pixel = 0.1
+
+
+@pytest.fixture(scope="module")
+def five() -> list[ViewGeometry]:
+    return ring_of_geometries(5)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One block: what was put into it and what came out."""
+
+    ties: Ties
+    shift_px: Array
+    block: BlockAdjustment
+
+    @property
+    def found_px(self) -> Array:
+        """(n, 2) shifts."""
+        return np.array([model.correction.parameters[:, 0] for model in self.block.models])  # type: ignore[attr-defined]
+
+
+def adjusted(
+    geometries: Sequence[ViewGeometry],
+    observations: Observations,
+    prior_px: Array | None = None,
+    options: BlockOptions | None = None,
+) -> BlockAdjustment:
+    return adjust_block(
+        [g.rpc for g in geometries],
+        [g.plan.shape for g in geometries],
+        observations,
+        np.full(len(geometries), PRIOR_PX) if prior_px is None else prior_px,
+        options or BlockOptions(),
+    )
+
+
+def tried(
+    geometries: Sequence[ViewGeometry], seed: int, blunders: float = 0.05, noise_px: float = NOISE_PX
+) -> Trial:
+    """Images shifted by what their priors allow; points seen by most of them."""
+    rng = np.random.default_rng(seed)
+    shift_px = rng.normal(0.0, PRIOR_PX, (len(geometries), 2))
+    ties = make_ties(geometries, rng, 300, noise_px, blunders, shift_px, 0.8)
+    return Trial(ties, shift_px, adjusted(geometries, ties.observations))
+
+
+@pytest.fixture(scope="module")
+def trials(five: list[ViewGeometry]) -> list[Trial]:
+    return [tried(five, seed) for seed in range(TRIALS)]
+
+
+def point_errors(trial: Trial) -> tuple[Array, Array]:
+    """Errors (p, 3) of the points against their common translation, and their covariances."""
+    rays = np.bincount(trial.ties.observations.point[trial.block.active], minlength=300)
+    held = (rays >= 3) & np.isfinite(trial.block.lon_lat_h[:, 0])
+    error_m = difference_m(trial.block.lon_lat_h[held], trial.ties.lon_lat_h[held])
+    return error_m - np.median(error_m, axis=0), trial.block.point_covariance_m2[held]
+
+
+def test_shifts_are_recovered_within_their_stated_covariance(trials: list[Trial]) -> None:
+    squares = []
+    for trial in trials:
+        error = (trial.found_px - trial.shift_px).ravel()
+        squares.append(error @ np.linalg.solve(trial.block.covariance_px2, error) / len(error))
+    # Robust weights discard a little of what is known, and blunders widen the scale: 0.76 on average.
+    assert 0.6 < np.mean(squares) < 1.3
+
+
+def test_what_tie_points_can_tell_of_the_shifts_is_told_to_a_tenth_of_a_pixel(
+    five: list[ViewGeometry], trials: list[Trial]
+) -> None:
+    gauge = np.concatenate([_per_metre(g) for g in five])
+    across = np.eye(10) - gauge @ np.linalg.pinv(gauge)
+    error_px = [across @ (t.found_px - t.shift_px).ravel() for t in trials]
+    assert np.abs(error_px).max() < a_tenth_of_a_pixel
+    assert np.std([t.shift_px for t in trials]) > 3.0
+
+
+def _per_metre(geometry: ViewGeometry) -> Array:
+    """(2, 3) how the middle of the image moves with the ground."""
+    middle = (np.array([geometry.plan.shape]) - 1.0) / 2.0
+    return geometry.rpc.project_derivative(geometry.rpc.locate(middle, np.array([180.0])))[0]
+
+
+def test_the_block_moves_as_a_whole_by_what_the_priors_say(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(0)
+    shift_px = rng.normal(0.0, PRIOR_PX, (5, 2))
+    ties = make_ties(five, rng, 300, NOISE_PX, 0.0, shift_px)
+    prior_px = np.array([1.0, 2.0, 4.0, 8.0, 4.0])
+    block = adjusted(five, ties.observations, prior_px)
+    found = np.array([model.correction.parameters[:, 0] for model in block.models])  # type: ignore[attr-defined]
+    gauge = np.concatenate([_per_metre(g) for g in five])
+    # No translation of the ground lowers the weighted squares of the shifts.
+    weight = np.repeat(prior_px, 2) ** -2.0
+    better_m = np.linalg.solve(gauge.T @ (gauge * weight[:, None]), gauge.T @ (weight * found.ravel()))
+    assert np.abs(better_m).max() < 2.0 * a_centimetre
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 0.2, 0.8])
+def test_where_the_block_lies_is_as_well_known_as_the_priors_whatever_the_noise(
+    five: list[ViewGeometry], noise_px: float
+) -> None:
+    ties = make_ties(five, np.random.default_rng(4), 300, noise_px)
+    stated = replace(ties.observations, sigma_px=np.full(len(ties.observations), NOISE_PX))
+    block = adjusted(five, stated)
+    gauge = np.concatenate([_per_metre(g) for g in five])
+    to_ground = np.linalg.pinv(gauge)
+    found_m = np.sqrt(np.diag(to_ground @ block.covariance_px2 @ to_ground.T))
+    expected_m = PRIOR_PX * np.sqrt(np.diag(np.linalg.inv(gauge.T @ gauge)))
+    np.testing.assert_allclose(found_m, expected_m, rtol=0.05)
+
+
+def test_an_image_that_is_known_exactly_holds_the_block(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(1)
+    shift_px = np.zeros((5, 2))
+    shift_px[2:] = rng.normal(0.0, PRIOR_PX, (3, 2))
+    ties = make_ties(five, rng, 300, NOISE_PX, 0.0, shift_px)
+    prior_px = np.array([1e-3, 1e-3, 50.0, 50.0, 50.0])
+    block = adjusted(five, ties.observations, prior_px)
+    found = np.array([model.correction.parameters[:, 0] for model in block.models])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(found, shift_px, atol=a_tenth_of_a_pixel)
+    error_m = difference_m(block.lon_lat_h, ties.lon_lat_h)
+    assert np.abs(error_m.mean(axis=0)).max() < 10.0 * a_centimetre
+
+
+def test_without_noise_rays_meet_and_the_ground_moves_in_one_piece(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(2)
+    shift_px = rng.normal(0.0, PRIOR_PX, (5, 2))
+    ties = make_ties(five, rng, 300, 0.0, 0.0, shift_px)
+    exact = replace(ties.observations, sigma_px=np.full(len(ties.observations), NOISE_PX))
+    block = adjusted(five, exact)
+    assert np.abs(block.residual_px).max() < 10.0 * a_millipixel
+    error_m = difference_m(block.lon_lat_h, ties.lon_lat_h)
+    assert np.abs(error_m.mean(axis=0)).max() > 0.5
+    assert (error_m - error_m.mean(axis=0)).std(axis=0).max() < 2.0 * a_centimetre
+
+
+def test_points_are_as_good_as_they_say_but_for_the_frame(trials: list[Trial]) -> None:
+    error_m, covariance = (np.concatenate(part) for part in zip(*map(point_errors, trials), strict=True))
+    square = whitened_square(error_m, covariance)
+    # Mean square of three normal errors: their median is 0.79.
+    assert 0.75 * 0.79 < np.median(square) < 1.1 * 0.79
+    assert np.mean(square > 4.0) < 0.01
+
+
+def test_without_blunders_points_are_exactly_as_good_as_they_say(five: list[ViewGeometry]) -> None:
+    trial = tried(five, 100, blunders=0.0)
+    error_m, covariance = point_errors(trial)
+    assert whitened_square(error_m, covariance).mean() == pytest.approx(1.0, abs=0.15)
+    assert trial.block.sigma_px == pytest.approx(1.0, abs=0.08)
+    assert trial.block.active.mean() > 0.99
+
+
+@pytest.mark.parametrize("noise_px", [0.05, 0.2, 1.0])
+def test_the_scale_of_the_residuals_is_the_noise(five: list[ViewGeometry], noise_px: float) -> None:
+    trial = tried(five, 101, noise_px=noise_px)
+    stated = replace(trial.ties.observations, sigma_px=np.full(len(trial.ties.observations), NOISE_PX))
+    block = adjusted(five, stated)
+    assert block.sigma_px * NOISE_PX == pytest.approx(noise_px, rel=0.15)
+
+
+def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> None:
+    wrong = np.concatenate([t.ties.wrong for t in trials])
+    active = np.concatenate([t.block.active for t in trials])
+    points = np.concatenate([1000 * k + t.ties.observations.point for k, t in enumerate(trials)])
+    touched = np.isin(points, points[wrong])
+    assert active[wrong].mean() < 0.02  # those along their epipolar line, or small
+    assert (~active[~touched]).mean() < 0.002
+
+
+def test_active_observations_hold_their_points_with_two_rays_at_least(trials: list[Trial]) -> None:
+    for trial in trials[:10]:
+        rays = np.bincount(trial.ties.observations.point[trial.block.active])
+        assert set(rays[rays > 0]).isdisjoint({1})
+
+
+def test_a_pair_meets_across_its_rays_and_keeps_its_parallax_as_the_priors_say() -> None:
+    pair = ring_of_geometries(2)
+    rng = np.random.default_rng(3)
+    shift_px = rng.normal(0.0, PRIOR_PX, (2, 2))
+    ties = make_ties(pair, rng, 400, NOISE_PX, 0.05, shift_px)
+    block = adjusted(pair, ties.observations)
+    found = np.array([model.correction.parameters[:, 0] for model in block.models])  # type: ignore[attr-defined]
+    gauge = np.concatenate([_per_metre(g) for g in pair])
+    across = np.eye(4) - gauge @ np.linalg.pinv(gauge)
+    assert np.abs(across @ (found - shift_px).ravel()).max() < a_tenth_of_a_pixel
+    better_m = np.linalg.lstsq(gauge, found.ravel(), rcond=None)[0]
+    assert np.abs(better_m).max() < 2.0 * a_centimetre
+    assert 0.9 < block.sigma_px < 1.4
+    error = (found - shift_px).ravel()
+    assert error @ np.linalg.solve(block.covariance_px2, error) / 4.0 < 4.0
+    assert np.sqrt(np.diag(block.covariance_px2)).min() > 0.3 * PRIOR_PX
+
+
+def test_corrected_models_are_those_the_points_refer_to(trials: list[Trial]) -> None:
+    trial = trials[0]
+    kept = trial.ties.observations.take(trial.block.active)
+    again = intersect(trial.block.models, kept, 300)
+    both = np.isfinite(again.lon_lat_h[:, 0])
+    error_m = difference_m(again.lon_lat_h[both], trial.block.lon_lat_h[both])
+    assert np.abs(error_m).max() < a_centimetre
+    np.testing.assert_allclose(
+        again.residual_px, trial.block.residual_px[trial.block.active], atol=a_millipixel
+    )
+
+
+def test_too_few_tie_points_are_refused_with_their_numbers(five: list[ViewGeometry]) -> None:
+    ties = make_ties(five, np.random.default_rng(0), 5, NOISE_PX)
+    with pytest.raises(NotEnoughPoints, match=r"^5 usable points found, 6 needed: tie points between 5"):
+        adjusted(five, ties.observations)
+    nothing = ties.observations.take(np.zeros(len(ties.observations), dtype=bool))
+    with pytest.raises(NotEnoughPoints, match=r"^0 usable points"):
+        adjusted(five, nothing)
+
+
+def test_a_block_that_does_not_settle_says_so(five: list[ViewGeometry]) -> None:
+    ties = make_ties(five, np.random.default_rng(0), 50, NOISE_PX, 0.05, np.full((5, 2), 3.0))
+    with pytest.raises(NoConvergence, match="after 1 iterations"):
+        adjusted(five, ties.observations, options=BlockOptions(max_iterations=1))
+
+
+def test_the_same_ties_give_the_same_block(five: list[ViewGeometry], trials: list[Trial]) -> None:
+    again = adjusted(five, trials[0].ties.observations)
+    np.testing.assert_array_equal(again.lon_lat_h, trials[0].block.lon_lat_h)
+    np.testing.assert_array_equal(again.covariance_px2, trials[0].block.covariance_px2)
