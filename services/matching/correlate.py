@@ -63,7 +63,8 @@ def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) 
     """
     if not np.isfinite(chip).all():
         return _rejected("nodata")
-    if chip.std() < options.min_contrast * abs(float(chip.mean())) or chip.std() == 0.0:
+    mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(chip))
+    if spread < options.min_contrast * abs(mean) or spread == 0.0:
         return _rejected("flat")
     scores = correlation_map(patch, chip)
     if scores is None:
@@ -128,12 +129,13 @@ _QUADRATIC = np.linalg.pinv(
 
 def _quadratic_peak(around: Array) -> tuple[Array, float]:
     """Offset of the top of a quadratic through 3 x 3 scores, and its smaller curvature."""
-    _, gradient_row, gradient_col, row_row, col_col, row_col = _QUADRATIC @ around.ravel()
-    hessian = np.array([[row_row, row_col], [row_col, col_col]])
-    curvature = float(-np.linalg.eigvalsh(hessian).max())
+    _, by_row, by_col, row_row, col_col, row_col = (_QUADRATIC @ around.ravel()).tolist()
+    curvature = -(row_row + col_col) / 2.0 - math.hypot((row_row - col_col) / 2.0, row_col)
     if curvature <= 0.0:
         return np.zeros(2), curvature
-    return -np.linalg.solve(hessian, [gradient_row, gradient_col]), curvature
+    determinant = row_row * col_col - row_col * row_col
+    offset = row_col * by_col - col_col * by_row, row_col * by_row - row_row * by_col
+    return np.array(offset) / determinant, curvature
 
 
 def _peak_sigma(score: float, curvature: float, pixels: int) -> float:
