@@ -100,7 +100,7 @@ def adjust_block(
         iterations += 1
         residual, derivative = _linearised(models, shift_px, observations, lon_lat_h)
         scale = _scale(residual, observations)
-        weight = _weights(residual, observations, options.cauchy * scale)
+        weight = _weights(residual, observations, scale, options.cauchy)
         step_px, step_m, normal = _schur_step(
             observations,
             residual,
@@ -151,9 +151,10 @@ def _scale(residual: Array, observations: Observations) -> float:
     return max(float(median), 1e-6)
 
 
-def _weights(residual: Array, observations: Observations, tuning: float) -> Array:
+def _weights(residual: Array, observations: Observations, scale: float, cauchy: float) -> Array:
     magnitude, _, _ = _magnitude(residual, observations)
-    weight = 1.0 / (1.0 + (magnitude / tuning) ** 2) / observations.sigma_px**2
+    robust = 1.0 / (1.0 + (magnitude / (cauchy * scale)) ** 2)
+    weight = robust / (scale * observations.sigma_px) ** 2
     return np.where(np.isfinite(weight), weight, 0.0)
 
 
@@ -180,7 +181,7 @@ def _finished(
     final, _ = residuals_and_derivatives(corrected, observations, again.lon_lat_h)
     return BlockAdjustment(
         models=corrected,
-        covariance_px2=np.asarray(np.linalg.inv(normal) * scale**2),
+        covariance_px2=np.asarray(np.linalg.inv(normal)),
         lon_lat_h=again.lon_lat_h,
         point_covariance_m2=again.covariance_m2,
         residual_px=np.where(np.isfinite(final), final, residual),
@@ -251,6 +252,20 @@ def _reduced(
     return normal, right
 
 
+def _translation_free(image: IntArray, derivative: Array, weight: Array, n_images: int) -> Array:
+    """Projector (2 n, 2 n) that takes out of shifts what moving the whole block on the ground would do.
+
+    Tie points cannot tell where a block is. Its images see it under slightly different angles from
+    edge to edge, though, and a distortion of a tenth of a pixel would pass for a move by metres: such a
+    move is left to the a priori sigmas alone.
+    """
+    moves = np.zeros((n_images, 2, 3))
+    np.add.at(moves, image, derivative * weight[:, None, None])
+    total = np.bincount(image, weight, n_images)
+    directions = (moves / np.maximum(total, 1e-300)[:, None, None]).reshape(-1, 3)
+    return np.asarray(np.eye(2 * n_images) - directions @ np.linalg.pinv(directions))
+
+
 def _schur_step(
     observations: Observations,
     residual: Array,
@@ -273,8 +288,10 @@ def _schur_step(
     normal, right = _reduced(
         point, image, residual, derivative, weight, inverse, point_right, len(sigma_px)
     )
+    held = _translation_free(image, derivative, weight, len(sigma_px))
     prior = np.repeat(sigma_px, 2) ** -2.0
-    normal += np.diag(prior)
+    normal = held @ normal @ held + np.diag(prior)
+    right = held @ right
     step_px = np.linalg.solve(normal, right - prior * shift_px.ravel()).reshape(-1, 2).astype(np.float64)
     moved = weight[:, None] * np.einsum("mij,mi->mj", derivative, step_px[image])
     np.subtract.at(point_right, point, moved)
