@@ -1,0 +1,57 @@
+"""What journeys share: a service of their own, and the command line beside it."""
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.serving import Service, until
+
+Amers = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[Service]:
+    """A running service with an empty store."""
+    folder = Path(tempfile.mkdtemp(prefix="amers-journey-", dir="/tmp"))
+    folder.chmod(0o755)
+    service = Service(folder / "data")
+    try:
+        assert until(service.is_ready)
+        assert until(service.workers)
+        yield service
+    finally:
+        service.process.terminate()
+        service.process.wait(timeout=60)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def amers(service: Service) -> Amers:
+    """Runs a command on the service's installation; what it prints as JSON."""
+
+    def run(*words: str | Path) -> Any:
+        done = subprocess.run(
+            [sys.executable, "-m", "app.cli.main", *map(str, words), "--json"],
+            env=service.environment,
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def secret(amers: Amers) -> str:
+    """A token that may register scenes."""
+    return str(amers("token", "create", "journey", "--scope", "register")["secret"])

@@ -1,0 +1,113 @@
+"""Three real views: points from two of them, the third registered on these by the service."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.formats.raster import open_raster, write_raster
+from services.formats.rpc_files import read_rpc
+from services.formats.rpc_text import parse_rpc_text
+from services.imagery import Window
+from services.intersection import intersect
+from services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
+from services.sensors.rpc import RpcModel
+from tests.journeys.ties import independent_tracks
+
+pytestmark = pytest.mark.real_data
+
+names = ("img_01", "img_02", "img_03")
+injected_shift_px = np.array([40.0, -25.0])
+injected_drift_px = 2.0
+injected_sigma_m = "15"
+delivered_residual_px = (0.4, 0.7)
+three_tenths_of_a_pixel = 0.3
+
+
+@pytest.fixture(scope="module")
+def triplet(real_data: Path) -> dict[str, Path]:
+    return {name: real_data / "phr_calanques_triplet" / f"{name}.tif" for name in names}
+
+
+@pytest.fixture(scope="module")
+def pixels(triplet):
+    images = {}
+    for name, path in triplet.items():
+        with_image = open_raster(path)
+        images[name] = with_image.read(Window(0, 0, *with_image.shape))
+        with_image.close()
+    return images
+
+
+@pytest.fixture(scope="module")
+def tracks(pixels):
+    return independent_tracks([pixels[name] for name in names])
+
+
+def median_residual_px(models: list[RpcModel], tracks) -> float:
+    found = intersect(models, tracks, int(tracks.point[-1]) + 1)
+    return float(np.median(np.linalg.norm(found.residual_px, axis=1)))
+
+
+def spoiled(model: RpcModel, shape: tuple[int, int]) -> RpcModel:
+    """The model wrong by the injected shift, and by the injected drift from one edge to the other."""
+    frame = no_correction(shape)
+    drift = np.diag([injected_drift_px / 2.0, injected_drift_px / 2.0])
+    parameters = np.column_stack([injected_shift_px, drift])
+    return fold_into_rpc(model, ImageCorrection(parameters, frame.centre, frame.half_size))
+
+
+def test_independent_ties_disagree_with_the_models_as_delivered(triplet, tracks):
+    models = [read_rpc(path).model for path in triplet.values()]
+    assert tracks.point[-1] > 300
+    low, high = delivered_residual_px
+    assert low < median_residual_px(models, tracks) < high
+
+
+@pytest.mark.parametrize(
+    ("sources", "third"),
+    [
+        (("img_01", "img_02"), "img_03"),
+        (("img_02", "img_03"), "img_01"),
+        (("img_01", "img_03"), "img_02"),
+    ],
+)
+def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
+    triplet, pixels, tracks, sources, third, service, amers, secret, tmp_path
+):
+    block = tmp_path / f"calanques-without-{third}"
+    images = [word for name in sources for word in ("--images", triplet[name])]
+    made = amers("production", "run", *images, "--gsd-m", "0.5,2", "-o", block)
+    assert made["points"] >= 100
+    amers("block", "ingest", block, "--publish")
+
+    delivered = read_rpc(triplet[third]).model
+    scene = tmp_path / f"{third}.tif"
+    wrong = spoiled(delivered, pixels[third].shape)
+    write_raster(scene, pixels[third].astype(np.uint16), wrong)
+    out = tmp_path / "registered"
+    done = amers(
+        *("scene", "register", scene, "--sigma-m", injected_sigma_m, "-o", out),
+        *("--server", service.url, "--token", secret),
+    )
+    amers("block", "withdraw", block.name)
+
+    models = dict.fromkeys(names, delivered)
+    for name in sources:
+        models[name] = parse_rpc_text((block / "models" / f"{name}_RPC.TXT").read_text())
+    models[third] = wrong
+    assert median_residual_px(list(models.values()), tracks) > 1.0
+    models[third] = parse_rpc_text((out / "refined_RPC.TXT").read_text())
+    assert median_residual_px(list(models.values()), tracks) < three_tenths_of_a_pixel
+    assert done["verdict"] in ("good", "usable")
+    assert np.allclose(np.array(done["shift_px"]), -injected_shift_px, atol=2.0)
+    for name in ("report.json", "report.html", "control_points.geojson", scene.name):
+        assert (out / name).stat().st_size > 0
+
+
+def test_a_refined_model_comes_back_in_the_tags_of_the_image(triplet, pixels, tmp_path):
+    delivered = read_rpc(triplet["img_01"]).model
+    moved = replace(delivered, image_offset=delivered.image_offset + injected_shift_px)
+    write_raster(tmp_path / "copy.tif", pixels["img_01"].astype(np.uint16), moved)
+    assert np.array_equal(read_rpc(tmp_path / "copy.tif").model.image_offset, moved.image_offset)

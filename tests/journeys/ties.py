@@ -1,0 +1,64 @@
+"""Tie points that neither production nor registration ever sees: features larger than theirs."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from services.matching.features import FeatureOptions
+from services.types import Array, FloatImage, Observations
+
+LARGEST_PX = 12.0
+
+
+def independent_tracks(images: Sequence[FloatImage]) -> Observations:
+    """Details that every image shows, matched without any model.
+
+    SIFT features of another size than those production uses, mutual best and clearly so, on the epipolar
+    geometry that MAGSAC finds, and consistent from the first image to the last.
+    """
+    found = [_features(pixels) for pixels in images]
+    links = [_matches(*one, *other) for one, other in pairwise(found)]
+    closing = _matches(*found[0], *found[-1])
+    tracks = []
+    for first, second in links[0].items():
+        track = [first, second]
+        for link in links[1:]:
+            track.append(link.get(track[-1], -1))
+        if -1 not in track and closing.get(first) == track[-1]:
+            tracks.append(track)
+    rows = np.array(tracks)
+    n, views = rows.shape
+    line_sample = np.stack([found[k][0][rows[:, k]] for k in range(views)], axis=1)
+    return Observations(
+        np.repeat(np.arange(n), views),
+        np.tile(np.arange(views), n),
+        line_sample.reshape(-1, 2),
+        np.ones(n * views),
+    )
+
+
+def _features(pixels: FloatImage) -> tuple[Array, FloatImage]:
+    low, high = np.percentile(pixels, [0.5, 99.5])
+    image = np.clip((pixels - low) / (high - low) * 255.0, 0.0, 255.0).astype(np.uint8)
+    sift = cv2.SIFT.create(contrastThreshold=0.01)
+    smallest = FeatureOptions().largest_px
+    kept = [point for point in sift.detect(image) if smallest < point.size < LARGEST_PX]
+    kept, descriptor = sift.compute(image, kept)
+    return np.array([point.pt[::-1] for point in kept]), descriptor
+
+
+def _matches(one: Array, one_d: FloatImage, other: Array, other_d: FloatImage) -> dict[int, int]:
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    best = {
+        first.queryIdx: first.trainIdx
+        for first, second in matcher.knnMatch(one_d, other_d, 2)
+        if first.distance < 0.8 * second.distance
+    }
+    back = {match.queryIdx: match.trainIdx for match in matcher.match(other_d, one_d)}
+    pairs = np.array([(i, j) for i, j in best.items() if back.get(j) == i])
+    _, inside = cv2.findFundamentalMat(
+        one[pairs[:, 0]], other[pairs[:, 1]], cv2.USAC_MAGSAC, 1.5, 0.999, 10_000
+    )
+    return {int(i): int(j) for i, j in pairs[inside.ravel() > 0]}
