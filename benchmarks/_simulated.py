@@ -1,0 +1,120 @@
+"""Simulated images in files, and control points whose truth is known."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.windows import Window as RasterWindow
+
+from services.formats.raster import gdal_rpc
+from services.imagery import ImageSource, ReducedImage, reduce_image, render_chip
+from services.intersection import intersect
+from services.matching.chips import chip_inside, chip_saliency, refine_on_chips
+from services.production import stored_chip
+from services.scene import Scene, scene_gsd_m, view_direction
+from services.sensors.rpc import RpcModel
+from services.simulation.view import ViewGeometry, render_view
+from services.simulation.world import World
+from services.types import Array, ChipArray, ControlPoints, Views
+
+LEAST_SALIENCY = 0.3
+
+
+def write_view(
+    path: Path, world: World, geometry: ViewGeometry, model: RpcModel, rng: np.random.Generator
+) -> None:
+    """Take an image strip by strip into a tiled, compressed GeoTIFF with RPC tags."""
+    lines, samples = geometry.plan.shape
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=lines,
+        width=samples,
+        count=1,
+        dtype="uint16",
+        tiled=True,
+        compress="deflate",
+        predictor=2,
+        BIGTIFF="IF_SAFER",
+    ) as file:
+        file.rpcs = gdal_rpc(model)
+        for line, strip in render_view(world, geometry, rng):
+            file.write(strip, 1, window=RasterWindow(0, line, samples, len(strip)))
+
+
+def lay_points(
+    world: World, references: Sequence[Scene], lon_lat: Array, gsds_m: tuple[float, ...]
+) -> tuple[ControlPoints, Callable[[int], ChipArray]]:
+    """Points measured on chips of images whose models are true, and intersected.
+
+    A place at its true height would not do: its chip shows roofs and slopes around it, and is found
+    where the whole of it agrees.
+
+    Args:
+        world: gives the heights to begin with.
+        references: two images or more, with their true models.
+        lon_lat: (n, 2) where points may lie; those that some image does not show whole, that are not
+            found in all of them, or that are not salient are left out.
+        gsds_m: ground samplings of the chips, finest first; points are measured on the finest.
+
+    Returns:
+        The points, and what cuts the chips (views, 101, 101) of the point of a row.
+    """
+    models = [scene.model for scene in references]
+    sources = {gsd_m: [reduced_for(scene, gsd_m) for scene in references] for gsd_m in gsds_m}
+    start = np.column_stack([lon_lat, world.height_m(lon_lat)])
+    for scene in references:
+        start = start[chip_inside(scene.model, scene.image.shape, start, gsds_m[-1], 2)]
+    seen = refine_on_chips(references, models, start, gsds_m[0])
+    found = intersect(models, seen, len(start))
+    saliency = np.array(
+        [
+            chip_saliency(render_chip(sources[gsds_m[0]][0], models[0], point, gsds_m[0]))
+            for point in start
+        ]
+    )
+    kept = np.isfinite(found.lon_lat_h[:, 0]) & (found.rays == len(references))
+    kept &= saliency >= LEAST_SALIENCY
+    ground, n = found.lon_lat_h[kept], int(kept.sum())
+    views = [(gsd_m, image) for gsd_m in gsds_m for image in range(len(references))]
+    image = np.tile([image for _, image in views], n)
+    directions = [view_direction(model, model.project(ground), ground) for model in models]
+    each = np.repeat(np.arange(n), len(views))
+    incidence_deg, azimuth_deg = (
+        np.array([direction[angle] for direction in directions])[image, each] for angle in (0, 1)
+    )
+    points = ControlPoints(
+        id=np.arange(n, dtype=np.int64),
+        lon_lat_h=ground,
+        covariance_m2=found.covariance_m2[kept],
+        saliency=saliency[kept],
+        views=Views(
+            start=np.arange(n + 1, dtype=np.int64) * len(views),
+            gsd_m=np.tile([gsd_m for gsd_m, _ in views], n),
+            image=image,
+            incidence_deg=incidence_deg,
+            azimuth_deg=azimuth_deg,
+            images=tuple(scene.acquisition for scene in references),
+        ),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=np.arange(n, dtype=np.int64) * len(views),
+        chip_files=("chips",),
+    )
+
+    def cut(row: int) -> ChipArray:
+        return np.stack(
+            [
+                stored_chip(render_chip(sources[gsd_m][image], models[image], ground[row], gsd_m))
+                for gsd_m, image in views
+            ]
+        )
+
+    return points, cut
+
+
+def reduced_for(scene: Scene, gsd_m: float) -> ImageSource | ReducedImage:
+    """The image, or what `render_chip` would reduce it to for every chip of a ground sampling."""
+    factor = int(gsd_m / scene_gsd_m(scene) / 2.0)
+    return reduce_image(scene.image, factor) if factor > 1 else scene.image
