@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 
 from services.production import Production, ProductionOptions, produce_points
-from services.scene import Scene
 from services.simulation.view import (
     SimulatedView,
     ViewGeometry,
@@ -17,7 +16,7 @@ from services.simulation.view import (
     simulate_view,
 )
 from services.simulation.world import World, make_world
-from services.types import Array, ChipArray, ControlPoints
+from services.types import ChipArray, ControlPoints
 
 SHAPE = (700, 700)
 GSD_M = 1.0
@@ -89,11 +88,6 @@ def spoiled_view(
     return simulate_view(
         world(world_seed), plan(), np.random.default_rng(seed), ground_error_m, error_px
     )
-
-
-def with_pixels(scene: Scene, pixels: Array) -> Scene:
-    """The scene with other pixels."""
-    return replace(scene, image=replace(scene.image, pixels=pixels.astype(np.float32)))  # type: ignore[type-var]
 
 
 def ring_of_geometries(
