@@ -209,10 +209,14 @@ def read_points(path: Path) -> PointRows:
         raise FormatError(
             f"{path.name}: geometry: row {row}: {geometry[row].geom_type} found, Point Z expected"
         )
+    # WKB writes an empty point as NaN coordinates, and what is empty has none to ask for.
+    placed = ~shapely.is_empty(geometry)
+    lon_lat_h = np.full((len(geometry), 3), np.nan)
+    lon_lat_h[placed] = shapely.get_coordinates(geometry[placed], include_z=True)
     chip_file, chip_files = _coded(table["chip_file"])
     return PointRows(
         id=table["id"].to_numpy(),
-        lon_lat_h=np.column_stack([f(geometry) for f in (shapely.get_x, shapely.get_y, shapely.get_z)]),
+        lon_lat_h=lon_lat_h,
         sigma_m=np.column_stack([table[name].to_numpy() for name in _SIGMAS]),
         correlation=np.column_stack([table[name].to_numpy() for name in _CORRELATIONS]),
         n_views=table["n_views"].to_numpy().astype(np.int64),
@@ -256,7 +260,9 @@ def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
             found = file.schema_arrow
             _check_schema(path.name, found, schema)
             table = file.read(columns=schema.names)
-    except (pa.ArrowException, OSError) as error:
+        # A file may claim text that is not, or offsets that lead nowhere.
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise FormatError(f"{path.name}: cannot be read as Parquet: {error}") from error
     for field in schema:
         if not field.nullable and table[field.name].null_count:

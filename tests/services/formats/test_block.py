@@ -385,6 +385,15 @@ def test_garbled_tables_raise_nothing_but_format_errors(tmp_path_factory, data):
         path.write_bytes(original)
 
 
+@pytest.mark.parametrize("table", ["points.parquet", "views.parquet"])
+def test_a_table_whose_names_are_no_text_is_refused(block, table):
+    path = block.folder / table
+    path.write_bytes(path.read_bytes().replace(b"chip_file", b"chip_\x80ile"))
+    resigned(block.folder)
+    with pytest.raises(FormatError, match=table):
+        check_block(block.folder)
+
+
 @settings(max_examples=100, deadline=None)
 @given(data=st.data())
 def test_garbled_documents_raise_nothing_but_format_errors(block_text, data):
