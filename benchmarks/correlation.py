@@ -145,7 +145,8 @@ def cases(world: World, count: int) -> dict[str, list[Pair]]:
     first = view(world, 1, JUNE)
     noise, day = view(world, 2, JUNE), view(world, 3, JULY)
     rng = np.random.default_rng(5)
-    margin_px = (CHIP_SIZE // 2 + RADIUS_PX + FARTHEST_PX + 5.0) * GSD_M / IMAGE_GSD_M
+    # Windows are north-up, images are not: their corners reach farther.
+    margin_px = np.sqrt(2.0) * (CHIP_SIZE // 2 + RADIUS_PX + FARTHEST_PX + 5.0) * GSD_M / IMAGE_GSD_M
     line_sample = rng.uniform(margin_px, SIDE_PX - margin_px, (count, 2))
     ground = true_ground(first, world, line_sample)
     offset_px = rng.uniform(-FARTHEST_PX, FARTHEST_PX, (count, 2))
