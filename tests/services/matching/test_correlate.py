@@ -42,10 +42,10 @@ class Trials:
 
 
 def trials(smoothness_px: float, noise: float, noise_smoothness_px: float | None, seed: int) -> Trials:
-    """Look for 150 chips; a noise without smoothness is white."""
+    """Look for 100 chips; a noise without smoothness is white."""
     rng = np.random.default_rng(seed)
     error, sigma, lost = [], [], 0
-    for _ in range(150):
+    for _ in range(100):
         ground = texture(rng, PERIOD, smoothness_px)
         shift = rng.uniform(-3.0, 3.0, 2)
         other = (
