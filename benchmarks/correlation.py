@@ -15,6 +15,7 @@ Run: python -m benchmarks.correlation
 
 import argparse
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -34,7 +35,6 @@ from services.imagery import ImageSource, render_chip
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
 from services.matching.points import MatchingOptions, chip_pixels, match_points
-from services.registration import reasons_in_words
 from services.scene import Scene
 from services.simulation.view import SimulatedView, ViewPlan, simulate_view, true_ground
 from services.simulation.world import World, make_world
@@ -217,7 +217,8 @@ def measure(case: str, pairs: list[Pair], repeats: int) -> list[Outcome]:
     peaks = [find_chip(pair.patch, pair.chip, OPTIONS) for pair in pairs]
     places["find_chip"] = np.array([peak.row_col for peak in peaks])
     true = np.array([pair.row_col for pair in pairs])
-    rejected = reasons_in_words(np.array([peak.reason for peak in peaks]))
+    reasons = Counter(peak.reason for peak in peaks if peak.reason != FOUND)
+    rejected = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     outcomes = []
     for name, place in places.items():
         error = place - true
