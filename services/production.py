@@ -25,6 +25,7 @@ from services.types import (
     Progress,
     Views,
     no_progress,
+    part_of,
 )
 
 
@@ -120,7 +121,7 @@ def produce_points(
         NotEnoughPoints: the images have too little in common.
     """
     _check(scenes)
-    ties = tie_points(scenes, options.features, _part_of(progress, 0.0, 0.5))
+    ties = tie_points(scenes, options.features, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"
@@ -136,7 +137,7 @@ def produce_points(
         candidates,
         options.fine_gsd_m,
         options.refinement,
-        _part_of(progress, 0.5, 0.4),
+        part_of(progress, 0.5, 0.4),
     )
     progress(0.9, "adjusting the block on its chips")
     final = _adjusted(scenes, [s.model for s in scenes], measured, options)
@@ -358,8 +359,3 @@ def stored_chip(pixels: FloatImage) -> ChipArray:
     """A chip as it is stored: uint16, 0 where there is nodata."""
     stored = np.clip(np.rint(np.nan_to_num(pixels, nan=0.0)), 1, np.iinfo(np.uint16).max)
     return np.where(np.isfinite(pixels), stored, 0).astype(np.uint16)
-
-
-def _part_of(progress: Progress, start: float, share: float) -> Progress:
-    """Progress of a part, as progress of the whole."""
-    return lambda fraction, message: progress(start + share * fraction, message)

@@ -26,6 +26,11 @@ def no_progress(fraction: float, message: str) -> None:
     """Progress that nobody watches."""
 
 
+def part_of(progress: Progress, start: float, share: float) -> Progress:
+    """Progress of a part, as progress of the whole."""
+    return lambda fraction, message: progress(start + share * fraction, message)
+
+
 @dataclass(frozen=True)
 class Acquisition:
     """How and when an image was taken.

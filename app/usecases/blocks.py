@@ -19,7 +19,7 @@ from services.formats.block_check import check_block
 from services.formats.block_json import BLOCK_JSON
 from services.formats.chip_files import read_chip_file
 from services.quality.block import BlockQuality, block_quality
-from services.types import Progress, no_progress
+from services.types import Progress, no_progress, part_of
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "staged": ("published",),
@@ -71,7 +71,7 @@ def ingest_block(
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    contents = check_block(folder, _part(progress, 0.0, 0.3))
+    contents = check_block(folder, part_of(progress, 0.0, 0.3))
     document = (folder / BLOCK_JSON).read_bytes()
     metadata = contents.document.metadata
     quality = block_quality(contents.points, contents.n_views, metadata.extent)
@@ -81,8 +81,8 @@ def ingest_block(
     )
     if block is None:
         raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
-    files = _store_chips(storage, folder, contents, _part(progress, 0.3, 0.6))
-    load_contents(connection, block.number, contents, files, _part(progress, 0.6, 1.0))
+    files = _store_chips(storage, folder, contents, part_of(progress, 0.3, 0.3))
+    load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
     return Ingested(block, quality)
 
 
@@ -232,12 +232,3 @@ def _store_chips(
             stored.append(file)
             progress(len(stored) / len(names), "storing chips")
     return stored
-
-
-def _part(progress: Progress, start: float, end: float) -> Progress:
-    """Progress of a part of the work, as progress of the whole."""
-
-    def report(fraction: float, message: str) -> None:
-        progress(start + (end - start) * fraction, message)
-
-    return report

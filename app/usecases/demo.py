@@ -27,7 +27,7 @@ from services.simulation.view import (
     true_line_sample,
 )
 from services.simulation.world import World, make_world
-from services.types import Array, Observations, Progress
+from services.types import Array, Observations, Progress, part_of
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
         BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),
         options.production,
         sigma_m=options.block_error_m,
-        progress=_part_of(progress, 0.3, 0.4),
+        progress=part_of(progress, 0.3, 0.4),
     )
     storage = Storage(settings.data_folder / "storage")
     with engine.opened(settings) as database:
@@ -133,7 +133,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
             points_of_store(database, storage),
             RegistrationOptions(),
             folder / "registered",
-            _part_of(progress, 0.75, 0.25),
+            part_of(progress, 0.75, 0.25),
         )
         with database.transaction() as connection:
             record(connection, registered)
@@ -246,8 +246,3 @@ def _centre(scene: SimulatedView, world: World) -> Array:
 
 def _ce90(error: Array) -> Quantile:
     return sample_quantile(np.hypot(error[:, 0], error[:, 1]))
-
-
-def _part_of(progress: Progress, start: float, share: float) -> Progress:
-    """Progress of a part, as progress of the whole."""
-    return lambda fraction, message: progress(start + share * fraction, message)

@@ -201,11 +201,7 @@ def predict_accuracy(
     line, sample = np.meshgrid(
         np.linspace(0.0, shape[0] - 1.0, grid), np.linspace(0.0, shape[1] - 1.0, grid), indexing="ij"
     )
-    correction = adjustment.correction
-    t = (np.column_stack([line.ravel(), sample.ravel()]) - correction.centre) / correction.half_size
-    design = np.zeros((grid * grid, 2, 6))
-    design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
-    covariance = design @ adjustment.covariance @ design.transpose(0, 2, 1)
+    covariance = adjustment.covariance_at(np.column_stack([line.ravel(), sample.ravel()]))
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
     ce90 = normal_ce90(covariance)
     worst, median = float(ce90.max()), float(np.median(ce90))

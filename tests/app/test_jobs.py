@@ -117,7 +117,7 @@ def test_a_request_for_work_becomes_a_job_in_the_queue(
         stored = jobs.find(connection, UUID(job["jobID"]))
     assert stored is not None
     assert stored.inputs["options"]["max_points"] == 100
-    assert stored.inputs["options"]["coarse_points"] == 60, "defaults are part of the record"
+    assert stored.inputs["options"]["coarse"]["points"] == 60, "defaults are part of the record"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from services.errors import ComputationError, CoverageError, NoConsensus, NotEno
 from services.geodesy import metres_per_degree
 from services.imagery import ArrayImage
 from services.intersection import intersect
-from services.registration import Registration, correction_std_px, register_scene
+from services.registration import Registration, register_scene
 from services.scene import Scene
 from services.simulation.view import SimulatedView, simulate_view
 from services.types import Array, Observations
@@ -91,7 +91,7 @@ def test_a_skewed_scene_needs_an_affine() -> None:
 def test_the_predicted_spread_is_that_of_the_errors(name: str) -> None:
     found = registration(name)
     image, error_px = errors_px(view_of(name), found)
-    std_px = correction_std_px(found.adjustment.correction, found.adjustment.covariance, image)
+    std_px = np.sqrt(np.diagonal(found.adjustment.covariance_at(image), axis1=1, axis2=2))
     ratio = np.sqrt((error_px**2).mean()) / np.sqrt((std_px**2).mean())
     assert 0.3 < ratio < 2.0
 

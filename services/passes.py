@@ -1,0 +1,103 @@
+"""One search of the points through one model: what all the stages of a registration share."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.imagery import image_gsd_m
+from services.matching.points import PointMatches
+from services.scene import Scene, scene_gsd_m
+from services.sensors.correction import CorrectedModel
+from services.types import Array, BoolArray, ControlPoints
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One search of the points through one model.
+
+    Attributes:
+        name: "coarse" or "fine".
+        chip_gsd_m: ground sampling of the chips.
+        search_radius_m: how far they were searched.
+        tried, matched, agreeing: numbers of points: searched, found, and part of the consensus.
+        move_m: how far the agreeing points lay from where they were expected, root mean square.
+    """
+
+    name: str
+    chip_gsd_m: float
+    search_radius_m: float
+    tried: int
+    matched: int
+    agreeing: int
+    move_m: float
+
+
+def search_radius_px(uncertainty_m: Array, gsd_m: float, largest: int) -> int:
+    """Search radius that holds three standard deviations of nearly all points, chip pixels."""
+    return int(np.clip(np.ceil(3.0 * np.percentile(uncertainty_m, 95) / gsd_m) + 2, 4, largest))
+
+
+def direction_deg(scene: Scene) -> tuple[float, float]:
+    """Incidence and azimuth of the scene, degrees."""
+    return scene.acquisition.incidence_deg, scene.acquisition.azimuth_deg
+
+
+def adjust_on(
+    scene: Scene,
+    points: ControlPoints,
+    matches: PointMatches,
+    candidates: BoolArray,
+    options: AdjustmentOptions,
+) -> SceneAdjustment:
+    """The correction of a scene from what was found of its points; see `adjust_scene`."""
+    return adjust_scene(
+        scene.model,
+        scene.image.shape,
+        points.lon_lat_h,
+        matches.line_sample,
+        matches.sigma_px,
+        points.covariance_m2,
+        options,
+        candidates,
+        matches.common_sigma_m / scene_gsd_m(scene),
+    )
+
+
+def model_uncertainty_m(
+    model: CorrectedModel, points: ControlPoints, adjustment: SceneAdjustment
+) -> Array:
+    """Standard deviation (n,) of where the points are expected after an adjustment, metres.
+
+    What the residuals show beyond the stated sigmas is counted too: a point still to be found may be as
+    far off as those that were.
+    """
+    line_sample = model.project(points.lon_lat_h)
+    variance = np.diagonal(adjustment.covariance_at(line_sample), axis1=1, axis2=2)
+    std_px = np.sqrt(variance.max(axis=1))
+    residual_px = float(np.sqrt(np.mean(adjustment.residual_px[adjustment.active] ** 2)))
+    gsd_m = np.array([image_gsd_m(model, ground) for ground in points.lon_lat_h])
+    return np.asarray(np.nan_to_num(np.hypot(std_px, residual_px) * gsd_m, nan=0.0))
+
+
+def summarised(
+    name: str, gsd_m: float, radius_px: int, matches: PointMatches, agreeing: BoolArray
+) -> Pass:
+    move_m = matches.displacement_m[agreeing]
+    return Pass(
+        name=name,
+        chip_gsd_m=gsd_m,
+        search_radius_m=radius_px * gsd_m,
+        tried=len(matches.reason),
+        matched=int((matches.reason == "").sum()),
+        agreeing=int(agreeing.sum()),
+        move_m=float(np.sqrt((move_m**2).sum(axis=1).mean())) if len(move_m) else math.nan,
+    )
+
+
+def reasons_in_words(reason: np.ndarray) -> str:
+    """How many points were not found, and why: "22 low_score, 16 nodata"."""
+    counted = Counter(str(r) for r in reason if r)
+    return ", ".join(f"{count} {name}" for name, count in counted.most_common()) or "none rejected"
