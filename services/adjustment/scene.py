@@ -37,6 +37,8 @@ class AdjustmentOptions:
         min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
             this fraction.
         folds: of the cross-validation.
+        untested_px: what drift and skew may still be at the edge of the image, one standard deviation,
+            where the measures are too few or too close to each other to tell.
     """
 
     order: Order | None = None
@@ -46,6 +48,7 @@ class AdjustmentOptions:
     min_spread: float = 0.2
     min_gain: float = 0.03
     folds: int = 5
+    untested_px: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,9 @@ class SceneAdjustment:
     Attributes:
         correction: of the scene's model.
         order: how many parameters were free.
-        validation_px: every order tried, with its cross-validated residual (rms, pixels).
-        covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for fixed parameters.
+        validation_px: every order tried, with its cross-validated residual (rms distance, pixels).
+        covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that were
+            found not to be needed, not for those that could not be tested.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
@@ -69,6 +73,13 @@ class SceneAdjustment:
     residual_px: Array
     active: BoolArray
     sigma0: float
+
+    def covariance_at(self, line_sample: Array) -> Array:
+        """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
+        t = (line_sample - self.correction.centre) / self.correction.half_size
+        design = np.zeros((len(t), 2, 6))
+        design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
+        return np.asarray(design @ self.covariance @ design.transpose(0, 2, 1))
 
 
 def adjust_scene(
@@ -138,6 +149,8 @@ def adjust_scene(
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
     covariance = cofactor * max(sigma0, 1.0) ** 2
     covariance[[0, 3], [0, 3]] += common_sigma_px**2
+    if options.order is None and "affine" not in dict(validation):
+        covariance += problem.covariance_of_untested(active, free, options.untested_px)
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,
@@ -181,6 +194,24 @@ class _Problem:
             cofactor[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
         return parameters, cofactor
 
+    def covariance_of_untested(self, active: BoolArray, free: BoolArray, untested_px: float) -> Array:
+        """Covariance (6, 6) that fixed parameters bring when they are not known to be zero.
+
+        Left out of the fit, they bias the free ones and are missing where the measures do not reach.
+        """
+        design = np.column_stack([np.ones(len(self.t)), self.t])[active]
+        covariance = np.zeros((6, 6))
+        for k in range(2):
+            fixed = np.flatnonzero(~free[k])
+            weight = 1.0 / self.variance[active, k][:, None]
+            a = design[:, free[k]]
+            # Error of all parameters per unit of the fixed ones.
+            error = np.zeros((3, len(fixed)))
+            error[free[k]] = np.linalg.solve((a * weight).T @ a, (a * weight).T @ design[:, fixed])
+            error[fixed] = -np.eye(len(fixed))
+            covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = untested_px**2 * error @ error.T
+        return covariance
+
     def residual(self, parameters: Array) -> Array:
         """(n, 2) pixels."""
         return np.asarray(self.misfit - parameters[:, 0] - self.t @ parameters[:, 1:].T)
@@ -213,8 +244,11 @@ def _choose_order(
 ) -> tuple[Order, tuple[tuple[Order, float], ...]]:
     """The simplest order that predicts held-out measures as well as any."""
     orders = [options.order] if options.order else _considered(problem, usable, options)
+    # All orders are judged by the same measures: those that fit the richest of them.
+    richest = problem.robust_solution(usable, _FREE[orders[-1]])
+    judges = usable & (problem.magnitude(richest) <= 3.0 * max(problem.scale(richest, usable), 1e-9))
     validation = tuple(
-        (order, _validation_px(problem, usable, order, options.folds)) for order in orders
+        (order, _validation_px(problem, usable, judges, order, options.folds)) for order in orders
     )
     best, best_px = validation[0]
     for order, value_px in validation[1:]:
@@ -237,8 +271,10 @@ def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions
     ]
 
 
-def _validation_px(problem: _Problem, usable: BoolArray, order: Order, folds: int) -> float:
-    """Robust size of the residuals of measures that were left out of the fit, pixels."""
+def _validation_px(
+    problem: _Problem, usable: BoolArray, judges: BoolArray, order: Order, folds: int
+) -> float:
+    """Distance (rms, pixels) of the judging measures from where a fit without them expects them."""
     rows = np.flatnonzero(usable)
     folds = min(folds, len(rows))
     # Neighbours in the image fall into different folds.
@@ -251,6 +287,4 @@ def _validation_px(problem: _Problem, usable: BoolArray, order: Order, folds: in
         active[rows[out]] = False
         parameters = problem.robust_solution(active, _FREE[order])
         held_out[out] = problem.residual(parameters)[rows[out]]
-    distance = np.hypot(held_out[:, 0], held_out[:, 1])
-    near = np.sort(distance)[: max(1, int(0.8 * len(distance)))]
-    return float(np.sqrt(np.mean(near**2)))
+    return float(np.sqrt((held_out[judges[rows]] ** 2).sum(axis=1).mean()))

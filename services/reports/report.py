@@ -59,7 +59,7 @@ class OrderScore:
 
     Attributes:
         order: "shift", "drift" or "affine".
-        left_out_px: root mean square of the residuals of left-out points, pixels.
+        left_out_px: distance of left-out points from where the others expect them, rms, pixels.
     """
 
     order: str

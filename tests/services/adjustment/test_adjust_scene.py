@@ -264,3 +264,27 @@ def test_the_order_of_the_points_does_not_matter() -> None:
         other.correction.parameters, first.correction.parameters, atol=a_millipixel
     )
     np.testing.assert_array_equal(other.active, first.active[order])
+
+
+def test_what_could_not_be_tested_is_not_taken_for_known():
+    """Points on a quarter of the image carry a shift; over the rest the model may drift unseen."""
+    rng = np.random.default_rng(8)
+    points = seen(np.array([[3.0, 1.0, 0.0], [-2.0, 0.0, 1.0]]), rng, 400)
+    near = (points.line_sample < np.array(SHAPE) * 0.3).all(axis=1)
+    found = points.adjust(candidates=near)
+    assert found.order == "shift"
+    assert "affine" not in dict(found.validation_px)
+    corners = np.array([[0.0, 0.0], np.array(SHAPE) - 1.0])
+    error = found.correction.apply(corners) - points.truth.apply(corners)
+    std = np.sqrt(np.diagonal(found.covariance_at(corners), axis1=1, axis2=2))
+    assert (np.abs(error) < 3.0 * std).all()
+    assert std[1].min() > 0.5
+    assert std[0].max() < 0.5 * std[1].min()
+
+
+def test_a_third_of_blunders_does_not_hide_the_order():
+    rng = np.random.default_rng(9)
+    orders = [
+        with_blunders(seen(TRUTH["affine"], rng), 12, rng).adjust().order for _ in range(TRIALS // 4)
+    ]
+    assert orders.count("affine") >= 0.9 * len(orders)
