@@ -10,6 +10,9 @@ from services.types import Array, FloatImage
 
 FOUND = ""
 
+_BLOCKED = -1.0
+"""Score of places that cannot be judged."""
+
 
 @dataclass(frozen=True)
 class CorrelationOptions:
@@ -76,6 +79,8 @@ def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) 
     if row in (0, scores.shape[0] - 1) or col in (0, scores.shape[1] - 1):
         return _rejected("border_peak", score)
     around = scores[row - 1 : row + 2, col - 1 : col + 2].astype(np.float64)
+    if around.min() <= _BLOCKED:
+        return _rejected("border_peak", score)
     if _second_peak(scores, int(row), int(col), options.second_distance_px) > options.max_second * score:
         return _rejected("ambiguous", score)
     offset, curvature = _quadratic_peak(around)
@@ -109,7 +114,7 @@ def correlation_map(patch: FloatImage, chip: FloatImage) -> FloatImage | None:
         + count[:-lines, :-samples]
     )
     blocked = covered > 0
-    return None if blocked.all() else np.where(blocked, np.float32(-1.0), scores)
+    return None if blocked.all() else np.where(blocked, np.float32(_BLOCKED), scores)
 
 
 def _second_peak(scores: FloatImage, row: int, col: int, distance: int) -> float:

@@ -220,3 +220,12 @@ def test_nodata_away_from_a_chip_does_not_move_it() -> None:
     beside = find_chip(patch, chip_of(ground), OPTIONS)
     assert beside.reason == FOUND
     np.testing.assert_allclose(beside.row_col, whole.row_col, atol=a_millipixel)
+
+
+def test_a_peak_beside_what_cannot_be_judged_is_not_believed():
+    ground = texture(np.random.default_rng(3), 128, 1.5)
+    chip = as_pixels(ground[6:107, 6:107])
+    patch = as_pixels(np.roll(ground, (2, -1), (0, 1))[:113, :113])
+    assert find_chip(patch, chip, CorrelationOptions()).reason == FOUND
+    patch[:, 106:] = np.nan
+    assert find_chip(patch, chip, CorrelationOptions()).reason == "border_peak"
