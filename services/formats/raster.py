@@ -42,7 +42,7 @@ MAX_EXPANSION = 5_000
 """Bytes of pixels a byte of file may declare: Deflate reaches 1,032 on a constant image."""
 
 # GDAL falls back to a twentieth of the machine's memory outside the environment that says otherwise.
-_CACHE = {"GDAL_CACHEMAX": 256_000_000}
+_CACHE = {"GDAL_CACHEMAX": 64_000_000}
 _OPTIONS = _CACHE | {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
