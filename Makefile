@@ -12,7 +12,7 @@ demo: postgis
 	$(BIN)/amers demo
 
 test: check postgis
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(READY)
 	$(BIN)/ruff format --check .
@@ -24,7 +24,7 @@ serve: postgis
 	$(BIN)/amers serve
 
 bench: postgis
-	set -e; for script in benchmarks/[a-z]*.py; do $(BIN)/python $$script; done
+	set -e; for script in benchmarks/[a-z]*.py; do $(BIN)/python -m benchmarks.$$(basename $$script .py); done
 
 postgis: $(READY)
 	@scripts/ensure-postgis
