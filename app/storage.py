@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+import shutil
 import threading
 import time
 from collections import OrderedDict
@@ -162,14 +163,17 @@ class Storage:
         )
         return sorted(path.relative_to(self.folder).as_posix() for path in found)
 
-    def sweep_unfinished(self, older_than_s: float) -> int:
-        """Remove what writers that were killed left behind; returns how many files."""
-        swept = 0
+    def sweep_unfinished(self, older_than_s: float) -> list[str]:
+        """Remove what writers that were killed left behind; returns the names removed."""
+        swept = []
         for path in (self.folder / UNFINISHED).glob("*"):
             with suppress(FileNotFoundError):
                 if time.time() - path.stat().st_mtime >= older_than_s:
-                    path.unlink()
-                    swept += 1
+                    if path.is_dir():
+                        shutil.rmtree(path, ignore_errors=True)
+                    else:
+                        path.unlink()
+                    swept.append(path.name)
         return swept
 
     def _locate(self, key: str) -> Path:

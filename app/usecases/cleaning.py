@@ -1,13 +1,11 @@
 """Removing files that no row of the store names: what was left by uploads and attempts cut off."""
 
-import shutil
-import time
 from collections.abc import Callable
 from uuid import UUID
 
 from app.db import jobs, scenes
 from app.db.engine import Connection, Database
-from app.storage import UNFINISHED, Storage
+from app.storage import Storage
 
 
 def remove_unnamed_files(database: Database, storage: Storage) -> list[str]:
@@ -33,24 +31,6 @@ def remove_unnamed_files(database: Database, storage: Storage) -> list[str]:
             if folder not in kept:
                 storage.delete(key)
                 removed.append(key)
-    return removed
-
-
-def remove_unfinished_files(storage: Storage, age_s: float) -> list[str]:
-    """Remove what processes that were killed have left half written: nothing takes so long to write.
-
-    Returns:
-        The names removed.
-    """
-    removed = []
-    folder = storage.folder / UNFINISHED
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.stat().st_mtime < time.time() - age_s:
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-            removed.append(path.name)
     return removed
 
 

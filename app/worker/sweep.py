@@ -16,7 +16,7 @@ from app.db import jobs, scenes
 from app.db.engine import Database
 from app.storage import Storage
 from app.usecases.blocks import sweep_storage
-from app.usecases.cleaning import remove_unfinished_files, remove_unnamed_files
+from app.usecases.cleaning import remove_unnamed_files
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
@@ -80,7 +80,7 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
     removed = remove_unnamed_files(database, storage)
-    removed += remove_unfinished_files(storage, LONGEST_UPLOAD_S + longest_job_s)
+    removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s)
     with database.transaction() as connection:
         connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
         removed += sweep_storage(connection, storage)
