@@ -17,7 +17,6 @@ from services.reports.html import format_html
 from services.reports.report import (
     BlockUsed,
     ChipPair,
-    PassSummary,
     Quicklook,
     RegistrationReport,
     RegistrationSummary,
@@ -86,7 +85,7 @@ def write_outputs(
         footprint=scene_footprint(scene),
         blocks=blocks,
         options=options,
-        passes=_passes(registration, scene),
+        passes=registration.passes,
         order_reason=_order_reason(registration, options),
         measures=registration.measures,
         adjustment=registration.adjustment,
@@ -179,20 +178,6 @@ def _carries_tags(delivered: DeliveredModel, image: Path) -> bool:
     with image.open("rb") as file:
         start = file.read(4)
     return delivered.convention == "tags" and DRIVER_OF_SIGNATURE.get(start) == "GTiff"
-
-
-def _passes(registration: Registration, scene: Scene) -> tuple[PassSummary, ...]:
-    gsd_m = scene_gsd_m(scene)
-    return tuple(
-        PassSummary(
-            chip_gsd_m=done.chip_gsd_m,
-            search_radius_px=done.search_radius_m / gsd_m,
-            tried=done.tried,
-            matched=done.matched,
-            agreeing=done.agreeing,
-        )
-        for done in registration.passes
-    )
 
 
 def _order_reason(registration: Registration, options: RegistrationOptions) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from services.adjustment.scene import SceneAdjustment
+from services.passes import Pass
 from services.quality.accuracy import Accuracy
 from services.quality.qualification import (
     Coverage,
@@ -32,25 +33,6 @@ class BlockUsed:
 
     id: str
     version: str
-
-
-@dataclass(frozen=True)
-class PassSummary:
-    """One round of matching.
-
-    Attributes:
-        chip_gsd_m: ground sampling of the chips looked for, metres.
-        search_radius_px: how far from the prediction, pixels of the scene.
-        tried: points looked for.
-        matched: points found.
-        agreeing: found points that agree on one correction.
-    """
-
-    chip_gsd_m: float
-    search_radius_px: float
-    tried: int
-    matched: int
-    agreeing: int
 
 
 @dataclass(frozen=True)
@@ -152,7 +134,7 @@ class RegistrationSummary:
     footprint: Array
     blocks: tuple[BlockUsed, ...]
     options: Any
-    passes: tuple[PassSummary, ...]
+    passes: tuple[Pass, ...]
     order_reason: str
     measures: Measures
     adjustment: SceneAdjustment
@@ -272,7 +254,7 @@ class RegistrationReport:
     scene: SceneRecord
     blocks: tuple[BlockUsed, ...]
     correction: CorrectionRecord
-    passes: tuple[PassSummary, ...]
+    passes: tuple[Pass, ...]
     equipment: Equipment
     reasons: tuple[ReasonCount, ...]
     image_residuals_px: ImageResiduals

@@ -7,13 +7,13 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from services.passes import Pass
 from services.quality.accuracy import accuracy
 from services.quality.qualification import QualificationOptions, qualify
 from services.reports.report import (
     BlockUsed,
     Check,
     ChipPair,
-    PassSummary,
     Quicklook,
     RegistrationReport,
     RegistrationSummary,
@@ -77,8 +77,8 @@ def summarised(registered) -> Callable[..., RegistrationSummary]:
             blocks=(BlockUsed("calanques", "1"),),
             options=Options(),
             passes=(
-                PassSummary(2.0, 60.0, 50, 44, 41),
-                PassSummary(0.5, 6.0, len(scene.measures.score), 52, 48),
+                Pass("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
+                Pass("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
             ),
             order_reason="drift: lowest cross-validated residual",
             measures=scene.measures,
