@@ -28,7 +28,7 @@ class Settings(BaseSettings):
             private cluster in the data folder.
         data_folder: the private cluster and the stored files.
         host, port: where the API listens.
-        upload_limit_bytes: largest scene or block that can be uploaded.
+        upload_limit_bytes: largest scene that can be uploaded.
         body_limit_bytes: largest body of every other request.
         public_points: points and chips can be read without a token.
         pool_size: most connections one API process opens for reading, and again for writing.

@@ -51,6 +51,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=version("amers"),
         lifespan=lifespan,
         openapi_url="/api",
+        # Their pages load scripts from elsewhere.
+        docs_url=None,
+        redoc_url=None,
     )
     app.add_middleware(
         BodyLimit, limit_bytes=chosen.body_limit_bytes, upload_limit_bytes=chosen.upload_limit_bytes

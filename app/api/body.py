@@ -3,7 +3,7 @@
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-UPLOADS = ("/scenes", "/blocks")
+UPLOADS = ("/scenes",)
 
 
 class BodyLimit:

@@ -43,7 +43,7 @@ def register(
         Path | None, typer.Option(help="Take the points from this block folder; no database.")
     ] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the model, metres.", min=0.0)
+        float | None, typer.Option(help="Accuracy of the model, metres.", min=0.01)
     ] = None,
     model: Annotated[
         Path | None, typer.Option(help="File of the model, if it is not found by itself.")
@@ -69,7 +69,7 @@ def register(
     try:
         with _registrar(block, server, token) as do:
             outcomes = [
-                _one(do, SceneFiles(scene, model, sigma_m or None), folder)
+                _one(do, SceneFiles(scene, model, sigma_m), folder)
                 for scene, folder in _folders(scenes, output)
             ]
     except ServiceFailure as failure:

@@ -22,7 +22,8 @@ from app.storage import Storage, StoredChips
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.registration_files import OUTPUTS, write_outputs
 from app.usecases.scenes import clean_name, folder_of, visible_scene
-from services.formats.block import FolderChips, read_block
+from services.formats.block import FolderChips
+from services.formats.block_check import check_block
 from services.formats.scenes import read_scene
 from services.registration import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
@@ -144,8 +145,8 @@ def run_registration(
 
 
 def points_of_block(folder: Path) -> FindPoints:
-    """Points straight out of a block folder."""
-    contents = read_block(folder)
+    """Points straight out of a block folder, once it has been checked entirely."""
+    contents = check_block(folder)
     metadata = contents.document.metadata
     said = next((figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m"), None)
 

@@ -151,7 +151,7 @@ def check_rpc(model: RpcModel, source: str) -> RpcModel:
 
 
 def _packed(model: RpcModel) -> Array:
-    """The model as one array for the kernels, denominators scaled to a constant term of one."""
+    """The model as one array for the kernels."""
     packed = np.empty(90)
     for k, (num, den) in enumerate(
         ((model.line_num, model.line_den), (model.sample_num, model.sample_den))
