@@ -1,0 +1,87 @@
+"""The main job on the simulated world, as a newcomer runs it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+half_a_pixel = 0.5
+injected_m = 50.0
+
+
+def amers(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "app.cli.main", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    done = amers("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_all_points_made_are_ingested_and_served(demo):
+    assert demo["points produced"] >= 100
+    assert demo["points ingested"] == demo["points produced"]
+    assert demo["points served in the footprint"] == demo["points produced"]
+
+
+def test_a_model_wrong_by_fifty_metres_comes_to_agree_with_the_block(demo):
+    assert demo["CE90 as delivered, on the Earth (m)"] == pytest.approx(injected_m, rel=0.05)
+    assert demo["CE90 registered, in the block's frame (px)"] < half_a_pixel
+    assert demo["verdict"] == "good"
+    assert 20 <= demo["points active"] <= demo["points matched"] <= demo["points visible"]
+
+
+def test_what_the_block_itself_is_wrong_by_is_shown_beside(demo):
+    frame_m = [
+        float(part) for part in demo["error of the block's frame, east, north, up (m)"].split(",")
+    ]
+    assert len(frame_m) == 3
+    assert demo["CE90 registered, on the Earth (m)"] > 0.0
+
+
+def test_the_report_is_where_it_says(demo):
+    report = Path(demo["report"])
+    assert "<html" in report.read_text(encoding="utf-8")
+    assert (report.parent / "refined_RPC.TXT").is_file()
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    refused = amers("demo", "-o", tmp_path)
+    assert refused.returncode == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--images", "one.tif"), "one.tif"),
+        (("--images", "one.tif", "--images", "two.tif", "--gsd-m", "2"), "--gsd-m"),
+        (("--images", "one.tif", "--images", "two.tif", "--gsd-m", "20,2"), "finer first"),
+    ],
+)
+def test_a_production_that_cannot_be_says_why_and_leaves_nothing(tmp_path, words, says):
+    refused = amers("production", "run", *words, "-o", tmp_path / "block")
+    assert refused.returncode == 2
+    assert says in refused.stderr
+    assert "Traceback" not in refused.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_block_that_is_there_is_not_written_over(tmp_path):
+    (tmp_path / "block").mkdir()
+    refused = amers(
+        "production", "run", "--images", "a.tif", "--images", "b.tif", "-o", tmp_path / "block"
+    )
+    assert refused.returncode == 2
+    assert "exists already" in refused.stderr
