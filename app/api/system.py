@@ -15,7 +15,6 @@ CONFORMS_TO = (
 LINKS = (
     ("self", "", "application/json", "this document"),
     ("service-desc", "api", "application/vnd.oai.openapi+json;version=3.1", "the API, machine readable"),
-    ("service-doc", "docs", "text/html", "the API, for people"),
     ("conformance", "conformance", "application/json", "what the service conforms to"),
 )
 

@@ -57,7 +57,8 @@ def ask(
     scene = upload.json()["id"]
 
     def execute() -> str:
-        body = {"inputs": {"scene": scene}}
+        # One pass is done in a blink; many leave time to do harm in the middle.
+        body = {"inputs": {"scene": scene, "options": {"fine_passes": 100}}}
         reply = client.post("/processes/register-scene/execution", json=body, headers=me)
         return str(reply.headers["location"])
 
