@@ -7,7 +7,7 @@ import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
 from services.coarse import CoarseOptions, search_coarsely
-from services.errors import CoverageError, NoConsensus, NotEnoughPoints
+from services.errors import CoverageError, InputError, NoConsensus, NotEnoughPoints
 from services.matching.consensus import affine_consensus
 from services.matching.points import MatchingOptions, PointMatches, match_points
 from services.matching.predict import inside, spread_over_image
@@ -55,6 +55,12 @@ class RegistrationOptions:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     adjustment: AdjustmentOptions = field(default_factory=lambda: AdjustmentOptions(min_points=6))
     qualification: QualificationOptions = field(default_factory=QualificationOptions)
+
+    def __post_init__(self) -> None:
+        """Refuse what no registration can be made with."""
+        for name in ("max_points", "fine_passes"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} given, 1 or more expected")
 
 
 @dataclass(frozen=True)
