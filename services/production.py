@@ -13,6 +13,7 @@ from services.imagery import render_chip
 from services.intersection import Intersection, intersect
 from services.matching.chips import RefinementOptions, chip_inside, chip_saliency, refine_on_chips
 from services.matching.features import FeatureOptions, tie_points
+from services.matching.predict import rank_in_group
 from services.scene import Scene, scene_gsd_m, view_direction
 from services.sensors.base import SensorModel
 from services.types import (
@@ -218,7 +219,7 @@ def _candidates(
             f"{options.min_views} images",
         )
     square = _squares(block.lon_lat_h[rows], options)
-    return block.lon_lat_h[rows[_best_of_each(square, inside - worst[rows], options.candidates)]]
+    return block.lon_lat_h[rows[rank_in_group(square, inside - worst[rows]) < options.candidates]]
 
 
 def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
@@ -231,14 +232,6 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
         side = float(np.sqrt(extent[0] * extent[1] / options.points))
     cell = np.floor(enu / side).astype(np.int64)
     return np.unique(cell, axis=0, return_inverse=True)[1].astype(np.int64)
-
-
-def _best_of_each(group: IntArray, preference: Array, count: int) -> IntArray:
-    """Rows of the `count` best members of every group."""
-    order = np.lexsort((-preference, group))
-    first = np.concatenate([[True], group[order][1:] != group[order][:-1]])
-    start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
-    return np.sort(order[np.arange(len(order)) - start < count])
 
 
 def _chosen(
@@ -269,7 +262,7 @@ def _chosen(
         )
     square = _squares(points.lon_lat_h[rows], options)
     preference = points.rays[rows] + saliency
-    best = _best_of_each(square, preference, 1)
+    best = np.flatnonzero(rank_in_group(square, preference) == 0)
     return [(int(rows[b]), float(saliency[b])) for b in best]
 
 

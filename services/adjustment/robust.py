@@ -16,11 +16,6 @@ def cauchy_weights(normalised: Array) -> Array:
     return np.asarray(1.0 / (1.0 + (normalised / CAUCHY_TUNING) ** 2))
 
 
-def robust_std(residual: Array) -> float:
-    """Standard deviation of residuals around zero, from their median magnitude; NaN rows are ignored."""
-    return float(MAD_TO_STD * np.nanmedian(np.abs(residual)))
-
-
 def deactivate(
     solve: Callable[[BoolArray], Array], active: BoolArray, tolerance: float, minimum: int
 ) -> BoolArray:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.robust import cauchy_weights, deactivate
+from services.adjustment.robust import MAD_TO_STD, cauchy_weights, deactivate
 from services.errors import NotEnoughPoints
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
@@ -221,9 +221,9 @@ class _Problem:
         return np.asarray(np.abs(self.residual(parameters) / np.sqrt(self.variance)).max(axis=1))
 
     def scale(self, parameters: Array, active: BoolArray) -> float:
-        """Robust standard deviation of the normalised residuals, not below what small samples hide."""
+        """Robust standard deviation of the normalised residuals."""
         normalised = self.residual(parameters)[active] / np.sqrt(self.variance[active])
-        return float(1.4826 * np.median(np.abs(normalised)))
+        return float(MAD_TO_STD * np.median(np.abs(normalised)))
 
     def robust_solution(self, active: BoolArray, free: BoolArray) -> Array:
         """Parameters (2, 3) by re-weighting, from the median shift on."""

@@ -36,12 +36,17 @@ def spread_over_image(
     side = np.sqrt(shape[0] * shape[1] / max(1.0, count / 2.0))
     cell = np.floor(line_sample / side).astype(np.int64)
     key = cell[:, 0] * 1_000_003 + cell[:, 1]
-    order = np.lexsort((-preference, key))
-    first = np.concatenate([[True], key[order][1:] != key[order][:-1]])
+    return np.lexsort((-preference, rank_in_group(key, preference)))[:count]
+
+
+def rank_in_group(group: IntArray, preference: Array) -> IntArray:
+    """How many members of its own group come before each, the larger preference first: (n,) from 0."""
+    order = np.lexsort((-preference, group))
+    first = np.concatenate([[True], group[order][1:] != group[order][:-1]])
     start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))
-    turn = np.arange(len(order)) - start
-    ranked = order[np.lexsort((-preference[order], turn))]
-    return ranked[:count]
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - start
+    return rank
 
 
 def choose_views(
