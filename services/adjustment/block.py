@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 from scipy.stats import chi2 as chi2_law
 
+from services.adjustment.robust import cauchy_weights
 from services.errors import NoConvergence, NotEnoughPoints
 from services.intersection import intersect, move_metres, residuals_and_derivatives
 from services.sensors.base import SensorModel
@@ -19,14 +20,12 @@ class BlockOptions:
     """How a block is adjusted.
 
     Attributes:
-        cauchy: residuals of this many robust standard deviations weigh half.
         tolerance: an observation leaves at the end when its residual exceeds so many of them.
         max_iterations: before the adjustment is said not to converge.
         converged_px: largest change of a correction at which it has.
         min_points: tie points needed.
     """
 
-    cauchy: float = 2.385
     tolerance: float = 4.0
     max_iterations: int = 100
     converged_px: float = 1e-3
@@ -100,7 +99,7 @@ def adjust_block(
         iterations += 1
         residual, derivative = _linearised(models, shift_px, observations, lon_lat_h)
         scale = _scale(residual, observations)
-        weight = _weights(residual, observations, scale, options.cauchy)
+        weight = _weights(residual, observations, scale)
         step_px, step_m, normal = _schur_step(
             observations,
             residual,
@@ -151,10 +150,9 @@ def _scale(residual: Array, observations: Observations) -> float:
     return max(float(median), 1e-6)
 
 
-def _weights(residual: Array, observations: Observations, scale: float, cauchy: float) -> Array:
+def _weights(residual: Array, observations: Observations, scale: float) -> Array:
     magnitude, _, _ = _magnitude(residual, observations)
-    robust = 1.0 / (1.0 + (magnitude / (cauchy * scale)) ** 2)
-    weight = robust / (scale * observations.sigma_px) ** 2
+    weight = cauchy_weights(magnitude / scale) / (scale * observations.sigma_px) ** 2
     return np.where(np.isfinite(weight), weight, 0.0)
 
 
