@@ -280,12 +280,14 @@ def _finished(
     lon_lat_h = intersection.lon_lat_h[rows]
     image, gsd_m, start = _views(scenes, block, lon_lat_h, rows, kept, options)
     incidence, azimuth = _directions(block, lon_lat_h, image, start)
-    views = Views(start, gsd_m, image, incidence, azimuth, tuple(s.acquisition for s in scenes))
+    taken = tuple(scene.acquisition for scene in scenes)
+    views = Views(start, gsd_m, image, incidence, azimuth, np.ones(len(image)), taken)
     points = ControlPoints(
         id=np.arange(len(rows), dtype=np.int64),
         lon_lat_h=lon_lat_h,
         covariance_m2=intersection.covariance_m2[rows],
         saliency=np.array([saliency for _, saliency in chosen]),
+        health=np.ones(len(rows)),
         views=views,
         chip_file=np.zeros(len(rows), dtype=np.int64),
         chip_row=start[:-1].copy(),

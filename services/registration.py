@@ -32,6 +32,7 @@ from services.types import (
     IntArray,
     Measures,
     Progress,
+    ViewMeasures,
     no_progress,
     part_of,
 )
@@ -71,6 +72,7 @@ class Registration:
         model: the scene's model with its correction.
         adjustment: the correction, its covariance, the residuals.
         measures: one row for every point the scene could show.
+        views: what the last search did with the views of these points.
         passes: the searches, in order.
         qualification: how good it is.
     """
@@ -78,6 +80,7 @@ class Registration:
     model: CorrectedModel
     adjustment: SceneAdjustment
     measures: Measures
+    views: ViewMeasures
     passes: tuple[Pass, ...]
     qualification: Qualification
 
@@ -165,7 +168,8 @@ def register_scene(
         frame_sigma_m,
     )
     progress(1.0, "registered")
-    return Registration(model, adjustment, measures, tuple(passes), qualification)
+    views = replace(matches.tried, point=rows[matches.tried.point])
+    return Registration(model, adjustment, measures, views, tuple(passes), qualification)
 
 
 def _choose_points(
@@ -259,6 +263,8 @@ def _measures(
     )
     views = np.zeros(n, dtype=np.int64)
     views[rows] = matches.views
+    by_gradient = np.zeros(n, dtype=bool)
+    by_gradient[rows] = matches.by_gradient
     return Measures(
         point_id=points.id[visible],
         lon_lat_h=points.lon_lat_h[visible],
@@ -267,6 +273,7 @@ def _measures(
         sigma_px=scattered(matches.sigma_px),
         score=scattered(matches.score),
         views=views,
+        by_gradient=by_gradient,
         residual_px=scattered(adjustment.residual_px, 2),
         residual_m=scattered(residual_m, 2),
         matched=matched,

@@ -64,6 +64,8 @@ class Views:
         gsd_m: (m,) ground sampling of each chip, metres.
         image: (m,) int64, rows of `images`.
         incidence_deg, azimuth_deg: (m,) direction from the point to the sensor.
+        health: (m,) share of the registrations that tried the view in which it agreed with the measure
+            of its point, as `health` shrinks it; 1 without a history.
         images: the images the chips were cut from.
     """
 
@@ -72,6 +74,7 @@ class Views:
     image: IntArray
     incidence_deg: Array
     azimuth_deg: Array
+    health: Array
     images: tuple[Acquisition, ...]
 
 
@@ -84,6 +87,8 @@ class ControlPoints:
         lon_lat_h: (n, 3).
         covariance_m2: (n, 3, 3) of east, north, up, relative to the frame of the point's block.
         saliency: (n,) 0 to 1, how well the point's chip can be located.
+        health: (n,) share of the registrations that tried the point in which it was active at the end,
+            as `health` shrinks it; 1 without a history.
         views: the views of the points.
         chip_file: (n,) int64, rows of `chip_files`.
         chip_row: (n,) int64, row of the point's first chip in its file; its views follow.
@@ -94,6 +99,7 @@ class ControlPoints:
     lon_lat_h: Array
     covariance_m2: Array
     saliency: Array
+    health: Array
     views: Views
     chip_file: IntArray
     chip_row: IntArray
@@ -113,6 +119,7 @@ class ControlPoints:
             image=self.views.image[kept],
             incidence_deg=self.views.incidence_deg[kept],
             azimuth_deg=self.views.azimuth_deg[kept],
+            health=self.views.health[kept],
             images=self.views.images,
         )
         return ControlPoints(
@@ -120,11 +127,29 @@ class ControlPoints:
             lon_lat_h=self.lon_lat_h[rows],
             covariance_m2=self.covariance_m2[rows],
             saliency=self.saliency[rows],
+            health=self.health[rows],
             views=views,
             chip_file=self.chip_file[rows],
             chip_row=self.chip_row[rows],
             chip_files=self.chip_files,
         )
+
+
+HEALTH_PRIOR_TRIES = 5.0
+"""Successful tries every point and view begins with: one failure says little, ten say much."""
+
+
+def health(tried: Array | IntArray, succeeded: Array | IntArray) -> Array:
+    """How often points or views served when they were tried, shrunk towards 1.
+
+    Five successes are added to what happened: 1 without a history, 0.83 after one failure in one try,
+    0.5 after five in five.
+
+    Args:
+        tried: (n,) registrations that tried it.
+        succeeded: (n,) those in which a point stayed active, or a view agreed with its point's measure.
+    """
+    return np.asarray((succeeded + HEALTH_PRIOR_TRIES) / (tried + HEALTH_PRIOR_TRIES))
 
 
 class ChipSource(Protocol):
@@ -161,6 +186,7 @@ class Measures:
         sigma_px: (n,) one standard deviation a coordinate, pixels of the scene; NaN where not found.
         score: (n,) best correlation seen; NaN where none was computed.
         views: (n,) int64, how many views of the point agree on the measure.
+        by_gradient: (n,) found by the edges of the chips only: the radiometry has changed.
         residual_px: (n, 2) found minus computed by the refined model, line and sample; NaN where not
             found.
         residual_m: (n, 2) the same on the ground, east and north.
@@ -176,10 +202,30 @@ class Measures:
     sigma_px: Array
     score: Array
     views: IntArray
+    by_gradient: BoolArray
     residual_px: Array
     residual_m: Array
     matched: BoolArray
     active: BoolArray
+    reason: npt.NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class ViewMeasures:
+    """What a registration did with each of k views that it tried.
+
+    Attributes:
+        point: (k,) int64, rows of the registration's `Measures`; ascending.
+        view: (k,) int64, number of the view within its point.
+        score: (k,) best correlation; NaN where none was computed.
+        agreed: (k,) found where the measure of the point is, to the tolerance of the views.
+        reason: (k,) str, why the view was not found; "" where it was.
+    """
+
+    point: IntArray
+    view: IntArray
+    score: Array
+    agreed: BoolArray
     reason: npt.NDArray[np.str_]
 
 

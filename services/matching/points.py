@@ -13,11 +13,13 @@ from services.matching.predict import choose_views
 from services.sensors.base import SensorModel
 from services.types import (
     Array,
+    BoolArray,
     ChipSource,
     ControlPoints,
     FloatImage,
     IntArray,
     Progress,
+    ViewMeasures,
     no_progress,
     point_chips,
 )
@@ -54,8 +56,10 @@ class PointMatches:
         score: (n,) best correlation among the views.
         views: (n,) how many views agree.
         reason: (n,) "" where found.
+        by_gradient: (n,) found by the edges of the chips only.
         common_sigma_m: standard deviation a coordinate of what all the measures have in common, metres:
             see `common_sigma`.
+        tried: what became of every view that was tried; its rows are those of the points.
     """
 
     line_sample: Array
@@ -64,7 +68,9 @@ class PointMatches:
     score: Array
     views: IntArray
     reason: np.ndarray
+    by_gradient: BoolArray
     common_sigma_m: float
+    tried: ViewMeasures
 
 
 def match_points(
@@ -102,6 +108,7 @@ def match_points(
     reason = np.full(n, "", dtype="<U16")
     scene_gsd_m = np.full(n, np.nan)
     offsets: dict[int, list[Array]] = {}
+    seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
         if done % 64 == 0:
             progress(done / n, f"searching {n} points with chips of {gsd_m:g} m")
@@ -121,11 +128,12 @@ def match_points(
             for number in numbers
         ]
         row_col, sigma, agreeing, reason[row] = _combined(peaks, options.agreement_px)
-        for number, peak in zip(numbers, peaks, strict=True):
+        for number, peak, agreed in zip(numbers, peaks, agreeing, strict=True):
+            seen.append((row, int(number), peak, bool(agreed)))
             if peak.reason == FOUND and reason[row] == FOUND:
                 image_number = int(points.views.image[points.views.start[row] + number])
                 offsets.setdefault(image_number, []).append(peak.row_col - row_col)
-        views[row] = agreeing
+        views[row] = agreeing.sum()
         score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
         displacement_m[row] = row_col[1] * gsd_m, -row_col[0] * gsd_m
         sigma_m[row] = sigma * gsd_m
@@ -137,7 +145,21 @@ def match_points(
         score,
         views,
         reason,
+        np.zeros(n, dtype=bool),
         common_sigma(list(offsets.values())) * gsd_m,
+        _view_measures(seen),
+    )
+
+
+def _view_measures(seen: list[tuple[int, int, Peak, bool]]) -> ViewMeasures:
+    """The views tried: point, number, peak, whether it agrees; by point and number."""
+    seen = sorted(seen, key=lambda view: view[:2])
+    return ViewMeasures(
+        point=np.array([point for point, *_ in seen], dtype=np.int64),
+        view=np.array([number for _, number, *_ in seen], dtype=np.int64),
+        score=np.array([peak.score for *_, peak, _ in seen], dtype=np.float64),
+        agreed=np.array([agreed for *_, agreed in seen], dtype=bool),
+        reason=np.array([peak.reason for *_, peak, _ in seen], dtype="<U16"),
     )
 
 
@@ -176,21 +198,23 @@ def _tile_order(line_sample: Array) -> Sequence[int]:
     return [int(row) for row in np.lexsort((tile[:, 1], tile[:, 0]))]
 
 
-def _combined(peaks: list[Peak], agreement_px: float) -> tuple[Array, float, int, str]:
-    """One measure from the views of a point: displacement, sigma, how many agree, reason."""
-    nothing = np.full(2, np.nan)
+def _combined(peaks: list[Peak], agreement_px: float) -> tuple[Array, float, BoolArray, str]:
+    """One measure from the views of a point: displacement, sigma, which of them agree, reason."""
+    nothing, none = np.full(2, np.nan), np.zeros(len(peaks), dtype=bool)
     found = [p for p in peaks if p.reason == FOUND]
     if not found:
         best = max(peaks, key=lambda p: -1.0 if np.isnan(p.score) else p.score)
-        return nothing, np.nan, 0, best.reason
+        return nothing, np.nan, none, best.reason
     row_col = np.array([p.row_col for p in found])
     sigma = np.array([p.sigma_px for p in found])
     near = np.hypot(*(row_col - np.median(row_col, axis=0)).T) <= agreement_px
-    agreeing = int(near.sum())
-    if 2 * agreeing <= len(found) and len(found) > 1:
-        return nothing, np.nan, agreeing, "views_disagree"
+    count = int(near.sum())
+    if 2 * count <= len(found) and len(found) > 1:
+        return nothing, np.nan, none, "views_disagree"
     weight = sigma[near] ** -2.0
     mean = (row_col[near] * weight[:, None]).sum(axis=0) / weight.sum()
     # Views of one scene share its noise and its shadows: their mean is no better than the best of them.
-    spread = row_col[near].std() / np.sqrt(agreeing)
+    spread = row_col[near].std() / np.sqrt(count)
+    agreeing = none.copy()
+    agreeing[np.flatnonzero([p.reason == FOUND for p in peaks])[near]] = True
     return mean, float(np.hypot(sigma[near].min(), spread)), agreeing, FOUND

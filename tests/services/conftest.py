@@ -96,6 +96,7 @@ def register(
         sigma_px=np.where(matched, noise_px, np.nan),
         score=np.where(matched, rng.uniform(0.8, 0.98, n), rng.uniform(0.1, 0.7, n)),
         views=np.full(n, 3),
+        by_gradient=np.zeros(n, dtype=bool),
         residual_px=residual_px,
         residual_m=np.column_stack([residual_px[:, 1], -residual_px[:, 0]]) * GSD_M,
         matched=matched,

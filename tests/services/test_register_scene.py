@@ -128,6 +128,18 @@ def test_measures_hold_together(name: str) -> None:
 
 
 @names
+def test_every_view_that_was_tried_is_told(name: str) -> None:
+    found = registration(name)
+    measures, views = found.measures, found.views
+    assert (np.diff(views.point) >= 0).all()
+    agreeing = np.bincount(views.point[views.agreed], minlength=len(measures.point_id))
+    np.testing.assert_array_equal(agreeing[measures.matched], measures.views[measures.matched])
+    assert not views.agreed[~measures.matched[views.point]].any()
+    assert (views.reason[views.agreed] == "").all()
+    assert (views.score[views.agreed] >= 0.8).all()
+
+
+@names
 def test_residuals_are_found_minus_computed(name: str) -> None:
     found = registration(name)
     measures = found.measures

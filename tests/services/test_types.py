@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.types import Acquisition, ControlPoints, IntArray, Observations, Views
+from services.types import Acquisition, ControlPoints, IntArray, Observations, Views, health
 
 view_counts = st.lists(st.integers(0, 4), min_size=1, max_size=8)
 
@@ -17,12 +17,14 @@ def points_with(counts: list[int]) -> ControlPoints:
         lon_lat_h=np.arange(3.0 * n).reshape(n, 3),
         covariance_m2=np.arange(9.0 * n).reshape(n, 3, 3),
         saliency=np.arange(float(n)) / n,
+        health=1.0 - np.arange(n) / 100.0,
         views=Views(
             start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
             gsd_m=1.0 + np.arange(m),
             image=np.arange(m) % 2,
             incidence_deg=10.0 + np.arange(m),
             azimuth_deg=20.0 + np.arange(m),
+            health=1.0 - np.arange(m) / 100.0,
             images=(Acquisition("a"), Acquisition("b")),
         ),
         chip_file=np.arange(n) % 3,
@@ -46,11 +48,11 @@ def test_taken_points_keep_everything_that_was_theirs(counts: list[int], data: s
     assert taken.views.start[0] == 0
     assert taken.views.start[-1] == len(taken.views.gsd_m) == len(taken.views.image)
     for new, old in enumerate(rows):
-        for name in ("id", "lon_lat_h", "covariance_m2", "saliency", "chip_file", "chip_row"):
+        for name in ("id", "lon_lat_h", "covariance_m2", "saliency", "health", "chip_file", "chip_row"):
             np.testing.assert_array_equal(getattr(taken, name)[new], getattr(points, name)[old])
         mine = slice(*taken.views.start[new : new + 2])
         theirs = slice(*points.views.start[old : old + 2])
-        for name in ("gsd_m", "image", "incidence_deg", "azimuth_deg"):
+        for name in ("gsd_m", "image", "incidence_deg", "azimuth_deg", "health"):
             np.testing.assert_array_equal(
                 getattr(taken.views, name)[mine], getattr(points.views, name)[theirs]
             )
@@ -65,6 +67,11 @@ def test_taking_twice_is_taking_the_rows_of_the_rows(counts: list[int], data: st
     np.testing.assert_array_equal(twice.id, once.id)
     np.testing.assert_array_equal(twice.views.start, once.views.start)
     np.testing.assert_array_equal(twice.views.gsd_m, once.views.gsd_m)
+
+
+def test_health_is_one_without_a_history_and_falls_with_every_failure() -> None:
+    tried = np.array([0, 1, 5, 5, 100])
+    np.testing.assert_allclose(health(tried, np.array([0, 0, 0, 5, 0])), [1, 5 / 6, 0.5, 1, 5 / 105])
 
 
 @given(st.integers(1, 20), st.data())
