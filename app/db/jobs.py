@@ -234,7 +234,7 @@ def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float
 def dismiss(connection: Connection, job_id: UUID) -> bool:
     """End a job nobody wants any more; whoever works on it finds out at its next write."""
     done = connection.execute(
-        """update job set state = 'dismissed', cancel_requested = true, message = 'dismissed',
+        """update job set state = 'dismissed', message = 'dismissed',
                lease_until = null, finished_at = clock_timestamp(), updated_at = clock_timestamp()
            where id = %s and state in ('accepted', 'running')""",
         (job_id,),
