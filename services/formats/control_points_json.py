@@ -1,0 +1,303 @@
+"""Marked points as JSON: Amers and Orthority GeoJSON, and the control points of OPF 1.0 (Pix4D)."""
+
+import hashlib
+import json
+import math
+from typing import Any
+
+import numpy as np
+from pyproj import CRS
+
+from services.errors import FormatError, InputError, VerticalDatumError
+from services.formats.control_points import (
+    MarkedPoints,
+    crs_from,
+    ground_from,
+    load_json,
+    marked_points,
+)
+from services.types import Array, Measures
+
+OPF_FORMAT = "application/opf-input-control-points+json"
+OPF_CORNER_PX = 0.5
+"""OPF counts from the corner of the first pixel."""
+OPF_EXTENSION = "AMERS_images"
+"""Where an OPF of ours keeps the names of the images, which OPF has in a list of cameras elsewhere."""
+
+
+def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
+    """GeoJSON of the points of a scene: where they are, where they were found, what became of them.
+
+    Args:
+        measures: all n points the scene could show.
+        image: name of the scene.
+        sigma_m: (n, 3) of the points, east, north, up; NaN where unknown.
+    """
+    numbers = {
+        "predicted_line": measures.predicted[:, 0],
+        "predicted_sample": measures.predicted[:, 1],
+        "line": measures.line_sample[:, 0],
+        "sample": measures.line_sample[:, 1],
+        "sigma_px": measures.sigma_px,
+        "score": measures.score,
+        "residual_line_px": measures.residual_px[:, 0],
+        "residual_sample_px": measures.residual_px[:, 1],
+        "residual_east_m": measures.residual_m[:, 0],
+        "residual_north_m": measures.residual_m[:, 1],
+        "sigma_east_m": sigma_m[:, 0],
+        "sigma_north_m": sigma_m[:, 1],
+        "sigma_up_m": sigma_m[:, 2],
+    }
+    features = [
+        {
+            "type": "Feature",
+            "id": int(measures.point_id[i]),
+            "geometry": {"type": "Point", "coordinates": [float(v) for v in lon_lat_h]},
+            "properties": {
+                "status": measure_status(measures, i),
+                "reason": str(measures.reason[i]),
+                "views": int(measures.views[i]),
+                **{name: _known(float(values[i])) for name, values in numbers.items()},
+            },
+        }
+        for i, lon_lat_h in enumerate(measures.lon_lat_h)
+    ]
+    document = {
+        "type": "FeatureCollection",
+        "image": image,
+        "pixel_origin": "the centre of the first pixel is line 0, sample 0",
+        "heights": "metres above the WGS 84 ellipsoid",
+        "features": features,
+    }
+    return json.dumps(document, allow_nan=False) + "\n"
+
+
+def measure_status(measures: Measures, row: int) -> str:
+    """What became of a point: "active", "deactivated" or "not matched"."""
+    if measures.active[row]:
+        return "active"
+    return "deactivated" if measures.matched[row] else "not matched"
+
+
+def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
+    """Read marked points from GeoJSON: those of a registration, a list of one's own, or Orthority's.
+
+    Each feature is a Point with longitude, latitude and height. Its properties hold `line` and
+    `sample`, from the centre of the first pixel, or Orthority's `ji` (column, row). Optional: `id`,
+    `image` or `filename`, `sigma_px`, `sigma_east_m`, `sigma_north_m`, `sigma_up_m`, `check`, and
+    `status`: a point whose status is neither missing nor "active" is not active. Features without a
+    place in the image are left out.
+
+    Args:
+        text: contents of the file.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when it is something else.
+        VerticalDatumError: when a point has no height.
+    """
+    document = load_json(text, source)
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list):
+        raise FormatError(f"{source}: expected a GeoJSON FeatureCollection")
+    image = str(document.get("image") or "")
+    rows = [
+        _geojson_row(feature, f"{source}, feature {count}", image, str(count))
+        for count, feature in enumerate(features, start=1)
+    ]
+    return _gathered([row for row in rows if row is not None])
+
+
+def format_opf(points: MarkedPoints) -> str:
+    """The active points and the check points as input control points of OPF 1.0, in EPSG:4979.
+
+    A camera is known by a number made from the name of its image; the names are in an extension.
+
+    Raises:
+        InputError: when a sigma is unknown, which OPF does not allow.
+    """
+    used = points.take(points.active | points.check)
+    gcps: dict[str, dict[str, Any]] = {}
+    for i, point in enumerate(used.id.tolist()):
+        lon, lat, height_m = used.lon_lat_h[i].tolist()
+        east_m, north_m, up_m = used.sigma_m[i].tolist()
+        if not np.isfinite([east_m, north_m, up_m, used.sigma_px[i]]).all():
+            raise InputError(f"point {point}: a sigma is unknown, this format takes known ones only")
+        gcp = gcps.setdefault(
+            point,
+            {
+                "id": point,
+                "geolocation": {
+                    "crs": {"definition": "EPSG:4979"},
+                    "coordinates": [lat, lon, height_m],
+                    "sigmas": [north_m, east_m, up_m],
+                },
+                "marks": [],
+                "is_checkpoint": bool(used.check[i]),
+            },
+        )
+        line, sample = (used.line_sample[i] + OPF_CORNER_PX).tolist()
+        gcp["marks"].append(
+            {
+                "camera_id": opf_camera_id(str(used.image[i])),
+                "position_px": [sample, line],
+                "accuracy": float(used.sigma_px[i]),
+            }
+        )
+    images = {str(opf_camera_id(name)): name for name in dict.fromkeys(used.image.tolist())}
+    document = {
+        "format": OPF_FORMAT,
+        "version": "1.0",
+        "gcps": list(gcps.values()),
+        "mtps": [],
+        "extensions": {OPF_EXTENSION: images},
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def opf_camera_id(image: str) -> int:
+    """The number of an image: the first 48 bits of the SHA-256 of its name, which every reader takes."""
+    return int.from_bytes(hashlib.sha256(image.encode()).digest()[:6], "big")
+
+
+def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
+    """Read the input control points of OPF 1.0.
+
+    Images are named by the extension of Amers, else by the number of their camera. Heights are those of
+    the reference system of each point: of its ellipsoid when it is two-dimensional, as OPF says.
+
+    Args:
+        text: contents of the file.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when it is something else.
+        VerticalDatumError: when heights need a grid that is not installed.
+    """
+    document = load_json(text, source)
+    if not isinstance(document, dict) or document.get("format") != OPF_FORMAT:
+        raise FormatError(f"{source}: expected a document of the format {OPF_FORMAT}")
+    if not str(document.get("version", "")).startswith("1."):
+        raise FormatError(f"{source}: expected OPF 1, found version {document.get('version')!r}")
+    gcps = document.get("gcps")
+    if not isinstance(gcps, list):
+        raise FormatError(f"{source}: expected a list of gcps")
+    extensions = document.get("extensions")
+    named = extensions.get(OPF_EXTENSION) if isinstance(extensions, dict) else None
+    images = named if isinstance(named, dict) else {}
+    rows = []
+    for count, gcp in enumerate(gcps, start=1):
+        rows += _opf_rows(gcp, images, f"{source}, gcp {count}")
+    return _gathered(rows)
+
+
+Row = dict[str, Any]
+"""One mark, by the names of `MarkedPoints`."""
+
+
+def _gathered(rows: list[Row]) -> MarkedPoints:
+    columns = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
+    return marked_points(
+        columns.pop("id", []), columns.pop("lon_lat_h", []), columns.pop("line_sample", []), **columns
+    )
+
+
+def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None:
+    """One feature; None when the image does not show it."""
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    properties = feature.get("properties") if isinstance(feature, dict) else None
+    if not isinstance(geometry, dict) or geometry.get("type") != "Point":
+        raise FormatError(f"{where}: expected a Point")
+    properties = properties if isinstance(properties, dict) else {}
+    coordinates = geometry.get("coordinates")
+    if isinstance(coordinates, list) and len(coordinates) == 2:
+        raise VerticalDatumError(f"{where}: expected longitude, latitude and height, found no height")
+    lon, lat, height_m = _numbers(coordinates, 3, "coordinates", where)
+    place = properties.get("ji", [properties.get("sample"), properties.get("line")])
+    if place == [None, None]:
+        return None
+    sample, line = _numbers(place, 2, "line and sample", where)
+    named = feature.get("id", properties.get("id"))
+    return {
+        "id": count if named is None else str(named),
+        "lon_lat_h": (lon, lat, height_m),
+        "line_sample": (line, sample),
+        "image": str(properties.get("image") or properties.get("filename") or image),
+        "sigma_px": _optional(properties, "sigma_px", where),
+        "sigma_m": [
+            _optional(properties, name, where)
+            for name in ("sigma_east_m", "sigma_north_m", "sigma_up_m")
+        ],
+        "residual_px": [
+            _optional(properties, name, where) for name in ("residual_line_px", "residual_sample_px")
+        ],
+        "active": properties.get("status", "active") == "active",
+        "check": properties.get("check") is True,
+    }
+
+
+def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
+    """The marks of one point."""
+    if not isinstance(gcp, dict) or not isinstance(gcp.get("geolocation"), dict):
+        raise FormatError(f"{where}: expected a geolocation")
+    location, marks = gcp["geolocation"], gcp.get("marks")
+    if not isinstance(marks, list) or not all(isinstance(mark, dict) for mark in marks):
+        raise FormatError(f"{where}: expected a list of marks")
+    ground, sigma_m = _opf_ground(location, where)
+    rows = []
+    for mark in marks:
+        sample, line = _numbers(mark.get("position_px"), 2, "position_px", where)
+        camera = str(mark.get("camera_id"))
+        rows.append(
+            {
+                "id": str(gcp.get("id")),
+                "lon_lat_h": ground,
+                "line_sample": (line - OPF_CORNER_PX, sample - OPF_CORNER_PX),
+                "image": str(images.get(camera, camera)),
+                "sigma_px": _optional(mark, "accuracy", where),
+                "sigma_m": sigma_m,
+                "check": gcp.get("is_checkpoint") is True,
+            }
+        )
+    return rows
+
+
+def _opf_ground(location: dict[str, Any], where: str) -> tuple[list[float], list[float]]:
+    """Longitude, latitude, height and the sigmas east, north, up of a geolocation."""
+    said = location.get("crs")
+    if not isinstance(said, dict) or not isinstance(said.get("definition"), str):
+        raise FormatError(f"{where}: expected a crs with its definition")
+    crs = crs_from(said["definition"], where)
+    coordinates = np.array([_numbers(location.get("coordinates"), 3, "coordinates", where)])
+    sigmas_m = _numbers(location.get("sigmas"), 3, "sigmas", where)
+    geoid_m = _optional(said, "geoid_height", where)
+    if crs.is_compound and not math.isnan(geoid_m):
+        coordinates[:, 2] += geoid_m
+        crs = crs.sub_crs_list[0]
+    ground = ground_from(coordinates, crs, "ellipsoid", where, axes_of_crs=True)[0]
+    return ground.tolist(), sigmas_m if _east_first(crs) else [sigmas_m[1], sigmas_m[0], sigmas_m[2]]
+
+
+def _east_first(crs: CRS) -> bool:
+    return crs.axis_info[0].direction == "east"
+
+
+def _numbers(values: Any, count: int, name: str, where: str) -> list[float]:
+    """So many finite numbers."""
+    if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
+        raise FormatError(f"{where}: {name} should be {count} numbers, found {str(values)[:60]}")
+    return [float(value) for value in values]
+
+
+def _optional(holder: dict[str, Any], name: str, where: str) -> float:
+    """A number that may be missing or null, NaN then."""
+    value = holder.get(name)
+    return math.nan if value is None else _numbers([value], 1, name, where)[0]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

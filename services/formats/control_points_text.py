@@ -1,0 +1,254 @@
+"""Marked points as text: ASP `.gcp`, QGIS `.points`, ENVI `.pts`."""
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from pyproj import CRS
+
+from services.errors import FormatError, InputError
+from services.formats.control_points import (
+    ELLIPSOID,
+    WGS84_3D,
+    MarkedPoints,
+    crs_from,
+    ground_from,
+    marked_points,
+)
+from services.formats.rpc_text import parse_number
+from services.types import Array
+
+QGIS_CORNER_PX = 0.5
+"""QGIS, as GDAL, counts from the corner of the first pixel."""
+ENVI_CORNER_PX = 1.5
+"""ENVI calls the corner of the first pixel (1, 1): its centre is (1.5, 1.5)."""
+
+_QGIS_COLUMNS = ["mapX", "mapY", "sourceX", "sourceY"]
+_ENVI_WGS84 = r"WGS[- ]?84"
+_ENVI_UTM = re.compile(rf"UTM\s*,\s*(\d+)\s*,\s*(North|South)\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
+_ENVI_GEOGRAPHIC = re.compile(rf"Geographic Lat/Lon\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
+
+
+def format_asp_gcp(points: MarkedPoints) -> str:
+    """The active points as an ASP `.gcp`, heights above the WGS 84 ellipsoid.
+
+    ASP reads the three sigmas of the ground as those of latitude, longitude and height with
+    `--use-lon-lat-height-gcp-error`, and counts pixels from the centre of the first one. Marks of one
+    point are on one line; blanks in names, which would end them, become underscores.
+
+    Raises:
+        InputError: when a sigma is unknown, which ASP does not allow.
+    """
+    lines = [
+        "# id lat lon height sigma_lat sigma_lon sigma_height [image column row sigma sigma] ...",
+        "# bundle_adjust --datum WGS_1984 --use-lon-lat-height-gcp-error",
+    ]
+    used = points.take(points.active & ~points.check)
+    for rows in _rows_of_each_point(used):
+        i = rows[0]
+        lon, lat, height_m = used.lon_lat_h[i]
+        east_m, north_m, up_m = (_positive(value, "sigma_m", used.id[i]) for value in used.sigma_m[i])
+        point = (
+            f"{used.id[i]} {_deg(lat)} {_deg(lon)} {_m(height_m)} {_m(north_m)} {_m(east_m)} {_m(up_m)}"
+        )
+        for k in rows:
+            line, sample = used.line_sample[k]
+            sigma = _px(_positive(used.sigma_px[k], "sigma_px", used.id[k]))
+            image = re.sub(r"[\s,]", "_", str(used.image[k])) or "image"
+            point += f" {image} {_px(sample)} {_px(line)} {sigma} {sigma}"
+        lines.append(point)
+    return "\n".join(lines) + "\n"
+
+
+def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file") -> MarkedPoints:
+    """Read an ASP `.gcp`: fields divided by blanks or commas, one point a line with all its marks.
+
+    Args:
+        text: contents of the file.
+        heights: above what: "ellipsoid" (of WGS 84) or a vertical reference system; ASP is told on the
+            command line, the file does not say.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when a line is not of that form.
+        VerticalDatumError: when nobody says what the heights are above.
+    """
+    ids, coordinates, sigmas_m, images, pixels, sigmas_px = [], [], [], [], [], []
+    for where, line in _lines(text, "#", source):
+        fields = line.replace(",", " ").split()
+        if len(fields) < 12 or (len(fields) - 7) % 5:
+            raise FormatError(
+                f"{where}: expected id, lat, lon, height, 3 sigmas, then for each image its "
+                f"name, column, row and 2 sigmas, found {len(fields)} fields"
+            )
+        lat, lon, height_m, north_m, east_m, up_m = _numbers(
+            fields[1:7], ["lat", "lon", "height", "sigma_lat", "sigma_lon", "sigma_height"], where
+        )
+        for start in range(7, len(fields), 5):
+            column, row, sigma_column, sigma_row = _numbers(
+                fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
+            )
+            ids.append(fields[0])
+            coordinates.append((lon, lat, height_m))
+            sigmas_m.append((east_m, north_m, up_m))
+            images.append(fields[start])
+            pixels.append((row, column))
+            sigmas_px.append(math.sqrt((sigma_column**2 + sigma_row**2) / 2.0))
+    ground = ground_from(_array(coordinates), WGS84_3D.to_2d(), heights, source)
+    known = {"sigma_m": sigmas_m, "image": images, "sigma_px": sigmas_px}
+    return marked_points(ids, ground, pixels, **known)
+
+
+def format_qgis_points(points: MarkedPoints) -> str:
+    """The points as a QGIS `.points` of its georeferencer: 2D, longitude and latitude of WGS 84.
+
+    Points that are not active, and check points, are written but not enabled. `dX`, `dY` are
+    computed minus observed as QGIS has them, with lines counted upwards.
+    """
+    rows = ["mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    enabled = points.active & ~points.check
+    for i in range(len(points)):
+        lon, lat, _ = points.lon_lat_h[i]
+        line, sample = points.line_sample[i] + QGIS_CORNER_PX
+        d_line, d_sample = np.nan_to_num(points.residual_px[i])
+        values = [_deg(lon), _deg(lat), _px(sample), _px(-line), str(int(enabled[i]))]
+        values += [_px(-d_sample), _px(d_line), _px(math.hypot(d_line, d_sample))]
+        rows.append(",".join(values))
+    wkt = CRS.from_epsg(4326).to_wkt()
+    return f"#CRS: {wkt}\n" + "\n".join(rows) + "\n"
+
+
+def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
+    """Read a QGIS `.points` of a raw image; it holds no heights, no names and no sigmas.
+
+    Args:
+        text: contents of the file; without a `#CRS` its map coordinates are longitude and latitude.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when a line is not of that form.
+    """
+    found = re.match(r"#CRS: *(.*)", text)
+    crs = crs_from(found[1].strip(), source) if found and found[1].strip() else CRS.from_epsg(4326)
+    lines = list(_lines(text, "#", source))
+    if not lines or lines[0][1].split(",")[:4] != _QGIS_COLUMNS:
+        raise FormatError(f"{source}: expected a line that starts with {','.join(_QGIS_COLUMNS)}")
+    coordinates, pixels, active = [], [], []
+    for where, line in lines[1:]:
+        fields = next(csv.reader([line]))
+        if len(fields) < 5:
+            raise FormatError(f"{where}: expected 5 fields or more, found {len(fields)}")
+        x, y, column, minus_row = _numbers(fields[:4], _QGIS_COLUMNS, where)
+        coordinates.append((x, y, 0.0))
+        pixels.append((-minus_row - QGIS_CORNER_PX, column - QGIS_CORNER_PX))
+        active.append(fields[4].strip() != "0")
+    ground = ground_from(_array(coordinates), crs.to_2d(), ELLIPSOID, source)
+    ground[:, 2] = np.nan
+    return marked_points(_counted(pixels), ground, pixels, active=active)
+
+
+def format_envi_pts(points: MarkedPoints) -> str:
+    """The active points as an ENVI `.pts` for its RPC tools, heights above the ellipsoid."""
+    lines = [
+        "; ENVI Orthorectification Ground Control Points File",
+        "; projection info = {Geographic Lat/Lon, WGS-84, units=Degrees}",
+        "; elevations are metres above the WGS 84 ellipsoid",
+        "; Map (x,y,elev), Image (x,y)",
+        ";",
+    ]
+    used = points.take(points.active & ~points.check)
+    for i in range(len(used)):
+        lon, lat, height_m = used.lon_lat_h[i]
+        line, sample = used.line_sample[i] + ENVI_CORNER_PX
+        lines.append(f"{_deg(lon)} {_deg(lat)} {_m(height_m)} {_px(sample)} {_px(line)}")
+    return "\n".join(lines) + "\n"
+
+
+def parse_envi_pts(text: str, heights: str | None = None, source: str = "ENVI points") -> MarkedPoints:
+    """Read an ENVI `.pts` with elevations, in longitude and latitude or UTM of WGS 84.
+
+    Args:
+        text: contents of the file.
+        heights: above what: "ellipsoid" or a vertical reference system; the file does not say.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when a line is not of that form, or the projection is another one.
+        VerticalDatumError: when nobody says what the heights are above.
+    """
+    crs = _envi_crs(text, source)
+    coordinates, pixels = [], []
+    for where, line in _lines(text, ";", source):
+        fields = line.split()
+        if len(fields) != 5:
+            raise FormatError(
+                f"{where}: expected map x, y, elevation, image x, y, found {len(fields)} fields"
+            )
+        x, y, height_m, column, row = _numbers(
+            fields, ["map x", "map y", "elevation", "image x", "image y"], where
+        )
+        coordinates.append((x, y, height_m))
+        pixels.append((row - ENVI_CORNER_PX, column - ENVI_CORNER_PX))
+    ground = ground_from(_array(coordinates), crs, heights, source)
+    return marked_points(_counted(pixels), ground, pixels)
+
+
+def _envi_crs(text: str, source: str) -> CRS:
+    info = re.search(r"^;\s*projection info\s*=\s*\{([^}\n]*)\}", text, re.MULTILINE)
+    found = info[1].strip() if info else ""
+    utm = _ENVI_UTM.match(found)
+    if utm is not None and 1 <= int(utm[1]) <= 60:
+        return CRS.from_epsg((32600 if utm[2].lower() == "north" else 32700) + int(utm[1]))
+    if _ENVI_GEOGRAPHIC.match(found):
+        return CRS.from_epsg(4326)
+    raise FormatError(
+        f"{source}: expected a projection info of Geographic Lat/Lon or UTM with WGS-84, "
+        f"found {found[:60] or 'none'!r}"
+    )
+
+
+def _lines(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:
+    """Lines that say something, each with its place."""
+    for count, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith(comment):
+            yield f"{source}, line {count}", line.strip()
+
+
+def _numbers(fields: list[str], names: list[str], where: str) -> list[float]:
+    return [parse_number(field, name, where) for field, name in zip(fields, names, strict=True)]
+
+
+def _rows_of_each_point(points: MarkedPoints) -> list[list[int]]:
+    rows: dict[str, list[int]] = {}
+    for i, point in enumerate(points.id.tolist()):
+        rows.setdefault(point, []).append(i)
+    return list(rows.values())
+
+
+def _positive(value: float, name: str, point: str) -> float:
+    if not value > 0.0:
+        raise InputError(f"point {point}: {name} is {value:g}, this format takes known sigmas only")
+    return float(value)
+
+
+def _array(coordinates: list[tuple[float, float, float]]) -> Array:
+    return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
+
+
+def _counted(rows: list[tuple[float, float]]) -> list[str]:
+    return [str(count) for count in range(1, len(rows) + 1)]
+
+
+def _deg(value: float) -> str:
+    """To a tenth of a micrometre."""
+    return f"{value:.12f}"
+
+
+def _m(value: float) -> str:
+    return f"{value:.6f}"
+
+
+def _px(value: float) -> str:
+    return f"{value + 0.0:.9f}"
