@@ -67,6 +67,15 @@ def metres_per_degree(lat_deg: float, h: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
+def metres_per_degree_at(lon_lat_h: Array) -> Array:
+    """`metres_per_degree` (n, 2) at positions (n, 3)."""
+    out = np.empty((len(lon_lat_h), 2))
+    for i in range(len(lon_lat_h)):
+        out[i] = metres_per_degree(lon_lat_h[i, 1], lon_lat_h[i, 2])
+    return out
+
+
+@njit(cache=True)
 def _to_ecef(lon_lat_h: Array) -> Array:
     out = np.empty((len(lon_lat_h), 3))
     for i in range(len(lon_lat_h)):

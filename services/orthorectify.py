@@ -1,0 +1,1 @@
+"""A scene laid on a map through its model and the terrain."""

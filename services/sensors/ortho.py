@@ -1,0 +1,57 @@
+"""Ortho-images: a map grid as the model of a scene. No parallax, hence planimetric control only."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.geodesy import ecef_from_lon_lat_h
+from services.map_grid import MapGrid
+from services.sensors.correction import ImageCorrection
+from services.types import Array
+
+LAND_M = (-430.0, 8850.0)
+"""Lowest and highest land of the Earth."""
+
+
+@dataclass(frozen=True)
+class OrthoModel:
+    """An image that was rectified onto a map: each pixel shows the ground straight below it.
+
+    Heights neither move a place in the image nor come out of it; `locate` gives back the height it was
+    given. What the producer's terrain model got wrong is in the image and not in the model.
+
+    Attributes:
+        grid: the pixels on the map.
+        height_range_m: lowest and highest ground, metres above the ellipsoid; only said, never needed.
+    """
+
+    grid: MapGrid
+    height_range_m: tuple[float, float] = LAND_M
+
+    def project(self, lon_lat_h: Array) -> Array:
+        """Image position of ground points: (n, 3) to (n, 2); NaN where the map has no place."""
+        return self.grid.line_sample(lon_lat_h[:, :2])
+
+    def project_derivative(self, lon_lat_h: Array) -> Array:
+        """Derivative of `project`: (n, 2, 3), pixels per metre east, north, up; none by the last."""
+        planimetric = self.grid.derivative(lon_lat_h)
+        return np.concatenate([planimetric, np.zeros((len(lon_lat_h), 2, 1))], axis=2)
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        """Ground position of image points at known heights: (n, 2) and (n,) to (n, 3)."""
+        return np.column_stack([self.grid.lon_lat(line_sample), height_m])
+
+    def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
+        """Verticals: origin (n, 3) at the upper height and unit direction (n, 3) downwards, in ECEF."""
+        top = self.locate(line_sample, np.full(len(line_sample), self.height_range_m[1]))
+        lon, lat = np.radians(top[:, 0]), np.radians(top[:, 1])
+        up = np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        return ecef_from_lon_lat_h(top), -up
+
+
+def fold_into_ortho(model: OrthoModel, correction: ImageCorrection) -> OrthoModel:
+    """The map grid that carries a correction exactly: an affine in the image is one on the map."""
+    inverse = np.linalg.inv(correction.jacobian)
+    first = correction.invert(np.zeros((1, 2)))
+    grid = replace(model.grid, origin_xy=model.grid.xy(first)[0], step_xy=model.grid.step_xy @ inverse)
+    return replace(model, grid=grid)

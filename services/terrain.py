@@ -1,0 +1,283 @@
+"""The ground as heights on a grid, and where a line of sight meets it."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from services.errors import CoverageError
+from services.geodesy import metres_per_degree, metres_per_degree_at
+from services.imagery import ArrayImage, ImageSource, Window
+from services.map_grid import MapGrid
+from services.sensors.base import SensorModel
+from services.types import Array, BoolArray, FloatImage, IntArray
+
+Geoid = Callable[[Array], Array]
+"""Height (n,) of a geoid above the ellipsoid at longitudes and latitudes (n, 2), metres."""
+
+_TILE = 2048
+"""Side of the pieces a grid is read in, cells."""
+_HELD_CELLS = 32_000_000
+"""Cells a piece of ground may have to be held in memory: 128 MB."""
+_MEET_TOLERANCE_M = 1e-4
+_MOST_LEVELS = 5000
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Heights of the ground on a map grid, read by pieces; bilinear between the nodes.
+
+    Attributes:
+        grid: where the nodes are.
+        heights: metres above the geoid, or above the ellipsoid when there is none; NaN in voids.
+        geoid: what the heights are counted from; None for the ellipsoid.
+        vertical: how the vertical datum is known, one sentence.
+    """
+
+    grid: MapGrid
+    heights: ImageSource
+    geoid: Geoid | None = None
+    vertical: str = "metres above the ellipsoid"
+
+    @property
+    def posting_m(self) -> float:
+        """Distance of the nodes at the centre of the grid: side of the square as large as a cell."""
+        centre = (np.array([self.grid.shape], dtype=np.float64) - 1.0) / 2.0
+        lon_lat_h = np.column_stack([self.grid.lon_lat(centre), [0.0]])
+        return float(abs(np.linalg.det(self.grid.derivative(lon_lat_h)[0])) ** -0.5)
+
+    def height_m(self, lon_lat: Array) -> Array:
+        """Height (n,) at longitudes and latitudes (n, 2), metres above the ellipsoid.
+
+        NaN outside the grid and beside voids. A cell reaches half a step around its node: there the
+        outermost heights hold.
+        """
+        position = self.grid.line_sample(np.asarray(lon_lat, dtype=np.float64)[:, :2])
+        height_m = np.full(len(position), np.nan)
+        for window, rows in self._pieces(position):
+            pixels = self.heights.read(window)
+            first = np.array([window.line, window.sample], dtype=np.float64)
+            height_m[rows] = bilinear_heights(pixels, position[rows] - first)
+        known = np.flatnonzero(np.isfinite(height_m))
+        if self.geoid is not None and len(known):
+            height_m[known] += self.geoid(lon_lat[known, :2])
+        return height_m
+
+    def slope(self, lon_lat: Array) -> Array:
+        """Slope (n, 2) of the ground, metres up per metre east and north; NaN as `height_m`.
+
+        Differences over one posting, which is what the grid knows.
+        """
+        half_m = self.posting_m / 2.0
+        metres = metres_per_degree_at(np.column_stack([lon_lat[:, :2], np.zeros(len(lon_lat))]))
+        out = np.empty((len(lon_lat), 2))
+        for axis in range(2):
+            step = np.zeros((len(lon_lat), 2))
+            step[:, axis] = half_m / metres[:, axis]
+            rise_m = self.height_m(lon_lat[:, :2] + step) - self.height_m(lon_lat[:, :2] - step)
+            out[:, axis] = rise_m / (2.0 * half_m)
+        return out
+
+    def around(self, lon_lat: Array) -> "Terrain":
+        """The part of the ground that holds some places (n, 2), in memory when it is not too large.
+
+        Raises:
+            CoverageError: no place lies on the grid.
+        """
+        position = self.grid.line_sample(lon_lat)
+        position = position[np.isfinite(position).all(axis=1)]
+        last = np.array(self.grid.shape) - 1
+        if len(position):
+            low = np.maximum(np.floor(position.min(axis=0)).astype(np.int64) - 1, 0)
+            high = np.minimum(np.ceil(position.max(axis=0)).astype(np.int64) + 1, last)
+        if not len(position) or (high < low).any():
+            raise CoverageError("the terrain does not reach the place: none of it lies on its grid")
+        lines, samples = (int(size) for size in high - low + 1)
+        window = Window(int(low[0]), int(low[1]), lines, samples)
+        heights: ImageSource = _Part(self.heights, window)
+        if lines * samples <= _HELD_CELLS:
+            heights = ArrayImage(self.heights.read(window))
+        origin_xy = self.grid.xy(low[None, :].astype(np.float64))[0]
+        grid = replace(self.grid, origin_xy=origin_xy, shape=(lines, samples))
+        return replace(self, grid=grid, heights=heights)
+
+    def range_m(self) -> tuple[float, float]:
+        """Lowest and highest ground, metres above the ellipsoid; a bound where there is a geoid.
+
+        Raises:
+            CoverageError: the grid has no height at all.
+        """
+        low, high = math.inf, -math.inf
+        for window in _tiles((0, 0), self.grid.shape):
+            pixels = self.heights.read(window)
+            finite = pixels[np.isfinite(pixels)]
+            if len(finite):
+                low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+        if low > high:
+            raise CoverageError("the terrain has no height here: it is void")
+        if self.geoid is None:
+            return low, high
+        axes = [np.linspace(0.0, size - 1.0, 33) for size in self.grid.shape]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        undulation = self.geoid(self.grid.lon_lat(places))
+        # Between the places looked at the geoid rises and falls by less than it does among them.
+        margin = float(np.ptp(undulation)) / 8.0 + 0.1
+        return low + float(undulation.min()) - margin, high + float(undulation.max()) + margin
+
+    def _pieces(self, position: Array) -> Iterator[tuple[Window, IntArray]]:
+        """Windows of the grid and the rows of the positions each of them serves."""
+        rows = np.flatnonzero(self.grid.contains(position))
+        if not len(rows):
+            return
+        node = np.floor(position[rows]).astype(np.int64)
+        tile = node // _TILE
+        key = tile[:, 0] * (self.grid.shape[1] // _TILE + 2) + tile[:, 1]
+        order = np.argsort(key, kind="stable")
+        for part in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+            low = np.maximum(node[part].min(axis=0), 0)
+            high = np.minimum(node[part].max(axis=0) + 1, np.array(self.grid.shape) - 1)
+            lines, samples = (int(size) for size in high - low + 1)
+            yield Window(int(low[0]), int(low[1]), lines, samples), rows[part]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A window of an image as an image."""
+
+    whole: ImageSource
+    window: Window
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.window.lines, self.window.samples
+
+    def read(self, window: Window) -> FloatImage:
+        line, sample = window.line + self.window.line, window.sample + self.window.sample
+        return self.whole.read(Window(line, sample, window.lines, window.samples))
+
+
+def meet(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
+    """Where the lines of sight of image positions meet the ground first, seen from the sensor.
+
+    Each line is followed from above the highest ground down, in steps that move it by no more than a
+    posting over the ground, until it is below the ground; the crossing is then found by regula falsi
+    (Illinois). So the visible side of a ridge is found, also where fixed-point steps would jump.
+
+    Args:
+        model: of the image.
+        line_sample: (n, 2) pixels.
+        terrain: the ground.
+
+    Returns:
+        (n, 3) lon, lat, height; NaN where the line meets no known ground.
+
+    Raises:
+        CoverageError: no line comes near the grid.
+    """
+    low_m, high_m = terrain.around(_both_ends(model, line_sample, model.height_range_m)).range_m()
+    ends = _both_ends(model, line_sample, (low_m, high_m))
+    ground = terrain.around(ends)
+    low_m, high_m = ground.range_m()
+    levels = _levels(ends, low_m, high_m, ground.posting_m)
+    above = np.full(len(line_sample), levels[0])
+    below = np.full(len(line_sample), np.nan)
+    falling = np.arange(len(line_sample))
+    for level in levels[1:]:
+        gap = _gap(model, line_sample[falling], np.full(len(falling), level), ground)
+        crossed = gap >= 0.0
+        below[falling[crossed]] = level
+        falling = falling[~crossed]
+        above[falling] = level
+        if not len(falling):
+            break
+    found = np.flatnonzero(np.isfinite(below))
+    height_m = np.full(len(line_sample), np.nan)
+    height_m[found] = _crossing(model, line_sample[found], above[found], below[found], ground)
+    return model.locate(line_sample, height_m)
+
+
+def _both_ends(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
+    """Places (2n, 2) of the lines of sight at two heights."""
+    return np.concatenate(
+        [model.locate(line_sample, np.full(len(line_sample), h))[:, :2] for h in heights_m]
+    )
+
+
+def _levels(ends: Array, low_m: float, high_m: float, posting_m: float) -> Array:
+    """Heights from above the highest to below the lowest ground; a step moves no line by a posting."""
+    low, high = np.split(ends, 2)
+    east, north = metres_per_degree(float(np.nanmean(low[:, 1])), high_m)
+    apart = low - high
+    apart[:, 0] = (apart[:, 0] + 180.0) % 360.0 - 180.0
+    moved_m = float(np.nanmax(np.hypot(apart[:, 0] * east, apart[:, 1] * north)))
+    count = int(np.clip(math.ceil(moved_m / posting_m), 1, _MOST_LEVELS))
+    return np.linspace(high_m + 1.0, low_m - 1.0, count + 2)
+
+
+def _gap(model: SensorModel, line_sample: Array, height_m: Array, terrain: Terrain) -> Array:
+    """How far (n,) the ground lies above the lines of sight at some heights; NaN where unknown."""
+    place = model.locate(line_sample, height_m)[:, :2]
+    gap = np.full(len(place), np.nan)
+    known = np.isfinite(place).all(axis=1)
+    gap[known] = terrain.height_m(place[known]) - height_m[known]
+    return gap
+
+
+def _crossing(
+    model: SensorModel, line_sample: Array, above: Array, below: Array, terrain: Terrain
+) -> Array:
+    """Height (n,) where lines meet the ground, above it at one height and below it at another."""
+    gap_above = _gap(model, line_sample, above, terrain)
+    gap_below = _gap(model, line_sample, below, terrain)
+    # A line that came out of a void has met the ground at an unknown place.
+    height = np.where(np.isfinite(gap_above), below, np.nan)
+    for _ in range(60):
+        open_: BoolArray = np.isfinite(height) & (np.abs(above - below) > _MEET_TOLERANCE_M)
+        if not open_.any():
+            break
+        weight = gap_above / np.where(gap_above == gap_below, 1.0, gap_above - gap_below)
+        height = np.where(open_, above + np.clip(weight, 0.0, 1.0) * (below - above), height)
+        gap = np.full(len(height), np.nan)
+        gap[open_] = _gap(model, line_sample[open_], height[open_], terrain)
+        height = np.where(open_ & ~np.isfinite(gap), np.nan, height)
+        settled = open_ & (np.abs(gap) < _MEET_TOLERANCE_M)
+        under = open_ & (gap >= 0.0)
+        over = open_ & (gap < 0.0)
+        gap_above = np.where(under, gap_above / 2.0, np.where(over, gap, gap_above))
+        gap_below = np.where(over, gap_below / 2.0, np.where(under, gap, gap_below))
+        below = np.where(under | settled, height, below)
+        above = np.where(over | settled, height, above)
+    return height
+
+
+@njit(cache=True)
+def bilinear_heights(heights: FloatImage, line_sample: Array) -> Array:
+    """Heights (n,) between the nodes of a grid at positions (n, 2).
+
+    NaN more than half a step outside, and where a node that counts is NaN.
+    """
+    lines, samples = heights.shape
+    out = np.empty(len(line_sample))
+    for i in range(len(line_sample)):
+        line, sample = line_sample[i, 0], line_sample[i, 1]
+        if not (-0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5):
+            out[i] = np.nan
+            continue
+        line = min(max(line, 0.0), lines - 1.0)
+        sample = min(max(sample, 0.0), samples - 1.0)
+        r0, c0 = int(line), int(sample)
+        fr, fc = line - r0, sample - c0
+        r1 = r0 + 1 if fr > 0.0 else r0
+        c1 = c0 + 1 if fc > 0.0 else c0
+        top = heights[r0, c0] + fc * (np.float64(heights[r0, c1]) - heights[r0, c0])
+        bottom = heights[r1, c0] + fc * (np.float64(heights[r1, c1]) - heights[r1, c0])
+        out[i] = top + fr * (bottom - top)
+    return out
+
+
+def _tiles(first: tuple[int, int], shape: tuple[int, int]) -> Iterator[Window]:
+    for line in range(first[0], shape[0], _TILE):
+        for sample in range(first[1], shape[1], _TILE):
+            yield Window(line, sample, min(_TILE, shape[0] - line), min(_TILE, shape[1] - sample))

@@ -1,0 +1,68 @@
+"""Ortho-images as models: no parallax, and a correction that folds into the map grid."""
+
+import numpy as np
+
+from services.adjustment.scene import AdjustmentOptions, adjust_scene
+from services.map_grid import MapGrid
+from services.scene import view_direction
+from services.sensors.correction import CorrectedModel, ImageCorrection
+from services.sensors.ortho import OrthoModel, fold_into_ortho
+
+a_micropixel = 1e-6
+a_nanometre = 1e-9
+
+SHAPE = (3200, 2400)
+GRID = MapGrid(
+    "EPSG:32633", np.array([330005.0, 5861995.0]), np.array([[0.0, 10.0], [-10.0, 0.0]]), SHAPE
+)
+MODEL = OrthoModel(GRID)
+PARAMETERS = np.array([[3.2, -0.4, 0.7], [-1.1, 0.5, 0.3]])
+CORRECTION = ImageCorrection(PARAMETERS, (np.array(SHAPE) - 1.0) / 2.0, np.array(SHAPE) / 2.0)
+
+
+def pixels(n: int = 100) -> np.ndarray:
+    return np.random.default_rng(2).uniform(0.0, np.array(SHAPE) - 1.0, (n, 2))
+
+
+def test_heights_move_nothing() -> None:
+    heights = np.linspace(-400.0, 8000.0, 100)
+    ground = MODEL.locate(pixels(), heights)
+    np.testing.assert_array_equal(ground[:, 2], heights)
+    np.testing.assert_allclose(MODEL.project(ground), pixels(), atol=a_micropixel)
+    derivative = MODEL.project_derivative(ground)
+    assert (derivative[:, :, 2] == 0.0).all()
+    np.testing.assert_allclose(np.abs(np.linalg.det(derivative[:, :, :2])) ** -0.5, 10.0, rtol=2e-3)
+
+
+def test_lines_of_sight_are_vertical() -> None:
+    ground = MODEL.locate(pixels(), np.zeros(100))
+    incidence_deg, _ = view_direction(MODEL, pixels(), ground)
+    np.testing.assert_allclose(incidence_deg, 0.0, atol=1e-9)
+    origin, direction = MODEL.line_of_sight(pixels())
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=a_nanometre)
+    assert ((origin * direction).sum(axis=1) < 0.0).all()
+
+
+def test_a_correction_folds_exactly_into_the_map_grid() -> None:
+    folded, corrected = fold_into_ortho(MODEL, CORRECTION), CorrectedModel(MODEL, CORRECTION)
+    ground = MODEL.locate(pixels(), np.zeros(100))
+    np.testing.assert_allclose(folded.project(ground), corrected.project(ground), atol=a_micropixel)
+    np.testing.assert_allclose(
+        folded.locate(pixels(), np.zeros(100)), corrected.locate(pixels(), np.zeros(100)), atol=1e-10
+    )
+
+
+def test_wrong_heights_of_points_do_not_reach_the_adjustment_of_an_ortho_image() -> None:
+    rng = np.random.default_rng(5)
+    ground = MODEL.locate(pixels(), np.full(100, 200.0))
+    seen = CORRECTION.apply(pixels()) + rng.normal(0.0, 0.1, (100, 2))
+    covariance = np.tile(np.diag([1.0, 1.0, 1e6]), (100, 1, 1))
+    ground[:, 2] += rng.normal(0.0, 1000.0, 100)
+    found = adjust_scene(
+        MODEL, SHAPE, ground, seen, np.full(100, 0.1), covariance, AdjustmentOptions(order="affine")
+    )
+    assert found.active.sum() > 90
+    # Points of 1 m on pixels of 10 m: 0.1 px, beside 0.1 px of the measures.
+    std_px = np.sqrt(np.diag(found.covariance).reshape(2, 3))
+    assert (std_px < 0.06).all()
+    assert (np.abs(found.correction.parameters - PARAMETERS) < 4.0 * std_px).all()

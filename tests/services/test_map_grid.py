@@ -1,0 +1,79 @@
+"""Map grids, held against GDAL and PROJ through rasterio."""
+
+import numpy as np
+import pytest
+from rasterio.transform import Affine
+from rasterio.warp import transform
+
+from services.geodesy import east_north_up
+from services.map_grid import MapGrid, utm_of
+
+a_micropixel = 1e-6
+a_millionth = 1e-6
+
+NORTH_UP = MapGrid(
+    "EPSG:32633", np.array([330005.0, 5861995.0]), np.diag([-10.0, 10.0])[::-1], (3200, 2400)
+)
+ROTATED = MapGrid("EPSG:2154", np.array([7e5, 6.6e6]), np.array([[0.4, 1.9], [-2.1, 0.3]]), (900, 700))
+DEGREES = MapGrid(
+    "EPSG:4326", np.array([179.2, -16.0]), np.array([[0.0, 1e-3], [-1e-3, 0.0]]), (800, 1600)
+)
+UTM_1 = MapGrid(
+    "EPSG:32701", np.array([172000.0, 8.2e6]), np.array([[0.0, 30.0], [-30.0, 0.0]]), (900, 900)
+)
+
+
+def positions(grid: MapGrid, n: int = 200) -> np.ndarray:
+    return np.random.default_rng(4).uniform(-0.5, np.array(grid.shape) - 0.5, (n, 2))
+
+
+@pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
+def test_pixels_lie_where_gdal_has_them(grid: MapGrid) -> None:
+    """GDAL counts from the corner of the first pixel: half a pixel between both."""
+    lines, samples = positions(grid).T
+    (a, b), (c, d) = grid.step_xy
+    corner = grid.origin_xy - grid.step_xy @ [0.5, 0.5]
+    x, y = Affine(b, a, corner[0], d, c, corner[1]) @ (samples + 0.5, lines + 0.5)
+    lon, lat = transform(grid.crs, "EPSG:4326", x, y)
+    ours = grid.lon_lat(positions(grid))
+    np.testing.assert_allclose((ours[:, 0] - lon + 180.0) % 360.0 - 180.0, 0.0, atol=1e-10)
+    np.testing.assert_allclose(ours[:, 1], lat, atol=1e-10)
+
+
+@pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
+def test_a_pixel_comes_back_through_the_ground(grid: MapGrid) -> None:
+    lon_lat = grid.lon_lat(positions(grid))
+    assert (np.abs(lon_lat[:, 0]) <= 180.0).all()
+    np.testing.assert_allclose(grid.line_sample(lon_lat), positions(grid), atol=a_micropixel)
+
+
+@pytest.mark.parametrize("grid", [DEGREES, UTM_1])
+def test_a_grid_across_the_antimeridian_has_no_seam(grid: MapGrid) -> None:
+    lon_lat = grid.lon_lat(positions(grid))
+    assert lon_lat[:, 0].max() > 179.0
+    assert lon_lat[:, 0].min() < -179.0
+    again = grid.line_sample(lon_lat + [360.0, 0.0])
+    np.testing.assert_allclose(again, positions(grid), atol=a_micropixel)
+
+
+@pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
+def test_the_derivative_is_that_of_small_moves_in_metres(grid: MapGrid) -> None:
+    place = np.append(grid.lon_lat(np.array([[100.0, 200.0]]))[0], 0.0)
+    near = np.column_stack([grid.lon_lat(np.array([[100.5, 200.0], [100.0, 200.5]])), np.zeros(2)])
+    moved_m = east_north_up(near, place)[:, :2]
+    derivative = grid.derivative(place[None, :])[0]
+    np.testing.assert_allclose(moved_m @ derivative.T, 0.5 * np.eye(2), atol=1e-4)
+
+
+def test_no_place_on_the_map_is_nan() -> None:
+    found = NORTH_UP.line_sample(np.array([[15.0, 52.0], [np.nan, 52.0], [15.0, 91.0]]))
+    assert np.isfinite(found[0]).all()
+    assert np.isnan(found[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "zone"),
+    [(5.4, 43.6, "EPSG:32631"), (-180.0, -1.0, "EPSG:32701"), (179.9, 1.0, "EPSG:32660")],
+)
+def test_every_place_has_its_utm_zone(lon: float, lat: float, zone: str) -> None:
+    assert utm_of(lon, lat) == zone

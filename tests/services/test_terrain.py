@@ -1,0 +1,152 @@
+"""Heights on a grid, and where lines of sight meet them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from services import terrain as terrain_module
+from services.errors import CoverageError
+from services.imagery import ArrayImage, FloatImage, Window
+from services.map_grid import MapGrid
+from services.sensors.ortho import OrthoModel
+from services.sensors.pushbroom import PushbroomModel
+from services.simulation.orbit import pushbroom_over
+from services.terrain import Terrain, meet
+from services.types import Array
+
+a_tenth_of_a_millimetre = 1e-4
+a_millimetre = 1e-3
+a_thousandth_of_a_pixel = 1e-3
+
+SHAPE = (300, 280)
+GRID = MapGrid("EPSG:32631", np.array([7e5, 4.8e6]), np.array([[0.0, 10.0], [-10.0, 0.0]]), SHAPE)
+
+
+def hills(amplitude_m: float = 150.0) -> FloatImage:
+    line, sample = np.indices(SHAPE)
+    smooth = np.sin(line / 17.0) * np.cos(sample / 13.0) + 0.3 * np.sin((line + sample) / 7.0)
+    return (500.0 + amplitude_m * smooth).astype(np.float32)
+
+
+def terrain(amplitude_m: float = 150.0) -> Terrain:
+    return Terrain(GRID, ArrayImage(hills(amplitude_m)))
+
+
+def places(n: int = 500, margin: float = 3.0) -> Array:
+    high = np.array(SHAPE) - 1.0 - margin
+    return np.random.default_rng(3).uniform(margin, high, (n, 2))
+
+
+def view(incidence_deg: float, azimuth_deg: float = 110.0) -> PushbroomModel:
+    lon, lat = GRID.lon_lat(np.array([[150.0, 140.0]]))[0]
+    return pushbroom_over(
+        np.array([lon, lat, 500.0]), (400, 400), 2.0, incidence_deg, azimuth_deg, (200.0, 800.0)
+    )
+
+
+def pixels_of(count: int = 400) -> Array:
+    return np.random.default_rng(8).uniform(0.0, 399.0, (count, 2))
+
+
+def test_heights_are_bilinear_between_the_nodes() -> None:
+    expected = map_coordinates(hills().astype(np.float64), places().T, order=1)
+    found = terrain().height_m(GRID.lon_lat(places()))
+    np.testing.assert_allclose(found, expected, atol=a_millimetre)
+
+
+def test_a_grid_read_by_pieces_gives_the_same_heights(monkeypatch: pytest.MonkeyPatch) -> None:
+    lon_lat = GRID.lon_lat(places(margin=-2.0))
+    whole, whole_range_m = terrain().height_m(lon_lat), terrain().range_m()
+    monkeypatch.setattr(terrain_module, "_TILE", 64)
+    monkeypatch.setattr(terrain_module, "_HELD_CELLS", 1000)
+    np.testing.assert_array_equal(terrain().height_m(lon_lat), whole)
+    assert terrain().range_m() == whole_range_m
+    np.testing.assert_allclose(terrain().around(lon_lat[:9]).height_m(lon_lat[:9]), whole[:9])
+
+
+def test_no_piece_is_larger_than_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Window] = []
+
+    class Watched(ArrayImage):
+        def read(self, window: Window) -> FloatImage:
+            read.append(window)
+            return super().read(window)
+
+    monkeypatch.setattr(terrain_module, "_TILE", 64)
+    replace(terrain(), heights=Watched(hills())).height_m(GRID.lon_lat(places()))
+    assert len(read) == 25
+    assert max(max(window.lines, window.samples) for window in read) <= 65
+
+
+def test_there_is_no_height_outside_nor_beside_a_void() -> None:
+    heights = hills()
+    heights[100, 100] = np.nan
+    outside = [[-0.6, 5.0], [5.0, SHAPE[1] - 0.4], [99.5, 100.5], [100.0, 100.0]]
+    inside = [[-0.4, 5.0], [99.0, 99.0], [100.0, 101.0], [101.5, 102.0]]
+    holed = replace(terrain(), heights=ArrayImage(heights))
+    assert np.isnan(holed.height_m(GRID.lon_lat(np.array(outside)))).all()
+    # On the nodes themselves, up to the rounding of the map projection.
+    assert np.isfinite(holed.height_m(GRID.lon_lat(np.array(inside) + [1e-7, 1e-7]))[[0, 2, 3]]).all()
+    assert np.isfinite(holed.height_m(GRID.lon_lat(np.array(inside[1:2]) - 1e-7))).all()
+
+
+def test_heights_above_a_geoid_become_heights_above_the_ellipsoid() -> None:
+    lon_lat = GRID.lon_lat(places())
+    undulating = replace(terrain(), geoid=lambda place: 40.0 + 2.0 * (place[:, 1] - 43.0))
+    expected = terrain().height_m(lon_lat) + 40.0 + 2.0 * (lon_lat[:, 1] - 43.0)
+    np.testing.assert_allclose(undulating.height_m(lon_lat), expected, atol=a_tenth_of_a_millimetre)
+    low, high = undulating.range_m()
+    assert low <= expected.min() < expected.max() <= high
+
+
+def test_the_slope_is_the_rise_per_metre() -> None:
+    line, sample = np.indices(SHAPE)
+    plane = Terrain(GRID, ArrayImage((100.0 + 3.0 * sample - 2.0 * line).astype(np.float32)))
+    lon_lat = GRID.lon_lat(places())
+    derivative = GRID.derivative(np.column_stack([lon_lat, np.zeros(len(lon_lat))]))
+    expected = np.array([-2.0, 3.0]) @ derivative
+    np.testing.assert_allclose(plane.slope(lon_lat), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("incidence_deg", [0.0, 12.0, 35.0])
+def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
+    model, ground = view(incidence_deg), terrain(60.0)
+    met = meet(model, pixels_of(), ground)
+    np.testing.assert_allclose(met[:, 2], ground.height_m(met[:, :2]), atol=a_millimetre)
+    np.testing.assert_allclose(model.project(met), pixels_of(), atol=a_thousandth_of_a_pixel)
+
+
+def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
+    """Slopes steeper than the line of sight: several places of the ground lie on one line."""
+    model, ground = view(40.0), terrain(400.0)
+    met = meet(model, pixels_of(), ground)
+    hidden_by_m = np.zeros(len(met))
+    twice = np.zeros(len(met), dtype=bool)
+    for above_m in np.arange(2.0, 900.0, 2.0):
+        place = model.locate(pixels_of(), met[:, 2] + above_m)
+        over_m = ground.height_m(place[:, :2]) - place[:, 2]
+        hidden_by_m = np.fmax(hidden_by_m, over_m)
+    for below_m in np.arange(5.0, 900.0, 5.0):
+        place = model.locate(pixels_of(), met[:, 2] - below_m)
+        twice |= ground.height_m(place[:, :2]) < place[:, 2]
+    assert twice.sum() > 20
+    assert hidden_by_m.max() < a_millimetre
+
+
+def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_ends_nowhere() -> None:
+    heights = hills(60.0)
+    heights[:, :140] = np.nan
+    met = meet(view(12.0), pixels_of(), replace(terrain(60.0), heights=ArrayImage(heights)))
+    known = np.isfinite(met[:, 2])
+    assert 0.3 < known.mean() < 0.7
+    far = replace(GRID, origin_xy=GRID.origin_xy + 1e5)
+    with pytest.raises(CoverageError, match="does not reach"):
+        meet(view(12.0), pixels_of(), replace(terrain(), grid=far))
+
+
+def test_the_verticals_of_an_ortho_image_end_straight_below() -> None:
+    model, ground = OrthoModel(GRID), terrain()
+    met = meet(model, places(), ground)
+    np.testing.assert_allclose(met[:, 2], ground.height_m(GRID.lon_lat(places())), atol=a_millimetre)
