@@ -97,8 +97,9 @@ def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
         VerticalDatumError: when a point has no height.
     """
     document = load_json(text, source)
-    features = document.get("features") if isinstance(document, dict) else None
-    if not isinstance(features, list):
+    document = document if isinstance(document, dict) else {}
+    features = document.get("features")
+    if document.get("type") != "FeatureCollection" or not isinstance(features, list):
         raise FormatError(f"{source}: expected a GeoJSON FeatureCollection")
     image = str(document.get("image") or "")
     rows = [

@@ -1,0 +1,143 @@
+"""Writes the same marked points in the formats of the field, without the code under test."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import make_rpc
+import numpy as np
+from pyproj import Transformer
+
+HERE = Path(__file__).parent
+IMAGE = "invented.tif"
+LON_LAT_H = [
+    (12.2912345678, 41.9391234567, 105.25),
+    (12.4001234567, 41.9298765432, 612.5),
+    (12.3456789012, 41.9012345678, 310.0),
+    (12.2898765432, 41.8634567891, 3.125),
+    (12.3987654321, 41.8587654321, -41.75),
+]
+SIGMA_EAST_NORTH_UP_M = [
+    (0.5, 0.75, 1.5),
+    (1.25, 1.0, 2.5),
+    (0.25, 0.25, 0.5),
+    (2.0, 1.5, 4.0),
+    (1.0, 1.0, 2.0),
+]
+SIGMA_PX = [0.11, 0.22, 0.33, 0.44, 0.55]
+
+
+def places():
+    """Line and sample from the centre of the first pixel."""
+    x, y, z = (
+        (np.array(values) - offset) / scale
+        for values, offset, scale in zip(
+            zip(*LON_LAT_H, strict=True),
+            (make_rpc.LONG_OFF, make_rpc.LAT_OFF, make_rpc.HEIGHT_OFF),
+            (make_rpc.LONG_SCALE, make_rpc.LAT_SCALE, make_rpc.HEIGHT_SCALE),
+            strict=True,
+        )
+    )
+    model, t = make_rpc.polynomials(), make_rpc.terms(x, y, z)
+    line = t @ model["LINE_NUM"] / (t @ model["LINE_DEN"]) * make_rpc.LINE_SCALE + make_rpc.LINE_OFF
+    sample = t @ model["SAMP_NUM"] / (t @ model["SAMP_DEN"]) * make_rpc.SAMP_SCALE + make_rpc.SAMP_OFF
+    return list(zip(line.tolist(), sample.tolist(), strict=True))
+
+
+def rows():
+    return list(
+        enumerate(zip(LON_LAT_H, SIGMA_EAST_NORTH_UP_M, places(), SIGMA_PX, strict=True), start=11)
+    )
+
+
+def asp():
+    lines = ["# invented"]
+    for number, ((lon, lat, h), (east, north, up), (line, sample), sigma) in rows():
+        lines.append(
+            f"{number}, {lat:.10f} {lon:.10f} {h} {north} {east} {up} "
+            f"{IMAGE} {sample!r} {line!r} {sigma} {sigma}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def qgis():
+    lines = ["#CRS: EPSG:4326", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    for _, ((lon, lat, _), _, (line, sample), _) in rows():
+        lines.append(f"{lon:.10f},{lat:.10f},{sample + 0.5!r},{-(line + 0.5)!r},1,0,0,0")
+    return "\n".join(lines) + "\n"
+
+
+def envi(projection, ground):
+    lines = [
+        "; ENVI Orthorectification Ground Control Points File",
+        f"; projection info = {{{projection}}}",
+    ]
+    lines += ["; Map (x,y,elev), Image (x,y)", ";"]
+    for (_, (_, _, (line, sample), _)), (x, y, h) in zip(rows(), ground, strict=True):
+        lines.append(f"{x:.10f} {y:.10f} {h} {sample + 1.5!r} {line + 1.5!r}")
+    return "\n".join(lines) + "\n"
+
+
+def utm():
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32633", always_xy=True)
+    return [(*to_utm.transform(lon, lat), h) for lon, lat, h in LON_LAT_H]
+
+
+def opf():
+    camera = int(hashlib.sha256(IMAGE.encode()).hexdigest()[:12], 16)
+    gcps = []
+    for number, ((lon, lat, h), (east, north, up), (line, sample), sigma) in rows():
+        location = {
+            "crs": {"definition": "EPSG:4979"},
+            "coordinates": [lat, lon, h],
+            "sigmas": [north, east, up],
+        }
+        mark = {"camera_id": camera, "position_px": [sample + 0.5, line + 0.5], "accuracy": sigma}
+        gcps.append(
+            {"id": str(number), "geolocation": location, "marks": [mark], "is_checkpoint": False}
+        )
+    document = {
+        "format": "application/opf-input-control-points+json",
+        "version": "1.0",
+        "gcps": gcps,
+        "mtps": [],
+    }
+    return (
+        json.dumps({**document, "extensions": {"AMERS_images": {str(camera): IMAGE}}}, indent=1) + "\n"
+    )
+
+
+def geojson():
+    features = []
+    for number, (ground, (east, north, up), (line, sample), sigma) in rows():
+        properties = {"status": "active", "line": line, "sample": sample, "sigma_px": sigma}
+        properties |= {"sigma_east_m": east, "sigma_north_m": north, "sigma_up_m": up}
+        geometry = {"type": "Point", "coordinates": list(ground)}
+        features.append(
+            {"type": "Feature", "id": number, "geometry": geometry, "properties": properties}
+        )
+    return (
+        json.dumps({"type": "FeatureCollection", "image": IMAGE, "features": features}, indent=1) + "\n"
+    )
+
+
+def orthority():
+    features = []
+    for number, (ground, _, (line, sample), _) in rows():
+        properties = {"filename": IMAGE, "ji": [sample, line], "id": str(number), "info": None}
+        geometry = {"type": "Point", "coordinates": list(ground)}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+if __name__ == "__main__":
+    for name, text in {
+        "invented.gcp": asp(),
+        "invented.points": qgis(),
+        "invented.pts": envi("Geographic Lat/Lon, WGS-84, units=Degrees", LON_LAT_H),
+        "invented_utm.pts": envi("UTM, 33, North, WGS-84, units=Meters", utm()),
+        "invented_opf.json": opf(),
+        "invented.geojson": geojson(),
+        "invented_orthority.geojson": orthority(),
+    }.items():
+        (HERE / name).write_text(text)

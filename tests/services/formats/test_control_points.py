@@ -1,0 +1,297 @@
+"""Marked points: every format reads to the same points, in the pixels of GDAL, and comes back."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.control import GroundControlPoint
+from rasterio.transform import RPCTransformer, from_gcps
+
+from services.errors import AmersError, FormatError, InputError, VerticalDatumError
+from services.formats.control_point_files import read_control_points
+from services.formats.control_points import MarkedPoints, marked_points
+from services.formats.control_points_json import (
+    format_opf,
+    opf_camera_id,
+    parse_geojson_points,
+    parse_opf,
+)
+from services.formats.control_points_text import (
+    format_asp_gcp,
+    format_envi_pts,
+    format_qgis_points,
+    parse_asp_gcp,
+    parse_envi_pts,
+    parse_qgis_points,
+)
+from services.formats.raster import gdal_rpc
+from services.formats.rpc_text import parse_rpc_text
+
+GOLDEN = Path(__file__).parents[2] / "golden"
+MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())
+FILES = [
+    "invented.gcp",
+    "invented.points",
+    "invented.pts",
+    "invented_utm.pts",
+    "invented_opf.json",
+    "invented.geojson",
+    "invented_orthority.geojson",
+]
+TEXTS = {name: (GOLDEN / name).read_text() for name in FILES}
+
+a_millionth_of_a_pixel = 1e-6
+a_nanodegree = 1e-9
+a_micrometre = 1e-6
+CORNER_OF_FIRST_PIXEL = 0.5
+
+FORMATS = [
+    (format_asp_gcp, lambda text: parse_asp_gcp(text, "ellipsoid"), "invented.gcp"),
+    (format_qgis_points, parse_qgis_points, "invented.points"),
+    (format_envi_pts, lambda text: parse_envi_pts(text, "ellipsoid"), "invented.pts"),
+    (format_opf, parse_opf, "invented_opf.json"),
+]
+every_format = pytest.mark.parametrize(
+    ("write", "parse", "golden"), FORMATS, ids=["asp", "qgis", "envi", "opf"]
+)
+
+
+def golden_points() -> MarkedPoints:
+    return parse_geojson_points(TEXTS["invented.geojson"])
+
+
+def gdal_position(points: MarkedPoints) -> np.ndarray:
+    """Line and sample of ground points by GDAL, from the corner of the first pixel."""
+    with RPCTransformer(gdal_rpc(MODEL)) as transformer:
+        rows, columns = transformer.rowcol(*points.lon_lat_h.T, op=np.positive)
+    return np.column_stack([rows, columns])
+
+
+def numbers(text: str) -> list[list[float]]:
+    """All numbers of the lines that are not comments, without the code under test."""
+    lines = [line for line in text.splitlines() if line[:1] not in "#;m"]
+    return [[float(v) for v in re.split(r"[ ,]+", line) if not v.endswith(".tif")] for line in lines]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_golden_file_reads_to_the_same_points_in_the_pixels_of_gdal(name: str) -> None:
+    points, expected = read_control_points(GOLDEN / name, "ellipsoid"), golden_points()
+    assert points.active.all()
+    assert not points.check.any()
+    on_ground = np.abs(points.lon_lat_h - expected.lon_lat_h)
+    assert on_ground[:, :2].max() < a_nanodegree
+    if name == "invented.points":
+        assert np.isnan(points.lon_lat_h[:, 2]).all()
+    else:
+        assert on_ground[:, 2].max() < a_micrometre
+    by_gdal = gdal_position(expected) - CORNER_OF_FIRST_PIXEL
+    assert np.abs(points.line_sample - by_gdal).max() < a_millionth_of_a_pixel
+
+
+def test_a_format_keeps_the_sigmas_and_names_it_has_a_place_for() -> None:
+    expected = golden_points()
+    assert expected.sigma_m[0].tolist() == [0.5, 0.75, 1.5]
+    for name in ("invented.gcp", "invented_opf.json"):
+        points = read_control_points(GOLDEN / name, "ellipsoid")
+        assert points.id.tolist() == expected.id.tolist()
+        assert points.image.tolist() == ["invented.tif"] * 5
+        np.testing.assert_array_equal(points.sigma_m, expected.sigma_m)
+        np.testing.assert_allclose(points.sigma_px, expected.sigma_px, rtol=1e-15)
+
+
+@every_format
+def test_what_is_written_is_the_golden_file(write, parse, golden: str) -> None:
+    written = write(golden_points())
+    if golden.endswith(".json"):
+        assert json.loads(written) == json.loads(TEXTS[golden])
+        return
+    for ours, theirs in zip(numbers(written), numbers(TEXTS[golden]), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=a_nanodegree)
+
+
+@every_format
+@given(data=st.data())
+@settings(max_examples=60)
+def test_any_point_comes_back(write, parse, golden: str, data: st.DataObject) -> None:
+    n = data.draw(st.integers(0, 4))
+    pixel = st.floats(-1e5, 1e6)
+    positive = st.floats(1e-3, 1e3)
+    rows = st.lists(
+        st.tuples(st.floats(-180.0, 180.0), st.floats(-90.0, 90.0), st.floats(-500.0, 9000.0)),
+        min_size=n,
+        max_size=n,
+    )
+    points = marked_points(
+        [str(k) for k in range(1, n + 1)],
+        data.draw(rows),
+        data.draw(st.lists(st.tuples(pixel, pixel), min_size=n, max_size=n)),
+        sigma_m=data.draw(st.lists(st.tuples(positive, positive, positive), min_size=n, max_size=n)),
+        sigma_px=data.draw(st.lists(positive, min_size=n, max_size=n)),
+        image=["image.tif"] * n,
+    )
+    again = parse(write(points))
+    assert again.id.tolist() == points.id.tolist()
+    assert np.abs(again.line_sample - points.line_sample).max(initial=0) < a_millionth_of_a_pixel
+    moved = np.nan_to_num(again.lon_lat_h - points.lon_lat_h)
+    assert np.abs(moved).max(initial=0) < a_micrometre
+
+
+def test_qgis_marks_of_a_map_image_give_gdal_back_its_geotransform() -> None:
+    """QGIS hands its points to GDAL as column and minus row."""
+    origin_lon, origin_lat, step = 12.0, 42.0, 1e-4
+    line_sample = np.array([[0.0, 0.0], [0.0, 999.0], [799.0, 999.0], [799.0, 0.0], [400.0, 500.0]])
+    lon = origin_lon + (line_sample[:, 1] + 0.5) * step
+    lat = origin_lat - (line_sample[:, 0] + 0.5) * step
+    points = marked_points(["a", "b", "c", "d", "e"], np.column_stack([lon, lat, 0 * lon]), line_sample)
+    gcps = [
+        GroundControlPoint(row=-minus_row, col=column, x=x, y=y)
+        for x, y, column, minus_row, *_ in numbers(format_qgis_points(points))
+    ]
+    fitted = from_gcps(gcps)
+    assert (fitted.c, fitted.f) == pytest.approx((origin_lon, origin_lat), abs=a_nanodegree)
+    assert (fitted.a, fitted.e) == pytest.approx((step, -step), rel=1e-9)
+
+
+def test_only_active_points_are_control_and_qgis_keeps_the_others_switched_off() -> None:
+    points = replace(golden_points(), active=np.array([True, False, True, True, True]))
+    held_out = replace(points, check=np.array([False, False, False, True, False]))
+    assert len(numbers(format_asp_gcp(held_out))) == len(numbers(format_envi_pts(held_out))) == 3
+    assert parse_qgis_points(format_qgis_points(held_out)).active.tolist() == [1, 0, 1, 0, 1]
+    opf = parse_opf(format_opf(held_out))
+    assert opf.check.tolist() == [False, False, True, False]
+
+
+def test_a_point_seen_in_two_images_is_one_point_with_two_marks() -> None:
+    points = golden_points()
+    twice = replace(
+        points, id=np.array(["1", "1", "2", "3", "4"]), image=np.array(["a", "b", "a", "a", "a"])
+    )
+    for write, parse in ((FORMATS[0][0], FORMATS[0][1]), (format_opf, parse_opf)):
+        again = parse(write(twice))
+        assert again.id.tolist() == ["1", "1", "2", "3", "4"]
+        assert again.image.tolist() == ["a", "b", "a", "a", "a"]
+    assert len(json.loads(format_opf(twice))["gcps"]) == 4
+
+
+def test_blanks_in_the_name_of_an_image_do_not_break_an_asp_line() -> None:
+    points = replace(golden_points(), image=np.full(5, "my image, 2.tif"))
+    assert parse_asp_gcp(format_asp_gcp(points), "ellipsoid").image[0] == "my_image__2.tif"
+
+
+def test_residuals_go_to_qgis_as_computed_minus_observed_with_lines_upwards() -> None:
+    points = replace(golden_points(), residual_px=np.tile([0.3, -0.4], (5, 1)))
+    assert numbers(format_qgis_points(points))[0][5:] == [0.4, 0.3, 0.5]
+
+
+@pytest.mark.parametrize("write", [format_asp_gcp, format_opf])
+def test_a_format_that_asks_for_sigmas_is_not_given_invented_ones(write) -> None:
+    with pytest.raises(InputError, match=r"point 11: .*known"):
+        write(replace(golden_points(), sigma_px=np.full(5, np.nan)))
+
+
+@pytest.mark.parametrize("name", ["invented.gcp", "invented.pts"])
+def test_heights_whose_datum_nobody_says_are_refused(name: str) -> None:
+    with pytest.raises(VerticalDatumError, match="does not say what its heights are above"):
+        read_control_points(GOLDEN / name)
+    with pytest.raises(VerticalDatumError, match="EPSG:4326 is not a vertical reference system"):
+        read_control_points(GOLDEN / name, "EPSG:4326")
+    with pytest.raises(FormatError, match="expected a reference system, found 'sea'"):
+        read_control_points(GOLDEN / name, "sea")
+
+
+def test_an_opf_point_with_a_constant_geoid_is_brought_to_the_ellipsoid() -> None:
+    document = json.loads(TEXTS["invented_opf.json"])
+    for gcp in document["gcps"]:
+        gcp["geolocation"]["crs"] = {"definition": "EPSG:4326+5773", "geoid_height": 48.5}
+    raised = parse_opf(json.dumps(document)).lon_lat_h - golden_points().lon_lat_h
+    np.testing.assert_allclose(raised, np.tile([0.0, 0.0, 48.5], (5, 1)), atol=a_micrometre)
+
+
+def test_an_opf_of_a_two_dimensional_system_has_ellipsoidal_heights_and_its_own_order_of_axes() -> None:
+    document = json.loads(TEXTS["invented_opf.json"])
+    for gcp, line in zip(document["gcps"], numbers(TEXTS["invented_utm.pts"]), strict=True):
+        gcp["geolocation"] |= {"crs": {"definition": "EPSG:32633"}, "coordinates": line[:3]}
+    points = parse_opf(json.dumps(document))
+    assert np.abs(points.lon_lat_h - golden_points().lon_lat_h).max() < a_micrometre
+    assert points.sigma_m[0].tolist() == [0.75, 0.5, 1.5]
+
+
+def test_an_opf_of_others_names_images_by_their_camera() -> None:
+    document = json.loads(TEXTS["invented_opf.json"])
+    del document["extensions"]
+    assert parse_opf(json.dumps(document)).image[0] == str(opf_camera_id("invented.tif"))
+
+
+def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
+    document = json.loads(TEXTS["invented.geojson"])
+    document["features"][1]["properties"] |= {"line": None, "sample": None, "status": "not matched"}
+    document["features"][2]["properties"] |= {"status": "deactivated"}
+    points = parse_geojson_points(json.dumps(document))
+    assert points.id.tolist() == ["11", "13", "14", "15"]
+    assert points.active.tolist() == [True, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("name", "was", "becomes", "says"),
+    [
+        ("invented.gcp", " 105.25", "", "line 2: expected id, lat"),
+        ("invented.gcp", "105.25", "high", "line 2: height should be a number, found 'high'"),
+        ("invented.points", "mapX", "X", "expected a line that starts with mapX,mapY"),
+        ("invented.points", "12.2912345678", "nan", "line 3: mapX should be a number, found 'nan'"),
+        ("invented.points", "EPSG:4326", "moon", "expected a reference system, found 'moon'"),
+        ("invented.pts", "WGS-84", "NAD27", "expected a projection info .* found 'Geographic"),
+        ("invented.pts", " 105.25", "", "line 5: expected map x, y, elevation, image x, y"),
+        ("invented_opf.json", '"1.0"', '"2.0"', "expected OPF 1, found version '2.0'"),
+        ("invented_opf.json", "application/opf-input", "x", "expected a document of the format"),
+        ("invented_opf.json", "position_px", "place", "gcp 1: position_px should be 2 numbers"),
+        ("invented_opf.json", "EPSG:4979", "EPSG:1", "gcp 1: expected a reference system"),
+        ("invented.geojson", '"Point"', '"Line"', "feature 1: expected a Point"),
+        ("invented.geojson", "FeatureCollection", "X", "expected a GeoJSON FeatureCollection"),
+        ("invented.geojson", '"line": 44', '"line": "a', "JSON|should be 2 numbers"),
+    ],
+)
+def test_a_wrong_field_is_named(tmp_path: Path, name: str, was: str, becomes: str, says: str) -> None:
+    assert was in TEXTS[name]
+    path = tmp_path / name
+    path.write_text(TEXTS[name].replace(was, becomes))
+    with pytest.raises(FormatError, match=says):
+        read_control_points(path, "ellipsoid")
+
+
+def test_a_geojson_point_without_a_height_is_refused() -> None:
+    document = json.loads(TEXTS["invented.geojson"])
+    document["features"][0]["geometry"]["coordinates"].pop()
+    with pytest.raises(VerticalDatumError, match="feature 1: expected longitude, latitude and height"):
+        parse_geojson_points(json.dumps(document))
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text("1,2,3")
+    with pytest.raises(FormatError, match=r"expected a name that ends in one of \.gcp, \.points"):
+        read_control_points(tmp_path / "points.csv")
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(data=st.data())
+@settings(max_examples=60)
+def test_a_garbled_file_gives_points_or_an_error_of_ours(name: str, data: st.DataObject) -> None:
+    text = TEXTS[name]
+    start = data.draw(st.integers(0, len(text)))
+    cut = data.draw(st.integers(0, 200))
+    garbled = text[:start] + data.draw(st.text(max_size=30)) + text[start + cut :]
+    parse = {
+        ".gcp": lambda t: parse_asp_gcp(t, "ellipsoid"),
+        ".points": parse_qgis_points,
+        ".pts": lambda t: parse_envi_pts(t, "ellipsoid"),
+        ".json": parse_opf,
+        ".geojson": parse_geojson_points,
+    }[Path(name).suffix]
+    try:
+        parse(garbled)
+    except AmersError:
+        return
