@@ -1,0 +1,70 @@
+"""The map page: files that `make page` has built, under a policy that lets nothing in from elsewhere."""
+
+from hashlib import sha256
+from mimetypes import guess_type
+from pathlib import Path
+
+from fastapi import APIRouter, Request, Response
+
+from app.errors import NotFound
+
+router = APIRouter(include_in_schema=False)
+
+BUILT = Path(__file__).parent / "built"
+POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "worker-src 'self'",
+        "connect-src 'self'",
+        "img-src 'self' blob: data:",
+        # A report that the page opens inherits this policy, and styles itself.
+        "style-src 'self' 'unsafe-inline'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+    "Vary": "Accept-Encoding",
+}
+
+
+@router.get("/map")
+def page(request: Request) -> Response:
+    """The page itself."""
+    return _file(request, "index.html")
+
+
+@router.get("/map/{name}")
+def part(name: str, request: Request) -> Response:
+    """One of the files the page is made of."""
+    return _file(request, name)
+
+
+def _file(request: Request, name: str) -> Response:
+    """A built file, compressed for those who take it, or nothing new for those who have it.
+
+    Raises:
+        NotFound: there is no such file, or the page is not built here.
+    """
+    if not (BUILT / "index.html").is_file():
+        raise NotFound("the page is not built in this installation: run `make page` where Node.js is")
+    if name not in {file.name for file in BUILT.iterdir() if file.suffix != ".gz"}:
+        raise NotFound(f"the page has no file {name:.100}")
+    headers = dict(HEADERS)
+    path = BUILT / name
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        path = BUILT / f"{name}.gz"
+        headers["Content-Encoding"] = "gzip"
+    content = path.read_bytes()
+    headers["ETag"] = f'"{sha256(content).hexdigest()[:32]}"'
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    kind = guess_type(name)[0] or "application/octet-stream"
+    return Response(content, media_type=kind, headers=headers)
