@@ -12,6 +12,7 @@ from app.api.body import BodyLimit
 from app.config import Settings, read_settings
 from app.db import engine
 from app.storage import Storage, StoredChips
+from app.web import page
 
 DESCRIPTION = (
     "An open base of 3D ground control points with image chips, "
@@ -25,6 +26,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     scenes.router,
     processes.router,
     jobs.router,
+    page.router,
 )
 
 
