@@ -1,0 +1,47 @@
+// Builds the page: one script, MapLibre's worker, one style sheet, the outline of the land; no address of elsewhere.
+import { build } from "esbuild";
+import { mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
+import { gzipSync } from "node:zlib";
+import { feature, mesh } from "topojson-client";
+
+const built = new URL("../app/web/built/", import.meta.url);
+const maplibre = "node_modules/maplibre-gl/dist";
+
+rmSync(built, { recursive: true, force: true });
+mkdirSync(built, { recursive: true });
+
+await build({
+  entryPoints: [
+    { in: "source/main.ts", out: "page" },
+    { in: "source/page.css", out: "page" },
+  ],
+  outdir: built.pathname,
+  bundle: true,
+  minify: true,
+  format: "esm",
+  target: "es2022",
+  legalComments: "eof",
+});
+writeFileSync(new URL("worker.js", built), withoutMap(readFileSync(`${maplibre}/maplibre-gl-worker.mjs`, "utf8")));
+writeFileSync(new URL("land.json", built), land());
+writeFileSync(new URL("index.html", built), readFileSync("source/index.html"));
+for (const name of readdirSync(built)) {
+  writeFileSync(new URL(`${name}.gz`, built), gzipSync(readFileSync(new URL(name, built)), { level: 9 }));
+}
+
+/** A script without the comment that points to its source map, which is not shipped. */
+function withoutMap(script) {
+  return script.replace(/\n\/\/# sourceMappingURL=.*\s*$/, "\n");
+}
+
+/** Land and borders of Natural Earth as GeoJSON, to 0.01 degree, as fine as the data are. */
+function land() {
+  const world = JSON.parse(readFileSync("node_modules/world-atlas/countries-50m.json", "utf8"));
+  const borders = mesh(world, world.objects.countries, (one, other) => one !== other);
+  const features = [
+    ...feature(world, world.objects.land).features,
+    { type: "Feature", properties: {}, geometry: borders },
+  ];
+  const rounded = (key, value) => (typeof value === "number" ? Math.round(value * 100) / 100 : value);
+  return JSON.stringify({ type: "FeatureCollection", features }, rounded);
+}

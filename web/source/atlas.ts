@@ -1,0 +1,157 @@
+// The map: land, density, blocks, points, scenes and the residuals of a registration.
+
+import type { Feature, FeatureCollection, Geometry, Position } from "geojson";
+import {
+  GeoJSONSource,
+  LngLatBounds,
+  Map as MapLibre,
+  NavigationControl,
+  ScaleControl,
+  setWorkerUrl,
+  VectorTileSource,
+} from "maplibre-gl";
+import { authorization, BASE } from "./api";
+import { mapStyle } from "./style";
+
+export type Bounds = [west: number, south: number, east: number, north: number];
+
+type Shape = Geometry | Pick<FeatureCollection, "type" | "features">;
+
+const WORLD: Bounds = [-180, -85, 180, 85];
+const NEAR_PX = 6;
+
+/** The map and what is on it; where the browser has no WebGL, everything but the map works. */
+export class Atlas {
+  private readonly map: MapLibre | null;
+  private readonly ready: Promise<void>;
+
+  constructor(container: HTMLElement, onPoint: (id: number) => void) {
+    this.map = opened(container);
+    const map = this.map;
+    if (!map) {
+      this.ready = Promise.resolve();
+      return;
+    }
+    this.ready = new Promise((resolve) => map.once("load", () => resolve()));
+    map.on("click", (event) => {
+      const { x, y } = event.point;
+      const [found] = map.queryRenderedFeatures(
+        [
+          [x - NEAR_PX, y - NEAR_PX],
+          [x + NEAR_PX, y + NEAR_PX],
+        ],
+        { layers: ["points"] },
+      );
+      if (found) onPoint(Number(found.properties["id"]));
+    });
+    map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
+    map.on("mouseleave", "points", () => (map.getCanvas().style.cursor = ""));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", (scheme) => this.repaint(scheme.matches));
+  }
+
+  /** Resolves when everything asked for is drawn. */
+  async idle(): Promise<void> {
+    await this.ready;
+    if (this.map && !this.map.areTilesLoaded()) await this.map.once("idle");
+  }
+
+  bounds(): Bounds {
+    if (!this.map) return WORLD;
+    const seen = this.map.getBounds();
+    const whole = seen.getEast() - seen.getWest() >= 360;
+    const [west, east] = whole ? [-180, 180] : [wrapped(seen.getWest()), wrapped(seen.getEast())];
+    return [west, Math.max(seen.getSouth(), -90), east, Math.min(seen.getNorth(), 90)];
+  }
+
+  /** Calls back now and after every move of the map, until the signal. */
+  whileMoving(callback: () => void, signal: AbortSignal): void {
+    callback();
+    this.map?.on("moveend", callback);
+    signal.addEventListener("abort", () => this.map?.off("moveend", callback));
+  }
+
+  /** Bring something into view; `closest` keeps small things in their surroundings. */
+  fit(geometry: Shape | null | undefined, closest = 14): void {
+    const positions = geometry ? positionsOf(geometry) : [];
+    if (!this.map || positions.length === 0) return;
+    const box = positions.reduce((box, position) => box.extend([position[0]!, position[1]!]), new LngLatBounds());
+    const padding = Math.min(60, this.map.getContainer().clientHeight / 6);
+    this.map.fitBounds(box, { padding, maxZoom: closest, animate: !matchMedia("(prefers-reduced-motion: reduce)").matches });
+  }
+
+  async choose(id: number | null): Promise<void> {
+    await this.ready;
+    this.map?.setFilter("chosen", ["==", ["get", "id"], id ?? -1]);
+  }
+
+  /** Put other features on one of the layers that the page fills itself. */
+  async show(source: "blocks" | "scenes" | "vectors", features: Feature[]): Promise<void> {
+    await this.ready;
+    const found = this.map?.getSource(source);
+    if (found instanceof GeoJSONSource) found.setData({ type: "FeatureCollection", features });
+  }
+
+  /** Ask for points and densities again: a block has come or gone. */
+  refresh(): void {
+    for (const name of ["points", "density"]) {
+      const source = this.map?.getSource(name);
+      if (source instanceof VectorTileSource) source.setTiles(source.tiles);
+    }
+  }
+
+  private repaint(dark: boolean): void {
+    for (const layer of mapStyle(dark).layers) {
+      const paint = Object.entries(layer.paint ?? {}) as [Parameters<MapLibre["setPaintProperty"]>[1], unknown][];
+      for (const [name, value] of paint) this.map?.setPaintProperty(layer.id, name, value as never);
+    }
+  }
+}
+
+function opened(container: HTMLElement): MapLibre | null {
+  setWorkerUrl(`${BASE}map/worker.js`);
+  try {
+    const map = new MapLibre({
+      container,
+      style: mapStyle(matchMedia("(prefers-color-scheme: dark)").matches),
+      center: [10, 25],
+      zoom: 1.2,
+      attributionControl: false,
+      dragRotate: false,
+      pitchWithRotate: false,
+      touchPitch: false,
+      transformRequest: (url) => ({ url, headers: url.startsWith(`${BASE}collections/`) ? authorization() : {} }),
+    });
+    map.touchZoomRotate.disableRotation();
+    map.keyboard.disableRotation();
+    map.addControl(new NavigationControl({ showCompass: false }), "top-right");
+    map.addControl(new ScaleControl({ maxWidth: 120 }), "bottom-right");
+    map.on("error", (event) => console.warn(event.error.message));
+    return map;
+  } catch (error) {
+    container.append(`The map cannot be shown: ${error instanceof Error ? error.message : "no WebGL"}`);
+    return null;
+  }
+}
+
+function wrapped(longitude: number): number {
+  return ((((longitude + 180) % 360) + 360) % 360) - 180;
+}
+
+function positionsOf(geometry: Shape): Position[] {
+  switch (geometry.type) {
+    case "FeatureCollection":
+      return geometry.features.flatMap((feature) => positionsOf(feature.geometry));
+    case "GeometryCollection":
+      return geometry.geometries.flatMap(positionsOf);
+    case "Point":
+      return [geometry.coordinates];
+    case "MultiPoint":
+    case "LineString":
+      return geometry.coordinates;
+    case "MultiLineString":
+    case "Polygon":
+      return geometry.coordinates.flat();
+    case "MultiPolygon":
+      return geometry.coordinates.flat(2);
+  }
+}

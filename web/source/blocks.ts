@@ -1,0 +1,96 @@
+// Blocks: what there is, how good each is, and its publication by an administrator.
+
+import { type BlockFeature, type BlockProperties, get, type Page, post } from "./api";
+import { badge, facts, figure, h, plural, problem, when } from "./elements";
+import { announce, type ShowView } from "./place";
+
+interface Distribution {
+  median: number;
+  p90: number;
+}
+interface Quality {
+  area_km2: number;
+  points_per_km2: number;
+  share_reaching_half: number;
+  share_reaching_quarter: number;
+  images_per_point: Distribution;
+  views_per_point: Distribution;
+  sigma_horizontal_m: Distribution;
+  sigma_up_m: Distribution;
+}
+
+export function blocks(signal?: AbortSignal): Promise<Page<BlockFeature>> {
+  return get<Page<BlockFeature>>("collections/blocks/items?limit=1000", signal);
+}
+
+/** All blocks that the caller may see. */
+export const showBlocks: ShowView = async ({ panel, atlas, signal }) => {
+  const { features } = await blocks(signal);
+  await atlas.show("blocks", features);
+  panel.replaceChildren(
+    h("h1", { tabindex: -1 }, "Blocks"),
+    h("p", {}, "A block is one production of points, published and withdrawn as a whole."),
+    features.length === 0 ? h("p", { class: "quiet" }, "There is none yet.") : null!,
+    h("ul", { class: "list" }, ...features.map(({ properties }) => row(properties))),
+  );
+};
+
+/** One block with its figures; an administrator publishes and withdraws it here. */
+export const showBlock: ShowView = async (place, number) => {
+  const { panel, atlas, signal, scopes } = place;
+  const at = encodeURIComponent(number);
+  const [block, quality] = await Promise.all([
+    get<BlockFeature>(`collections/blocks/items/${at}`, signal),
+    get<Quality>(`blocks/${at}/quality`, signal),
+  ]);
+  const { properties } = block;
+  const published = properties.state === "published";
+  const act = h("button", { type: "button", class: published ? "" : "strong", onclick: () => void change() }, published ? "Withdraw" : "Publish");
+  const told = h("div");
+  panel.replaceChildren(
+    h("p", {}, h("a", { href: "#/blocks" }, "← Blocks")),
+    h("h1", { tabindex: -1 }, properties.title || properties.id),
+    h("p", {}, badge(properties.state), " ", h("span", { class: "quiet" }, `since ${when(properties.state_changed_at)}`)),
+    scopes.includes("admin") ? h("p", {}, act) : null!,
+    told,
+    facts({
+      Name: `${properties.id}, version ${properties.version}`,
+      Points: figure(properties.n_points),
+      Chips: figure(properties.n_views),
+      Area: figure(quality.area_km2, "km²"),
+      Density: figure(quality.points_per_km2, "points/km²"),
+      "Area with 1 point for 2 km²": figure(100 * quality.share_reaching_half, "%"),
+      "Area with 1 point for 4 km²": figure(100 * quality.share_reaching_quarter, "%"),
+      "Images a point, median": figure(quality.images_per_point.median),
+      "Chips a point, median": figure(quality.views_per_point.median),
+      "Stated deviation, horizontal, median": figure(quality.sigma_horizontal_m.median, "m"),
+      "Stated deviation, height, median": figure(quality.sigma_up_m.median, "m"),
+    }),
+  );
+  atlas.fit(block.geometry);
+
+  async function change(): Promise<void> {
+    act.disabled = true;
+    try {
+      await post(`blocks/${at}/${published ? "withdraw" : "publish"}`);
+      announce(`${properties.id} is ${published ? "withdrawn" : "published"}.`);
+      await atlas.show("blocks", (await blocks(signal)).features);
+      atlas.refresh();
+      await showBlock(place, number);
+      panel.querySelector("button")?.focus();
+    } catch (error) {
+      act.disabled = false;
+      if (!signal.aborted) told.replaceChildren(problem(error));
+    }
+  }
+};
+
+function row(block: BlockProperties): HTMLElement {
+  return h(
+    "li",
+    {},
+    h("a", { href: `#/block/${block.number}` }, block.title || block.id),
+    badge(block.state),
+    h("span", { class: "quiet" }, `${block.id}@${block.version} · ${plural(block.n_points, "point")}`),
+  );
+}

@@ -1,0 +1,161 @@
+// A job: its progress while it runs, its reason when it failed, its report when it is done.
+
+import type { FeatureCollection, Point, Polygon } from "geojson";
+import { blobUrl, call, get, type Job, type Result, type Verdict } from "./api";
+import { badge, facts, figure, h, problem, when } from "./elements";
+import { announce, pause, type Place, type ShowView } from "./place";
+import { type MeasureProperties, residualVectors } from "./residuals";
+
+const POLL_MS = 1000;
+
+interface Spread {
+  n: number;
+  rms: number;
+}
+interface Report {
+  verdict: Verdict;
+  criteria: { name: string; value: number | null; comparison: string; limit: number; needed_for: string; passed: boolean }[];
+  scene: { name: string; gsd_m: number; footprint_lon_lat: [number, number][] };
+  correction: { order: string; words: string[]; shift_m: number };
+  equipment: { visible: number; matched: number; active: number };
+  reasons: { stage: string; reason: string; count: number }[];
+  image_residuals_px: Record<"x" | "y" | "xy", Spread>;
+  ground_residuals_m: Record<"east" | "north" | "horizontal", Spread>;
+  predicted: { worst_px: number | null; worst_m: number | null };
+}
+type Results = Record<string, Result>;
+
+/** Watches a job until it has ended, then shows what it made. */
+export const showJob: ShowView = async (place, id) => {
+  const { panel, signal } = place;
+  const heading = h("h1", { tabindex: -1 }, "Job");
+  const body = h("div");
+  panel.replaceChildren(h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")), heading, body);
+  let job = await find(id, signal);
+  heading.textContent = job.processID.replace("-", " ").replace(/^./, (first) => first.toUpperCase());
+  const running = progressOf(job);
+  if (!ended(job)) body.replaceChildren(running.element);
+  while (!ended(job)) {
+    running.update(job);
+    await pause(POLL_MS, signal);
+    job = await find(id, signal);
+  }
+  announce(`The job is ${job.status}.`);
+  if (job.status === "successful") await showResults(place, job, heading, body);
+  else body.replaceChildren(outcome(job));
+};
+
+function find(id: string, signal: AbortSignal): Promise<Job> {
+  return get<Job>(`jobs/${encodeURIComponent(id)}`, signal);
+}
+
+function ended(job: Job): boolean {
+  return !["accepted", "running"].includes(job.status);
+}
+
+function progressOf(first: Job): { element: HTMLElement; update(job: Job): void } {
+  const bar = h("progress", { max: 100, "aria-label": "Progress of the job" });
+  const words = h("p", {});
+  const stop = h("button", { type: "button", onclick: () => void dismiss() }, "Stop");
+  return {
+    element: h("div", { class: "upload" }, words, bar, stop),
+    update(job) {
+      bar.value = job.progress;
+      words.textContent = job.status === "accepted" ? "Waiting for a worker" : `${job.progress} % · ${job.message ?? "at work"}`;
+    },
+  };
+
+  async function dismiss(): Promise<void> {
+    stop.disabled = true;
+    try {
+      await call(`jobs/${first.jobID}`, { method: "DELETE" });
+    } catch (error) {
+      stop.replaceWith(problem(error));
+    }
+  }
+}
+
+function outcome(job: Job): HTMLElement {
+  return h(
+    "div",
+    {},
+    h("p", {}, badge(job.status), " ", h("span", { class: "quiet" }, when(job.finished))),
+    job.error ? problem(`${job.error.title}: ${job.error.detail}`) : h("p", {}, job.message),
+  );
+}
+
+async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElement, body: HTMLElement): Promise<void> {
+  const results = await get<Results>(`jobs/${job.jobID}/results`, signal);
+  const told = results["report.json"];
+  const measured = results["control_points.geojson"];
+  if (!told || !measured) {
+    body.replaceChildren(outcome(job), await downloads(results, signal));
+    return;
+  }
+  const [report, points] = await Promise.all([
+    get<Report>(told.href, signal),
+    get<FeatureCollection<Point, MeasureProperties>>(measured.href, signal),
+  ]);
+  const ring = report.scene.footprint_lon_lat;
+  const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
+  const { features, exaggeration } = residualVectors(points);
+  heading.textContent = report.scene.name;
+  body.replaceChildren(...summary(report, exaggeration), await downloads(results, signal));
+  await atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]);
+  await atlas.show("vectors", features);
+  signal.addEventListener("abort", () => void atlas.show("vectors", []));
+  atlas.fit(footprint, 17);
+}
+
+function summary(report: Report, exaggeration: number): HTMLElement[] {
+  const { equipment, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
+  return [
+    h("p", {}, badge(report.verdict), " ", h("span", { class: "quiet" }, report.correction.words.join("; "))),
+    facts({
+      "Points visible, matched, active": `${figure(equipment.visible)}, ${figure(equipment.matched)}, ${figure(equipment.active)}`,
+      "Residual in the image, rms": `${figure(px.xy.rms, "px")} (x ${figure(px.x.rms)}, y ${figure(px.y.rms)})`,
+      "Residual on the ground, rms": figure(ground.horizontal.rms, "m"),
+      "Predicted CE90, worst place": `${figure(predicted.worst_px, "px")}, ${figure(predicted.worst_m, "m")}`,
+    }),
+    h("p", { class: "legend-line" }, h("span", { class: "swatch vector", "aria-hidden": "true" }), `Residuals on the map, drawn ${figure(exaggeration)} times longer; grey: not used.`),
+    h("h2", {}, "Criteria"),
+    h(
+      "table",
+      {},
+      h("thead", {}, h("tr", {}, ...["Criterion", "Value", "Limit", "Met"].map((name) => h("th", { scope: "col" }, name)))),
+      h("tbody", {}, ...report.criteria.map(criterion)),
+    ),
+  ];
+}
+
+function criterion({ name, value, comparison, limit, needed_for, passed }: Report["criteria"][number]): HTMLElement {
+  return h(
+    "tr",
+    {},
+    h("th", { scope: "row" }, name.replaceAll("_", " ")),
+    h("td", {}, figure(value)),
+    h("td", {}, `${comparison} ${figure(limit)}`),
+    h("td", { class: passed ? "" : "missed" }, passed ? "yes" : `no, not ${needed_for}`),
+  );
+}
+
+/** Links to the files; they are fetched with the token first, which a plain link could not send. */
+async function downloads(results: Results, signal: AbortSignal): Promise<HTMLElement> {
+  const files = Object.values(results).filter((result) => typeof result === "object" && result?.href);
+  const page = files.find(({ title }) => title === "report.html");
+  const open = page ? h("p", {}, h("a", { class: "button strong", target: "_blank", href: await blobUrl(page.href, signal) }, "Open the report")) : null;
+  const rows = files.map((file) => {
+    const link = h("a", { href: "#", role: "button", onclick: (event) => void save(event, file, link) }, file.title);
+    return h("li", {}, link, h("span", { class: "quiet" }, file.type));
+  });
+  return h("div", {}, open, h("h2", {}, "Files"), h("ul", { class: "list" }, ...rows));
+
+  async function save(event: Event, file: Result, link: HTMLElement): Promise<void> {
+    event.preventDefault();
+    try {
+      h("a", { href: await blobUrl(file.href, signal), download: file.title }).click();
+    } catch (error) {
+      link.replaceWith(problem(error));
+    }
+  }
+}

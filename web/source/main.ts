@@ -1,0 +1,66 @@
+// The page begins here: who calls, the map, and which view the address names.
+
+import { type Caller, showAccess, whoCalls } from "./access";
+import { Refused } from "./api";
+import { Atlas } from "./atlas";
+import { blocks, showBlock, showBlocks } from "./blocks";
+import { h, problem } from "./elements";
+import { showJob } from "./job";
+import { go, type ShowView } from "./place";
+import { showPoint, showPoints } from "./points";
+import { showScene, showScenes } from "./scenes";
+
+const VIEWS: Record<string, { show: ShowView; section: string }> = {
+  points: { show: showPoints, section: "points" },
+  point: { show: showPoint, section: "points" },
+  scenes: { show: showScenes, section: "scenes" },
+  scene: { show: showScene, section: "scenes" },
+  job: { show: showJob, section: "scenes" },
+  blocks: { show: showBlocks, section: "blocks" },
+  block: { show: showBlock, section: "blocks" },
+  access: { show: showAccess, section: "access" },
+};
+
+const panel = document.getElementById("panel")!;
+const access = document.getElementById("access")!;
+let leaving = new AbortController();
+
+async function start(): Promise<void> {
+  const atlas = new Atlas(document.getElementById("map")!, (id) => go(`#/point/${id}`));
+  const caller = await whoCalls().catch(() => null);
+  if (caller) access.textContent = caller.name;
+  addEventListener("hashchange", () => void route(atlas, caller, true));
+  await Promise.all([route(atlas, caller, false), opening(atlas)]);
+}
+
+/** What the map shows at first: the blocks there are. */
+async function opening(atlas: Atlas): Promise<void> {
+  try {
+    const { features } = await blocks();
+    await atlas.show("blocks", features);
+    if (/^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features }, 11);
+  } catch (error) {
+    if (error instanceof Refused && error.status === 401) go("#/access");
+  }
+}
+
+async function route(atlas: Atlas, caller: Caller | null, moved: boolean): Promise<void> {
+  leaving.abort(new DOMException("gone elsewhere", "AbortError"));
+  leaving = new AbortController();
+  const { signal } = leaving;
+  const [, name = "points", argument = ""] = location.hash.split("/");
+  const view = VIEWS[name] ?? VIEWS["points"]!;
+  for (const link of document.querySelectorAll("header a")) {
+    if (link.getAttribute("href") === `#/${view.section}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  panel.scrollTop = 0;
+  try {
+    await view.show({ panel, atlas, signal, scopes: caller?.scopes ?? [] }, decodeURIComponent(argument));
+    if (moved && !signal.aborted) panel.querySelector("h1")?.focus({ preventScroll: true });
+  } catch (error) {
+    if (!signal.aborted) panel.replaceChildren(h("h1", { tabindex: -1 }, "That did not work"), problem(error));
+  }
+}
+
+void start();

@@ -1,0 +1,94 @@
+// Points: what is in view, and one point with its chips.
+
+import { blobUrl, get, type Page, type PointFeature, type View } from "./api";
+import { facts, figure, h, plural, problem } from "./elements";
+import type { ShowView } from "./place";
+
+const LISTED = 50;
+const SETTLED_MS = 250;
+
+/** The points of the part of the world that the map shows, counted and listed. */
+export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
+  const list = h("ul", { class: "list", "aria-label": "Points in view" });
+  const count = h("p", { class: "count" }, "…");
+  panel.replaceChildren(
+    h("h1", { tabindex: -1 }, "Control points"),
+    h("p", {}, "Ground positions in three dimensions, each with image chips. Select one on the map or in the list."),
+    legend(),
+    h("h2", {}, "In view"),
+    count,
+    list,
+  );
+  let asked = 0;
+  atlas.whileMoving(() => {
+    const mine = ++asked;
+    setTimeout(() => mine === asked && !signal.aborted && void fill(), mine === 1 ? 0 : SETTLED_MS);
+  }, signal);
+
+  async function fill(): Promise<void> {
+    try {
+      const page = await get<Page<PointFeature>>(`collections/points/items?bbox=${atlas.bounds().join(",")}&limit=${LISTED}`, signal);
+      const total = page.numberMatched ?? page.features.length;
+      count.textContent = total > page.features.length ? `${plural(total, "point")}, the first ${page.features.length}:` : plural(total, "point");
+      list.replaceChildren(...page.features.map(row));
+    } catch (error) {
+      if (!signal.aborted) count.replaceChildren(problem(error));
+    }
+  }
+};
+
+/** One point: where it is, how well that is known, and what it looks like. */
+export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
+  const point = await get<PointFeature>(`collections/points/items/${encodeURIComponent(id)}`, signal);
+  const [lon, lat, height] = point.geometry.coordinates;
+  const { properties } = point;
+  const chips = h("ul", { class: "chips", "aria-label": "Chips" });
+  panel.replaceChildren(
+    h("p", {}, h("a", { href: "#/points" }, "← Points")),
+    h("h1", { tabindex: -1 }, `Point ${id}`),
+    facts({
+      Latitude: `${lat?.toFixed(7)}°`,
+      Longitude: `${lon?.toFixed(7)}°`,
+      "Height above the ellipsoid": `${height?.toFixed(2)} m`,
+      "Standard deviation east, north, up": [properties.sigma_east_m, properties.sigma_north_m, properties.sigma_up_m]
+        .map((sigma) => figure(sigma))
+        .join(", ")
+        .concat(" m"),
+      Saliency: figure(properties.saliency),
+      Block: properties.block,
+    }),
+    h("h2", {}, plural(properties.views?.length ?? 0, "chip")),
+    chips,
+  );
+  atlas.fit(point.geometry, 13);
+  await atlas.choose(Number(id));
+  signal.addEventListener("abort", () => void atlas.choose(null));
+  await Promise.all((properties.views ?? []).map((view, number) => show(chips, id, view, number, signal)));
+};
+
+async function show(chips: HTMLElement, id: string, view: View, number: number, signal: AbortSignal): Promise<void> {
+  const told = [view.image_id, figure(view.gsd_m, "m"), view.acquired_at?.slice(0, 10)].filter(Boolean).join(" · ");
+  const image = h("img", { alt: `Chip ${number}: ${told}`, width: 101, height: 101 });
+  chips.append(h("li", {}, h("figure", {}, image, h("figcaption", {}, told))));
+  try {
+    image.src = await blobUrl(`collections/points/items/${encodeURIComponent(id)}/chips/${number}?f=png`, signal);
+  } catch (error) {
+    if (!signal.aborted) image.replaceWith(problem(error));
+  }
+}
+
+function row(point: PointFeature): HTMLElement {
+  const [lon, lat] = point.geometry.coordinates;
+  return h(
+    "li",
+    {},
+    h("a", { href: `#/point/${point.id}` }, String(point.id)),
+    h("span", { class: "quiet" }, `${lat?.toFixed(4)}°, ${lon?.toFixed(4)}°`),
+  );
+}
+
+function legend(): HTMLElement {
+  const names = ["fewer than 1 for 4 km²", "1 for 4 km² or more", "1 for 2 km² or more"];
+  const row = (name: string, step: number) => h("li", {}, h("span", { class: `swatch density-${step}`, "aria-hidden": "true" }), name);
+  return h("ul", { class: "legend", "aria-label": "Colours of the density" }, ...names.map(row));
+}
