@@ -7,10 +7,16 @@ __all__ = [
     "ComputationError",
     "Conflict",
     "InputError",
+    "InvalidParameter",
     "NotAllowed",
     "NotFound",
     "TooLarge",
+    "TooMany",
 ]
+
+
+class InvalidParameter(InputError):
+    """A parameter of a request does not hold what it should; OGC API calls for 400."""
 
 
 class NotFound(AmersError):
@@ -23,6 +29,10 @@ class Conflict(AmersError):
 
 class TooLarge(AmersError):
     """More bytes than the installation accepts."""
+
+
+class TooMany(AmersError):
+    """More at once than the caller may have; later it may be possible."""
 
 
 class NotAllowed(AmersError):

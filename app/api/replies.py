@@ -11,18 +11,31 @@ from fastapi.responses import JSONResponse
 from psycopg_pool import PoolTimeout
 from starlette.exceptions import HTTPException
 
-from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
+from app.errors import (
+    AmersError,
+    ComputationError,
+    Conflict,
+    InputError,
+    InvalidParameter,
+    NotAllowed,
+    NotFound,
+    TooLarge,
+    TooMany,
+)
 
 PROBLEM_JSON = "application/problem+json"
 HTTP_STATUS: dict[type[Exception], int] = {
     InputError: 422,
+    InvalidParameter: 400,
     ComputationError: 409,
     Conflict: 409,
     NotFound: 404,
     TooLarge: 413,
+    TooMany: 429,
     AmersError: 500,
 }
 RETRY_SECONDS = "5"
+HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
 
 
 def install(app: FastAPI) -> None:
@@ -70,7 +83,7 @@ def status_of(error: AmersError) -> int:
 def _refused(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, AmersError)
     status = status_of(error)
-    headers = {"WWW-Authenticate": 'Bearer realm="amers"'} if status == 401 else None
+    headers = HEADERS.get(status)
     return problem(status, str(error), headers=headers, error=type(error).__name__)
 
 
@@ -80,7 +93,9 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
         {"field": ".".join(map(str, item["loc"])), "message": item["msg"]} for item in error.errors()
     ]
     detail = "; ".join(f"{item['field']}: {item['message']}" for item in wrong)
-    return problem(422, detail, error="InputError", errors=wrong)
+    # OGC API calls for 400 where a parameter of the query is wrong; 422 is for what is sent.
+    only_query = all(item["loc"][0] == "query" for item in error.errors())
+    return problem(400 if only_query else 422, detail, error="InputError", errors=wrong)
 
 
 def _not_routed(request: Request, error: Exception) -> JSONResponse:
@@ -99,4 +114,6 @@ def _unavailable(request: Request, error: Exception) -> JSONResponse:
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
     """Says nothing of what happened inside; the server logs the error with its trace."""
-    return problem(500, "an unexpected error, which has been logged")
+    request_id = getattr(request.state, "request_id", None)
+    headers = None if request_id is None else {"X-Request-ID": request_id}
+    return problem(500, "an unexpected error, which has been logged", headers=headers)
