@@ -1,17 +1,18 @@
-# Everything does its own set-up: a virtual environment, and PostgreSQL with PostGIS where it is missing.
+# Everything does its own set-up: a virtual environment, PostgreSQL with PostGIS where it is missing, the map page.
 
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
 BIN := .venv/bin
 READY := .venv/ready
+PAGE := app/web/built/index.html
 
-.PHONY: demo test check serve bench postgis
+.PHONY: demo test check serve bench postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
 
-test: check postgis
+test: check postgis page chromium
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(READY)
@@ -20,7 +21,7 @@ check: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-serve: postgis
+serve: postgis page
 	$(BIN)/amers serve
 
 bench: postgis
@@ -28,6 +29,14 @@ bench: postgis
 
 postgis: $(READY)
 	@scripts/ensure-postgis
+
+page: $(PAGE)
+
+$(PAGE): $(wildcard web/* web/source/*) scripts/make-page
+	@scripts/make-page
+
+chromium:
+	@scripts/ensure-chromium
 
 $(READY): pyproject.toml constraints.txt scripts/make-venv
 	scripts/make-venv .venv
