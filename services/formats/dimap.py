@@ -16,10 +16,19 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.rpc_text import parse_number, rpc_from_numbers
 from services.sensors.rpc import RpcModel
+from services.sensors.rpc_fit import fit_to_ground
 from services.types import Acquisition, Array
 
 _PROFILES = {"PHR": "PHR", "S6": "SPOT6", "S7": "SPOT7", "PNEO": "PNEO"}
 _FOLD_TOLERANCE_PX = 1e-7
+TO_GROUND_LIMIT_PX = 0.01
+"""How far the two models of a document may be apart in the image."""
+
+_TO_GROUND = {
+    "Inverse_Model": ("Direct_Model", ("SAMP", "LINE")),
+    "GroundtoImage_Values": ("ImagetoGround_Values", ("LON", "LAT")),
+}
+"""For the element of the model from the ground: that to the ground, and how it calls lon and lat."""
 
 
 def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
@@ -59,8 +68,10 @@ def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:
     A model that differs from the document's own by a shift and a scale of each image coordinate (a
     crop, a shift, a drift) is written into the image offsets and scales, which the document's two models
     share: both stay true, and every coefficient stays as delivered. Any other model replaces the
-    coefficients from the ground to the image, and the model from the image to the ground, which would
-    contradict them, is removed. Validity domains stay as delivered. The rest is copied to the letter.
+    coefficients from the ground to the image, and those from the image to the ground are fitted anew to
+    it; where no such fit comes within `TO_GROUND_LIMIT_PX` of it, the model to the ground, which would
+    contradict it, is removed. Validity domains and the stated errors of the fits stay as delivered. The
+    rest is copied to the letter.
 
     Args:
         text: the document the scene came with.
@@ -204,16 +215,31 @@ def _image_frame(own: RpcModel, model: RpcModel) -> tuple[Array, Array] | None:
 
 
 def _with_coefficients(text: str, values: str, model: RpcModel) -> str:
-    """The document with a new model from the ground and without the one to the ground."""
-    to_ground = {"Inverse_Model": "Direct_Model", "GroundtoImage_Values": "ImagetoGround_Values"}[values]
-    text = re.sub(rf"[ \t]*<{to_ground}\b.*?</{to_ground}>\s*?\n?", "", text, flags=re.DOTALL)
-    head, body, tail = _split(text, values)
-    for name, coefficients in (
-        ("LINE_NUM", model.line_num),
-        ("LINE_DEN", model.line_den),
-        ("SAMP_NUM", model.sample_num),
-        ("SAMP_DEN", model.sample_den),
-    ):
+    """The document with a new model from the ground, and one to the ground that agrees with it."""
+    polynomials = {
+        "LINE_NUM": model.line_num,
+        "LINE_DEN": model.line_den,
+        "SAMP_NUM": model.sample_num,
+        "SAMP_DEN": model.sample_den,
+    }
+    text = _with_polynomials(text, values, polynomials)
+    to_ground, (lon, lat) = _TO_GROUND[values]
+    fit = fit_to_ground(model)
+    if not fit.max_error_px < TO_GROUND_LIMIT_PX:
+        return re.sub(rf"[ \t]*<{to_ground}\b.*?</{to_ground}>\s*?\n?", "", text, flags=re.DOTALL)
+    polynomials = {
+        f"{lon}_NUM": fit.lon_num,
+        f"{lon}_DEN": fit.lon_den,
+        f"{lat}_NUM": fit.lat_num,
+        f"{lat}_DEN": fit.lat_den,
+    }
+    return _with_polynomials(text, to_ground, polynomials)
+
+
+def _with_polynomials(text: str, element: str, polynomials: dict[str, Array]) -> str:
+    """The document with other coefficients in one of its elements."""
+    head, body, tail = _split(text, element)
+    for name, coefficients in polynomials.items():
         for i, value in enumerate(coefficients.tolist(), start=1):
             body = _with_number(body, f"{name}_COEFF_{i}", value)
     return head + body + tail

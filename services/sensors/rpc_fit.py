@@ -70,6 +70,74 @@ def fit_rpc(
     return min(fits, key=lambda fit: fit.max_error_px)
 
 
+@dataclass(frozen=True)
+class GroundFit:
+    """An RPC turned round: from normalised (sample, line, height) to normalised longitude and latitude.
+
+    Attributes:
+        lon_num, lon_den, lat_num, lat_den: (20,) in the order of RPC00B, sample in the place of
+            longitude and line in that of latitude; normalised by the offsets and scales of the RPC.
+        max_error_px: largest distance in the image between a place and where the RPC sees its ground;
+            infinite where there is none.
+    """
+
+    lon_num: Array
+    lon_den: Array
+    lat_num: Array
+    lat_den: Array
+    max_error_px: float
+
+
+def fit_to_ground(model: RpcModel, nodes: tuple[int, int, int] = (16, 16, 8)) -> GroundFit:
+    """Fit rational polynomials from the image to the ground to an RPC, over its whole range.
+
+    What a DIMAP file holds beside the RPC. Fitted as `fit_rpc` is, checked between its nodes.
+
+    Args:
+        model: its offsets and scales are kept.
+        nodes: lines, samples and heights of the grid of points.
+    """
+    between = (2 * nodes[0] + 5, 2 * nodes[1] + 5, nodes[2] - 1)
+    places, ground = _normalised_pairs(model, nodes, _MARGIN)
+    check, _ = _normalised_pairs(model, between, _CHECK_MARGIN)
+    expected_px = model.image_offset + check[:, [1, 0]] * model.image_scale
+    fits = []
+    for ridge in RIDGES:
+        polynomials = [
+            part for k in range(2) for part in _fit_ratio(cubic_terms(places), ground[:, k], ridge)
+        ]
+        lon_num, lon_den, lat_num, lat_den = polynomials
+        terms = cubic_terms(check)
+        located = np.column_stack(
+            [terms @ lon_num / (terms @ lon_den), terms @ lat_num / (terms @ lat_den), check[:, 2]]
+        )
+        seen_px = model.project(model.ground_offset + located * model.ground_scale)
+        error_px = np.linalg.norm(seen_px - expected_px, axis=1)
+        worst_px = float(np.nan_to_num(error_px, nan=np.inf).max(initial=0.0)) if len(check) else np.inf
+        fits.append(GroundFit(lon_num, lon_den, lat_num, lat_den, worst_px))
+    return min(fits, key=lambda fit: fit.max_error_px)
+
+
+def _normalised_pairs(
+    model: RpcModel, nodes: tuple[int, int, int], extent: float
+) -> tuple[Array, Array]:
+    """Normalised (sample, line, height) over the range of an RPC, and the ground seen there.
+
+    Places whose ground lies beyond the range of the RPC are left out.
+    """
+    line, sample, height = (
+        axis.ravel() for axis in np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in nodes))
+    )
+    places = np.column_stack([extent * sample, extent * line, min(extent, 1.0) * height])
+    image = model.image_offset + places[:, [1, 0]] * model.image_scale
+    ground = model.locate(image, model.ground_offset[2] + places[:, 2] * model.ground_scale[2])
+    ground[:, 0] = (
+        model.ground_offset[0] + (ground[:, 0] - model.ground_offset[0] + 180.0) % 360.0 - 180.0
+    )
+    seen = np.isfinite(ground).all(axis=1)
+    return places[seen], ((ground - model.ground_offset) / model.ground_scale)[seen]
+
+
 def _fit(
     image: Array,
     ground: Array,

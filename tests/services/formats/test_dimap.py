@@ -112,10 +112,23 @@ def test_a_shift_and_a_drift_move_both_models_of_the_document(text: str) -> None
 
 
 @both_versions
-def test_a_model_that_mixes_lines_and_samples_removes_the_one_it_contradicts(text: str) -> None:
-    mixed = replace(MODEL, line_num=MODEL.line_num + 1e-4 * MODEL.sample_num)
+def test_a_model_that_mixes_lines_and_samples_is_written_in_both_directions(text: str) -> None:
+    mixed = replace(MODEL, line_num=MODEL.line_num + 1e-3 * MODEL.sample_num)
     written = format_dimap_rpc(text, mixed)
     np.testing.assert_array_equal(parse_dimap_rpc(written).line_num, mixed.line_num)
+    assert misfit_px(parse_dimap_rpc(written), mixed) == 0.0
+    assert contradiction_px(text) < a_hundredth_of_a_pixel
+    assert contradiction_px(written) < a_hundredth_of_a_pixel
+    changed = [(a, b) for a, b in zip(text.splitlines(), written.splitlines(), strict=True) if a != b]
+    assert all("_COEFF_" in a or "_OFF" in a for a, _ in changed)
+    assert len(changed) > 80
+
+
+@both_versions
+def test_a_model_to_the_ground_that_would_contradict_is_removed(text: str, monkeypatch) -> None:
+    monkeypatch.setattr("services.formats.dimap.TO_GROUND_LIMIT_PX", 0.0)
+    mixed = replace(MODEL, line_num=MODEL.line_num + 1e-3 * MODEL.sample_num)
+    written = format_dimap_rpc(text, mixed)
     assert misfit_px(parse_dimap_rpc(written), mixed) == 0.0
     assert "Direct_Model>" not in written
     assert "ImagetoGround_Values" not in written

@@ -6,8 +6,8 @@ import pytest
 from services.errors import CoverageError
 from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
 from services.sensors.pushbroom import PushbroomModel
-from services.sensors.rpc import check_rpc
-from services.sensors.rpc_fit import fit_rpc
+from services.sensors.rpc import check_rpc, cubic_terms
+from services.sensors.rpc_fit import fit_rpc, fit_to_ground
 from services.simulation.orbit import pushbroom_over
 
 HEIGHTS_M = (50.0, 850.0)
@@ -85,3 +85,17 @@ def test_a_drift_is_refitted_to_what_folding_gives_exactly() -> None:
 def test_a_model_that_does_not_reach_the_heights_is_refused_with_numbers() -> None:
     with pytest.raises(CoverageError, match=r"only \d+ of 2048 points"):
         fit_rpc(a_pushbroom((300, 400)), (300, 400), (-6.4e6, 100.0))
+
+
+@pytest.mark.parametrize("lon", [5.4, 180.0])
+def test_an_rpc_is_turned_round_within_a_hundredth_of_a_pixel(lon: float) -> None:
+    shape = (3000, 4000)
+    model = fit_rpc(a_pushbroom(shape, lon=lon), shape, HEIGHTS_M).model
+    fit = fit_to_ground(model)
+    rng = np.random.default_rng(3)
+    normalised = rng.uniform(-0.95, 0.95, (500, 3))
+    terms = cubic_terms(normalised)
+    side = [terms @ fit.lon_num / (terms @ fit.lon_den), terms @ fit.lat_num / (terms @ fit.lat_den)]
+    ground = model.ground_offset + np.column_stack([*side, normalised[:, 2]]) * model.ground_scale
+    expected = model.image_offset + normalised[:, [1, 0]] * model.image_scale
+    assert np.abs(model.project(ground) - expected).max() <= fit.max_error_px < a_hundredth_of_a_pixel
