@@ -2,9 +2,10 @@
 
 import os
 from pathlib import Path
+from typing import Annotated, Literal
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from app.errors import InputError
 
@@ -35,7 +36,17 @@ class Settings(BaseSettings):
         read_timeout_seconds: longest time the database may spend on one statement of a reading request.
         job_memory_bytes, job_seconds: what one job may use before it is stopped.
         lease_seconds: how long a job waits for a silent worker before another takes it over.
+        storage_url: a bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; none: the
+            data folder.
+        scene_folder: holds scenes that may be registered where they lie; none: not at all.
+        result_days: how long the files that jobs have made are kept; none: for ever.
         ingest_folder: holds the block folders that may be ingested through the API; none: not at all.
+        quota_upload_bytes: what the scenes of one token may take in the storage at once.
+        quota_jobs: how many jobs of one token may wait or run at once.
+        public_metrics: metrics can be read without a token.
+        cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*`: all.
+        log_format: lines for people (`text`) or for programs (`json`).
+        log_level: the least grave events that are logged.
     """
 
     model_config = SettingsConfigDict(env_prefix="AMERS_", frozen=True)
@@ -52,7 +63,25 @@ class Settings(BaseSettings):
     job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
     lease_seconds: float = Field(default=30.0, gt=0)
+    storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")
+    scene_folder: Path | None = None
+    result_days: float | None = Field(default=None, gt=0)
     ingest_folder: Path | None = None
+    quota_upload_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
+    quota_jobs: int = Field(default=100, ge=0)
+    public_metrics: bool = False
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
+    log_format: Literal["text", "json"] = "text"
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @field_validator("cors_origins", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return (
+            [part.strip() for part in value.split(",") if part.strip()]
+            if isinstance(value, str)
+            else value
+        )
 
     @field_validator("data_folder")
     @classmethod

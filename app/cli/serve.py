@@ -1,5 +1,6 @@
 """`amers serve`: the API and one worker."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from typing import Annotated
 import typer
 import uvicorn
 
+from app import logs
 from app.config import Settings, read_settings
 from app.db import embedded, engine
 
@@ -24,7 +26,11 @@ if os.getppid() == int(sys.argv.pop()):
 FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 60.0
 STOP_SECONDS = 20.0
+DRAIN_SECONDS = 30
+"""Requests under way when the service is told to end have so long to be answered."""
 WATCH_S = 2.0
+
+log = logging.getLogger(__name__)
 
 
 def serve(
@@ -34,6 +40,7 @@ def serve(
 ) -> None:
     """Run the API and one worker, until Ctrl-C."""
     settings = read_settings()
+    logs.configure(settings)
     with embedded.database(settings) as dsn:
         engine.ensure_schema(dsn, upgradable=settings.database_url is None)
         command = (sys.executable, "-c", WORKER, "worker", str(os.getpid()))
@@ -43,6 +50,10 @@ def serve(
                 factory=True,
                 host=host or settings.host,
                 port=port or settings.port,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                timeout_graceful_shutdown=DRAIN_SECONDS,
             )
 
 
@@ -56,7 +67,7 @@ def watched(settings: Settings) -> Iterator[None]:
             try:
                 embedded.revive(settings)
             except Exception as error:
-                typer.echo(f"amers: {error}", err=True)
+                log.error("the database could not be started again: %s", error)
 
     watcher = threading.Thread(target=watch, name="database-watcher")
     watcher.start()
@@ -92,9 +103,7 @@ def _keep_running(command: tuple[str, ...], stop: threading.Event) -> None:
         if stop.is_set():
             break
         pause_s = FIRST_PAUSE_S if lived_s > LONGEST_PAUSE_S else min(2 * pause_s, LONGEST_PAUSE_S)
-        typer.echo(
-            f"amers: the worker ended ({process.returncode}), next one in {pause_s:.0f} s", err=True
-        )
+        log.error("the worker ended (%d), next one in %.0f s", process.returncode, pause_s)
         stop.wait(pause_s)
 
 

@@ -1,5 +1,6 @@
 """Connections, pools and the version of the schema."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import psycopg
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import ConnectionPool
 
+from app import origin
 from app.config import Settings
 from app.db import embedded
 from app.errors import InputError
@@ -18,7 +20,12 @@ from app.errors import InputError
 Connection = psycopg.Connection[DictRow]
 Pool = ConnectionPool[Connection]
 
+READER = "amers_reader"
+"""Role of the connections that answer reading requests: it can do nothing but select."""
 FIRST_SPATIAL_PLAN = "select st_asgeojson(st_makepoint(0, 0, 0)), 1 from point where false"
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class Database:
     def transaction(self) -> Iterator[Connection]:
         """One transaction, committed at the end of the context, rolled back by an exception."""
         with self.writer.connection() as connection:
+            say_origin(connection)
             yield connection
 
 
@@ -80,6 +88,10 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
     """Pools on a database, whatever its schema."""
     limit_ms = round(1000 * settings.read_timeout_seconds)
     reading = f"-c default_transaction_read_only=on -c statement_timeout={limit_ms}"
+    if _may_read_as_reader(dsn):
+        reading += f" -c role={READER}"
+    else:
+        log.warning("reading as the role of the database's owner: there is no usable %s", READER)
     with (
         _pool(dsn, settings.pool_size, {"options": reading}) as reader,
         _pool(dsn, settings.pool_size, {}) as writer,
@@ -91,7 +103,23 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
 def connect(dsn: str) -> Iterator[Connection]:
     """A connection without a pool: one transaction, committed at the end of the context."""
     with _reachable(dsn) as connection:
+        say_origin(connection)
         yield connection
+
+
+def say_origin(connection: Connection) -> None:
+    """Tell the transaction who is behind it, for the record of changes."""
+    where = origin.current()
+    connection.execute(
+        """select set_config('amers.actor', %s, true), set_config('amers.actor_name', %s, true),
+                  set_config('amers.request_id', %s, true), set_config('amers.job_id', %s, true)""",
+        [
+            str(where.actor or ""),
+            where.actor_name,
+            where.request_id or "",
+            str(where.job_id or ""),
+        ],
+    )
 
 
 def status(dsn: str) -> SchemaStatus:
@@ -143,6 +171,7 @@ def upgrade(dsn: str) -> None:
     config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
     config.attributes["dsn"] = dsn
     command.upgrade(config, "head")
+    _grant_reading(dsn)
 
 
 def migrations_folder() -> Path:
@@ -153,6 +182,42 @@ def migrations_folder() -> Path:
 def newest_revision() -> str:
     """The revision this Amers needs; migrations are named `REVISION_what_it_does.py`, in order."""
     return max(path.name.split("_")[0] for path in (migrations_folder() / "versions").glob("[0-9]*.py"))
+
+
+def _grant_reading(dsn: str) -> None:
+    """Let the reading role read all tables, those of later migrations too.
+
+    Roles belong to the cluster, not to the database: this is no migration, and a restore does it again.
+    Where the owner of the database may not make roles, reading goes on as the owner, still read-only.
+    """
+    with _reachable(dsn) as connection:
+        connection.execute(
+            f"""do $$ begin
+                begin
+                    create role {READER} nologin;
+                exception when duplicate_object or unique_violation then null;
+                end;
+                if not pg_has_role('{READER}', 'member') then
+                    execute format('grant {READER} to %I', current_user);
+                end if;
+                grant usage on schema public to {READER};
+                grant select on all tables in schema public to {READER};
+                alter default privileges in schema public grant select on tables to {READER};
+            exception when insufficient_privilege then
+                raise notice 'no role {READER}: %', sqlerrm;
+            end $$"""
+        )
+
+
+def _may_read_as_reader(dsn: str) -> bool:
+    with _reachable(dsn) as connection:
+        row = connection.execute(
+            """select from pg_roles where rolname = %(role)s
+                and pg_has_role(current_user, oid, 'member')
+                and has_table_privilege(oid, to_regclass('block'), 'select')""",
+            {"role": READER},
+        ).fetchone()
+    return row is not None
 
 
 def _pool(dsn: str, size: int, options: dict[str, Any]) -> Pool:

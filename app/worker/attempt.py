@@ -22,6 +22,7 @@ from app.config import Settings
 from app.db import jobs
 from app.db.engine import Database
 from app.db.jobs import Job, LostJob
+from app.origin import Origin, working_for
 from app.storage import UNFINISHED
 
 FAILURES_ALLOWED = 3
@@ -71,6 +72,10 @@ class Attempts:
 
     def do_job(self, job_id: UUID) -> None:
         """Claim a job and see one attempt at it through; does nothing when it is not to be had."""
+        with working_for(Origin(actor_name=f"worker {self.worker}", job_id=job_id)):
+            self._do_job(job_id)
+
+    def _do_job(self, job_id: UUID) -> None:
         with self.database.transaction() as connection:
             job = jobs.claim(connection, job_id, self.worker, self.settings.lease_seconds)
         if job is None:

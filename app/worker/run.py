@@ -16,9 +16,11 @@ from uuid import UUID
 
 import cv2
 
+from app import logs
 from app.config import read_settings
 from app.db.engine import pooled
 from app.db.jobs import LostJob
+from app.origin import Origin, working_for
 from app.usecases.jobs import do_attempt
 from app.worker.attempt import OUT_OF_MEMORY
 
@@ -32,11 +34,12 @@ def main(arguments: list[str]) -> int:
     """Do the attempt and return the exit code."""
     job_id, attempt, worker_pid, memory_bytes = arguments
     die_with(int(worker_pid))
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     settings = read_settings()
+    logs.configure(settings)
     assert settings.database_url is not None, "the worker names its database"
+    doing = Origin(actor_name=f"worker {worker_pid}", job_id=UUID(job_id))
     try:
-        with pooled(settings.database_url.get_secret_value(), settings) as database:
+        with working_for(doing), pooled(settings.database_url.get_secret_value(), settings) as database:
             limit_memory(int(memory_bytes))
             do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:

@@ -109,6 +109,33 @@ def test_reading_connections_can_neither_write_nor_take_too_long(dsn, tmp_path):
             connection.execute("select pg_sleep(5)")
 
 
+def test_reading_connections_have_a_role_that_can_only_select(dsn, tmp_path):
+    settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path)
+    with engine.opened(settings) as database:
+        with database.reading() as connection:
+            assert connection.execute("select current_user as me").fetchone()["me"] == engine.READER
+            assert connection.execute("select count(*) as n from audit").fetchone()["n"] == 0
+        forbidden = (
+            "select pg_read_file('/etc/passwd')",
+            "copy (select 1) to program 'true'",
+            "select lo_import('/etc/passwd')",
+        )
+        for statement in forbidden:
+            with (
+                pytest.raises(
+                    (psycopg.errors.InsufficientPrivilege, psycopg.errors.ReadOnlySqlTransaction)
+                ),
+                database.reading() as connection,
+            ):
+                connection.execute(statement)
+        with (
+            pytest.raises(psycopg.errors.InsufficientPrivilege),
+            database.reading() as connection,
+        ):
+            connection.execute("set transaction read write")
+            connection.execute("delete from token")
+
+
 def test_a_transaction_is_kept_whole_or_not_at_all(dsn, tmp_path):
     settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path)
     with engine.opened(settings) as database:
