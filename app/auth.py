@@ -16,12 +16,14 @@ class Scope(StrEnum):
 
     READ = "read"
     REGISTER = "register"
+    MONITOR = "monitor"
     ADMIN = "admin"
 
 
 INCLUDED = {
     Scope.READ: frozenset({Scope.READ}),
     Scope.REGISTER: frozenset({Scope.READ, Scope.REGISTER}),
+    Scope.MONITOR: frozenset({Scope.MONITOR}),
     Scope.ADMIN: frozenset(Scope),
 }
 

@@ -11,6 +11,7 @@ from app.errors import Conflict, InputError, NotFound
 
 LONGEST_DAYS = 36_500
 LONGEST_NAME = 200
+LARGEST_QUOTA = {"upload_quota_bytes": 2**62, "job_quota": 1_000_000}
 
 
 @dataclass(frozen=True)
@@ -22,24 +23,41 @@ class NewToken:
 
 
 def create_token(
-    connection: Connection, name: str, scopes: Iterable[str], days: int | None = None
+    connection: Connection,
+    name: str,
+    scopes: Iterable[str],
+    days: int | None = None,
+    upload_quota_bytes: int | None = None,
+    job_quota: int | None = None,
 ) -> NewToken:
     """Make a token.
 
     Args:
         name: for people, need not be unique.
-        scopes: one or more of `read`, `register`, `admin`.
+        scopes: one or more of `read`, `register`, `monitor`, `admin`.
         days: how long it is valid; None for ever.
+        upload_quota_bytes, job_quota: what it may have at once; None: as much as the settings say.
 
     Raises:
-        InputError: no name, an unknown scope or none, or a number of days that makes no sense.
+        InputError: no name, an unknown scope or none, or a number that makes no sense.
     """
     if not 0 < len(name.strip()) <= LONGEST_NAME:
         raise InputError(f"the name of a token has 1 to {LONGEST_NAME} characters")
     if days is not None and not 1 <= days <= LONGEST_DAYS:
         raise InputError(f"a token is valid for 1 to {LONGEST_DAYS} days, {days} asked for")
+    for field, quota in (("upload_quota_bytes", upload_quota_bytes), ("job_quota", job_quota)):
+        if quota is not None and not 0 <= quota <= LARGEST_QUOTA[field]:
+            raise InputError(f"{field}: {quota} found, 0 to {LARGEST_QUOTA[field]} expected")
     secret = new_secret()
-    token = tokens.insert_token(connection, name.strip(), secret_hash(secret), _known(scopes), days)
+    token = tokens.insert_token(
+        connection,
+        name.strip(),
+        secret_hash(secret),
+        _known(scopes),
+        days,
+        upload_quota_bytes,
+        job_quota,
+    )
     return NewToken(token, secret)
 
 
@@ -69,6 +87,6 @@ def _known(scopes: Iterable[str]) -> tuple[str, ...]:
     unknown = asked - set(Scope)
     if unknown or not asked:
         raise InputError(
-            f"scopes are read, register, admin; asked for: {', '.join(sorted(asked)) or 'none'}"
+            f"scopes are {', '.join(Scope)}; asked for: {', '.join(sorted(asked)) or 'none'}"
         )
     return tuple(str(scope) for scope in Scope if scope in asked)

@@ -15,7 +15,8 @@ from app.usecases.tokens import create_token, list_tokens, revoke_token
 ALLOWED = {
     "read": {Scope.READ},
     "register": {Scope.READ, Scope.REGISTER},
-    "admin": {Scope.READ, Scope.REGISTER, Scope.ADMIN},
+    "monitor": {Scope.MONITOR},
+    "admin": {Scope.READ, Scope.REGISTER, Scope.MONITOR, Scope.ADMIN},
 }
 
 
