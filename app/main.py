@@ -6,12 +6,25 @@ from importlib.metadata import version
 
 from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware.cors import CORSMiddleware
 
-from app.api import blocks, collections, jobs, points, processes, replies, scenes, system
+from app.api import (
+    blocks,
+    collections,
+    jobs,
+    operations,
+    points,
+    processes,
+    replies,
+    scenes,
+    system,
+    tokens,
+)
 from app.api.body import BodyLimit
+from app.api.watch import RequestMetrics, Watch
 from app.config import Settings, read_settings
 from app.db import engine
-from app.storage import Storage, StoredChips
+from app.storage import StoredChips, open_storage
 from app.web import page
 
 DESCRIPTION = (
@@ -26,7 +39,36 @@ ROUTERS: tuple[APIRouter, ...] = (
     scenes.router,
     processes.router,
     jobs.router,
+    tokens.router,
+    operations.router,
     page.router,
+)
+
+CORS_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
+CORS_HEADERS = (
+    "Authorization",
+    "Content-Type",
+    "Idempotency-Key",
+    "Prefer",
+    "Tus-Resumable",
+    "Upload-Checksum",
+    "Upload-Length",
+    "Upload-Metadata",
+    "Upload-Offset",
+    "X-Checksum",
+    "X-Request-ID",
+)
+CORS_EXPOSED = (
+    "Content-Crs",
+    "Content-Disposition",
+    "Link",
+    "Location",
+    "Retry-After",
+    "Tus-Resumable",
+    "Upload-Expires",
+    "Upload-Length",
+    "Upload-Offset",
+    "X-Request-ID",
 )
 
 
@@ -39,7 +81,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         opening = engine.opened(chosen)
         app.state.settings = chosen
         app.state.database = await run_in_threadpool(opening.__enter__)
-        app.state.storage = Storage(chosen.data_folder / "storage")
+        app.state.storage = open_storage(chosen)
         app.state.chips = StoredChips(app.state.storage)
         try:
             yield
@@ -60,6 +102,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(
         BodyLimit, limit_bytes=chosen.body_limit_bytes, upload_limit_bytes=chosen.upload_limit_bytes
     )
+    app.add_middleware(
+        CORSMiddleware,
+        allow_origins=chosen.cors_origins,
+        allow_methods=CORS_METHODS,
+        allow_headers=CORS_HEADERS,
+        expose_headers=CORS_EXPOSED,
+    )
+    app.state.metrics = RequestMetrics()
+    app.add_middleware(Watch, metrics=app.state.metrics)
     replies.install(app)
     for router in ROUTERS:
         app.include_router(router)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from fastapi import Depends, Header, Request
 
+from app import origin
 from app.auth import Scope, authenticate, require
 from app.config import Settings
 from app.db.engine import Connection, Database
@@ -44,14 +45,8 @@ def _reading(database: DatabaseDep) -> Iterator[Connection]:
         yield connection
 
 
-def _transaction(database: DatabaseDep) -> Iterator[Connection]:
-    with database.transaction() as connection:
-        yield connection
-
-
 # Scope "function": committed before the reply is sent, so that a commit that fails is an error reply.
 ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
-WriteConnection = Annotated[Connection, Depends(_transaction, scope="function")]
 
 
 def _caller(
@@ -64,10 +59,22 @@ def _caller(
     if kind.lower() != "bearer" or not secret.strip():
         raise NotAllowed("the Authorization header must read `Bearer TOKEN`", known=False)
     with database.reading() as connection:
-        return authenticate(connection, secret.strip())
+        caller = authenticate(connection, secret.strip())
+    here = origin.current()
+    here.actor, here.actor_name = caller.id, caller.name
+    return caller
 
 
 CallerDep = Annotated[Token | None, Depends(_caller)]
+
+
+def _transaction(database: DatabaseDep, caller: CallerDep) -> Iterator[Connection]:
+    """A transaction that begins when it is known who calls: the record of changes says so."""
+    with database.transaction() as connection:
+        yield connection
+
+
+WriteConnection = Annotated[Connection, Depends(_transaction, scope="function")]
 
 
 def _reader(caller: CallerDep) -> Token:
@@ -89,7 +96,15 @@ def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
     return require(caller, Scope.READ)
 
 
+def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
+    """Anybody where metrics are public, else a caller with scope `monitor`."""
+    if caller is None and settings.public_metrics:
+        return None
+    return require(caller, Scope.MONITOR)
+
+
 Reader = Annotated[Token, Depends(_reader)]
 Registrar = Annotated[Token, Depends(_registrar)]
 Admin = Annotated[Token, Depends(_admin)]
+MetricsReader = Annotated[Token | None, Depends(_metrics_reader)]
 PointsReader = Annotated[Token | None, Depends(_points_reader)]
