@@ -123,8 +123,9 @@ class Terrain:
         places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         undulation = self.geoid(self.grid.lon_lat(places))
         # Between the places looked at the geoid rises and falls by less than it does among them.
-        margin = float(np.ptp(undulation)) / 8.0 + 0.1
-        return low + float(undulation.min()) - margin, high + float(undulation.max()) + margin
+        lowest, highest = float(np.nanmin(undulation)), float(np.nanmax(undulation))
+        margin = (highest - lowest) / 8.0 + 0.1
+        return low + lowest - margin, high + highest + margin
 
     def _pieces(self, position: Array) -> Iterator[tuple[Window, IntArray]]:
         """Windows of the grid and the rows of the positions each of them serves."""

@@ -13,12 +13,14 @@ import numpy as np
 import numpy.typing as npt
 import rasterio
 import rasterio.rpc
+from pyproj.exceptions import ProjError
 from rasterio.enums import MaskFlags
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
 from services.imagery import Window
+from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
 from services.types import FloatImage
 
@@ -36,6 +38,8 @@ DRIVER_OF_SIGNATURE = {
     b"NSIF": "NITF",
 }
 """The drivers that may open a file, by its first bytes; no other driver is ever asked."""
+GDAL_FIRST_PIXEL = 0.5
+"""Line and sample GDAL gives to the centre of the first pixel."""
 MAX_PIXELS = 40_000_000_000
 """Pixels an image may declare: twice a strip of 40,000 samples and 500,000 lines."""
 MAX_EXPANSION = 5_000
@@ -48,6 +52,7 @@ _OPTIONS = _CACHE | {
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_NUM_THREADS": 1,
     "OPJ_NUM_THREADS": 1,
+    "GTIFF_REPORT_COMPD_CS": "YES",
 }
 
 
@@ -132,6 +137,30 @@ def open_raster(path: Path, band: int = 1) -> RasterImage:
             dataset.close()
             raise
     return image
+
+
+def map_grid_of(image: RasterImage) -> MapGrid | None:
+    """Where the pixels lie on a map, when the file says so itself; None when it does not.
+
+    Raises:
+        FormatError: when it says so in a way that cannot be used.
+    """
+    t = image.dataset.transform
+    if image.dataset.crs is None or t.is_identity:
+        return None
+    crs = image.dataset.crs.to_wkt(version="WKT2_2019")
+    step_xy = np.array([[t.b, t.a], [t.e, t.d]])
+    origin_xy = np.array([t.c, t.f]) + step_xy @ [GDAL_FIRST_PIXEL, GDAL_FIRST_PIXEL]
+    grid = MapGrid(crs, origin_xy, step_xy, image.shape)
+    if not abs(np.linalg.det(step_xy)) > 0.0:
+        raise FormatError(f"{image.path}: its geotransform {tuple(t)[:6]} lays all pixels on a line")
+    try:
+        found = grid.lon_lat((np.array([image.shape], dtype=np.float64) - 1.0) / 2.0)
+    except ProjError as error:
+        raise FormatError(f"{image.path}: its reference system leads to no place: {error}") from error
+    if not np.isfinite(found).all():
+        raise FormatError(f"{image.path}: its centre is nowhere on the Earth in {crs[:60]}…")
+    return grid
 
 
 def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:

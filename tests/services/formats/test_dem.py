@@ -1,0 +1,234 @@
+"""Terrain out of files: no height without its datum, no void taken for a height."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
+from rasterio.transform import from_origin
+
+from services.errors import CoverageError, FormatError, VerticalDatumError
+from services.formats.dem import FilledVoids, read_dem
+from services.formats.geoid import geoid_of_grid
+from services.imagery import ArrayImage, Window
+from services.terrain import Terrain
+
+a_millimetre = 1e-3
+a_decimetre = 0.1
+between_nodes_of_15_arc_minutes_m = 0.5
+
+SHAPE = (60, 80)
+HEIGHTS = (500.0 + 3.0 * np.indices(SHAPE)[0] - 2.0 * np.indices(SHAPE)[1]).astype(np.float32)
+
+
+def write_dem(
+    path: Path, crs: str = "EPSG:32631", heights: np.ndarray = HEIGHTS, **options: object
+) -> Path:
+    transform = from_origin(7e5, 4.8e6, 30.0, 30.0)
+    if crs.startswith(("EPSG:4326", "EPSG:4979")):
+        transform = from_origin(5.0, 44.0, 0.001, 0.001)
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=heights.shape[0],
+        width=heights.shape[1],
+        count=1,
+        dtype=heights.dtype,
+        crs=crs,
+        transform=transform,
+        **options,
+    ) as file:
+        file.write(heights, 1)
+    return path
+
+
+def write_geoid(path: Path, west: float = 0.0, south: float = 40.0, slope: float = 0.5) -> Path:
+    """A geoid of 40 m in the south-west that rises to the north and to the east."""
+    rows, columns, step = 41, 41, 0.25
+    row, column = np.indices((rows, columns))
+    values = (40.0 + slope * step * row + 2.0 * slope * step * column).astype(">f4")
+    path.write_bytes(struct.pack(">4d2i", south, west, step, step, rows, columns) + values.tobytes())
+    return path
+
+
+def undulation(lon_lat: np.ndarray) -> np.ndarray:
+    return 40.0 + 0.5 * (lon_lat[:, 1] - 40.0) + lon_lat[:, 0]
+
+
+def nodes(terrain: Terrain) -> np.ndarray:
+    position = np.random.default_rng(1).integers(1, 59, (20, 2)).astype(np.float64)
+    return terrain.grid.lon_lat(position)
+
+
+def test_heights_above_the_ellipsoid_are_read_as_they_are(tmp_path: Path) -> None:
+    terrain = read_dem(write_dem(tmp_path / "a.tif"), "ellipsoid")
+    position = np.array([[0.0, 0.0], [10.5, 20.25], [59.0, 79.0]])
+    expected = 500.0 + 3.0 * position[:, 0] - 2.0 * position[:, 1]
+    found = terrain.height_m(terrain.grid.lon_lat(position))
+    np.testing.assert_allclose(found, expected, atol=a_millimetre)
+    # GDAL's corner of the first pixel lies half a step before the first node.
+    np.testing.assert_allclose(terrain.grid.origin_xy, [7e5 + 15.0, 4.8e6 - 15.0])
+    assert terrain.posting_m == pytest.approx(30.0, rel=1e-3)
+
+
+def test_a_file_that_does_not_say_its_datum_is_refused_until_the_caller_does(tmp_path: Path) -> None:
+    path = write_dem(tmp_path / "a.tif")
+    with pytest.raises(VerticalDatumError, match=r"a\.tif.*does not say"):
+        read_dem(path)
+    assert "by the caller" in read_dem(path, "ellipsoid").vertical
+
+
+def test_a_file_with_three_axes_has_ellipsoidal_heights(tmp_path: Path) -> None:
+    terrain = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4979"))
+    assert terrain.vertical == "metres above the ellipsoid, by the file"
+    assert terrain.geoid is None
+
+
+def test_a_geoid_grid_lifts_the_heights_the_file_counts_from_it(tmp_path: Path) -> None:
+    grid = write_geoid(tmp_path / "geoid of a place.gtx")
+    terrain = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"), geoid=grid)
+    above = read_dem(write_dem(tmp_path / "b.tif", "EPSG:4326"), "ellipsoid")
+    expected = above.height_m(nodes(above)) + undulation(nodes(above))
+    np.testing.assert_allclose(terrain.height_m(nodes(above)), expected, atol=a_millimetre)
+    assert terrain.vertical == "EGM96 height by the file, from geoid of a place.gtx"
+    low, high = terrain.range_m()
+    assert low <= expected.min()
+    assert high >= expected.max()
+
+
+def test_heights_in_feet_become_metres(tmp_path: Path) -> None:
+    grid = write_geoid(tmp_path / "geoid.gtx")
+    feet = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4326+8228"), geoid=grid)
+    above = read_dem(write_dem(tmp_path / "b.tif", "EPSG:4326"), "ellipsoid")
+    expected = 0.3048 * above.height_m(nodes(above)) + undulation(nodes(above))
+    np.testing.assert_allclose(feet.height_m(nodes(above)), expected, atol=a_millimetre)
+
+
+def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> None:
+    """Unless PROJ has been given the grid on this machine, which then gives what the grid gives."""
+    path = write_dem(tmp_path / "a.tif")
+    try:
+        terrain = read_dem(path, "EGM96")
+    except VerticalDatumError as error:
+        assert "us_nga_egm96_15.tif" in str(error)  # noqa: PT017 - either is right
+    else:
+        assert terrain.height_m(nodes(terrain))[0] - HEIGHTS.max() + np.ptp(HEIGHTS) + 1.0 > 40.0
+
+
+@pytest.mark.parametrize(
+    ("crs", "said", "grid", "expected"),
+    [
+        ("EPSG:4326+5773", "ellipsoid", False, "from EGM96 height, and the ellipsoid was given"),
+        ("EPSG:4979", "EGM96", False, "from the ellipsoid, and EGM96 height was given"),
+        ("EPSG:4979", None, True, "need no geoid"),
+        ("EPSG:4326", "ellipsoid", True, "need no geoid"),
+        ("EPSG:4326", "mean sea level", False, "expected ellipsoid"),
+        ("EPSG:4326+6357", None, True, "found depths"),
+    ],
+)
+def test_contradictions_about_the_datum_are_refused(
+    tmp_path: Path, crs: str, said: str | None, grid: bool, expected: str
+) -> None:
+    geoid = write_geoid(tmp_path / "geoid.gtx") if grid else None
+    with pytest.raises(VerticalDatumError, match=expected):
+        read_dem(write_dem(tmp_path / "a.tif", crs), said, geoid)
+
+
+def test_a_geoid_of_elsewhere_is_refused(tmp_path: Path) -> None:
+    grid = write_geoid(tmp_path / "geoid.gtx", west=100.0)
+    with pytest.raises(CoverageError, match="does not reach"):
+        read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
+
+
+@given(cut=st.integers(0, 6700), start=st.integers(0, 60), noise=st.binary(min_size=1, max_size=40))
+def test_a_damaged_geoid_is_refused_or_is_one(
+    tmp_path_factory: pytest.TempPathFactory, cut: int, start: int, noise: bytes
+) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    whole = write_geoid(folder / "geoid.gtx").read_bytes()
+    for name, data in (
+        ("cut.gtx", whole[:cut]),
+        ("bad.gtx", whole[:start] + noise + whole[start + len(noise) :]),
+    ):
+        (folder / name).write_bytes(data)
+        try:
+            geoid = geoid_of_grid(folder / name)
+        except VerticalDatumError:
+            continue
+        heights = geoid(np.array([[2.0, 41.0], [9.0, 49.0]]))
+        assert heights.shape == (2,)
+
+
+def test_an_image_without_a_place_is_no_terrain(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with rasterio.open(path, "w", driver="GTiff", height=9, width=9, count=1, dtype="int16") as file:
+        file.write(np.ones((9, 9), np.int16), 1)
+    with pytest.raises(FormatError, match="no reference system"):
+        read_dem(path, "ellipsoid")
+
+
+def test_voids_are_voids_whether_declared_or_not(tmp_path: Path) -> None:
+    heights = HEIGHTS.astype(np.int16)
+    heights[10, 10], heights[20, 20], heights[30, 30], heights[40, 40] = -32768, -9999, 32767, 77
+    terrain = read_dem(write_dem(tmp_path / "a.tif", heights=heights, nodata=77), "ellipsoid")
+    void = np.array([[10.0, 10.0], [20.0, 20.0], [30.0, 30.0], [40.0, 40.0]])
+    assert np.isnan(terrain.height_m(terrain.grid.lon_lat(void))).all()
+    assert terrain.range_m() == (float(HEIGHTS.min()), float(HEIGHTS.max()))
+
+
+def test_scaled_heights_are_scaled(tmp_path: Path) -> None:
+    path = write_dem(tmp_path / "a.tif", heights=(HEIGHTS * 10.0).astype(np.int16))
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (0.1,), (5.0,)
+    terrain = read_dem(path, "ellipsoid")
+    low, high = terrain.range_m()
+    assert (low, high) == pytest.approx((HEIGHTS.min() + 5.0, HEIGHTS.max() + 5.0), abs=a_decimetre)
+
+
+def test_filled_voids_do_not_depend_on_the_window_they_are_read_in() -> None:
+    rng = np.random.default_rng(3)
+    heights = HEIGHTS.copy()
+    heights[rng.random(SHAPE) < 0.2] = np.nan
+    heights[20:45, 30:60] = np.nan
+    filled = FilledVoids(ArrayImage(heights), 5)
+    whole = filled.read(Window(0, 0, *SHAPE))
+    known = np.isfinite(heights)
+    np.testing.assert_array_equal(whole[known], heights[known])
+    part = filled.read(Window(15, 25, 20, 30))
+    np.testing.assert_allclose(part, whole[15:35, 25:55], atol=a_millimetre)
+    assert np.isnan(whole[30:35, 40:50]).all()
+    assert np.isfinite(whole[:15]).all()
+    # Filled from within 5 nodes of a plane that rises by 3.6 m a node.
+    assert np.nanmax(np.abs(whole - HEIGHTS)) < 5 * 3.61
+    assert np.isnan(filled.read(Window(-3, -3, 3, 3))).all()
+
+
+@pytest.mark.real_data
+def test_the_egm96_grid_gives_the_values_its_makers_published(real_data: Path) -> None:
+    """Source: NGA, test values of EGM96 beside its programme F477."""
+    published = np.array(
+        [
+            [-90.2208450, 38.6281550, -31.628],
+            [-54.9788860, -14.6212170, -2.969],
+            [102.4487290, 46.8743190, -43.575],
+            [133.8747120, -23.6174460, 15.871],
+            [-0.0005000, 38.6254730, 50.066],
+            [0.0023000, -0.4667440, 17.329],
+        ]
+    )
+    found = geoid_of_grid(real_data / "geoid" / "egm96_15.gtx")(published[:, :2])
+    np.testing.assert_allclose(found, published[:, 2], atol=between_nodes_of_15_arc_minutes_m)
+
+
+@pytest.mark.real_data
+def test_srtm_heights_of_the_ventoux_rise_by_its_geoid(real_data: Path) -> None:
+    path = real_data / "phr_ventoux_pair" / "dem" / "N44E005_UTM.tif"
+    summit = np.array([[5.2786, 44.1741]])
+    above_geoid = read_dem(path, "ellipsoid").height_m(summit)
+    terrain = read_dem(path, "EGM96", real_data / "geoid" / "egm96_15.gtx")
+    assert 1850.0 < above_geoid[0] < 1920.0
+    assert terrain.height_m(summit)[0] - above_geoid[0] == pytest.approx(51.0, abs=1.0)
