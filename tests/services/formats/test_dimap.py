@@ -72,10 +72,10 @@ def locate_by_direct_model(text: str, line_sample: Array, height_m: Array) -> Ar
     return np.column_stack(sides)
 
 
-def contradiction_px(text: str) -> float:
-    """Distance in the image between a document's two models."""
+def contradiction_px(text: str, over: RpcModel = MODEL) -> float:
+    """Distance in the image between a document's two models, over the range of one."""
     model = parse_dimap_rpc(text)
-    ground = ground_of(MODEL)
+    ground = ground_of(over)
     line_sample = model.project(ground)
     back = np.column_stack([locate_by_direct_model(text, line_sample, ground[:, 2]), ground[:, 2]])
     return float(np.abs(model.project(back) - line_sample).max())
@@ -200,3 +200,16 @@ def test_a_product_document_tells_sensor_time_and_sun_at_the_centre() -> None:
 def test_an_rpc_document_tells_the_family_of_the_sensor_only() -> None:
     told = parse_dimap_acquisition(V3, "image")
     assert (told.sensor, told.acquired_at) == ("PNEO", None)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("folder", ["phr_rpc_only/calanques", "phr_rpc_only/toulouse"])
+def test_a_delivered_document_keeps_its_two_directions_together(real_data: Path, folder: str) -> None:
+    path = sorted((real_data / folder).glob("RPC*.XML"))[0]
+    text = path.read_text()
+    own = parse_dimap_rpc(text)
+    mixed = replace(own, line_num=own.line_num + 1e-4 * own.sample_num)
+    written = format_dimap_rpc(text, mixed)
+    delivered_px, written_px = contradiction_px(text, own), contradiction_px(written, own)
+    assert written_px < a_hundredth_of_a_pixel
+    assert written_px < 2.0 * delivered_px + 0.001
