@@ -10,7 +10,7 @@ from app.cli.progress import shown_progress
 from app.cli.store import transaction
 from app.config import read_settings
 from app.db.blocks import Block
-from app.storage import Storage
+from app.storage import open_storage
 from app.usecases import blocks
 from services.quality.block import BlockQuality, Distribution, quality_document
 
@@ -27,7 +27,7 @@ def ingest(
 ) -> None:
     """Check a block entirely and load it, staged."""
     settings = read_settings()
-    storage = Storage(settings.data_folder / "storage")
+    storage = open_storage(settings)
     with transaction(settings) as connection:
         with shown_progress() as progress:
             ingested = blocks.ingest_block(connection, storage, path, progress)

@@ -13,7 +13,7 @@ from app.cli.remote import Service, ServiceFailure
 from app.config import read_settings
 from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
-from app.storage import Storage
+from app.storage import open_storage
 from app.usecases.registration import (
     SceneFiles,
     points_of_block,
@@ -111,7 +111,7 @@ def _on_block(block: Path) -> Register:
 def _on_store() -> Iterator[Register]:
     """Registers with the points of the store, which remembers the registration and its measures."""
     settings = read_settings()
-    storage = Storage(settings.data_folder / "storage")
+    storage = open_storage(settings)
     with engine.opened(settings) as database:
 
         def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from app.config import Settings
 from app.db import engine
-from app.storage import Storage
+from app.storage import open_storage
 from app.usecases import blocks
 from app.usecases.production import BlockIdentity, run_production
 from app.usecases.registration import SceneFiles, points_of_store, record, run_registration
@@ -121,7 +121,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
         sigma_m=options.block_error_m,
         progress=part_of(progress, 0.3, 0.4),
     )
-    storage = Storage(settings.data_folder / "storage")
+    storage = open_storage(settings)
     with engine.opened(settings) as database:
         progress(0.7, "ingesting the block")
         with database.transaction() as connection:

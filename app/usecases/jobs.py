@@ -17,7 +17,7 @@ from app.db.engine import Connection, Database
 from app.db.jobs import Job, LostJob
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NotFound
-from app.storage import Storage
+from app.storage import Storage, open_storage
 from app.usecases.block_ingestion import INGEST_BLOCK
 from app.usecases.processes import Process, Work
 from app.usecases.registration import REGISTER_SCENE
@@ -127,7 +127,7 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
     if job is None or (job.attempt, job.state) != (attempt, "running"):
         raise LostJob(f"attempt {attempt} of job {job_id} is over")
     process = find_process(job.kind)
-    storage = Storage(settings.data_folder / "storage")
+    storage = open_storage(settings)
     try:
         inputs = process.parse_inputs(job.inputs)
         progress = _ReportedProgress(database, job)

@@ -17,7 +17,7 @@ import psycopg
 from app.config import Settings
 from app.db import engine, jobs
 from app.db.engine import Database
-from app.storage import Storage
+from app.storage import open_storage
 from app.worker.attempt import Attempts
 from app.worker.sweep import Sweeper
 
@@ -38,7 +38,7 @@ def run_worker(settings: Settings) -> None:
 
 @contextmanager
 def _sweeping(database: Database, settings: Settings, stop: threading.Event) -> Iterator[None]:
-    storage = Storage(settings.data_folder / "storage")
+    storage = open_storage(settings)
     sweeper = threading.Thread(target=Sweeper(database, storage, settings, stop).run, name="sweeper")
     sweeper.start()
     try:

@@ -208,7 +208,7 @@ def test_a_file_that_is_not_of_chips_is_refused(storage, stored_chips, content):
 
 
 def test_more_files_than_may_be_open_are_read_by_many_threads(storage, stored_chips, monkeypatch):
-    monkeypatch.setattr("app.storage.OPEN_CHIP_FILES", 2)
+    monkeypatch.setattr("app.storage.chips.OPEN_CHIP_FILES", 2)
     for number in range(6):
         storage.put(f"chips/{number}.npy", [npy(np.full((4, CHIP_SIZE, CHIP_SIZE), number, np.uint8))])
 

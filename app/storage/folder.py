@@ -4,26 +4,17 @@ import hashlib
 import os
 import re
 import shutil
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkstemp
-from typing import Any, BinaryIO
-
-import numpy as np
-import numpy.typing as npt
-from numpy.lib import format as npy
+from typing import BinaryIO, Protocol
 
 from app.errors import InputError, NotFound, TooLarge
-from services.conventions import CHIP_SIZE
-from services.errors import FormatError
 
 UNFINISHED = "unfinished"
-OPEN_CHIP_FILES = 64
 COPY_BYTES = 1 << 20
 KEY = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
@@ -39,6 +30,16 @@ class StoredFile:
     key: str
     size_bytes: int
     sha256: str
+
+
+class RangeReader(Protocol):
+    """An open file of the storage that is read by position; safe to share between threads."""
+
+    def read(self, start: int, length: int) -> bytes:
+        """So many bytes from a position; fewer at the end of the file."""
+
+    def close(self) -> None:
+        """Let go of the file."""
 
 
 class Writing:
@@ -70,17 +71,11 @@ class Writing:
         """Checksum of what was written so far, in hexadecimal."""
         return self._hash.hexdigest()
 
-    def place(self, path: Path) -> None:
-        """Give the file its name once its bytes are on the disk."""
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    def finish(self) -> Path:
+        """The file, once all its bytes are on the disk."""
         self._file.flush()
         os.fsync(self._file.fileno())
-        self._path.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        return self._path
 
 
 @dataclass(frozen=True)
@@ -96,10 +91,10 @@ class Storage:
     @contextmanager
     def writing(self, key: str, limit_bytes: int | None = None) -> Iterator[Writing]:
         """Write a file piece by piece; it takes its place at the end, or vanishes by an exception."""
-        path = self._locate(key)
+        self._locate(key)
         with self._unfinished(limit_bytes) as writing:
             yield writing
-            writing.place(path)
+            self._place(writing.finish(), key)
 
     def put(self, key: str, chunks: Iterable[bytes], limit_bytes: int | None = None) -> StoredFile:
         """Store a file, replacing the one of that key.
@@ -125,11 +120,47 @@ class Storage:
                     writing.write(chunk)
             key = chips_key(writing.sha256)
             if not self.exists(key):
-                writing.place(self._locate(key))
+                self._place(writing.finish(), key)
         return StoredFile(key, writing.size_bytes, writing.sha256)
 
+    def adopt(self, path: Path, key: str) -> None:
+        """Make a file of `scratch` the one of that key; it is no longer where it was."""
+        self._locate(key)
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+        self._place(path, key)
+
+    def scratch(self) -> Path:
+        """A folder for what is not finished, on the file system of the storage if it has one.
+
+        What stays in it is swept after a while.
+        """
+        folder = self.folder / UNFINISHED
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return folder
+
+    def fetch(self, key: str, folder: Path) -> Path:
+        """A file on this machine, for libraries that open files themselves: never to be changed.
+
+        Args:
+            folder: where a copy goes if the storage is elsewhere.
+
+        Raises:
+            InputError: the key is not one.
+            NotFound: there is no such file.
+        """
+        return self.path(key)
+
+    def reader(self, key: str) -> RangeReader:
+        """A file, to be read by position."""
+        return _FileReader(os.open(self.path(key), os.O_RDONLY | os.O_CLOEXEC))
+
+    def size(self, key: str) -> int:
+        """How large a file is, bytes."""
+        return self.path(key).stat().st_size
+
     def path(self, key: str) -> Path:
-        """Where a file is, for libraries that open files themselves.
+        """Where a file of the folder is.
 
         Raises:
             InputError: the key is not one.
@@ -176,10 +207,19 @@ class Storage:
                     swept.append(path.name)
         return swept
 
+    def _place(self, unfinished: Path, key: str) -> None:
+        """Give a file its name."""
+        path = self._locate(key)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        unfinished.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
     def _locate(self, key: str) -> Path:
-        if not KEY.fullmatch(key) or key.split("/")[0] == UNFINISHED:
-            raise InputError(f"not a key of the storage: {key!r}")
-        path = self.folder / key
+        path = self.folder / checked_key(key)
         if any(
             part.is_symlink()
             for part in (path, *path.parents)
@@ -191,9 +231,7 @@ class Storage:
     @contextmanager
     def _unfinished(self, limit_bytes: int | None) -> Iterator[Writing]:
         """A temporary file on the same file system, so that one rename puts it in its place."""
-        folder = self.folder / UNFINISHED
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, name = mkstemp(dir=folder)
+        handle, name = mkstemp(dir=self.scratch())
         try:
             with os.fdopen(handle, "wb") as file:
                 yield Writing(file, Path(name), limit_bytes)
@@ -201,79 +239,28 @@ class Storage:
             Path(name).unlink(missing_ok=True)
 
 
+@dataclass(frozen=True)
+class _FileReader:
+    descriptor: int
+
+    def read(self, start: int, length: int) -> bytes:
+        return os.pread(self.descriptor, length, start)
+
+    def close(self) -> None:
+        os.close(self.descriptor)
+
+
+def checked_key(key: str) -> str:
+    """The key, if it is one.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not KEY.fullmatch(key) or key.split("/")[0] == UNFINISHED:
+        raise InputError(f"not a key of the storage: {key!r}")
+    return key
+
+
 def chips_key(sha256: str) -> str:
     """The key of a chip file: its content's checksum, so that the same file is stored once."""
     return f"chips/{sha256}.npy"
-
-
-@dataclass(frozen=True)
-class _ChipFile:
-    descriptor: int
-    first_byte: int
-    dtype: np.dtype[Any]
-    n_chips: int
-
-
-class StoredChips:
-    """The chips of the storage, as a `services.types.ChipSource`; files are named by their keys.
-
-    Files stay open and their headers parsed; a read is one `pread`. Safe to share between threads.
-    """
-
-    def __init__(self, storage: Storage) -> None:
-        self._storage = storage
-        self._open: OrderedDict[str, _ChipFile] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def read(self, file: str, row: int, count: int) -> npt.NDArray[Any]:
-        """Consecutive chips of one file.
-
-        Returns:
-            (count, 101, 101) uint8 or uint16; 0 is nodata.
-
-        Raises:
-            FormatError: the file is not one of chips, or ends before the last of them.
-        """
-        with self._lock:
-            chips = self._find(file)
-            size = count * CHIP_SIZE * CHIP_SIZE * chips.dtype.itemsize
-            if not 0 <= row <= row + count <= chips.n_chips:
-                raise FormatError(
-                    f"{file} holds {chips.n_chips} chips; {count} asked for from row {row}"
-                )
-            start = chips.first_byte + size // max(count, 1) * row
-            raw = os.pread(chips.descriptor, size, start)
-        if len(raw) != size:
-            raise FormatError(f"{file} ends too early: {len(raw)} of {size} bytes from row {row}")
-        return np.frombuffer(raw, chips.dtype).reshape(count, CHIP_SIZE, CHIP_SIZE)
-
-    def close(self) -> None:
-        """Close all files."""
-        with self._lock:
-            while self._open:
-                os.close(self._open.popitem()[1].descriptor)
-
-    def _find(self, file: str) -> _ChipFile:
-        chips = self._open.pop(file, None) or _open_chips(self._storage.path(file))
-        self._open[file] = chips
-        if len(self._open) > OPEN_CHIP_FILES:
-            os.close(self._open.popitem(last=False)[1].descriptor)
-        return chips
-
-
-def _open_chips(path: Path) -> _ChipFile:
-    with path.open("rb") as file:
-        try:
-            version = npy.read_magic(file)
-            read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
-            shape, fortran, dtype = read_header(file)
-        except (ValueError, KeyError) as error:
-            raise FormatError(f"{path.name} is not a NumPy file: {error}") from error
-        if (
-            fortran
-            or len(shape) != 3
-            or shape[1:] != (CHIP_SIZE, CHIP_SIZE)
-            or dtype.str not in ("|u1", "<u2")
-        ):
-            raise FormatError(f"{path.name} is not a file of chips: shape {shape}, {dtype.str}")
-        return _ChipFile(os.open(path, os.O_RDONLY | os.O_CLOEXEC), file.tell(), dtype, shape[0])

@@ -1,0 +1,39 @@
+"""Files by key, in a folder or in a bucket: written whole or not at all, read by position."""
+
+from app.config import Settings
+from app.storage.chips import StoredChips
+from app.storage.folder import (
+    KEY,
+    UNFINISHED,
+    RangeReader,
+    Storage,
+    StoredFile,
+    Writing,
+    chips_key,
+)
+
+__all__ = [
+    "KEY",
+    "UNFINISHED",
+    "RangeReader",
+    "Storage",
+    "StoredChips",
+    "StoredFile",
+    "Writing",
+    "chips_key",
+    "open_storage",
+]
+
+
+def open_storage(settings: Settings) -> Storage:
+    """The storage of an installation: a bucket where `storage_url` names one, else its data folder.
+
+    Raises:
+        InputError: the bucket cannot be used as it is named.
+    """
+    folder = settings.data_folder / "storage"
+    if settings.storage_url is None:
+        return Storage(folder)
+    from app.storage.bucket import BucketStorage  # 0.1 s and 10 MB that a folder does not need
+
+    return BucketStorage(folder, settings.storage_url)

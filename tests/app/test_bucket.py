@@ -1,0 +1,112 @@
+"""The storage in a bucket: the same as in a folder, over S3."""
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.config import Settings
+from app.errors import InputError, NotFound, TooLarge
+from app.storage import Storage, StoredChips, chips_key, open_storage
+from services.conventions import CHIP_SIZE
+from services.errors import FormatError
+from tests.app.buckets import running_bucket
+
+SEVERAL_PARTS = 12_000_000
+"""Bytes that are sent in parts."""
+
+
+@pytest.fixture(scope="module")
+def storage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Storage]:
+    with pytest.MonkeyPatch.context() as patch, running_bucket(patch) as url:
+        folder = tmp_path_factory.mktemp("machine")
+        yield open_storage(Settings(data_folder=folder, storage_url=url))
+
+
+def unfinished(storage: Storage) -> list[Path]:
+    return list(storage.scratch().iterdir())
+
+
+def test_a_file_is_found_in_a_bucket_as_it_was_put(storage: Storage, tmp_path: Path):
+    stored = storage.put("scenes/a/scene.tif", [b"one", b"", b"two"])
+    assert (stored.size_bytes, stored.sha256) == (6, hashlib.sha256(b"onetwo").hexdigest())
+    storage.put("scenes/a/scene_RPC.TXT", [b"x"])
+    storage.put("scenes/ab/other", [b"y"])
+    with storage.open("scenes/a/scene.tif") as file:
+        assert file.read() == b"onetwo"
+    assert storage.fetch("scenes/a/scene.tif", tmp_path).read_bytes() == b"onetwo"
+    assert (storage.size("scenes/a/scene.tif"), storage.exists("scenes/a")) == (6, False)
+    assert storage.keys("scenes/a") == ["scenes/a/scene.tif", "scenes/a/scene_RPC.TXT"]
+    storage.delete("scenes/a/scene.tif")
+    storage.delete("scenes/a/scene.tif")
+    assert not storage.exists("scenes/a/scene.tif")
+    assert unfinished(storage) == []
+
+
+def test_a_file_of_many_parts_arrives_whole(storage: Storage, tmp_path: Path):
+    data = np.random.default_rng(1).bytes(SEVERAL_PARTS)
+    path = tmp_path / "large"
+    path.write_bytes(data)
+    assert storage.put_file("scenes/large", path).size_bytes == len(data)
+    with storage.open("scenes/large") as file:
+        assert file.read() == data
+    assert storage.reader("scenes/large").read(5_000_000, 100) == data[5_000_000:5_000_100]
+
+
+def test_a_file_that_breaks_off_or_is_too_large_leaves_the_former_one(storage: Storage):
+    storage.put("scenes/b", [b"former"])
+
+    def breaking() -> Iterator[bytes]:
+        yield b"lat"
+        raise ConnectionError
+
+    with pytest.raises(ConnectionError):
+        storage.put("scenes/b", breaking())
+    with pytest.raises(TooLarge):
+        storage.put("scenes/b", [bytes(20)], limit_bytes=10)
+    with storage.open("scenes/b") as file:
+        assert file.read() == b"former"
+    assert unfinished(storage) == []
+
+
+def test_a_file_that_is_not_in_the_bucket_is_not_found(storage: Storage, tmp_path: Path):
+    for ask in (storage.open, storage.size, storage.reader, lambda key: storage.fetch(key, tmp_path)):
+        with pytest.raises(NotFound):
+            ask("scenes/none")
+        with pytest.raises(InputError):
+            ask("../none")
+    with pytest.raises(InputError):
+        storage.put("../up", [b"x"])
+
+
+def test_a_file_of_the_scratch_folder_is_taken_over(storage: Storage):
+    path = storage.scratch() / "arrived"
+    path.write_bytes(b"II*")
+    storage.adopt(path, "scenes/c/a.tif")
+    assert storage.size("scenes/c/a.tif") == 3
+    assert unfinished(storage) == []
+
+
+def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path):
+    chips = np.random.default_rng(2).integers(0, 4096, (50, CHIP_SIZE, CHIP_SIZE)).astype(np.uint16)
+    np.save(tmp_path / "chips.npy", chips)
+    first, again = (storage.put_chips(tmp_path / "chips.npy") for _ in range(2))
+    assert first == again
+    assert first.key == chips_key(first.sha256)
+    stored = StoredChips(storage)
+    np.testing.assert_array_equal(stored.read(first.key, 17, 3), chips[17:20])
+    with pytest.raises(FormatError, match="50 chips"):
+        stored.read(first.key, 49, 2)
+    storage.put("chips/none.npy", [b"none"])
+    with pytest.raises(FormatError, match="not a NumPy file"):
+        stored.read("chips/none.npy", 0, 1)
+
+
+def test_an_address_that_is_none_is_refused_by_name(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("AMERS_STORAGE_URL", "http://elsewhere/bucket")
+    from app.config import read_settings
+
+    with pytest.raises(InputError, match="AMERS_STORAGE_URL"):
+        read_settings()
