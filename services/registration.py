@@ -143,19 +143,57 @@ def register_scene(
             options.matching,
             part,
         )
-        agreeing = _agreement(model, tried, matches, radius_px * fine_m, options)
+        agreeing = agreement(model, tried, matches, radius_px * fine_m, options.adjustment.min_points)
         adjustment = adjust_on(scene, tried, matches, agreeing, options.adjustment)
         passes.append(summarised("fine", fine_m, radius_px, matches, agreeing))
         model = CorrectedModel(scene.model, adjustment.correction)
         uncertainty_m = model_uncertainty_m(model, tried, adjustment)
 
-    measures = _measures(scene, points, visible, chosen, matches, adjustment)
     progress(0.95, "qualifying the result")
-    rows = np.searchsorted(visible, chosen)
+    registration = qualified(
+        scene,
+        points,
+        (visible, chosen),
+        matches,
+        adjustment,
+        tuple(passes),
+        options,
+        frame_sigma_m,
+    )
+    progress(1.0, "registered")
+    return registration
+
+
+def qualified(
+    scene: Scene,
+    points: ControlPoints,
+    rows: tuple[IntArray, IntArray],
+    matches: PointMatches,
+    adjustment: SceneAdjustment,
+    passes: tuple[Pass, ...],
+    options: RegistrationOptions,
+    frame_sigma_m: float,
+) -> Registration:
+    """A registration from its last search and adjustment, with all that says how good it is.
+
+    Args:
+        scene: as delivered.
+        points: control points.
+        rows: of the points that the scene may show, and of those that were tried; ascending.
+        matches: of the points tried.
+        adjustment: of the points tried.
+        passes: the searches, in order.
+        options: of the adjustment and the qualification, and the seed of the draws.
+        frame_sigma_m: see `register_scene`.
+    """
+    visible, chosen = rows
+    tried = points.take(chosen)
+    measures = _measures(scene, points, visible, chosen, matches, adjustment)
+    row_of_tried = np.searchsorted(visible, chosen)
 
     def refit(held: BoolArray) -> SceneAdjustment:
         fixed = replace(options.adjustment, order=adjustment.order)
-        return adjust_on(scene, tried, matches, held[rows], fixed)
+        return adjust_on(scene, tried, matches, held[row_of_tried], fixed)
 
     qualification = qualify(
         measures,
@@ -167,9 +205,9 @@ def register_scene(
         np.random.default_rng(options.seed),
         frame_sigma_m,
     )
-    progress(1.0, "registered")
-    views = replace(matches.tried, point=rows[matches.tried.point])
-    return Registration(model, adjustment, measures, views, tuple(passes), qualification)
+    model = CorrectedModel(scene.model, adjustment.correction)
+    views = replace(matches.tried, point=row_of_tried[matches.tried.point])
+    return Registration(model, adjustment, measures, views, passes, qualification)
 
 
 def _choose_points(
@@ -197,28 +235,28 @@ def _start_uncertainty(scene: Scene, points: ControlPoints) -> Array:
     return np.asarray(np.sqrt(scene.sigma_m**2 + points.covariance_m2[:, [0, 1], [0, 1]].max(axis=1)))
 
 
-def _agreement(
+def agreement(
     model: SensorModel,
     points: ControlPoints,
     matches: PointMatches,
     radius_m: float,
-    options: RegistrationOptions,
+    min_points: int,
 ) -> BoolArray:
     """Points whose measures fit one affine displacement, or an error that says why there are too few."""
     predicted = model.project(points.lon_lat_h)
     found = matches.reason == ""
-    if found.sum() < options.adjustment.min_points:
+    if found.sum() < min_points:
         raise NotEnoughPoints(
             int(found.sum()),
-            options.adjustment.min_points,
+            min_points,
             f"{len(points)} tried within {radius_m:.1f} m, {reasons_in_words(matches.reason)}",
         )
     tolerance_px = 3.0 * float(np.median(_point_sigma_px(model, points, matches)[found])) + 0.5
     agreeing = affine_consensus(predicted, matches.line_sample - predicted, found, tolerance_px)
-    if agreeing.sum() < options.adjustment.min_points:
+    if agreeing.sum() < min_points:
         raise NoConsensus(
             f"{int(found.sum())} points found of {len(points)} tried, but only {int(agreeing.sum())} "
-            f"agree within {tolerance_px:.1f} px, {options.adjustment.min_points} needed"
+            f"agree within {tolerance_px:.1f} px, {min_points} needed"
         )
     return agreeing
 
