@@ -5,6 +5,8 @@ splitting, and everything about a block or a rectangle follows from a hash of wh
 therefore be computed without knowing any other, and the land repeats as the lattice does.
 """
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -19,10 +21,16 @@ BLOCK_M = 260.0
 ROAD_HALF_WIDTH_M = 3.2
 TREE_LATTICE_M = 6.5
 
-FIELDS, WOOD, VILLAGE, WORKS = 0, 1, 2, 3
-_LOT_M = np.array([95.0, 400.0, 27.0, 75.0])
-_TREES = np.array([0.012, 0.85, 0.22, 0.03])
-_TEXTURE = np.array([0.09, 0.22, 0.16, 0.10])
+ORCHARD_ROW_M = 7.0
+"""Distance of the trees of an orchard, which stand on a square lattice."""
+
+ESTATE_LOT_M = 24.0
+"""Side of the lots of a housing estate, each with the same house."""
+
+FIELDS, WOOD, VILLAGE, WORKS, ORCHARD, ESTATE = 0, 1, 2, 3, 4, 5
+_LOT_M = np.array([95.0, 400.0, 27.0, 75.0, 400.0, ESTATE_LOT_M])
+_TREES = np.array([0.012, 0.85, 0.22, 0.03, 0.0, 0.0])
+_TEXTURE = np.array([0.09, 0.22, 0.16, 0.10, 0.05, 0.05])
 
 
 def cover_land(
@@ -32,6 +40,7 @@ def cover_land(
     blotches: FloatImage,
     posting_m: float,
     seed: int,
+    patterned_share: float = 0.0,
 ) -> tuple[FloatImage, FloatImage, npt.NDArray[np.uint16]]:
     """Albedo, roofs and fields of a world.
 
@@ -42,6 +51,7 @@ def cover_land(
         blotches: (b, b) coarse noise of unit spread, stretched over the world.
         posting_m: size of a cell.
         seed: what the hashes start from.
+        patterned_share: of the blocks that are orchards or housing estates, the same over and over.
 
     Returns:
         Albedo (n, n), roof heights (n, n) with `NO_ROOF` on open ground, number of the field (n, n).
@@ -50,7 +60,18 @@ def cover_land(
     albedo = np.empty(shape, dtype=np.float32)
     roof = np.full(shape, NO_ROOF, dtype=np.float32)
     parcel = np.zeros(shape, dtype=np.uint16)
-    _cover(terrain_m, warp, texture, blotches, posting_m, np.uint64(seed), albedo, roof, parcel)
+    _cover(
+        terrain_m,
+        warp,
+        texture,
+        blotches,
+        posting_m,
+        np.uint64(seed),
+        patterned_share,
+        albedo,
+        roof,
+        parcel,
+    )
     return albedo, roof, parcel
 
 
@@ -104,6 +125,19 @@ def _highest_below(terrain: FloatImage, warp: FloatImage, u: float, v: float, wa
 
 
 @njit(cache=True)
+def _lot(h: np.uint64, kind: int, p: float, q: float, side: float, box: Array) -> np.uint64:
+    """The lot of a block that holds (p, q), into `box`, and its hash; those of an estate are alike."""
+    if kind != ESTATE:
+        return _split(h, p, q, side, _LOT_M[kind], box)
+    box[0] = math.floor(p / ESTATE_LOT_M) * ESTATE_LOT_M
+    box[2] = math.floor(q / ESTATE_LOT_M) * ESTATE_LOT_M
+    box[1], box[3] = box[0] + ESTATE_LOT_M, box[2] + ESTATE_LOT_M
+    if box[1] > side or box[3] > side:
+        box[1] = box[0]
+    return h
+
+
+@njit(cache=True)
 def _split(h: np.uint64, p: float, q: float, side: float, limit: float, box: Array) -> np.uint64:
     """The rectangle of a block that holds (p, q), into `box` (p0, p1, q0, q1), and its hash; metres."""
     box[0], box[1], box[2], box[3] = 0.0, side, 0.0, side
@@ -124,8 +158,11 @@ def _split(h: np.uint64, p: float, q: float, side: float, limit: float, box: Arr
 
 
 @njit(cache=True)
-def _kind(h: np.uint64) -> int:
+def _kind(h: np.uint64, patterned_share: float) -> int:
     """What a block is."""
+    draw = _part(_mix(h, 11), 0)
+    if draw < patterned_share:
+        return ORCHARD if draw < 0.5 * patterned_share else ESTATE
     draw = _part(h, 3)
     if draw < 0.50:
         return FIELDS
@@ -160,11 +197,24 @@ def _tree(h: np.uint64, p: float, q: float, chance: float, side: float) -> float
 
 
 @njit(cache=True)
+def _orchard_tree(p: float, q: float) -> float:
+    """How the trees of an orchard change the albedo: crowns and their shadows, one like the other."""
+    dp = p / ORCHARD_ROW_M - math.floor(p / ORCHARD_ROW_M) - 0.5
+    dq = q / ORCHARD_ROW_M - math.floor(q / ORCHARD_ROW_M) - 0.5
+    if dp * dp + dq * dq < 0.08:
+        return 0.45
+    dp, dq = dp + 0.2, dq + 0.2
+    return 0.6 if dp * dp + dq * dq < 0.08 else 1.0
+
+
+@njit(cache=True)
 def _ground_albedo(h: np.uint64, kind: int, box: Array, p: float, q: float) -> float:
     """Crops with rows along one side and a track or a hedge around; soil of woods; gardens and yards."""
     edge = min(min(p - box[0], box[1] - p), min(q - box[2], box[3] - q))
     if kind == WOOD:
         return 0.13
+    if kind == ORCHARD:
+        return 0.22 * _orchard_tree(p, q)
     if kind != FIELDS:
         return 0.08 if edge < 0.7 else 0.12 + 0.16 * _part(h, 1)
     if edge < 1.3:
@@ -179,7 +229,9 @@ def _ground_albedo(h: np.uint64, kind: int, box: Array, p: float, q: float) -> f
 @njit(cache=True)
 def _building(h: np.uint64, kind: int, box: Array, walls: Array) -> float:
     """Walls of the building of a lot (p0, p1, q0, q1), and its height above the ground; 0 for none."""
-    if kind in (WOOD, FIELDS) or _part(h, 2) < 0.16:
+    if kind in (WOOD, FIELDS, ORCHARD) or box[1] <= box[0]:
+        return 0.0
+    if kind != ESTATE and _part(h, 2) < 0.16:
         return 0.0
     b = _mix(h, 7)
     for axis in range(2):
@@ -210,6 +262,8 @@ def _roof_albedo(h: np.uint64, kind: int, walls: Array, p: float, q: float) -> f
         side = 1.0 if q > walls[2] + depth * 0.5 else 0.0
     else:
         side = 1.0 if p > walls[0] + width * 0.5 else 0.0
+    if kind == ESTATE:
+        return tone * (0.78 + 0.5 * side)
     chimney = edge > 1.5 and _part(_mix(h, int(p / 1.6) * 64 + int(q / 1.6)), 0) < 0.05
     return (0.55 if chimney else 1.0) * tone * (0.78 + 0.5 * side)
 
@@ -222,6 +276,7 @@ def _cover(
     blotches: FloatImage,
     posting: float,
     seed: np.uint64,
+    patterned_share: float,
     albedo: FloatImage,
     roof: FloatImage,
     parcel: npt.NDArray[np.uint16],
@@ -234,7 +289,7 @@ def _cover(
     coarse = len(blotches) / n
     box = np.empty(4)
     walls = np.empty(4)
-    last_hash = np.uint64(0)
+    last_house = np.uint64(0)
     last_roof = 0.0
     for r in range(n):
         for c in range(n):
@@ -242,7 +297,7 @@ def _cover(
             bu, bv = int(np.floor(u / cells)), int(np.floor(v / cells))
             p, q = (u - bu * cells) * posting, (v - bv * cells) * posting
             block = _mix(_mix(seed, bu % blocks), bv % blocks)
-            kind = _kind(block)
+            kind = _kind(block, patterned_share)
             grain = texture[r % tile, c % tile]
             blotch = 1.0 + 0.12 * bilinear(blotches, c * coarse, r * coarse)
             edge = min(min(p, side - p), min(q, side - q))
@@ -253,12 +308,13 @@ def _cover(
             if edge < ROAD_HALF_WIDTH_M + 1.5:
                 albedo[r, c] = 0.15 * blotch * (1.0 + 0.15 * grain)
                 continue
-            h = _split(block, p, q, side, _LOT_M[kind], box)
+            h = _lot(block, kind, p, q, side, box)
             height = _building(h, kind, box, walls)
             if height > 0.0 and walls[0] <= p <= walls[1] and walls[2] <= q <= walls[3]:
-                if h != last_hash:
+                house = _mix(_mix(h, int(walls[0])), int(walls[2]))
+                if house != last_house:
                     origin_u, origin_v = bu * cells, bv * cells
-                    last_hash = h
+                    last_house = house
                     last_roof = height + _highest_below(
                         terrain, warp, origin_u, origin_v, walls / posting
                     )

@@ -1,6 +1,7 @@
 """What the ground sends up on a given day: crops that change, slopes that face the sun, shadows."""
 
 import math
+from dataclasses import dataclass
 from datetime import date
 
 import cv2
@@ -10,7 +11,7 @@ from numba import njit
 
 from services.imagery import BLUR_PER_RATIO
 from services.simulation.land import NO_ROOF
-from services.simulation.world import World
+from services.simulation.world import World, natural_noise
 from services.types import BoolArray, FloatImage
 
 SKY_LIGHT = 0.30
@@ -19,28 +20,54 @@ SKY_LIGHT = 0.30
 CHANGING_SHARE = 0.35
 """Share of the fields that are at another stage of the year on another day."""
 
+SEASONAL_GRAIN = 0.35
+"""Spread of the logarithm of what grows over the ground from one season to another."""
+
 _STRIP_ROWS = 1024
+_GRAIN_CELLS = 512
 
 
-def radiance_of_day(
-    world: World, day: date, sun_elevation_deg: float, sun_azimuth_deg: float
-) -> FloatImage:
-    """Light sent up by every cell of a world, 1 for a white level ground in the sun.
+@dataclass(frozen=True)
+class Day:
+    """The state of a world on a day.
 
-    Fields differ from day to day: most a little, `CHANGING_SHARE` of them a lot. Slopes, flat roofs and
-    the shadows of buildings follow the sun; the shadows of trees belong to the albedo and do not.
+    Attributes:
+        stage: (65536,) factor of the albedo of every field.
+        grain: (t, t) factor of the albedo of all open ground, repeated; what has grown since.
+        sun: (3,) unit vector to the sun, east, north, up.
+        reach: cells that the shadow of the highest roof is long.
+        shaded: squares of 16 cells that a shadow may reach.
+    """
+
+    stage: FloatImage
+    grain: FloatImage
+    sun: npt.NDArray[np.float64]
+    reach: int
+    shaded: BoolArray
+
+
+def day_of(
+    world: World, day: date, sun_elevation_deg: float, sun_azimuth_deg: float, season: float = 0.0
+) -> Day:
+    """How a world looks on a day.
+
+    Fields differ from day to day: most a little, `CHANGING_SHARE` of them a lot.
 
     Args:
         world: the ground.
         day: two images of the same day see the same fields.
         sun_elevation_deg, sun_azimuth_deg: where the sun stands.
+        season: 0 to 1; more of the fields are at another stage, at 1 all of them, and another texture
+            covers what grows.
     """
     rng = np.random.default_rng([world.seed, day.toordinal()])
     stage = rng.uniform(0.93, 1.07, 65536)
-    changing = rng.uniform(size=65536) < CHANGING_SHARE
+    changing = rng.uniform(size=65536) < CHANGING_SHARE + season * (1.0 - CHANGING_SHARE)
     stage[changing] = rng.uniform(0.55, 1.6, int(changing.sum()))
     stage[0] = 1.0
-    out = np.empty_like(world.albedo)
+    grain = np.ones((1, 1), dtype=np.float32)
+    if season > 0.0:
+        grain = np.exp(np.float32(SEASONAL_GRAIN * season) * natural_noise(rng, _GRAIN_CELLS, 1.0, 0.0))
     elevation, azimuth = math.radians(sun_elevation_deg), math.radians(sun_azimuth_deg)
     sun = np.array(
         [
@@ -49,27 +76,41 @@ def radiance_of_day(
             math.sin(elevation),
         ]
     )
-    reach = int(roof_clearance_m(world) / math.tan(elevation) / world.posting_m) + 2
-    shaded = near_buildings(world.roof_m, reach)
+    reach = int(world.roof_clearance_m / math.tan(elevation) / world.posting_m) + 2
+    return Day(stage.astype(np.float32), grain, sun, reach, near_buildings(world.roof_m, reach))
+
+
+def radiance_of_day(
+    world: World, day: date, sun_elevation_deg: float, sun_azimuth_deg: float
+) -> FloatImage:
+    """Light sent up by every cell of a world, 1 for a white level ground in the sun.
+
+    Slopes, flat roofs and the shadows of buildings follow the sun; the shadows of trees belong to the
+    albedo and do not. See `day_of`.
+    """
+    rows, columns = world.albedo.shape
+    return radiance(world, day_of(world, day, sun_elevation_deg, sun_azimuth_deg), 0, 0, rows, columns)
+
+
+def radiance(world: World, day: Day, row: int, column: int, rows: int, columns: int) -> FloatImage:
+    """Light (rows, columns) sent up on a day by the cells from (row, column) on; the grid repeats."""
+    out = np.empty((rows, columns), dtype=np.float32)
     _light(
         world.terrain_m,
         world.roof_m,
         world.albedo,
         world.parcel,
-        stage.astype(np.float32),
-        shaded,
-        sun,
+        day.stage,
+        day.grain,
+        day.shaded,
+        day.sun,
         world.posting_m,
-        reach,
+        day.reach,
+        row,
+        column,
         out,
     )
     return out
-
-
-def roof_clearance_m(world: World) -> float:
-    """How far a roof stands above the terrain at most; zero without buildings."""
-    strips = (slice(r, r + _STRIP_ROWS) for r in range(0, len(world.roof_m), _STRIP_ROWS))
-    return max(0.0, *(float((world.roof_m[s] - world.terrain_m[s]).max()) for s in strips))
 
 
 def near_buildings(roof_m: FloatImage, reach: int, block: int = 16) -> BoolArray:
@@ -97,23 +138,36 @@ def smooth_radiance(radiance: FloatImage, roof_m: FloatImage, ratio: float) -> F
     """
     if ratio <= 1.0:
         return radiance
-    sigma = BLUR_PER_RATIO * math.sqrt(ratio * ratio - 1.0)
-    margin = math.ceil(4.0 * sigma)
+    margin = smoothing_margin(ratio)
     out = np.empty_like(radiance)
     rows, columns = radiance.shape
     for first in range(0, rows, _STRIP_ROWS):
         count = min(_STRIP_ROWS, rows - first)
         take = np.arange(first - margin, first + count + margin) % rows
         wrap = np.arange(-margin, columns + margin) % columns
-        strip = radiance[take][:, wrap]
-        roof = (roof_m[take][:, wrap] > NO_ROOF).astype(np.float32)
-        smooth = np.empty_like(strip)
-        for share in (roof, 1.0 - roof):
-            weight = cv2.GaussianBlur(share, (0, 0), sigma)
-            light = cv2.GaussianBlur(strip * share, (0, 0), sigma)
-            inside = share > 0.0
-            smooth[inside] = light[inside] / weight[inside]
+        smooth = averaged(radiance[take][:, wrap], roof_m[take][:, wrap] > NO_ROOF, ratio)
         out[first : first + count] = smooth[margin : margin + count, margin : margin + columns]
+    return out
+
+
+def smoothing_margin(ratio: float) -> int:
+    """How many cells around decide on the light averaged over pixels `ratio` times larger."""
+    if ratio <= 1.0:
+        return 0
+    return math.ceil(4.0 * BLUR_PER_RATIO * math.sqrt(ratio * ratio - 1.0)) + 1
+
+
+def averaged(light: FloatImage, built: BoolArray, ratio: float) -> FloatImage:
+    """Light averaged over pixels `ratio` times larger than its own, built cells and others apart."""
+    if ratio <= 1.0:
+        return light
+    sigma = BLUR_PER_RATIO * math.sqrt(ratio * ratio - 1.0)
+    out = np.empty_like(light)
+    for inside in (built, ~built):
+        share = inside.astype(np.float32)
+        weight = cv2.GaussianBlur(share, (0, 0), sigma)
+        smooth = cv2.GaussianBlur(light * share, (0, 0), sigma)
+        out[inside] = smooth[inside] / weight[inside]
     return out
 
 
@@ -124,25 +178,33 @@ def _light(
     albedo: FloatImage,
     parcel: npt.NDArray[np.uint16],
     stage: FloatImage,
+    grain: FloatImage,
     shaded: BoolArray,
     sun: npt.NDArray[np.float64],
     posting: float,
     reach: int,
+    first_row: int,
+    first_column: int,
     out: FloatImage,
 ) -> None:
     rows, columns = terrain.shape
+    tile = len(grain)
     horizontal = math.hypot(sun[0], sun[1])
     step_x, step_y = sun[0] / horizontal, -sun[1] / horizontal
     rise = sun[2] / horizontal * posting
-    for r in range(rows):
+    for i in range(out.shape[0]):
+        r = (first_row + i) % rows
         above = r - 1 if r > 0 else rows - 1
         below = r + 1 if r + 1 < rows else 0
-        for c in range(columns):
+        for j in range(out.shape[1]):
+            c = (first_column + j) % columns
             left = c - 1 if c > 0 else columns - 1
             right = c + 1 if c + 1 < columns else 0
             height = roof[r, c]
             facing = sun[2]
+            grown = np.float32(1.0)
             if height == NO_ROOF:
+                grown = grain[r % tile, c % tile]
                 height = terrain[r, c]
                 east = (terrain[r, right] - terrain[r, left]) / (2.0 * posting)
                 north = (terrain[above, c] - terrain[below, c]) / (2.0 * posting)
@@ -158,4 +220,4 @@ def _light(
                         direct = 0.0
                         break
             light = SKY_LIGHT + (1.0 - SKY_LIGHT) * direct
-            out[r, c] = albedo[r, c] * stage[parcel[r, c]] * light
+            out[i, j] = albedo[r, c] * stage[parcel[r, c]] * light * grown

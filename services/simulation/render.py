@@ -9,12 +9,7 @@ import numpy.typing as npt
 
 from services.errors import InputError
 from services.sensors.base import SensorModel
-from services.simulation.light import (
-    SKY_LIGHT,
-    near_buildings,
-    roof_clearance_m,
-    smooth_radiance,
-)
+from services.simulation.light import SKY_LIGHT, near_buildings, smooth_radiance
 from services.simulation.rays import WALL_ALBEDO, meet_surface, render_lines
 from services.simulation.world import World
 from services.types import Array, BoolArray, FloatImage
@@ -22,11 +17,14 @@ from services.types import Array, BoolArray, FloatImage
 DARKEST, BRIGHTEST = 1, 4095
 """Range of the pixels: 12 bits, zero kept for nodata."""
 
-_NODE_SPACING = 64
+NODE_SPACING = 64
+"""Samples between the lines of sight that go through the model; those between are interpolated."""
+
 _HEIGHT_MARGIN_M = 2.0
-_STEEPEST = 0.9
+STEEPEST = 0.9
+"""Largest product of slope and tangent of the incidence: beyond one, terrain hides itself."""
+
 _LINES_AT_ONCE = 256
-_STRIP_ROWS = 1024
 
 
 @dataclass(frozen=True)
@@ -47,13 +45,21 @@ class Radiometry:
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """What the kernels need to know about a world as one image sees it."""
+class Sight:
+    """What the kernels need to know about a world as one image sees it.
+
+    Attributes:
+        near: squares of 16 cells where buildings may be met.
+        clearance_m: highest roof above the terrain, and what the terrain may rise below a line.
+        low_m, high_m: heights between which lines of sight run.
+        walls: (4,) light of walls that face west, east, north, south.
+    """
 
     near: BoolArray
     clearance_m: float
     low_m: float
     high_m: float
+    walls: Array
 
 
 def render(
@@ -90,29 +96,34 @@ def render(
         InputError: when slopes are so steep that the terrain would hide itself.
     """
     light = smooth_radiance(radiance, world.roof_m, gsd_m / world.posting_m)
-    walls = _wall_light(sun_elevation_deg, sun_azimuth_deg)
-    sight = _sight(world, incidence_deg)
+    sight = sight_of(world, incidence_deg, sun_elevation_deg, sun_azimuth_deg)
     for first in range(0, shape[0], _LINES_AT_ONCE):
         count = min(_LINES_AT_ONCE, shape[0] - first)
-        low, high = (
-            _nodes(world, model, first, count, shape[1], h) for h in (sight.low_m, sight.high_m)
-        )
-        strip = np.empty((count, shape[1]), dtype=np.float32)
-        render_lines(
-            world.terrain_m,
-            world.roof_m,
-            light,
-            sight.near,
-            low,
-            high,
-            sight.low_m,
-            sight.high_m,
-            _NODE_SPACING,
-            sight.clearance_m,
-            walls,
-            strip,
-        )
-        yield first, _digitise(strip, radiometry, rng)
+        low, high = nodes(world, model, sight, first, count, 0, shape[1] // NODE_SPACING + 2)
+        strip = light_met(world, light, sight, low, high, (count, shape[1]))
+        yield first, digitise(strip, radiometry, rng)
+
+
+def light_met(
+    world: World, light: FloatImage, sight: Sight, low: Array, high: Array, shape: tuple[int, int]
+) -> FloatImage:
+    """Light (lines, samples) met by lines of sight, interpolated between `nodes`."""
+    out = np.empty(shape, dtype=np.float32)
+    render_lines(
+        world.terrain_m,
+        world.roof_m,
+        light,
+        sight.near,
+        low,
+        high,
+        sight.low_m,
+        sight.high_m,
+        NODE_SPACING,
+        sight.clearance_m,
+        sight.walls,
+        out,
+    )
+    return out
 
 
 def surface_seen(world: World, model: SensorModel, line_sample: Array) -> Array:
@@ -127,47 +138,58 @@ def surface_seen(world: World, model: SensorModel, line_sample: Array) -> Array:
     return model.locate(line_sample, height)
 
 
-def _sight(world: World, incidence_deg: float) -> _Sight:
-    """How far buildings may hide the ground, and between which heights rays run."""
+def sight_of(
+    world: World, incidence_deg: float, sun_elevation_deg: float, sun_azimuth_deg: float
+) -> Sight:
+    """How far buildings may hide the ground, between which heights rays run, how walls are lit.
+
+    Raises:
+        InputError: when slopes are so steep that the terrain would hide itself.
+    """
     tangent = math.tan(math.radians(incidence_deg + 2.0))
-    steepness = tangent * _steepest_slope(world)
-    if steepness > _STEEPEST:
+    steepness = tangent * world.steepest_slope
+    if steepness > STEEPEST:
         raise InputError(
-            f"a view under {incidence_deg:g} degrees of slopes up to {steepness / tangent:.2f} m/m "
+            f"a view under {incidence_deg:g} degrees of slopes up to {world.steepest_slope:.2f} m/m "
             "would need terrain that hides itself, which is not simulated"
         )
-    clearance_m = roof_clearance_m(world) / (1.0 - steepness) + 0.1
+    clearance_m = world.roof_clearance_m / (1.0 - steepness) + 0.1
     low, high = world.height_range_m
-    return _Sight(
+    return Sight(
         near=near_buildings(world.roof_m, math.ceil(clearance_m * tangent / world.posting_m) + 2),
         clearance_m=clearance_m,
         low_m=low - _HEIGHT_MARGIN_M,
         high_m=high + _HEIGHT_MARGIN_M,
+        walls=_wall_light(sun_elevation_deg, sun_azimuth_deg),
     )
 
 
-def _steepest_slope(world: World) -> float:
-    """Largest slope of the terrain, metres a metre."""
-    steepest = 0.0
-    for r in range(0, len(world.terrain_m), _STRIP_ROWS):
-        strip = world.terrain_m[r : r + _STRIP_ROWS + 1]
-        steepest = max(steepest, float(np.abs(np.diff(strip, axis=1)).max()))
-        if len(strip) > 1:
-            steepest = max(steepest, float(np.abs(np.diff(strip, axis=0)).max()))
-    return math.sqrt(2.0) * steepest / world.posting_m
+def nodes(
+    world: World, model: SensorModel, sight: Sight, first: int, count: int, node: int, n_nodes: int
+) -> tuple[Array, Array]:
+    """Grid positions of some lines, and of a quarter pixel around, at both heights of a sight.
 
+    Args:
+        world: its grid.
+        model: true geometry of the image.
+        sight: its heights.
+        first, count: lines.
+        node, n_nodes: every `NODE_SPACING`-th sample, counted from sample -0.5.
 
-def _nodes(
-    world: World, model: SensorModel, first: int, count: int, samples: int, height_m: float
-) -> Array:
-    """Grid positions (3, count, nodes, 2) of some lines, and of a quarter pixel around, at a height."""
+    Returns:
+        Low and high, (3, count, n_nodes, 2) columns and rows each.
+    """
     line = first + np.arange(-1.0, count + 1.0)
-    sample = -0.5 + _NODE_SPACING * np.arange(samples // _NODE_SPACING + 2)
+    sample = -0.5 + NODE_SPACING * np.arange(node, node + n_nodes)
     image = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1).reshape(-1, 2)
-    ground = model.locate(image, np.full(len(image), height_m))
-    nodes = world.column_row(ground[:, :2]).reshape(len(line), len(sample), 2)
-    before, at, after = nodes[:-2], nodes[1:-1], nodes[2:]
-    return np.stack([at + 0.25 * (before - at), at, at + 0.25 * (after - at)])
+
+    def at(height_m: float) -> Array:
+        ground = model.locate(image, np.full(len(image), height_m))
+        grid = world.column_row(ground[:, :2]).reshape(len(line), len(sample), 2)
+        before, here, after = grid[:-2], grid[1:-1], grid[2:]
+        return np.stack([here + 0.25 * (before - here), here, here + 0.25 * (after - here)])
+
+    return at(sight.low_m), at(sight.high_m)
 
 
 def _wall_light(sun_elevation_deg: float, sun_azimuth_deg: float) -> Array:
@@ -179,7 +201,7 @@ def _wall_light(sun_elevation_deg: float, sun_azimuth_deg: float) -> Array:
     return np.asarray(WALL_ALBEDO * (SKY_LIGHT + (1.0 - SKY_LIGHT) * direct))
 
 
-def _digitise(
+def digitise(
     light: FloatImage, radiometry: Radiometry, rng: np.random.Generator
 ) -> npt.NDArray[np.uint16]:
     """Pixels of light, with noise."""

@@ -1,6 +1,8 @@
 """A piece of ground that is known exactly: heights, buildings and what covers them."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ Parcels = npt.NDArray[np.uint16]
 _TEXTURE_TILE = 2048
 _TERRAIN_NODES = 512
 _WARP_NODES = 256
+_STRIP_ROWS = 1024
 
 
 @dataclass(frozen=True)
@@ -53,11 +56,28 @@ class World:
         rows, columns = self.terrain_m.shape
         return self.lon_lat(np.array([[(columns - 1) / 2.0, (rows - 1) / 2.0]]))[0]
 
-    @property
+    @cached_property
     def height_range_m(self) -> tuple[float, float]:
         """Lowest ground and highest ground or roof, metres above the ellipsoid."""
         low, high = float(self.terrain_m.min()), float(self.terrain_m.max())
         return low, max(high, float(self.roof_m.max()))
+
+    @cached_property
+    def roof_clearance_m(self) -> float:
+        """How far a roof stands above the terrain at most; zero without buildings."""
+        strips = (slice(r, r + _STRIP_ROWS) for r in range(0, len(self.roof_m), _STRIP_ROWS))
+        return max(0.0, *(float((self.roof_m[s] - self.terrain_m[s]).max()) for s in strips))
+
+    @cached_property
+    def steepest_slope(self) -> float:
+        """Largest slope of the terrain, metres a metre."""
+        steepest = 0.0
+        for r in range(0, len(self.terrain_m), _STRIP_ROWS):
+            strip = self.terrain_m[r : r + _STRIP_ROWS + 1]
+            steepest = max(steepest, float(np.abs(np.diff(strip, axis=1)).max()))
+            if len(strip) > 1:
+                steepest = max(steepest, float(np.abs(np.diff(strip, axis=0)).max()))
+        return math.sqrt(2.0) * steepest / self.posting_m
 
     def lon_lat(self, column_row: Array) -> Array:
         """Longitude and latitude (n, 2) of grid positions (n, 2)."""
@@ -88,6 +108,8 @@ def make_world(
     relief_m: float = 60.0,
     centre_lon_lat: tuple[float, float] = (5.4, 43.6),
     lowest_m: float = 150.0,
+    smallest_hill_m: float = 350.0,
+    patterned_share: float = 0.0,
 ) -> World:
     """Draw a world: hills, fields between roads, woods, villages with buildings, trees.
 
@@ -98,29 +120,31 @@ def make_world(
         relief_m: from the lowest to the highest ground.
         centre_lon_lat: degrees.
         lowest_m: height of the lowest ground above the ellipsoid.
+        smallest_hill_m: wavelength below which the terrain is smooth; so that slopes are gentler.
+        patterned_share: of the land that is orchards and housing estates, where details have doubles.
     """
     tiles = max(1, round(size_m / posting_m / _TEXTURE_TILE))
     tile = fft.next_fast_len(round(size_m / posting_m / tiles))
     n = tiles * tile
     seed = int(rng.integers(2**31))
-    terrain = _stretch(_natural_noise(rng, min(n, _TERRAIN_NODES), 2.6, 350.0 / size_m), n)
+    terrain = _stretch(natural_noise(rng, min(n, _TERRAIN_NODES), 2.6, smallest_hill_m / size_m), n)
     terrain -= terrain.min()
     terrain *= relief_m / terrain.max()
     terrain += np.float32(lowest_m)
     warp_m = 40.0 * min(1.0, size_m / 2000.0 + 0.3)
     warp = np.stack(
-        [warp_m / posting_m * _natural_noise(rng, _WARP_NODES, 3.0, 300.0 / size_m) for _ in range(2)]
+        [warp_m / posting_m * natural_noise(rng, _WARP_NODES, 3.0, 300.0 / size_m) for _ in range(2)]
     )
-    texture = _natural_noise(rng, tile, 1.0, 0.0)
-    blotches = _natural_noise(rng, _WARP_NODES, 1.5, 0.0)
-    albedo, roof, parcel = cover_land(terrain, warp, texture, blotches, posting_m, seed)
+    texture = natural_noise(rng, tile, 1.0, 0.0)
+    blotches = natural_noise(rng, _WARP_NODES, 1.5, 0.0)
+    albedo, roof, parcel = cover_land(terrain, warp, texture, blotches, posting_m, seed, patterned_share)
     east_m, north_m = metres_per_degree(centre_lon_lat[1], lowest_m + relief_m / 2.0)
     step = np.array([posting_m / east_m, posting_m / north_m])
     origin = np.array(centre_lon_lat) + (n - 1) / 2.0 * step * [-1.0, 1.0]
     return World(seed, origin, step, posting_m, terrain, roof, albedo, parcel)
 
 
-def _natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: float) -> FloatImage:
+def natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: float) -> FloatImage:
     """Periodic noise (n, n) of unit spread whose amplitudes fall with the frequency.
 
     Args:

@@ -2,11 +2,12 @@
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
 from services.geodesy import east_north_up
-from services.simulation.land import NO_ROOF
+from services.simulation.land import ESTATE_LOT_M, NO_ROOF
 from services.simulation.world import World, make_world
 
 a_micrometre = 1e-6
@@ -82,3 +83,34 @@ def test_the_texture_reaches_down_to_the_posting_as_in_nature(world: World) -> N
     power = [spectrum[(radius >= a) & (radius < b)].mean() for a, b in pairwise(bands)]
     slope = np.polyfit(np.log(np.sqrt(bands[1:] * bands[:-1])), np.log(power), 1)[0]
     assert -3.5 < slope < -1.5
+
+
+def test_details_of_patterned_land_have_doubles_nearby() -> None:
+    def best_double(patterned_share: float) -> float:
+        """Median over small pieces of land of how well the land a house away looks like them."""
+        world = make_world(
+            np.random.default_rng(8), 1000.0, 1.0, relief_m=1.0, patterned_share=patterned_share
+        )
+        half, reach, lot = 15, 55, int(ESTATE_LOT_M / 2.0)
+        scores = []
+        for row, column in np.random.default_rng(1).integers(reach, 1000 - reach, (60, 2)):
+            around = world.albedo[row - reach : row + reach + 1, column - reach : column + reach + 1]
+            piece = around[reach - half : reach + half + 1, reach - half : reach + half + 1]
+            score = cv2.matchTemplate(around, piece, cv2.TM_CCOEFF_NORMED)
+            middle = reach - half
+            score[
+                middle - lot // 2 : middle + lot // 2 + 1, middle - lot // 2 : middle + lot // 2 + 1
+            ] = -1
+            scores.append(score.max())
+        return float(np.median(scores))
+
+    assert best_double(1.0) > best_double(0.0) + 0.1
+
+
+def test_larger_hills_are_gentler() -> None:
+    steep, gentle = (
+        make_world(np.random.default_rng(8), 2000.0, 4.0, relief_m=300.0, smallest_hill_m=hill)
+        for hill in (300.0, 1200.0)
+    )
+    assert gentle.steepest_slope < steep.steepest_slope
+    assert np.ptp(gentle.terrain_m) == pytest.approx(300.0, abs=0.01)

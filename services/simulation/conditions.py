@@ -1,0 +1,125 @@
+"""What stands between a world and a good image of it: haze, clouds, season, other bands, noise."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.errors import InputError
+from services.simulation.grid import bilinear_values
+from services.simulation.render import Radiometry
+from services.simulation.world import natural_noise
+from services.types import Array, FloatImage
+
+HAZE_LIGHT = 0.35
+"""Light of haze that hides everything, in that of a white ground in the sun."""
+
+INVERSION_LIGHT = 0.6
+"""Light that is dark where contrast is inverted; what is brighter is as dark."""
+
+CLOUD_LIGHT = 0.65
+CLOUD_RELIEF = 0.08
+"""Light of a thick cloud and how much it varies over it."""
+
+SHADOW_LIGHT = 0.45
+"""What a thick cloud leaves of the light below it."""
+
+_CLOUD_NODES = 256
+_CLOUD_EDGE = 0.25
+_SHADOW_SHIFT = (0.05, 0.03)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """How an image was taken, besides its geometry.
+
+    Attributes:
+        haze: 0 to 1, share of the ground's contrast that is lost.
+        cloud_cover: 0 to 1, share of the image under clouds; their shadows come on top.
+        inverted: what is bright is dark, as between some pairs of bands.
+        season: 0 to 1, how far the ground is from another day's; see `light.day_of`.
+        noise: standard deviation where it is dark, of 12 bits; the sensor's when that is larger.
+    """
+
+    haze: float = 0.0
+    cloud_cover: float = 0.0
+    inverted: bool = False
+    season: float = 0.0
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse shares that are none."""
+        for name in ("haze", "cloud_cover", "season"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"{name}: {getattr(self, name)} given, 0 to 1 expected")
+
+
+CLEAR = Conditions()
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """Where an image is cloudy; the same for a pixel whatever is read with it.
+
+    Attributes:
+        thickness: (n, n) noise of unit spread, stretched over the image.
+        threshold: thickness from which on there is cloud.
+        per_px: (2,) nodes a line and a sample.
+    """
+
+    thickness: FloatImage
+    threshold: float
+    per_px: Array
+
+    def opacity(self, line: Array, sample: Array, shift: tuple[float, float] = (0.0, 0.0)) -> FloatImage:
+        """How much of the ground is hidden, 0 to 1: (lines, samples).
+
+        Args:
+            line, sample: (lines,) and (samples,) pixels.
+            shift: lines and samples in sizes of the image, of what hides it.
+        """
+        size = len(self.thickness)
+        y = (line[:, None] + 0.5) * self.per_px[0] + shift[0] * size
+        x = (sample[None, :] + 0.5) * self.per_px[1] + shift[1] * size
+        grid = np.column_stack([np.broadcast_to(v, (len(line), len(sample))).ravel() for v in (x, y)])
+        thickness = bilinear_values(self.thickness, grid).reshape(len(line), len(sample))
+        t = np.clip((thickness - self.threshold) / _CLOUD_EDGE + 0.5, 0.0, 1.0)
+        return np.asarray(t * t * (3.0 - 2.0 * t), dtype=np.float32)
+
+
+def clouds_over(shape: tuple[int, int], cover: float, rng: np.random.Generator) -> Clouds | None:
+    """Clouds over a share of an image; none when it is zero.
+
+    Args:
+        shape: lines and samples.
+        cover: 0 to 1.
+        rng: where they are.
+    """
+    if cover == 0.0:
+        return None
+    thickness = natural_noise(rng, _CLOUD_NODES, 1.8, 0.01)
+    threshold = float(np.quantile(thickness, 1.0 - cover))
+    return Clouds(thickness, threshold, _CLOUD_NODES / np.array(shape, dtype=np.float64))
+
+
+def under_clouds(light: FloatImage, clouds: Clouds, line: Array, sample: Array) -> FloatImage:
+    """Light (lines, samples) of the ground with clouds and their shadows over it."""
+    shadow = clouds.opacity(line, sample, _SHADOW_SHIFT)
+    cloud = clouds.opacity(line, sample)
+    top = CLOUD_LIGHT + CLOUD_RELIEF * (2.0 * shadow - 1.0)
+    ground = light * (1.0 - (1.0 - SHADOW_LIGHT) * shadow)
+    return np.asarray(ground + cloud * (top - ground), dtype=np.float32)
+
+
+def inverted(light: FloatImage) -> FloatImage:
+    """Light whose contrast is the opposite."""
+    return np.maximum(np.float32(INVERSION_LIGHT) - light, np.float32(0.0))
+
+
+def seen_through(conditions: Conditions, radiometry: Radiometry) -> Radiometry:
+    """From light to numbers through haze, with the noise of the conditions."""
+    return replace(
+        radiometry,
+        gain=radiometry.gain * (1.0 - conditions.haze),
+        haze=radiometry.haze + radiometry.gain * HAZE_LIGHT * conditions.haze,
+        noise_floor=max(radiometry.noise_floor, conditions.noise),
+    )

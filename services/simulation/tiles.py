@@ -1,0 +1,195 @@
+"""Images of a world rendered where they are read: scenes larger than anyone would render whole."""
+
+from collections import OrderedDict
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from services.imagery import Window
+from services.simulation.conditions import (
+    CLEAR,
+    Clouds,
+    Conditions,
+    clouds_over,
+    inverted,
+    seen_through,
+    under_clouds,
+)
+from services.simulation.land import NO_ROOF
+from services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
+from services.simulation.rays import meet_surface
+from services.simulation.render import NODE_SPACING, digitise, light_met, nodes, sight_of
+from services.simulation.view import ViewGeometry
+from services.simulation.world import World
+from services.types import Array, FloatImage
+
+TILE_PX = NODE_SPACING
+_CELLS = 128
+_CACHED_TILES = 16_384
+
+Pixels = npt.NDArray[np.uint16]
+
+
+class LightOnDemand:
+    """Light of a day averaged over pixels, computed for the cells that are asked for.
+
+    Attributes:
+        values: (rows, columns), NaN where not computed yet.
+    """
+
+    def __init__(self, world: World, day: Day, ratio: float) -> None:
+        """Prepare the light of a day.
+
+        Args:
+            world: the ground.
+            day: its state.
+            ratio: pixel size in cells, to which the light is averaged.
+        """
+        self.values: FloatImage = np.full(world.albedo.shape, np.nan, dtype=np.float32)
+        self._world, self._day, self._ratio = world, day, ratio
+
+    def compute(self, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]) -> None:
+        """Compute what is missing from row and column (2,) `first` to `last`; the grid repeats."""
+        rows, columns = self.values.shape
+        for row in _starts(int(first[0]), int(last[0]), rows):
+            for column in _starts(int(first[1]), int(last[1]), columns):
+                if np.isnan(self.values[row, column]):
+                    self._compute_tile(row, column)
+
+    def _compute_tile(self, row: int, column: int) -> None:
+        out = self.values[row : row + _CELLS, column : column + _CELLS]
+        margin = smoothing_margin(self._ratio)
+        height, width = out.shape[0] + 2 * margin, out.shape[1] + 2 * margin
+        light = radiance(self._world, self._day, row - margin, column - margin, height, width)
+        take = np.arange(row - margin, row - margin + height) % len(self.values)
+        wrap = np.arange(column - margin, column - margin + width) % self.values.shape[1]
+        built = self._world.roof_m[take[:, None], wrap] > NO_ROOF
+        smooth = averaged(light, built, self._ratio)
+        out[:] = smooth[margin : height - margin, margin : width - margin]
+
+
+def _starts(first: int, last: int, size: int) -> Iterator[int]:
+    """First cells of the tiles that hold cells `first` to `last` of an axis that repeats."""
+    if last - first >= size:
+        first, last = 0, size - 1
+    at = first
+    while at <= last:
+        start = at % size // _CELLS * _CELLS
+        yield start
+        at += min(start + _CELLS, size) - at % size
+
+
+class TiledView:
+    """An image of a world as an `ImageSource`: tiles are rendered when a window first touches them.
+
+    The pixels are those of the image, not of the window: noise is drawn tile by tile from a seed of its
+    own, and no tile knows what was rendered before it.
+    """
+
+    def __init__(
+        self, world: World, geometry: ViewGeometry, seed: int, conditions: Conditions = CLEAR
+    ) -> None:
+        """Prepare an image.
+
+        Args:
+            world: the ground.
+            geometry: how it is taken.
+            seed: of clouds and noise.
+            conditions: what it is taken through.
+
+        Raises:
+            InputError: when slopes are so steep that the terrain would hide itself.
+        """
+        plan, acquisition = geometry.plan, geometry.acquisition
+        sun = acquisition.sun_elevation_deg, acquisition.sun_azimuth_deg
+        day = day_of(world, plan.acquired_at.date(), *sun, conditions.season)
+        self._world = world
+        self._geometry = geometry
+        self._conditions = conditions
+        self._seed = seed
+        self._sight = sight_of(world, plan.incidence_deg, *sun)
+        self._light = LightOnDemand(world, day, plan.gsd_m / world.posting_m)
+        self._clouds: Clouds | None = clouds_over(
+            plan.shape, conditions.cloud_cover, np.random.default_rng([seed, 0])
+        )
+        self._radiometry = seen_through(conditions, plan.radiometry)
+        self._tiles: OrderedDict[tuple[int, int], Pixels] = OrderedDict()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        return self._geometry.plan.shape
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window, float32; NaN beyond the image."""
+        out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
+        start = np.array([window.line, window.sample])
+        first = np.maximum(start, 0)
+        last = np.minimum(start + out.shape, self.shape)
+        if not (last > first).all():
+            return out
+        low, high = first // TILE_PX, (last - 1) // TILE_PX
+        for row in range(low[0], high[0] + 1):
+            for column, pixels in self._row_of_tiles(row, int(low[1]), int(high[1])):
+                corner = np.array([row, column]) * TILE_PX
+                a, b = np.maximum(first, corner), np.minimum(last, corner + pixels.shape)
+                (r0, c0), (r1, c1) = a - start, b - start
+                (i0, j0), (i1, j1) = a - corner, b - corner
+                out[r0:r1, c0:c1] = pixels[i0:i1, j0:j1]
+        return out
+
+    def _row_of_tiles(self, row: int, first: int, last: int) -> Iterator[tuple[int, Pixels]]:
+        """Columns and pixels of neighbouring tiles, rendered where they are missing."""
+        missing = [c for c in range(first, last + 1) if (row, c) not in self._tiles]
+        if missing:
+            low, high = self._nodes(row, missing[0], missing[-1] + 1)
+        for column in range(first, last + 1):
+            pixels = self._tiles.pop((row, column), None)
+            if pixels is None:
+                at = column - missing[0]
+                pixels = self._render(row, column, low[:, :, at : at + 2], high[:, :, at : at + 2])
+            self._tiles[row, column] = pixels
+            yield column, pixels
+        while len(self._tiles) > _CACHED_TILES:
+            self._tiles.popitem(last=False)
+
+    def _nodes(self, row: int, first: int, last: int) -> tuple[Array, Array]:
+        """Lines of sight of a row of tiles, from one node to another."""
+        line = row * TILE_PX
+        count = min(TILE_PX, self.shape[0] - line)
+        model = self._geometry.true_model
+        return nodes(self._world, model, self._sight, line, count, first, last - first + 1)
+
+    def _render(self, row: int, column: int, low: Array, high: Array) -> Pixels:
+        """One tile."""
+        line = np.arange(row * TILE_PX, min((row + 1) * TILE_PX, self.shape[0]), dtype=np.float64)
+        sample = np.arange(
+            column * TILE_PX, min((column + 1) * TILE_PX, self.shape[1]), dtype=np.float64
+        )
+        light = self._light_met(low, high, (len(line), len(sample)))
+        if self._conditions.inverted:
+            light = inverted(light)
+        if self._clouds is not None:
+            light = under_clouds(light, self._clouds, line, sample)
+        rng = np.random.default_rng([self._seed, 1, row, column])
+        return digitise(light, self._radiometry, rng)
+
+    def _light_met(self, low: Array, high: Array, shape: tuple[int, int]) -> FloatImage:
+        """Light of the pixels of a tile, after that of the cells around what they show."""
+        sight = self._sight
+        ends = [low[1, [0, -1]].reshape(-1, 2), high[1, [0, -1]].reshape(-1, 2)]
+        height, _ = meet_surface(
+            self._world.terrain_m, self._world.roof_m, ends[0], ends[1], sight.low_m, sight.high_m
+        )
+        share = (height - sight.low_m) / (sight.high_m - sight.low_m)
+        column_row = ends[0] + share[:, None] * (ends[1] - ends[0])
+        first = np.floor(column_row.min(axis=0)).astype(np.int64)[::-1]
+        last = np.ceil(column_row.max(axis=0)).astype(np.int64)[::-1]
+        margin = 8
+        while True:
+            self._light.compute(first - margin, last + margin)
+            light = light_met(self._world, self._light.values, sight, low, high, shape)
+            if np.isfinite(light).all() or margin > max(self._light.values.shape):
+                return light
+            margin *= 4
