@@ -1,0 +1,63 @@
+"""The files of the map page, as they are served."""
+
+import json
+from gzip import compress
+from pathlib import Path
+
+import pytest
+
+from app.web import page
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A page of two files, instead of what may have been built here."""
+    monkeypatch.setattr(page, "BUILT", tmp_path)
+    for name, text in (("index.html", "<p>page</p>"), ("page.js", "let page"), ("page.js.gz", "zipped")):
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_the_page_lets_no_script_in_from_elsewhere(client, built):
+    reply = client.get("/map", headers={"Accept-Encoding": "identity"})
+    assert reply.status_code == 200
+    assert reply.headers["content-type"].startswith("text/html")
+    policy = reply.headers["content-security-policy"].split("; ")
+    assert {"default-src 'none'", "script-src 'self'", "connect-src 'self'"} <= set(policy)
+
+
+def test_a_file_is_compressed_only_for_those_who_take_it(client, built):
+    reply = client.get("/map/page.js", headers={"Accept-Encoding": "identity"})
+    assert (reply.text, "content-encoding" in reply.headers) == ("let page", False)
+    (built / "page.js.gz").write_bytes(compress(b"let page"))
+    zipped = client.get("/map/page.js", headers={"Accept-Encoding": "gzip"})
+    assert (zipped.text, zipped.headers["content-encoding"]) == ("let page", "gzip")
+
+
+def test_what_the_browser_has_is_not_sent_again(client, built):
+    plain = {"Accept-Encoding": "identity"}
+    first = client.get("/map/page.js", headers=plain)
+    again = client.get("/map/page.js", headers={**plain, "If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+@pytest.mark.parametrize("name", ["nothing.js", "page.js.gz", "..%2Fpage.py", "%2E%2E"])
+def test_nothing_but_the_page_is_served(client, built, name):
+    assert client.get(f"/map/{name}").status_code == 404
+
+
+def test_an_installation_without_the_page_says_so_at_its_address(client, tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "BUILT", tmp_path / "not built")
+    reply = client.get("/map")
+    assert reply.status_code == 404
+    assert "make page" in reply.json()["detail"]
+
+
+def test_the_lock_file_has_versions_and_no_addresses():
+    text = (ROOT / "web" / "package-lock.json").read_text()
+    assert "://" not in text
+    assert "resolved" not in text
+    wanted = json.loads((ROOT / "web" / "package.json").read_text())["devDependencies"]
+    assert [version for version in wanted.values() if not version[0].isdigit()] == []
