@@ -37,11 +37,29 @@ function withoutMap(script) {
 /** Land and borders of Natural Earth as GeoJSON, to 0.01 degree, as fine as the data are. */
 function land() {
   const world = JSON.parse(readFileSync("node_modules/world-atlas/countries-50m.json", "utf8"));
+  const lands = feature(world, world.objects.land).features.flatMap(({ geometry }) => geometry.coordinates);
   const borders = mesh(world, world.objects.countries, (one, other) => one !== other);
-  const features = [
-    ...feature(world, world.objects.land).features,
-    { type: "Feature", properties: {}, geometry: borders },
+  const geometries = [
+    { type: "MultiPolygon", coordinates: lands.map((rings) => rings.map((ring) => closedAtThePole(unrolled(ring)))) },
+    { type: "MultiLineString", coordinates: borders.coordinates.map(unrolled) },
   ];
+  const features = geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry }));
   const rounded = (key, value) => (typeof value === "number" ? Math.round(value * 100) / 100 : value);
   return JSON.stringify({ type: "FeatureCollection", features }, rounded);
+}
+
+/** A line without the jump at the antimeridian: it goes on beyond 180 degrees, where the map wraps it around. */
+function unrolled(line) {
+  let turn = 0;
+  return line.map(([lon, lat], at) => {
+    const step = at === 0 ? 0 : lon - line[at - 1][0];
+    if (Math.abs(step) > 180) turn -= 360 * Math.sign(step);
+    return [lon + turn, lat];
+  });
+}
+
+/** A ring that has gone around the south pole, by way of the pole's edge of the map. */
+function closedAtThePole(ring) {
+  const [first, last] = [ring[0], ring.at(-1)];
+  return Math.abs(last[0] - first[0]) < 180 ? ring : [...ring, [last[0], -90], [first[0], -90], first];
 }

@@ -1,7 +1,7 @@
 // Signing in: a bearer token, kept in this tab until it is closed.
 
 import { get, Refused, setToken, token } from "./api";
-import { h, problem } from "./elements";
+import { fill, h, problem } from "./elements";
 import { go, type ShowView } from "./place";
 
 export interface Caller {
@@ -28,7 +28,8 @@ export async function whoCalls(): Promise<Caller | null> {
 
 export const showAccess: ShowView = async ({ panel, scopes }) => {
   if (token()) {
-    panel.replaceChildren(
+    fill(
+    panel,
       h("h1", { tabindex: -1 }, "Signed in"),
       h("p", {}, `This token allows: ${scopes.join(", ")}. It is kept until this tab is closed.`),
       h("p", {}, h("button", { type: "button", onclick: () => enter(null) }, "Sign out")),
@@ -37,7 +38,8 @@ export const showAccess: ShowView = async ({ panel, scopes }) => {
   }
   const secret = h("input", { type: "password", id: "secret", autocomplete: "off", spellcheck: false, required: true });
   const told = h("div");
-  panel.replaceChildren(
+  fill(
+    panel,
     h("h1", { tabindex: -1 }, "Sign in"),
     h("p", {}, "Paste a token. An administrator makes one with ", h("code", {}, "amers token create"), "; it is kept until this tab is closed."),
     h(

@@ -1,7 +1,7 @@
 // Blocks: what there is, how good each is, and its publication by an administrator.
 
 import { type BlockFeature, type BlockProperties, get, type Page, post } from "./api";
-import { badge, facts, figure, h, plural, problem, when } from "./elements";
+import { badge, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { announce, type ShowView } from "./place";
 
 interface Distribution {
@@ -27,10 +27,11 @@ export function blocks(signal?: AbortSignal): Promise<Page<BlockFeature>> {
 export const showBlocks: ShowView = async ({ panel, atlas, signal }) => {
   const { features } = await blocks(signal);
   await atlas.show("blocks", features);
-  panel.replaceChildren(
+  fill(
+    panel,
     h("h1", { tabindex: -1 }, "Blocks"),
     h("p", {}, "A block is one production of points, published and withdrawn as a whole."),
-    features.length === 0 ? h("p", { class: "quiet" }, "There is none yet.") : null!,
+    features.length === 0 ? h("p", { class: "quiet" }, "There is none yet.") : null,
     h("ul", { class: "list" }, ...features.map(({ properties }) => row(properties))),
   );
 };
@@ -47,11 +48,12 @@ export const showBlock: ShowView = async (place, number) => {
   const published = properties.state === "published";
   const act = h("button", { type: "button", class: published ? "" : "strong", onclick: () => void change() }, published ? "Withdraw" : "Publish");
   const told = h("div");
-  panel.replaceChildren(
+  fill(
+    panel,
     h("p", {}, h("a", { href: "#/blocks" }, "← Blocks")),
     h("h1", { tabindex: -1 }, properties.title || properties.id),
     h("p", {}, badge(properties.state), " ", h("span", { class: "quiet" }, `since ${when(properties.state_changed_at)}`)),
-    scopes.includes("admin") ? h("p", {}, act) : null!,
+    scopes.includes("admin") ? h("p", {}, act) : null,
     told,
     facts({
       Name: `${properties.id}, version ${properties.version}`,

@@ -15,8 +15,13 @@ export function h<Name extends keyof HTMLElementTagNameMap>(
     else if (value === true) element.setAttribute(key, "");
     else if (value !== false && value != null) element.setAttribute(key, String(value));
   }
-  element.append(...children.filter((child) => child != null && child !== false).map((child) => child as Node));
+  fill(element, ...children);
   return element;
+}
+
+/** Put other children into an element; empty ones are left out. */
+export function fill(element: HTMLElement, ...children: Child[]): void {
+  element.replaceChildren(...children.filter((child) => child != null && child !== false).map((child) => child as Node));
 }
 
 /** A list of names and their values; rows without a value are left out. */

@@ -2,7 +2,7 @@
 
 import type { FeatureCollection, Point, Polygon } from "geojson";
 import { blobUrl, call, get, type Job, type Result, type Verdict } from "./api";
-import { badge, facts, figure, h, problem, when } from "./elements";
+import { badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
 import { type MeasureProperties, residualVectors } from "./residuals";
 
@@ -30,11 +30,11 @@ export const showJob: ShowView = async (place, id) => {
   const { panel, signal } = place;
   const heading = h("h1", { tabindex: -1 }, "Job");
   const body = h("div");
-  panel.replaceChildren(h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")), heading, body);
+  fill(panel, h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")), heading, body);
   let job = await find(id, signal);
   heading.textContent = job.processID.replace("-", " ").replace(/^./, (first) => first.toUpperCase());
   const running = progressOf(job);
-  if (!ended(job)) body.replaceChildren(running.element);
+  if (!ended(job)) fill(body, running.element);
   while (!ended(job)) {
     running.update(job);
     await pause(POLL_MS, signal);
@@ -42,7 +42,7 @@ export const showJob: ShowView = async (place, id) => {
   }
   announce(`The job is ${job.status}.`);
   if (job.status === "successful") await showResults(place, job, heading, body);
-  else body.replaceChildren(outcome(job));
+  else fill(body, outcome(job));
 };
 
 function find(id: string, signal: AbortSignal): Promise<Job> {
@@ -89,7 +89,7 @@ async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElem
   const told = results["report.json"];
   const measured = results["control_points.geojson"];
   if (!told || !measured) {
-    body.replaceChildren(outcome(job), await downloads(results, signal));
+    fill(body, outcome(job), await downloads(results, signal));
     return;
   }
   const [report, points] = await Promise.all([
@@ -100,7 +100,7 @@ async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElem
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
   const { features, exaggeration } = residualVectors(points);
   heading.textContent = report.scene.name;
-  body.replaceChildren(...summary(report, exaggeration), await downloads(results, signal));
+  fill(body, ...summary(report, exaggeration), await downloads(results, signal));
   await atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]);
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));

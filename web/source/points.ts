@@ -1,7 +1,7 @@
 // Points: what is in view, and one point with its chips.
 
 import { blobUrl, get, type Page, type PointFeature, type View } from "./api";
-import { facts, figure, h, plural, problem } from "./elements";
+import { facts, figure, fill, h, plural, problem } from "./elements";
 import type { ShowView } from "./place";
 
 const LISTED = 50;
@@ -11,7 +11,8 @@ const SETTLED_MS = 250;
 export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   const list = h("ul", { class: "list", "aria-label": "Points in view" });
   const count = h("p", { class: "count" }, "…");
-  panel.replaceChildren(
+  fill(
+    panel,
     h("h1", { tabindex: -1 }, "Control points"),
     h("p", {}, "Ground positions in three dimensions, each with image chips. Select one on the map or in the list."),
     legend(),
@@ -22,10 +23,10 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   let asked = 0;
   atlas.whileMoving(() => {
     const mine = ++asked;
-    setTimeout(() => mine === asked && !signal.aborted && void fill(), mine === 1 ? 0 : SETTLED_MS);
+    setTimeout(() => mine === asked && !signal.aborted && void refresh(), mine === 1 ? 0 : SETTLED_MS);
   }, signal);
 
-  async function fill(): Promise<void> {
+  async function refresh(): Promise<void> {
     try {
       const page = await get<Page<PointFeature>>(`collections/points/items?bbox=${atlas.bounds().join(",")}&limit=${LISTED}`, signal);
       const total = page.numberMatched ?? page.features.length;
@@ -43,7 +44,8 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
   const [lon, lat, height] = point.geometry.coordinates;
   const { properties } = point;
   const chips = h("ul", { class: "chips", "aria-label": "Chips" });
-  panel.replaceChildren(
+  fill(
+    panel,
     h("p", {}, h("a", { href: "#/points" }, "← Points")),
     h("h1", { tabindex: -1 }, `Point ${id}`),
     facts({

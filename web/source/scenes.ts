@@ -2,7 +2,7 @@
 
 import type { Feature } from "geojson";
 import { get, type Job, post, type Scene } from "./api";
-import { badge, bytes, facts, figure, h, plural, problem, when } from "./elements";
+import { badge, bytes, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { go, type Place, type ShowView } from "./place";
 import { type SceneUpload, uploadModel, uploadScene } from "./upload";
 
@@ -13,7 +13,8 @@ const MODELS = ".txt,.xml,.rpb,.rpc";
 export const showScenes: ShowView = async (place) => {
   const { panel, atlas, signal, scopes } = place;
   if (!scopes.includes("register")) {
-    panel.replaceChildren(
+    fill(
+    panel,
       h("h1", { tabindex: -1 }, "Scenes"),
       h("p", {}, "Scenes are registered by those who may: ", h("a", { href: "#/access" }, "sign in"), " with a token of scope ", h("code", {}, "register"), "."),
     );
@@ -24,7 +25,8 @@ export const showScenes: ShowView = async (place) => {
     get<{ jobs: Job[] }>("jobs?limit=20", signal),
   ]);
   await atlas.show("scenes", outlines(scenes));
-  panel.replaceChildren(
+  fill(
+    panel,
     h("h1", { tabindex: -1 }, "Scenes"),
     uploadForm(place),
     h("h2", {}, "Jobs"),
@@ -41,7 +43,8 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
   atlas.fit(scene.footprint);
   const told = h("div");
   const again = h("button", { type: "button", class: "strong", onclick: () => void start() }, "Register");
-  panel.replaceChildren(
+  fill(
+    panel,
     h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")),
     h("h1", { tabindex: -1 }, scene.name),
     facts({
