@@ -36,6 +36,11 @@ class MapGrid:
         """Whether the map is longitude and latitude."""
         return _horizontal(self.crs).is_geographic
 
+    @property
+    def first_axis_is_north(self) -> bool:
+        """Whether the reference system itself names northings or latitudes first; grids never do."""
+        return _horizontal(self.crs).axis_info[0].direction.lower() == "north"
+
     def xy(self, line_sample: Array) -> Array:
         """Map positions (n, 2) of pixel positions (n, 2)."""
         return np.asarray(self.origin_xy + line_sample @ self.step_xy.T)

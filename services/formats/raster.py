@@ -19,6 +19,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
+from services.formats.bands import BandMix, default_mix, one_band
 from services.imagery import Window
 from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
@@ -47,7 +48,7 @@ MAX_EXPANSION = 5_000
 
 # GDAL falls back to a twentieth of the machine's memory outside the environment that says otherwise.
 _CACHE = {"GDAL_CACHEMAX": 64_000_000}
-_OPTIONS = _CACHE | {
+OPTIONS = _CACHE | {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_NUM_THREADS": 1,
@@ -58,17 +59,22 @@ _OPTIONS = _CACHE | {
 
 @dataclass(frozen=True)
 class RasterImage:
-    """One band of an image file, an `ImageSource`; for one thread at a time.
+    """One band of an image file, or a mix of several, an `ImageSource`; for one thread at a time.
 
     Attributes:
         path: the file.
         dataset: as opened by `open_raster`.
-        band: counted from one.
+        mix: the bands and their weights.
     """
 
     path: Path
     dataset: rasterio.DatasetReader
-    band: int
+    mix: BandMix
+
+    @property
+    def band(self) -> int:
+        """The first of the bands."""
+        return self.mix.bands[0]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -98,26 +104,50 @@ class RasterImage:
         self.dataset.close()
 
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
-        flags = self.dataset.mask_flag_enums[self.band - 1]
-        nodata = self.dataset.nodatavals[self.band - 1]
-        with _as_format_error(self.path, "its pixels"), rasterio.Env(**_CACHE):
-            pixels = self.dataset.read(self.band, window=window)
+        if len(self.mix.bands) == 1:
+            self._fill_band(out, self.band, window)
+            return
+        out[:] = 0.0
+        one = np.empty_like(out)
+        for band, weight in zip(self.mix.bands, self.mix.weights, strict=True):
+            self._fill_band(one, band, window)
+            out += np.float32(weight) * one
+
+    def _fill_band(self, out: FloatImage, band: int, window: RasterWindow) -> None:
+        flags = self.dataset.mask_flag_enums[band - 1]
+        nodata = self.dataset.nodatavals[band - 1]
+        saturated = self._saturated(band)
+        with as_format_error(self.path, "its pixels"), rasterio.Env(**_CACHE):
+            pixels = self.dataset.read(band, window=window)
             out[:] = pixels
             if MaskFlags.nodata in flags:
                 out[pixels == nodata] = np.nan
             elif MaskFlags.all_valid not in flags:
-                out[self.dataset.read_masks(self.band, window=window) == 0] = np.nan
+                out[self.dataset.read_masks(band, window=window) == 0] = np.nan
+            if saturated is not None:
+                out[pixels >= saturated] = np.nan
+
+    def _saturated(self, band: int) -> int | None:
+        """The number that means "this or brighter"; None where white is an ordinary colour.
+
+        Eight bits have been stretched for the eye, and real numbers have no end.
+        """
+        dtype = np.dtype(self.dataset.dtypes[band - 1])
+        if dtype.kind not in "ui" or dtype.itemsize < 2:
+            return None
+        bits = self.dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")
+        return int(2 ** int(bits) - 1) if bits.isdigit() else int(np.iinfo(dtype).max)
 
 
-def open_raster(path: Path, band: int = 1) -> RasterImage:
-    """Open one band of a GeoTIFF (or COG), JPEG 2000 or NITF file.
+def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
+    """Open one band, or a mix of several, of a GeoTIFF (or COG), JPEG 2000 or NITF file.
 
     Only the file itself is looked at: no sidecar, no address, no archive, no file that names others.
     The far corner is read, so that a truncated file is told now rather than in the middle of the work.
 
     Args:
         path: of a regular file.
-        band: counted from one.
+        bands: a band, counted from one, or a mix; None for what `default_mix` takes.
 
     Raises:
         FormatError: when the file cannot be used; the message says why and what was expected.
@@ -126,10 +156,12 @@ def open_raster(path: Path, band: int = 1) -> RasterImage:
     if "://" in str(path) or str(path).startswith("/vsi") or not resolved.is_file():
         raise FormatError(f"{path}: expected the name of an image file")
     driver = _driver(path)
-    with rasterio.Env(**_OPTIONS):
-        with _as_format_error(path, f"the image as {driver}"):
+    with rasterio.Env(**OPTIONS):
+        with as_format_error(path, f"the image as {driver}"):
             dataset = rasterio.open(resolved, driver=driver)
-        image = RasterImage(path, dataset, band)
+        if bands is None:
+            bands = default_mix(tuple(colour.name for colour in dataset.colorinterp))
+        image = RasterImage(path, dataset, bands if isinstance(bands, BandMix) else one_band(bands))
         try:
             _check_declaration(image)
             image.read(Window(image.shape[0] - 1, image.shape[1] - 1, 1, 1))
@@ -183,8 +215,8 @@ def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:
         raise FormatError(f"{path_out}: the delivered image would be written over")
     shutil.copyfile(path_in, path_out)
     with (
-        _as_format_error(path_out, "a GeoTIFF whose tags can be written"),
-        rasterio.Env(**_OPTIONS),
+        as_format_error(path_out, "a GeoTIFF whose tags can be written"),
+        rasterio.Env(**OPTIONS),
         rasterio.open(path_out.resolve(), "r+", driver="GTiff", IGNORE_COG_LAYOUT_BREAK="YES") as copy,
     ):
         copy.rpcs = gdal_rpc(model)
@@ -200,7 +232,7 @@ def write_raster(path: Path, pixels: npt.NDArray[Any], model: RpcModel | None = 
     """
     lines, samples = pixels.shape
     with (
-        rasterio.Env(**_OPTIONS),
+        rasterio.Env(**OPTIONS),
         rasterio.open(
             path.resolve(),
             "w",
@@ -261,11 +293,12 @@ def _driver(path: Path) -> str:
 def _check_declaration(image: RasterImage) -> None:
     """Refuse sizes and bands that cannot be, before anything is allocated for them."""
     dataset, path = image.dataset, image.path
-    if not 1 <= image.band <= dataset.count:
-        raise FormatError(f"{path}: expected a band {image.band}, the image has {dataset.count}")
-    dtype = np.dtype(dataset.dtypes[image.band - 1])
-    if dtype.kind not in "uif":
-        raise FormatError(f"{path}: expected whole or real pixels, found {dtype.name}")
+    for band in image.mix.bands:
+        if not 1 <= band <= dataset.count:
+            raise FormatError(f"{path}: expected a band {band}, the image has {dataset.count}")
+        dtype = np.dtype(dataset.dtypes[band - 1])
+        if dtype.kind not in "uif":
+            raise FormatError(f"{path}: expected whole or real pixels, found {dtype.name}")
     pixels, size = dataset.width * dataset.height, os.path.getsize(path)
     if pixels > MAX_PIXELS or pixels * dtype.itemsize > MAX_EXPANSION * size:
         raise FormatError(
@@ -275,7 +308,7 @@ def _check_declaration(image: RasterImage) -> None:
 
 
 @contextmanager
-def _as_format_error(path: Path, expected: str) -> Iterator[None]:
+def as_format_error(path: Path, expected: str) -> Iterator[None]:
     """Tell the driver's errors as errors of the file."""
     try:
         yield

@@ -148,23 +148,33 @@ def model_of_image(
     return DeliveredModel(model, path, convention, origin, f"{convention} of {path.name}, {reason}")
 
 
+def has_rpc(image: RasterImage) -> bool:
+    """Whether an image has RPC tags, or a file beside it that is named like its RPC."""
+    return bool(image.dataset.tags(ns="RPC")) or bool(_files_beside(image)[1])
+
+
 def _find_model(image: RasterImage) -> tuple[RpcModel, Path, Convention]:
     tags = image.dataset.tags(ns="RPC")
     if tags:
         return _parse_tags(tags, image.path.name), image.path, "tags"
+    names, found = _files_beside(image)
+    if found:
+        return _read_model_file(found[0])
+    raise FormatError(
+        f"{image.path}: no sensor model: the file lies on no map and has no RPC tags, and there is no "
+        f"{', '.join(names)} beside it"
+    )
+
+
+def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
+    """The names an image's RPC may have, and the files beside it that have one of them."""
     stem = image.path.stem
     names = [f"{stem}_RPC.TXT", f"{stem}.RPB", f"{stem}_RPC.XML"]
     airbus = re.fullmatch(r"IMG_(.+?)(_R\d+C\d+)?", stem, re.IGNORECASE)
     if airbus is not None:
         names.append(f"RPC_{airbus[1]}.XML")
     beside = {file.name.upper(): file for file in image.path.resolve().parent.iterdir()}
-    for name in names:
-        if name.upper() in beside:
-            return _read_model_file(beside[name.upper()])
-    raise FormatError(
-        f"{image.path}: no sensor model: the file has no RPC tags, and there is no {', '.join(names)} "
-        "beside it"
-    )
+    return names, [beside[name.upper()] for name in names if name.upper() in beside]
 
 
 def _read_model_file(path: Path) -> tuple[RpcModel, Path, Convention]:
