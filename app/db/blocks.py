@@ -21,8 +21,8 @@ INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
 
 COLUMNS = (
-    "number, id, version, title, state, n_points, n_views, checksum, created_at, state_changed_at, "
-    "st_asbinary(extent) as outline"
+    "number, id, version, title, state, priority, n_points, n_superseded, n_views, checksum, "
+    "created_at, state_changed_at, st_asbinary(extent) as outline"
 )
 
 
@@ -33,6 +33,8 @@ class Block:
     Attributes:
         number: of this version in this database.
         id, version: as its producer names it.
+        priority: of blocks over one place, the points of the greater one are served.
+        n_superseded: how many of its points are not served because a better block has them.
         outline: (m, 2) lon, lat, not closed.
         checksum: sha256 of its block.json.
     """
@@ -42,7 +44,9 @@ class Block:
     version: str
     title: str
     state: BlockState
+    priority: int
     n_points: int
+    n_superseded: int
     n_views: int
     checksum: str
     created_at: datetime
@@ -61,7 +65,12 @@ def lock_sweep(connection: Connection) -> None:
 
 
 def insert_block(
-    connection: Connection, contents: BlockContents, document: str, checksum: str, quality: BlockQuality
+    connection: Connection,
+    contents: BlockContents,
+    document: str,
+    checksum: str,
+    quality: BlockQuality,
+    priority: int = 0,
 ) -> Block | None:
     """A new block, staged, without its points.
 
@@ -70,6 +79,7 @@ def insert_block(
         document: the text of its block.json.
         checksum: sha256 of the same.
         quality: its figures.
+        priority: against other blocks over the same place.
 
     Returns:
         None when there is a block of that id and version.
@@ -77,8 +87,9 @@ def insert_block(
     metadata = contents.document.metadata
     row = connection.execute(
         f"""insert into block
-                (id, version, title, state, extent, n_points, n_views, metadata, quality, checksum)
-            values (%s, %s, %s, 'staged', st_geomfromwkb(%s, 4326), %s, %s, %s::jsonb, %s::jsonb, %s)
+                (id, version, title, state, extent, n_points, n_views, metadata, quality, checksum,
+                 priority)
+            values (%s, %s, %s, 'staged', st_geomfromwkb(%s, 4326), %s, %s, %s::jsonb, %s::jsonb, %s, %s)
             on conflict (id, version) do nothing returning {COLUMNS}""",
         [
             metadata.id,
@@ -90,6 +101,7 @@ def insert_block(
             document,
             json.dumps(quality_document(quality)),
             checksum,
+            priority,
         ],
     ).fetchone()
     return _block(row) if row else None
@@ -144,6 +156,18 @@ def set_state(connection: Connection, number: int, state: BlockState) -> Block:
         f"update block set state = %s, state_changed_at = now() where number = %s returning {COLUMNS}",
         [state, number],
     ).fetchone()
+    assert row is not None
+    return _block(row)
+
+
+def set_priority(connection: Connection, number: int, priority: int) -> None:
+    """Let the points of a block win over those of blocks of a smaller priority."""
+    connection.execute("update block set priority = %s where number = %s", [priority, number])
+
+
+def read_block_row(connection: Connection, number: int) -> Block:
+    """A block that is known to exist, as it stands now."""
+    row = connection.execute(f"select {COLUMNS} from block where number = %s", [number]).fetchone()
     assert row is not None
     return _block(row)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.db import blocks
+from app.db import blocks, overlaps
 from app.db.blocks import Block, BlockState
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
@@ -27,6 +27,7 @@ MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "withdrawn": ("published",),
 }
 CHIPS = "chips"
+LARGEST_PRIORITY = 1000
 FILES_AT_ONCE = 4
 
 
@@ -51,7 +52,11 @@ class Published:
 
 
 def ingest_block(
-    connection: Connection, storage: Storage, folder: Path, progress: Progress = no_progress
+    connection: Connection,
+    storage: Storage,
+    folder: Path,
+    progress: Progress = no_progress,
+    priority: int = 0,
 ) -> Ingested:
     """Check a block folder, put its chips into the storage and its rows into the store, staged.
 
@@ -63,6 +68,7 @@ def ingest_block(
         storage: where the chips go.
         folder: of the block.
         progress: told on the way.
+        priority: against other blocks over the same place; the greater one wins.
 
     Raises:
         FormatError: the block is not what it should be; nothing is changed.
@@ -71,13 +77,14 @@ def ingest_block(
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
+    _check_priority(priority)
     contents = check_block(folder, part_of(progress, 0.0, 0.3))
     document = (folder / BLOCK_JSON).read_bytes()
     metadata = contents.document.metadata
     quality = block_quality(contents.points, contents.n_views, metadata.extent)
     blocks.lock_ingestion(connection)
     block = blocks.insert_block(
-        connection, contents, document.decode(), sha256(document).hexdigest(), quality
+        connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
     )
     if block is None:
         raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
@@ -89,29 +96,67 @@ def ingest_block(
 def publish_block(connection: Connection, reference: str) -> Published:
     """Make a block visible, and the version of it that was visible before no longer, in one step.
 
+    Of points of several blocks over one place those of the better block are served: `app.db.overlaps`.
+
     Raises:
         NotFound: there is no such block.
         Conflict: it is published already, or the reference means several versions.
     """
-    block = find_block(connection, reference)
-    versions = blocks.lock_versions(connection, block.id)
+    block, versions = _to_change(connection, reference)
     before = next((v for v in versions if v.state == "published" and v.number != block.number), None)
-    current = next(v for v in versions if v.number == block.number)
-    published = _change(connection, current, "published")
-    superseded = None if before is None else _change(connection, before, "withdrawn")
-    return Published(published, superseded)
+    _change(connection, block, "published")
+    if before is not None:
+        _change(connection, before, "withdrawn")
+        overlaps.settle(connection, before.number)
+    overlaps.settle(connection, block.number)
+    return Published(
+        blocks.read_block_row(connection, block.number),
+        None if before is None else blocks.read_block_row(connection, before.number),
+    )
 
 
 def withdraw_block(connection: Connection, reference: str) -> Block:
-    """Make a block invisible; it can be published again.
+    """Make a block invisible; it can be restored.
 
     Raises:
         NotFound: there is no such block.
         Conflict: it is not published, or the reference means several versions.
     """
+    block, _ = _to_change(connection, reference)
+    _change(connection, block, "withdrawn")
+    overlaps.settle(connection, block.number)
+    return blocks.read_block_row(connection, block.number)
+
+
+def restore_block(connection: Connection, reference: str) -> Published:
+    """Make a block visible again that was withdrawn or superseded, in place of its visible version.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: it was never published or is published, or the reference means several versions.
+    """
     block = find_block(connection, reference)
-    versions = blocks.lock_versions(connection, block.id)
-    return _change(connection, next(v for v in versions if v.number == block.number), "withdrawn")
+    if block.state == "staged":
+        raise Conflict(
+            f"block {block.id}@{block.version} was never published: there is nothing to restore"
+        )
+    return publish_block(connection, str(block.number))
+
+
+def prioritise_block(connection: Connection, reference: str, priority: int) -> Block:
+    """Let a block win or lose against other blocks over the same place, at once if it is published.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: the reference means several versions.
+        InputError: the priority is out of range.
+    """
+    _check_priority(priority)
+    block, _ = _to_change(connection, reference)
+    blocks.set_priority(connection, block.number, priority)
+    if block.state == "published":
+        overlaps.settle(connection, block.number)
+    return blocks.read_block_row(connection, block.number)
 
 
 def find_block(connection: Connection, reference: str) -> Block:
@@ -203,6 +248,21 @@ def sweep_storage(connection: Connection, storage: Storage) -> list[str]:
     for key in unnamed:
         storage.delete(key)
     return unnamed
+
+
+def _to_change(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
+    """A block as it stands once nobody else is changing it, and all versions of it."""
+    overlaps.lock_publications(connection)
+    number = find_block(connection, reference).number
+    versions = blocks.lock_versions(connection, blocks.read_block_row(connection, number).id)
+    return next(version for version in versions if version.number == number), versions
+
+
+def _check_priority(priority: int) -> None:
+    if not -LARGEST_PRIORITY <= priority <= LARGEST_PRIORITY:
+        raise InputError(
+            f"priority: {priority} found, {-LARGEST_PRIORITY} to {LARGEST_PRIORITY} expected"
+        )
 
 
 def _change(connection: Connection, block: Block, state: BlockState) -> Block:

@@ -1,0 +1,206 @@
+"""Several blocks over one place: which point is served, whatever the order of events."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from app.db import engine, overlaps
+from app.db.overlaps import SAME_PLACE_M
+from app.errors import Conflict, InputError
+from app.usecases import blocks
+from services.formats.block import write_block
+from services.formats.block_json import AccuracyFigure
+from services.types import Array
+from tests.factories import BOX, control_points, metadata, noise_chips
+
+metre_of_latitude_deg = 1.0 / 111_000.0
+
+
+def made(
+    folder, name: str, lon_lat: Array, frame_sigma_m: float | None = None, version: str = "1", box=BOX
+):
+    """A block with points at these positions."""
+    points = control_points(len(lon_lat), np.random.default_rng(5), box)
+    points = replace(points, lon_lat_h=np.column_stack([lon_lat, points.lon_lat_h[:, 2]]))
+    said = metadata(name, version, box)
+    if frame_sigma_m is not None:
+        frame = AccuracyFigure("absolute", "frame_sigma_m", frame_sigma_m, 30, "survey")
+        said = replace(said, accuracy=(*said.accuracy, frame))
+    write_block(folder, said, points, noise_chips(points), {})
+    return folder
+
+
+@pytest.fixture
+def places():
+    """Positions 100 m apart from each other."""
+    step = np.arange(10) * 100.0 * metre_of_latitude_deg
+    grid = np.stack(np.meshgrid(5.21 + 2 * step, 43.21 + step), axis=-1).reshape(-1, 2)
+    return grid[:30]
+
+
+@pytest.fixture
+def ingest(connection, storage, tmp_path):
+    """Ingests a block with points at these positions, staged."""
+
+    def ingest(name: str, lon_lat: Array, priority: int = 0, **said):
+        folder = made(tmp_path / f"{name}{said.get('version', '')}", name, lon_lat, **said)
+        return blocks.ingest_block(connection, storage, folder, priority=priority).block.number
+
+    return ingest
+
+
+def served(connection) -> dict[str, int]:
+    """How many points of each block are served."""
+    rows = connection.execute(
+        """select b.id || '@' || b.version as name, count(*) as n, b.n_points - b.n_superseded as told
+           from point p join block b on b.number = p.block_number
+           where b.state = 'published' and p.superseded_by is null group by b.number order by 1"""
+    ).fetchall()
+    assert all(row["n"] == row["told"] for row in rows)
+    return {row["name"]: row["n"] for row in rows}
+
+
+def test_of_two_blocks_over_one_place_the_one_with_the_better_frame_is_served(
+    connection, ingest, places
+):
+    near = places + [0.0, 5.0 * metre_of_latitude_deg]
+    ingest("good", places[:20], frame_sigma_m=0.5)
+    ingest("poor", near, frame_sigma_m=5.0)
+    for name in ("poor", "good"):
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"good@1": 20, "poor@1": 10}
+    named = connection.execute(
+        "select count(*) as n from point l join point w on w.id = l.superseded_by"
+        " where st_distancesphere(l.geom, w.geom) between 4.5 and 5.5"
+    ).fetchone()
+    assert named["n"] == 20
+
+
+def test_points_further_apart_than_one_place_are_both_served(connection, ingest, places):
+    ingest("a", places)
+    ingest("b", places + [0.0, 1.1 * SAME_PLACE_M * metre_of_latitude_deg])
+    ingest("c", places + [0.0, -0.9 * SAME_PLACE_M * metre_of_latitude_deg])
+    for name in ("a", "b", "c"):
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"b@1": 30, "c@1": 30}
+
+
+def test_a_priority_comes_before_every_figure_and_may_change_while_published(connection, ingest, places):
+    ingest("good", places, frame_sigma_m=0.5)
+    ingest("poor", places, frame_sigma_m=5.0, priority=1)
+    for name in ("good", "poor"):
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"poor@1": 30}
+    assert blocks.prioritise_block(connection, "good", 2).n_superseded == 0
+    assert served(connection) == {"good@1": 30}
+    with pytest.raises(InputError, match="priority: 1001 found"):
+        blocks.prioritise_block(connection, "good", 1001)
+
+
+def test_a_withdrawal_gives_the_place_to_the_next_best(connection, ingest, places):
+    for priority, name in enumerate(("third", "second", "first")):
+        ingest(name, places, priority=priority)
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"first@1": 30}
+    assert blocks.withdraw_block(connection, "first").n_superseded == 0
+    assert served(connection) == {"second@1": 30}
+    blocks.withdraw_block(connection, "second")
+    assert served(connection) == {"third@1": 30}
+    blocks.restore_block(connection, "first")
+    assert served(connection) == {"first@1": 30}
+    assert blocks.withdraw_block(connection, "third").n_superseded == 0
+
+
+def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, ingest, places):
+    rng = np.random.default_rng(3)
+    names = ("a", "b", "c")
+    for name in names:
+        jitter = rng.normal(0.0, 6.0, places.shape) * metre_of_latitude_deg
+        ingest(name, places + jitter, frame_sigma_m=float(rng.uniform(0.5, 3.0)))
+    found = []
+    for order in permutations(names):
+        for name in order:
+            blocks.publish_block(connection, name)
+        rows = connection.execute("select id, superseded_by from point order by id").fetchall()
+        found.append([tuple(row.values()) for row in rows])
+        for name in order[::-1]:
+            blocks.withdraw_block(connection, name)
+        left = connection.execute("select count(superseded_by) as n from point").fetchone()
+        assert left["n"] == 0
+    assert all(one == found[0] for one in found)
+    assert any(superseded for _, superseded in found[0])
+
+
+def test_a_new_version_takes_the_places_of_the_old_one(connection, ingest, places):
+    ingest("poor", places, frame_sigma_m=5.0)
+    ingest("good", places, frame_sigma_m=0.5)
+    ingest("good", places[:10], frame_sigma_m=0.5, version="2")
+    for name in ("poor", "good@1", "good@2"):
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"good@2": 10, "poor@1": 20}
+    restored = blocks.restore_block(connection, "good@1")
+    assert restored.superseded is not None
+    assert restored.superseded.version == "2"
+    assert served(connection) == {"good@1": 30}
+
+
+def test_one_place_is_one_place_across_the_antimeridian(connection, ingest):
+    box = (179.9, -17.0, -179.9, -16.9)
+    lon_lat = np.array([[179.95, -16.95], [-179.95, -16.95]])
+    ingest("a", lon_lat, box=box)
+    ingest("b", lon_lat, box=box, priority=1)
+    for name in ("a", "b"):
+        blocks.publish_block(connection, name)
+    assert served(connection) == {"b@1": 2}
+
+
+def test_only_a_block_that_was_published_is_restored(connection, ingest, places):
+    ingest("a", places)
+    with pytest.raises(Conflict, match="never published"):
+        blocks.restore_block(connection, "a")
+
+
+def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_place(
+    connection, ingest, dsn, places
+):
+    for version in ("1", "2", "3"):
+        ingest("a", places, version=version)
+    for priority, name in enumerate(("b", "c"), start=1):
+        ingest(name, places, priority=priority)
+    connection.commit()
+
+    def publish(reference: str) -> str | None:
+        with engine.connect(dsn) as own:
+            superseded = blocks.publish_block(own, reference).superseded
+        return None if superseded is None else superseded.version
+
+    wanted = ("a@1", "a@2", "a@3", "b", "c")
+    with ThreadPoolExecutor(len(wanted)) as administrators:
+        list(administrators.map(publish, wanted))
+    assert served(connection) == {"c@1": 30}
+    states = [(block.id, block.state) for block in blocks.list_blocks(connection)]
+    assert sorted(states) == [
+        ("a", "published"),
+        ("a", "withdrawn"),
+        ("a", "withdrawn"),
+        ("b", "published"),
+        ("c", "published"),
+    ]
+    history = connection.execute(
+        "select count(*) as n from audit where kind = 'block' and action = 'changed'"
+        " and before ->> 'state' = 'staged' and after ->> 'state' = 'published'"
+    ).fetchone()
+    assert history["n"] == len(wanted)
+    connection.rollback()
+
+
+def test_publications_wait_for_each_other(dsn):
+    with engine.connect(dsn) as one, engine.connect(dsn) as other:
+        overlaps.lock_publications(one)
+        other.execute("set local lock_timeout = '100ms'")
+        with pytest.raises(Exception, match="lock timeout"):
+            overlaps.lock_publications(other)
+        other.rollback()
