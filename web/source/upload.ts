@@ -1,7 +1,7 @@
 // Uploads that survive a lost connection: tus 1.0, piece by piece.
 
 import { type HttpResponse, Upload } from "tus-js-client";
-import { address, authorization, call } from "./api";
+import { address, authorization, call, Refused, type Scene } from "./api";
 
 const PIECE_BYTES = 8 * 1024 * 1024;
 const RETRY_MS = [0, 1000, 3000, 5000, 10000, 20000, 30000];
@@ -28,14 +28,14 @@ export function uploadScene(image: File, sigmaM: string, progress: (sent: number
   const done = new Promise<string>((resolve, reject) => {
     upload = new Upload(image, {
       endpoint: address("uploads"),
-      headers: authorization(),
+      headers: { Accept: "application/json", ...authorization() },
       metadata: { filename: image.name, ...(sigmaM ? { sigma_m: sigmaM } : {}) },
       chunkSize: PIECE_BYTES,
       retryDelays: RETRY_MS,
       removeFingerprintOnSuccess: true,
       onAfterResponse: noted,
       onProgress: (sent, all) => progress(sent, all ?? image.size),
-      onError: (error) => reject(new Error(told(error))),
+      onError: (error) => reject(refusal(error)),
       onSuccess: () => resolve(scene),
     });
   });
@@ -43,7 +43,17 @@ export function uploadScene(image: File, sigmaM: string, progress: (sent: number
     if (previous) upload.resumeFromPreviousUpload(previous);
     upload.start();
   });
-  return { done, pause: () => void upload.abort(), resume: () => upload.start() };
+  return { done: done.catch(plainly(image, sigmaM)), pause: () => void upload.abort(), resume: () => upload.start() };
+}
+
+/** For a service without resumable uploads: the file in one request; any other error stays what it is. */
+function plainly(image: File, sigmaM: string): (error: unknown) => Promise<string> {
+  return async (error) => {
+    if (!(error instanceof Refused) || error.status !== 404) throw error;
+    const query = new URLSearchParams({ name: image.name, ...(sigmaM ? { sigma_m: sigmaM } : {}) });
+    const reply = await call(`scenes?${query}`, { method: "POST", body: image });
+    return ((await reply.json()) as Scene).id;
+  };
 }
 
 /** Upload a file with the model of a scene beside its image. */
@@ -51,12 +61,13 @@ export async function uploadModel(scene: string, model: File): Promise<void> {
   await call(`scenes/${scene}/files/${encodeURIComponent(model.name)}`, { method: "PUT", body: model });
 }
 
-/** The service's own words out of an error of the upload. */
-function told(error: Error): string {
+/** What went wrong with an upload, in the service's own words if it said any. */
+function refusal(error: Error): Refused {
   const reply = "originalResponse" in error ? (error.originalResponse as HttpResponse | null) : null;
+  if (!reply) return new Refused(0, "The service does not answer; choose the same file again to go on.");
   try {
-    return (JSON.parse(reply?.getBody() ?? "") as { detail: string }).detail;
+    return new Refused(reply.getStatus(), (JSON.parse(reply.getBody()) as { detail: string }).detail);
   } catch {
-    return reply ? `The upload was refused (${reply.getStatus()}).` : "The service does not answer; choose the same file again to go on.";
+    return new Refused(reply.getStatus(), `The upload was refused (${reply.getStatus()}).`);
   }
 }
