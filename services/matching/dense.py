@@ -1,0 +1,209 @@
+"""Places of a scene looked for on a reference ortho-image, rendered into the scene's own geometry."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from services.errors import InputError
+from services.imagery import (
+    ArrayImage,
+    ImageSource,
+    ReducedImage,
+    Window,
+    image_gsd_m,
+    low_pass,
+    mean_pixels,
+    sample_image,
+)
+from services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from services.matching.points import PointMatches
+from services.sensors.base import SensorModel
+from services.terrain import Terrain, meet
+from services.types import Array, FloatImage, IntArray, Progress, ViewMeasures, no_progress
+
+_NODE_PX = 4
+"""Pixels of a level between the lines of sight that are followed down to the ground."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A reference ortho-image and the ground it shows.
+
+    Attributes:
+        image: its pixels.
+        model: an ortho model.
+        terrain: the ground; None takes it at height zero, which only a scene without parallax allows.
+        sigma_m: how far a detail of it lies off the rest of it, one standard deviation a coordinate.
+        height_sigma_m: the same of the heights.
+        common_sigma_m: what all the places measured on it have in common, one standard deviation a
+            coordinate: shadows and roofs lean the same way all over.
+        frame_sigma_m: how well it lies on the Earth as a whole, one standard deviation a coordinate; NaN
+            when unknown.
+    """
+
+    image: ImageSource
+    model: SensorModel
+    terrain: Terrain | None
+    sigma_m: float
+    height_sigma_m: float
+    common_sigma_m: float
+    frame_sigma_m: float = float("nan")
+
+
+@dataclass(frozen=True)
+class DenseOptions:
+    """How places are searched.
+
+    Attributes:
+        window_px: side of the piece of the reference that is looked for, pixels of the level; odd.
+        correlation: when a correlation peak is believed.
+    """
+
+    window_px: int = 41
+    correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.7))
+
+    def __post_init__(self) -> None:
+        """Refuse windows that have no centre or nothing to correlate."""
+        if self.window_px < 11 or self.window_px % 2 == 0:
+            raise InputError(f"window_px: {self.window_px} given, an odd number from 11 on expected")
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places of a level of a scene, and the ground a model sees there.
+
+    Attributes:
+        cell: (n, 2) pixels of the level; pixel c covers `factor` pixels of the scene from c * factor on.
+        factor: pixels of the scene to one of the level.
+        line_sample: (n, 2) their centres, pixels of the scene.
+        lon_lat_h: (n, 3) the ground.
+        nodes: (n, k, k, 2) where the ground around is in the reference.
+    """
+
+    cell: IntArray
+    factor: int
+    line_sample: Array
+    lon_lat_h: Array
+    nodes: Array
+
+
+def places_seen(
+    model: SensorModel, reference: Reference, line_sample: Array, factor: int, window_px: int
+) -> Places:
+    """The places nearest to image positions (n, 2) whose surroundings lie on the reference's terrain.
+
+    Args:
+        model: of the scene.
+        reference: what it will be held against.
+        line_sample: (n, 2) pixels of the scene.
+        factor: pixels of the scene to one of the level.
+        window_px: side of what will be looked for, pixels of the level.
+
+    Raises:
+        CoverageError: the terrain is nowhere near.
+    """
+    cell = np.floor((line_sample + 0.5) / factor).astype(np.int64)
+    centre = np.asarray(cell * float(factor) + (factor - 1) / 2.0, dtype=np.float64)
+    half = -(-(window_px // 2) // _NODE_PX)
+    offset = np.arange(-half, half + 1) * float(_NODE_PX * factor)
+    around = centre[:, None, None, :] + np.stack(np.meshgrid(offset, offset, indexing="ij"), axis=-1)
+    ground = ground_seen(model, around.reshape(-1, 2), reference.terrain)
+    nodes = np.asarray(reference.model.project(ground).reshape(around.shape), dtype=np.float64)
+    inside = np.isfinite(nodes).all(axis=(1, 2, 3))
+    inside &= ((nodes >= 0.0) & (nodes <= np.array(reference.image.shape) - 1.0)).all(axis=(1, 2, 3))
+    lon_lat_h = ground.reshape(*around.shape[:3], 3)[:, half, half]
+    return Places(cell[inside], factor, centre[inside], lon_lat_h[inside], nodes[inside])
+
+
+def match_places(
+    image: ImageSource | ReducedImage,
+    model: SensorModel,
+    reference: Reference,
+    places: Places,
+    radius_px: int,
+    options: DenseOptions,
+    progress: Progress = no_progress,
+) -> PointMatches:
+    """Search the ground that a model sees at some places of a scene around them.
+
+    The reference and its terrain are rendered into the geometry of the scene, so that what differs is
+    the error of the model; the scene itself is averaged, never resampled.
+
+    Args:
+        image: the scene, or its reduction by the factor of the places.
+        model: of the scene.
+        reference: what it is held against.
+        places: all of them are tried.
+        radius_px: how far to search, pixels of the level.
+        options: thresholds.
+        progress: told the fraction of the places done.
+    """
+    n, factor = len(places.cell), places.factor
+    line_sample = np.full((n, 2), np.nan)
+    sigma_px = np.full(n, np.nan)
+    score = np.full(n, np.nan)
+    reason = np.full(n, "", dtype="<U16")
+    for i in range(n):
+        if i % 64 == 0:
+            progress(i / n, f"searching {n} places at 1:{factor}")
+        ground = places.lon_lat_h[i]
+        ratio = factor * image_gsd_m(model, ground) / image_gsd_m(reference.model, ground)
+        positions = _between_nodes(places.nodes[i], options.window_px)
+        chip = sample_image(reference.image, positions, ratio)
+        patch = _level_patch(image, places.cell[i], options.window_px // 2 + radius_px, factor)
+        peak = find_chip(low_pass(patch, 1.0 / ratio), chip, options.correlation)
+        score[i], reason[i] = peak.score, peak.reason
+        if peak.reason == FOUND:
+            line_sample[i] = places.line_sample[i] + peak.row_col * factor
+            sigma_px[i] = peak.sigma_px * factor
+    derivative = model.project_derivative(places.lon_lat_h)[:, :, :2]
+    moved_px = line_sample - places.line_sample
+    found = reason == FOUND
+    return PointMatches(
+        line_sample=line_sample,
+        displacement_m=np.asarray(
+            np.linalg.solve(derivative, moved_px[:, :, None])[:, :, 0], np.float64
+        ),
+        sigma_px=sigma_px,
+        score=score,
+        views=found.astype(np.int64),
+        reason=reason,
+        by_gradient=np.zeros(n, dtype=bool),
+        common_sigma_m=reference.common_sigma_m,
+        tried=ViewMeasures(np.arange(n), np.zeros(n, dtype=np.int64), score, found, reason),
+    )
+
+
+def ground_seen(model: SensorModel, line_sample: Array, terrain: Terrain | None) -> Array:
+    """The ground (n, 3) lon, lat, height that a model sees at image positions (n, 2).
+
+    Raises:
+        InputError: when there is no terrain and heights move what the scene shows.
+    """
+    if terrain is not None:
+        return meet(model, line_sample, terrain)
+    middle_m = np.array([sum(model.height_range_m) / 2.0])
+    if model.project_derivative(model.locate(line_sample[:1], middle_m))[0, :, 2].any():
+        raise InputError("a terrain model is needed: heights move what this scene shows")
+    ground = model.locate(line_sample, np.zeros(len(line_sample)))
+    return ground
+
+
+def _between_nodes(nodes: Array, size: int) -> Array:
+    """Positions (size, size, 2) between nodes (k, k, 2), bilinear."""
+    half = nodes.shape[0] // 2
+    pixel = (np.arange(size) - size // 2) / _NODE_PX
+    weight = np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
+    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+
+
+def _level_patch(
+    image: ImageSource | ReducedImage, cell: IntArray, half: int, factor: int
+) -> FloatImage:
+    """Pixels (2 half + 1) squared of a level around one of them."""
+    line, sample = (int(v) - half for v in cell)
+    size = 2 * half + 1
+    if isinstance(image, ReducedImage):
+        return ArrayImage(image.pixels).read(Window(line, sample, size, size))
+    window = Window(line * factor, sample * factor, size * factor, size * factor)
+    return mean_pixels(image.read(window), factor)

@@ -1,0 +1,100 @@
+"""Sentinel-2 scenes of another day on a reference ortho-image: the dense method on real pixels."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from services.formats.raster import map_grid_of, open_raster
+from services.imagery import ImageSource, Window
+from services.matching.dense import Reference
+from services.reference import register_on_reference
+from services.registration import Registration
+from services.scene import Scene
+from services.sensors.ortho import OrthoModel
+from services.types import Acquisition, Array, FloatImage
+
+pytestmark = pytest.mark.real_data
+
+SHIFT_EAST_M, SHIFT_NORTH_M = 6.4, 18.3
+"""Of the May scene against the June one, measured with SIFT features over all of both."""
+SHIFT_ALLOWED_M = 1.0
+LARGEST_LOCAL_SHIFT_PX = 0.7
+MEDIAN_ALLOWED_PX = 0.05
+TYPICAL_ALLOWED_PX = 0.3
+"""Of two measures with windows of 31 and 41 pixels in a field of shifts that changes from one to the next."""
+
+
+def ortho(path: Path) -> tuple[ImageSource, OrthoModel]:
+    image = open_raster(path)
+    grid = map_grid_of(image)
+    assert grid is not None
+    return image, OrthoModel(grid)
+
+
+def registered(reference: Path, scene: Path, sigma_m: float) -> tuple[Registration, OrthoModel]:
+    image, model = ortho(reference)
+    held = Reference(image, model, None, sigma_m=1.0, height_sigma_m=5.0, common_sigma_m=0.5)
+    scene_image, scene_model = ortho(scene)
+    found = register_on_reference(
+        Scene(scene_image, scene_model, Acquisition(scene.stem), sigma_m), held
+    )
+    return found, scene_model
+
+
+def test_the_may_scene_of_berlin_is_found_eighteen_metres_north_and_its_clouds_are_left_out(
+    real_data: Path,
+) -> None:
+    (june,) = (real_data / "s2a_berlin_pair").glob("ref_*.tif")
+    (may,) = (real_data / "s2a_berlin_pair").glob("tgt_*.tif")
+    found, model = registered(june, may, sigma_m=30.0)
+    centre = (np.array([[3152.0, 2074.0]]) - 1.0) / 2.0
+    shift_xy = model.grid.step_xy @ (found.model.correction.apply(centre) - centre)[0]
+    assert shift_xy[0] == pytest.approx(SHIFT_EAST_M, abs=SHIFT_ALLOWED_M)
+    assert shift_xy[1] == pytest.approx(SHIFT_NORTH_M, abs=SHIFT_ALLOWED_M)
+    assert found.qualification.verdict == "good"
+    not_found = np.isin(found.measures.reason, ["low_score", "nodata"])
+    assert 0.2 < not_found.mean() < 0.7
+
+
+def plain_displacement(left: FloatImage, right: FloatImage, line_sample: Array) -> Array:
+    """Where pieces of one image lie in the other, pixel against pixel: (n, 2), NaN where at the edge."""
+    found = np.full((len(line_sample), 2), np.nan)
+    for i, (line, sample) in enumerate(np.round(line_sample).astype(int)):
+        piece = left[line - 15 : line + 16, sample - 15 : sample + 16]
+        around = right[line - 19 : line + 20, sample - 19 : sample + 20]
+        if piece.shape != (31, 31) or around.shape != (39, 39):
+            continue
+        scores = cv2.matchTemplate(around, piece, cv2.TM_CCOEFF_NORMED)
+        row, col = np.unravel_index(scores.argmax(), scores.shape)
+        if 0 < row < 8 and 0 < col < 8:
+            tops = [_top(scores[row - 1 : row + 2, col]), _top(scores[row, col - 1 : col + 2])]
+            found[i] = np.array([row, col]) - 4 + tops
+    return found
+
+
+def _top(scores: FloatImage) -> float:
+    before, at, after = (float(score) for score in scores)
+    return (before - after) / (2.0 * (before - 2.0 * at + after))
+
+
+def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_them(
+    real_data: Path,
+) -> None:
+    folder = real_data / "s2_maricopa_pair"
+    found, _ = registered(folder / "left.tif", folder / "right.tif", sigma_m=20.0)
+    left, right = (
+        image.read(Window(0, 0, *image.shape))
+        for image, _ in (ortho(folder / "left.tif"), ortho(folder / "right.tif"))
+    )
+    measures = found.measures
+    plain = plain_displacement(left, right, measures.predicted)
+    difference = (measures.line_sample - measures.predicted - plain)[measures.matched]
+    difference = difference[np.isfinite(difference).all(axis=1)]
+    assert len(difference) > 500
+    assert np.abs(np.median(difference, axis=0)).max() < MEDIAN_ALLOWED_PX
+    assert np.median(np.abs(difference), axis=0).max() < TYPICAL_ALLOWED_PX
+    # One shift for all cannot follow fields that moved by themselves, and the residuals say so.
+    assert np.abs(found.adjustment.correction.parameters[:, 0]).max() < LARGEST_LOCAL_SHIFT_PX
+    assert found.adjustment.sigma0 > 2.0

@@ -1,0 +1,153 @@
+"""Scenes registered on a reference ortho-image and its terrain instead of points."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from services.errors import CoverageError, InputError, NoConsensus
+from services.imagery import ArrayImage, sample_image
+from services.map_grid import MapGrid, utm_of
+from services.matching.dense import DenseOptions, Reference
+from services.reference import ReferenceOptions, register_on_reference
+from services.registration import Registration
+from services.sensors.ortho import OrthoModel
+from services.simulation.view import true_ground
+from services.terrain import Terrain
+from tests.services.simulated import block_views, spoiled_view, world
+
+REFERENCE_GSD_M = 1.0
+POSTING_M = 5.0
+SIGMA_M = 25.0
+OPTIONS = ReferenceOptions(places=300)
+ERROR_ALLOWED_PX = 0.1
+"""Of the model, root mean square: roofs lean differently in the reference and in the scene."""
+MAP_ALLOWED_PX = 0.1
+
+
+@cache
+def grid(posting_m: float) -> MapGrid:
+    """A map of the middle of the world, on UTM."""
+    lon, lat = world().centre_lon_lat
+    crs = utm_of(lon, lat)
+    centre = MapGrid(crs, np.zeros(2), np.eye(2), (2, 2)).line_sample(np.array([[lon, lat]]))[0]
+    size = round(900.0 / posting_m)
+    step = np.array([[0.0, posting_m], [-posting_m, 0.0]])
+    return MapGrid(crs, centre - step @ np.full(2, (size - 1) / 2.0), step, (size, size))
+
+
+def positions(of: MapGrid) -> np.ndarray:
+    return np.stack(np.meshgrid(*(np.arange(n) for n in of.shape), indexing="ij"), -1).reshape(-1, 2)
+
+
+@cache
+def terrain() -> Terrain:
+    nodes = grid(POSTING_M)
+    heights = world().height_m(nodes.lon_lat(positions(nodes).astype(float)))
+    return Terrain(nodes, ArrayImage(heights.reshape(nodes.shape).astype(np.float32)))
+
+
+@cache
+def reference() -> Reference:
+    """The first view of the block, rectified through its true model."""
+    pixels = grid(REFERENCE_GSD_M)
+    lon_lat = pixels.lon_lat(positions(pixels).astype(float))
+    ground = np.column_stack([lon_lat, world().height_m(lon_lat)])
+    view = block_views()[0]
+    seen = view.geometry.true_model.project(ground).reshape(*pixels.shape, 2)
+    image = ArrayImage(sample_image(view.image, seen, 1.0))
+    return Reference(
+        image, OrthoModel(pixels), terrain(), sigma_m=0.3, height_sigma_m=1.0, common_sigma_m=0.15
+    )
+
+
+@cache
+def registered() -> Registration:
+    return register_on_reference(spoiled_view().as_scene(SIGMA_M), reference(), OPTIONS)
+
+
+def error_px(registration: Registration) -> np.ndarray:
+    """Where the model puts what the image really shows, minus where it is: (n, 2)."""
+    axis = np.linspace(60.0, 640.0, 12)
+    shown = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    return registration.model.project(true_ground(spoiled_view(), world(), shown)) - shown
+
+
+def test_a_scene_forty_metres_off_is_brought_onto_the_reference() -> None:
+    before = spoiled_view().as_scene(SIGMA_M).model
+    shown = np.full((1, 2), 350.0)
+    assert np.hypot(*(before.project(true_ground(spoiled_view(), world(), shown)) - shown)[0]) > 30.0
+    error = error_px(registered())
+    assert np.sqrt((error**2).sum(axis=1).mean()) < ERROR_ALLOWED_PX
+
+
+def test_the_stated_accuracy_covers_the_error() -> None:
+    axis = np.linspace(60.0, 640.0, 12)
+    shown = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    variance = np.diagonal(registered().adjustment.covariance_at(shown), axis1=1, axis2=2)
+    assert (error_px(registered()) ** 2 / variance).mean() < 1.5
+
+
+def test_levels_go_down_to_full_resolution_and_their_searches_shrink() -> None:
+    passes = registered().passes
+    assert {one.name for one in passes} == {"dense"}
+    gsd_m = [one.chip_gsd_m for one in passes]
+    assert gsd_m == sorted(gsd_m, reverse=True)
+    assert gsd_m[0] > 1.5 * gsd_m[-1]
+    assert passes[-1].search_radius_m < passes[0].search_radius_m / 4.0
+    assert passes[-1].move_m < 2.0 * gsd_m[-1]
+
+
+def test_places_found_before_are_the_first_to_be_searched_again() -> None:
+    measures = registered().measures
+    known = measures.lon_lat_h[measures.active][::7]
+    again = register_on_reference(
+        spoiled_view().as_scene(SIGMA_M), reference(), OPTIONS, known=known
+    ).measures
+    distance_deg = np.abs(known[:, None, :2] - again.lon_lat_h[None, :, :2]).max(axis=2).min(axis=1)
+    one_pixel_deg = 1.0 / 70_000.0
+    assert np.mean(distance_deg < one_pixel_deg) > 0.8
+
+
+def test_an_ortho_scene_needs_no_terrain() -> None:
+    moved_px = np.array([7.0, -4.0])
+    first = reference()
+    grid_off = replace(
+        first.model.grid, origin_xy=first.model.grid.origin_xy - first.model.grid.step_xy @ moved_px
+    )
+    view = spoiled_view().as_scene(SIGMA_M)
+    scene = replace(view, image=first.image, model=OrthoModel(grid_off), sigma_m=6.0)
+    found = register_on_reference(scene, replace(first, terrain=None), OPTIONS)
+    # The image is the reference's own: a pixel says where it is, but for the shift.
+    shift = found.adjustment.correction.parameters[:, 0]
+    assert np.abs(shift + moved_px).max() < MAP_ALLOWED_PX
+
+
+def test_a_scene_with_parallax_needs_terrain() -> None:
+    with pytest.raises(InputError, match="terrain model is needed"):
+        register_on_reference(
+            spoiled_view().as_scene(SIGMA_M), replace(reference(), terrain=None), OPTIONS
+        )
+
+
+def test_a_reference_of_another_place_is_refused() -> None:
+    pixels = grid(REFERENCE_GSD_M)
+    elsewhere = OrthoModel(replace(pixels, origin_xy=pixels.origin_xy + 3000.0))
+    with pytest.raises(CoverageError, match="it lies elsewhere"):
+        register_on_reference(
+            spoiled_view().as_scene(SIGMA_M), replace(reference(), model=elsewhere), OPTIONS
+        )
+
+
+def test_a_reference_that_shows_something_else_is_not_believed() -> None:
+    noise = np.random.default_rng(0).normal(500.0, 50.0, reference().image.shape).astype(np.float32)
+    with pytest.raises(NoConsensus, match="does not agree with the scene"):
+        register_on_reference(
+            spoiled_view().as_scene(SIGMA_M), replace(reference(), image=ArrayImage(noise)), OPTIONS
+        )
+
+
+def test_windows_without_a_centre_are_refused() -> None:
+    with pytest.raises(InputError, match="window_px: 40 given"):
+        DenseOptions(window_px=40)
