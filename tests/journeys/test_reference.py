@@ -23,7 +23,7 @@ SHIFT_ALLOWED_M = 1.0
 LARGEST_LOCAL_SHIFT_PX = 0.7
 MEDIAN_ALLOWED_PX = 0.05
 TYPICAL_ALLOWED_PX = 0.3
-"""Of two measures with windows of 31 and 41 pixels in a field of shifts that changes from one to the next."""
+"""Of two measures, with windows of 31 and 41 pixels, in a field of shifts that changes between them."""
 
 
 def ortho(path: Path) -> tuple[ImageSource, OrthoModel]:
