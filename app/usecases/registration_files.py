@@ -1,6 +1,5 @@
 """What a registration leaves in a folder: report, control points, refined model."""
 
-import json
 import math
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -8,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from services.formats.raster import DRIVER_OF_SIGNATURE
-from services.formats.rpc_files import DeliveredModel, read_rpc, write_model
+from services.formats.control_points import marked_points
+from services.formats.control_points_json import format_measures, format_opf, measure_status
+from services.formats.control_points_text import format_asp_gcp, format_envi_pts, format_qgis_points
+from services.formats.refined import write_refined
+from services.formats.residual_layers import exaggeration_for, write_residual_layers
 from services.imagery import reduce_image, render_chip
 from services.registration import Registration, RegistrationOptions
 from services.reports.document import format_report
@@ -23,10 +25,8 @@ from services.reports.report import (
     build_report,
 )
 from services.scene import Scene, scene_footprint, scene_gsd_m
-from services.sensors.correction import CorrectedModel, fold_into_rpc
-from services.sensors.rpc import RpcModel
-from services.sensors.rpc_fit import fit_rpc
-from services.types import ChipSource, ControlPoints, Measures, point_chips
+from services.sensors.ortho import OrthoModel
+from services.types import Array, ChipSource, ControlPoints, Measures, point_chips
 
 QUICKLOOK_PX = 1200
 GALLERY_EACH = 6
@@ -36,13 +36,23 @@ OUTPUTS = {
     "report.json": "The report as a document.",
     "report.html": "The report as a page.",
     "control_points.geojson": "What happened to each control point.",
-    "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image.",
+    "control_points.gcp": "The active control points for the Ames Stereo Pipeline.",
+    "control_points.points": "The control points for the georeferencer of QGIS.",
+    "control_points.pts": "The active control points for ENVI.",
+    "control_points_opf.json": "The active control points as OPF 1.0.",
+    "residuals.gpkg": "Residual vectors and control points as layers of a GeoPackage.",
+    "correction.json": "The correction found, whatever the model of the scene.",
+    "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image, unless none fits.",
 }
-"""What every registration makes; the refined model in the convention of the input comes on top."""
+"""What a registration makes; the refined model in the convention of the input comes on top."""
 
 MEDIA_TYPES = {
     ".json": "application/json",
     ".geojson": "application/geo+json",
+    ".gcp": "text/plain",
+    ".points": "text/plain",
+    ".pts": "text/plain",
+    ".gpkg": "application/geopackage+sqlite3",
     ".html": "text/html",
     ".txt": "text/plain",
     ".rpb": "text/plain",
@@ -63,24 +73,27 @@ def write_outputs(
     registration: Registration,
     options: RegistrationOptions,
     started_at: datetime,
+    copy_image: bool = False,
 ) -> tuple[RegistrationReport, dict[str, Path]]:
     """Write everything a user takes home from a registration.
 
     Args:
         folder: made when missing; files of the same names are replaced.
         image, model: the files of the scene, to write the refined model as they have it.
+        copy_image: also copy a GeoTIFF, with the refined model in its tags.
 
     Returns:
         The report, and the files by name.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    refined, refit_error_px = refined_rpc(registration.model, scene.image.shape)
+    refined = write_refined(
+        image, model, registration.model, registration.adjustment, scene.image.shape, folder, copy_image
+    )
     summary = RegistrationSummary(
         scene=image.stem,
         acquisition=scene.acquisition,
         shape=scene.image.shape,
         gsd_m=scene_gsd_m(scene),
-        model_kind="RPC",
+        model_kind="map grid" if isinstance(scene.model, OrthoModel) else "RPC",
         sigma_m=scene.sigma_m,
         footprint=scene_footprint(scene),
         blocks=blocks,
@@ -92,92 +105,60 @@ def write_outputs(
         qualification=registration.qualification,
         quicklook=_quicklook(scene),
         gallery=_gallery(scene, points, chips, registration),
-        refit_error_px=refit_error_px,
+        refit_error_px=refined.max_error_px,
+        refined_note=refined.note,
         software_version=version("amers"),
         started_at=started_at,
         finished_at=datetime.now(UTC),
     )
     report = build_report(summary)
+    sigma_m = _point_sigmas_m(points, registration.measures)
     texts = {
         "report.json": format_report(report),
         "report.html": format_html(report, summary),
-        "control_points.geojson": format_measures(registration.measures),
+        "control_points.geojson": format_measures(registration.measures, image.name, sigma_m),
+        **_exchanged(registration.measures, image.name, sigma_m),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
-    delivered = read_rpc(image, model)
-    copied = image if _carries_tags(delivered, image) else None
-    if copied is not None:
-        (folder / image.name).unlink(missing_ok=True)
-    models = write_model(delivered, refined, folder, copied)
-    return report, {path.name: path for path in [*(folder / name for name in texts), *models]}
+    layers = folder / "residuals.gpkg"
+    exaggeration = exaggeration_for(registration.measures)
+    write_residual_layers(layers, registration.measures, image.name, exaggeration)
+    written = [*(folder / name for name in texts), layers, *refined.files]
+    return report, {path.name: path for path in written}
 
 
-def refined_rpc(model: CorrectedModel, shape: tuple[int, int]) -> tuple[RpcModel, float]:
-    """The RPC of a corrected model, and the largest difference of the two in pixels; NaN: none.
-
-    A correction of each coordinate by itself folds into the delivered RPC exactly; one that mixes them
-    is fitted anew over the range of heights of the delivered model.
-    """
-    base = model.base
-    assert isinstance(base, RpcModel)
-    if not model.correction.parameters[[0, 1], [2, 1]].any():
-        return fold_into_rpc(base, model.correction), math.nan
-    fitted = fit_rpc(model, shape, model.height_range_m)
-    return fitted.model, fitted.max_error_px
-
-
-def format_measures(measures: Measures) -> str:
-    """GeoJSON of the points of a scene: where they are, where they were found, what became of them."""
-    numbers = {
-        "predicted_line": measures.predicted[:, 0],
-        "predicted_sample": measures.predicted[:, 1],
-        "line": measures.line_sample[:, 0],
-        "sample": measures.line_sample[:, 1],
-        "sigma_px": measures.sigma_px,
-        "score": measures.score,
-        "residual_line_px": measures.residual_px[:, 0],
-        "residual_sample_px": measures.residual_px[:, 1],
-        "residual_east_m": measures.residual_m[:, 0],
-        "residual_north_m": measures.residual_m[:, 1],
+def _exchanged(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]:
+    """The points that were found, in the formats of other tools."""
+    found = np.flatnonzero(measures.matched)
+    marks = marked_points(
+        [str(point) for point in measures.point_id[found]],
+        measures.lon_lat_h[found],
+        measures.line_sample[found],
+        sigma_m=sigma_m[found],
+        image=[image] * len(found),
+        sigma_px=measures.sigma_px[found],
+        residual_px=measures.residual_px[found],
+        active=measures.active[found],
+    )
+    return {
+        "control_points.gcp": format_asp_gcp(marks),
+        "control_points.points": format_qgis_points(marks),
+        "control_points.pts": format_envi_pts(marks),
+        "control_points_opf.json": format_opf(marks),
     }
-    features = [
-        {
-            "type": "Feature",
-            "id": int(measures.point_id[i]),
-            "geometry": {"type": "Point", "coordinates": [float(v) for v in lon_lat_h]},
-            "properties": {
-                "status": _status(measures, i),
-                "reason": str(measures.reason[i]),
-                "views": int(measures.views[i]),
-                **{name: _finite(float(values[i])) for name, values in numbers.items()},
-            },
-        }
-        for i, lon_lat_h in enumerate(measures.lon_lat_h)
-    ]
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+
+
+def _point_sigmas_m(points: ControlPoints, measures: Measures) -> Array:
+    """Sigmas (n, 3) of the points of the measures, east, north, up."""
+    order = np.argsort(points.id)
+    rows = order[np.searchsorted(points.id, measures.point_id, sorter=order)]
+    return np.sqrt(np.diagonal(points.covariance_m2[rows], axis1=1, axis2=2))
 
 
 def media_type(name: str) -> str:
     """The media type of an output."""
     return MEDIA_TYPES.get(Path(name).suffix.lower(), "application/octet-stream")
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _status(measures: Measures, row: int) -> str:
-    if measures.active[row]:
-        return "active"
-    return "deactivated" if measures.matched[row] else "not matched"
-
-
-def _carries_tags(delivered: DeliveredModel, image: Path) -> bool:
-    """Whether the model came in the tags of a GeoTIFF, and goes back into those of a copy."""
-    with image.open("rb") as file:
-        start = file.read(4)
-    return delivered.convention == "tags" and DRIVER_OF_SIGNATURE.get(start) == "GTiff"
 
 
 def _order_reason(registration: Registration, options: RegistrationOptions) -> str:
@@ -221,7 +202,7 @@ def _gallery(
                 found=render_chip(scene.image, registration.model, measures.lon_lat_h[i], gsd_m),
                 score=float(measures.score[i]),
                 residual_px=measures.residual_px[i],
-                status=_status(measures, i),
+                status=measure_status(measures, i),
             )
         )
     return tuple(pairs)

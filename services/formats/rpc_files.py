@@ -80,16 +80,17 @@ def read_rpc(
 
 
 def write_model(
-    delivered: DeliveredModel, model: RpcModel, folder: Path, image_path: Path | None = None
+    delivered: DeliveredModel | None, model: RpcModel, folder: Path, image_path: Path | None = None
 ) -> list[Path]:
     """Write a refined model as `refined_RPC.TXT` and in the convention of the model it refines.
 
     Both are in the pixels of the image that was read: the model of a crop stays that of the crop,
-    even where the delivered one was the full scene's. An RPB or DIMAP file keeps its name; RPC tags
-    need a copy of the image, which is only made when `image_path` is given.
+    even where the delivered one was the full scene's. A file keeps its name; RPC tags become the
+    `STEM_RPC.TXT` that GDAL prefers to them when it lies beside the image, and go into a copy of the
+    image only when `image_path` is given.
 
     Args:
-        delivered: the model as read.
+        delivered: the model as read; None for one of another kind, which only leaves the text.
         model: the refined one.
         folder: where to write; made when missing.
         image_path: the image, to have a copy of it with the refined model in its tags.
@@ -102,16 +103,12 @@ def write_model(
     """
     folder.mkdir(parents=True, exist_ok=True)
     texts = {"refined_RPC.TXT": format_rpc_text(model)}
-    if delivered.convention == "rpb":
-        satellite = rpb_satellite(read_text(delivered.path))
-        texts[delivered.path.name] = format_rpb(model, satellite)
-    elif delivered.convention == "dimap":
-        own = read_text(delivered.path)
-        texts[delivered.path.name] = format_dimap_rpc(own, model, delivered.path.name)
+    if delivered is not None:
+        texts |= _in_own_convention(delivered, model)
     written = []
     for name, text in texts.items():
         target = folder / name
-        if target.resolve() == delivered.path.resolve():
+        if delivered is not None and target.resolve() == delivered.path.resolve():
             raise FormatError(f"{target}: the delivered model would be written over")
         target.write_bytes(text.encode(_encoding(text)))
         written.append(target)
@@ -119,6 +116,17 @@ def write_model(
         copy_with_rpc(image_path, folder / image_path.name, model)
         written.append(folder / image_path.name)
     return written
+
+
+def _in_own_convention(delivered: DeliveredModel, model: RpcModel) -> dict[str, str]:
+    """The file that takes the place of the delivered one, by its name."""
+    path = delivered.path
+    if delivered.convention == "rpb":
+        return {path.name: format_rpb(model, rpb_satellite(read_text(path)))}
+    if delivered.convention == "dimap":
+        return {path.name: format_dimap_rpc(read_text(path), model, path.name)}
+    name = f"{path.stem}_RPC.TXT" if delivered.convention == "tags" else path.name
+    return {name: format_rpc_text(model)}
 
 
 def model_of_image(

@@ -118,8 +118,9 @@ class RegistrationSummary:
         qualification: of the registration.
         quicklook: the scene reduced; None when there is none.
         gallery: chips beside what was found; the report picks the best, middle and worst scores.
-        refit_error_px: largest difference between the corrected model and the delivered one; NaN when
-            the delivered one carries the correction exactly.
+        refit_error_px: largest difference between the corrected model and the one written; 0 when that
+            carries the correction exactly, NaN when nothing was written.
+        refined_note: which files carry the correction, and how well, in words.
         software_version: of Amers.
         started_at, finished_at: UTC, given by the caller; None when unknown.
         checks: against independent points, if there are any.
@@ -146,6 +147,7 @@ class RegistrationSummary:
     started_at: datetime | None = None
     finished_at: datetime | None = None
     checks: tuple[Check, ...] = ()
+    refined_note: str = ""
 
 
 @dataclass(frozen=True)
@@ -187,8 +189,9 @@ class CorrectionRecord:
         shift_m: length of that displacement on the ground, by the ground sampling of the image.
         words: the parameters as sentences.
         sigma0: a posteriori standard deviation of unit weight.
-        refit_error_px: largest difference between the corrected model and the one fitted to it; NaN when
-            the delivered model carries the correction exactly.
+        refit_error_px: largest difference between the corrected model and the one written; 0 when that
+            carries the correction exactly.
+        refined_note: which files carry the correction, and how well, in words.
     """
 
     order: str
@@ -203,6 +206,7 @@ class CorrectionRecord:
     words: tuple[str, ...]
     sigma0: float
     refit_error_px: float
+    refined_note: str
 
 
 @dataclass(frozen=True)
@@ -320,6 +324,7 @@ def _correction_record(summary: RegistrationSummary) -> CorrectionRecord:
         words=correction_in_words(adjustment, summary.gsd_m),
         sigma0=adjustment.sigma0,
         refit_error_px=summary.refit_error_px,
+        refined_note=summary.refined_note,
     )
 
 

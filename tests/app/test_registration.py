@@ -20,18 +20,21 @@ from app.db import engine
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.registration import SceneFiles, points_of_block, points_of_store, run_registration
-from app.usecases.registration_files import refined_rpc
+from app.usecases.registration_files import OUTPUTS
+from services.formats.control_point_files import read_control_points
 from services.formats.rpc_files import read_rpc
 from services.registration import RegistrationOptions
 from services.reports.document import report_schema
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, no_correction
+from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.workers import ended, running_worker, wait_until
 
 A_TENTH_OF_A_PIXEL = 0.1
-COMMON_FILES = {"report.json", "report.html", "control_points.geojson", "refined_RPC.TXT"}
+A_MILLIONTH_OF_A_PIXEL = 1e-6
+COMMON_FILES = set(OUTPUTS)
 
 Bearer = Callable[[str], dict[str, str]]
 Amers = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -90,10 +93,26 @@ def assert_registered(folder: Path, world: FlatWorld) -> None:
     assert report["blocks"] == [{"id": "flat", "version": "1"}]
     refined = read_rpc(world.image, folder / "refined_RPC.TXT").model
     assert largest_error_px(refined, world.true_model) < A_TENTH_OF_A_PIXEL
+    assert_exchanged(folder, report["equipment"]["active"])
     points = json.loads((folder / "control_points.geojson").read_text())["features"]
     active = [point for point in points if point["properties"]["status"] == "active"]
     assert len(active) == report["equipment"]["active"]
     assert "<html" in (folder / "report.html").read_text()
+
+
+def assert_exchanged(folder: Path, active: int) -> None:
+    """Every format holds the active points where the document of the registration has them."""
+    document = read_control_points(folder / "control_points.geojson")
+    used = document.take(document.active)
+    assert len(used) == active
+    for name in ("gcp", "points", "pts"):
+        points = read_control_points(folder / f"control_points.{name}", "ellipsoid")
+        assert (
+            np.abs(points.line_sample[points.active] - used.line_sample).max() < A_MILLIONTH_OF_A_PIXEL
+        )
+    opf = read_control_points(folder / "control_points_opf.json")
+    assert np.abs(opf.line_sample - used.line_sample).max() < A_MILLIONTH_OF_A_PIXEL
+    assert np.abs(opf.lon_lat_h - used.lon_lat_h).max() == 0.0
 
 
 def test_the_delivered_model_is_wrong_before(world: FlatWorld):
@@ -105,14 +124,14 @@ def test_a_correction_that_mixes_lines_and_samples_is_carried_by_a_fitted_rpc(wo
     shape = (1200, 1200)
     affine = replace(no_correction(shape), parameters=np.array([[9.0, 1.0, -2.0], [-7.0, 1.5, 0.5]]))
     corrected = CorrectedModel(world.true_model, affine)
-    refined, refit_error_px = refined_rpc(corrected, shape)
+    refined = refined_rpc(corrected, shape)
     a_hundredth_of_a_pixel = 0.01
-    assert 0.0 <= refit_error_px < a_hundredth_of_a_pixel
-    assert largest_error_px(refined, corrected) < a_hundredth_of_a_pixel
+    assert 0.0 < refined.max_error_px < a_hundredth_of_a_pixel
+    assert largest_error_px(refined.model, corrected) < a_hundredth_of_a_pixel
     drift = replace(affine, parameters=np.array([[9.0, 1.0, 0.0], [-7.0, 0.0, 0.5]]))
-    folded, none = refined_rpc(CorrectedModel(world.true_model, drift), shape)
-    assert np.isnan(none)
-    assert largest_error_px(folded, CorrectedModel(world.true_model, drift)) < 1e-6
+    folded = refined_rpc(CorrectedModel(world.true_model, drift), shape)
+    assert folded.max_error_px == 0.0
+    assert largest_error_px(folded.model, CorrectedModel(world.true_model, drift)) < 1e-6
 
 
 def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
@@ -137,7 +156,7 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     assert (done["status"], done["progress"]) == ("successful", 100), done
     results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
     assert results.pop("verdict") in ("good", "usable")
-    assert set(results) == COMMON_FILES
+    assert set(results) == COMMON_FILES | {"scene_RPC.TXT"}
     folder = tmp_path / "downloaded"
     folder.mkdir()
     for name, link in results.items():
@@ -224,10 +243,10 @@ def test_the_command_registers_straight_from_a_block_folder(
     told = json.loads(done.stdout)
     assert told["verdict"] in ("good", "usable")
     assert np.allclose(told["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
-    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged.tif"}
+    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged_RPC.TXT"}
     assert_registered(folder, world)
-    copy = read_rpc(folder / "tagged.tif").model
-    assert largest_error_px(copy, world.true_model) < A_TENTH_OF_A_PIXEL
+    beside = read_rpc(world.tagged, folder / "tagged_RPC.TXT").model
+    assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
 
 
 def test_the_command_registers_with_the_store_and_remembers_the_measures(

@@ -1,6 +1,7 @@
 """A scene: its model found, placed and written back; its accuracy and acquisition told."""
 
 import math
+import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -226,8 +227,7 @@ def test_a_refined_model_reads_back_from_every_file_it_is_written_to(
     delivered = read_rpc(path)
     model = refined(delivered.model)
     written = write_model(delivered, model, tmp_path / "out")
-    expected = {"refined_RPC.TXT"} | ({sidecar} if not sidecar.endswith(".TXT") else set())
-    assert {file.name for file in written} == expected
+    assert {file.name for file in written} == {"refined_RPC.TXT", sidecar}
     for file in written:
         assert misfit_px(read_rpc(path, file).model, model) < a_millionth_of_a_pixel
     assert (tmp_path / sidecar).read_text() == text
@@ -245,13 +245,23 @@ def test_the_refined_model_of_a_crop_is_in_the_pixels_of_the_crop(tmp_path: Path
         assert misfit_px(again.model, model) < a_millionth_of_a_pixel
 
 
+def test_refined_tags_become_the_text_that_gdal_prefers_to_them(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "a.tif", tagged=CROP)
+    model = refined(read_rpc(path).model)
+    written = write_model(read_rpc(path), model, tmp_path / "out")
+    assert [file.name for file in written] == ["refined_RPC.TXT", "a_RPC.TXT"]
+    with rasterio.open(path) as before:
+        assert before.rpcs.line_num_coeff == CROP.line_num.tolist()
+    shutil.copy(written[1], tmp_path)
+    with rasterio.open(path) as after:
+        np.testing.assert_allclose(after.rpcs.line_num_coeff, model.line_num, rtol=1e-14)
+
+
 def test_refined_tags_are_written_to_a_copy_when_the_image_is_given(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif", tagged=CROP)
-    delivered = read_rpc(path)
-    model = refined(delivered.model)
-    assert [file.name for file in write_model(delivered, model, tmp_path / "b")] == ["refined_RPC.TXT"]
-    written = write_model(delivered, model, tmp_path / "out", image_path=path)
-    assert [file.name for file in written] == ["refined_RPC.TXT", "a.tif"]
+    model = refined(read_rpc(path).model)
+    written = write_model(read_rpc(path), model, tmp_path / "out", image_path=path)
+    assert [file.name for file in written] == ["refined_RPC.TXT", "a_RPC.TXT", "a.tif"]
     assert misfit_px(read_rpc(tmp_path / "out" / "a.tif").model, model) < a_millionth_of_a_pixel
     assert misfit_px(read_rpc(path).model, CROP) < a_millionth_of_a_pixel
 
