@@ -1,0 +1,84 @@
+"""The correction of a model as a small document: what every registration leaves, whatever its model.
+
+With `t = ((line, sample) - centre) / half_size`, a position by the delivered model moves by
+`parameters (1, t_line, t_sample)`. Pixels count from the centre of the first one, at (0, 0).
+"""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from services.errors import FormatError
+from services.formats.control_points import load_json
+from services.sensors.correction import ImageCorrection
+from services.types import Array
+
+CORRECTION_FORMAT = "amers-image-correction/1"
+
+
+def format_correction(
+    correction: ImageCorrection, order: str, covariance_px2: Array, applies_to: str, carried: str
+) -> str:
+    """A correction as a document.
+
+    Args:
+        correction: from positions by the delivered model to true ones.
+        order: "shift", "drift" or "affine".
+        covariance_px2: (6, 6) of the parameters, row by row.
+        applies_to: where the delivered model came from, in words.
+        carried: which files carry the correction and how well, in words.
+    """
+    document = {
+        "format": CORRECTION_FORMAT,
+        "applies_to": applies_to,
+        "carried": carried,
+        "pixel_origin": "the centre of the first pixel is line 0, sample 0",
+        "formula": "(line, sample) + parameters_px (1, t_line, t_sample), "
+        "t = ((line, sample) - centre_px) / half_size_px",
+        "order": order,
+        "parameters_px": correction.parameters.tolist(),
+        "centre_px": correction.centre.tolist(),
+        "half_size_px": correction.half_size.tolist(),
+        "covariance_px2": [
+            [v if math.isfinite(v) else None for v in row] for row in covariance_px2.tolist()
+        ],
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
+    """Read a correction.
+
+    Args:
+        text: contents of the file.
+        source: its name, for the messages.
+
+    Raises:
+        FormatError: when it is something else, or moves no image to another.
+    """
+    document = load_json(text, source)
+    if not isinstance(document, dict) or document.get("format") != CORRECTION_FORMAT:
+        raise FormatError(f"{source}: expected a document of the format {CORRECTION_FORMAT}")
+    correction = ImageCorrection(
+        parameters=_numbers(document, "parameters_px", (2, 3), source),
+        centre=_numbers(document, "centre_px", (2,), source),
+        half_size=_numbers(document, "half_size_px", (2,), source),
+    )
+    if not (correction.half_size > 0.0).all():
+        raise FormatError(f"{source}: half_size_px should be positive")
+    if not np.linalg.det(correction.jacobian) > 0.0:
+        raise FormatError(f"{source}: parameters_px fold or mirror the image")
+    return correction
+
+
+def _numbers(document: dict[str, Any], name: str, shape: tuple[int, ...], source: str) -> Array:
+    try:
+        values = np.array(document.get(name), dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != shape or not np.isfinite(values).all():
+        expected = " x ".join(map(str, shape))
+        raise FormatError(f"{source}: {name} should be {expected} numbers")
+    return values

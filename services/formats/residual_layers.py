@@ -1,0 +1,106 @@
+"""What a registration did with its points, as layers of a GeoPackage for a GIS."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyogrio
+import shapely
+
+from services.formats.control_points_json import measure_status
+from services.geodesy import metres_per_degree_at
+from services.types import Array, Measures
+
+CRS_3D = "EPSG:4979"
+"""Longitude, latitude, height above the WGS 84 ellipsoid."""
+
+Fields = dict[str, npt.NDArray[np.generic]]
+
+
+def write_residual_layers(path: Path, measures: Measures, image: str, exaggeration: float) -> None:
+    """Write the layers `residuals` (3D lines) and `control_points` (3D points).
+
+    A line starts at the control point and goes, at its height, towards where the refined model sees the
+    measure: the residual on the ground, observed minus computed, times the exaggeration, which is an
+    attribute of each line. Only points that were found have one.
+
+    Args:
+        path: a file of that name is replaced.
+        measures: all n points the scene could show.
+        image: name of the scene.
+        exaggeration: how many times longer than on the ground the lines are.
+    """
+    path.unlink(missing_ok=True)
+    fields = _fields(measures, image)
+    found = measures.matched & np.isfinite(measures.residual_m).all(axis=1)
+    start = measures.lon_lat_h[found]
+    end = start.copy()
+    end[:, :2] += exaggeration * measures.residual_m[found] / metres_per_degree_at(start)
+    lines = shapely.linestrings(np.stack([start, end], axis=1))
+    stretch = {"exaggeration": np.full(len(lines), exaggeration)}
+    of_found = {name: values[found] for name, values in fields.items()}
+    _write(path, "residuals", "LineString Z", lines, {**of_found, **stretch})
+    _write(path, "control_points", "Point Z", shapely.points(measures.lon_lat_h), fields)
+
+
+def exaggeration_for(measures: Measures, share: float = 0.04) -> float:
+    """How many times to stretch residuals to be seen: the larger ones get a share of the scene's size.
+
+    Args:
+        measures: with their residuals.
+        share: of the diagonal of the points, for the residual that 90 % are smaller than.
+
+    Returns:
+        1, 2 or 5 times a power of ten.
+    """
+    length_m = np.hypot(*measures.residual_m[measures.active].T)
+    length_m = length_m[np.isfinite(length_m)]
+    if not len(length_m):
+        return 1.0
+    away = measures.lon_lat_h[:, :2] - measures.lon_lat_h[0, :2]
+    away[:, 0] = (away[:, 0] + 180.0) % 360.0 - 180.0
+    extent_m = np.ptp(away, axis=0) * metres_per_degree_at(measures.lon_lat_h[:1])[0]
+    wanted = share * float(np.hypot(*extent_m)) / max(float(np.quantile(length_m, 0.9)), 1e-9)
+    if not wanted > 1.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted))
+
+
+def _fields(measures: Measures, image: str) -> Fields:
+    """Attributes of all points."""
+    n = len(measures.point_id)
+    numbers: dict[str, Array] = {
+        "line": measures.line_sample[:, 0],
+        "sample": measures.line_sample[:, 1],
+        "sigma_px": measures.sigma_px,
+        "score": measures.score,
+        "residual_line_px": measures.residual_px[:, 0],
+        "residual_sample_px": measures.residual_px[:, 1],
+        "residual_east_m": measures.residual_m[:, 0],
+        "residual_north_m": measures.residual_m[:, 1],
+        "residual_m": np.hypot(*measures.residual_m.T),
+        "height_m": measures.lon_lat_h[:, 2],
+    }
+    return {
+        "point_id": measures.point_id,
+        "image": np.full(n, image, dtype=object),
+        "status": np.array([measure_status(measures, i) for i in range(n)], dtype=object),
+        "reason": measures.reason.astype(object),
+        "views": measures.views,
+        **numbers,
+    }
+
+
+def _write(path: Path, layer: str, kind: str, geometry: npt.NDArray[np.object_], fields: Fields) -> None:
+    pyogrio.raw.write(
+        path,
+        shapely.to_wkb(geometry, output_dimension=3),
+        list(fields.values()),
+        list(fields),
+        layer=layer,
+        driver="GPKG",
+        geometry_type=kind,
+        crs=CRS_3D,
+        append=path.exists(),
+    )

@@ -1,0 +1,106 @@
+"""What a registration leaves: its correction, an RPC only while it is true, layers a GIS opens."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+
+from services.errors import FormatError
+from services.formats.correction_json import format_correction, parse_correction
+from services.formats.residual_layers import exaggeration_for, write_residual_layers
+from services.geodesy import metres_per_degree_at
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
+from services.simulation.orbit import pushbroom_over
+
+A_MICROMETRE = 1e-6
+CORRECTION = ImageCorrection(
+    np.array([[12.0, 1.5, -0.25], [-7.0, 0.125, 0.5]]),
+    np.array([499.5, 599.5]),
+    np.array([500.0, 600.0]),
+)
+
+
+def written(correction: ImageCorrection = CORRECTION) -> str:
+    return format_correction(correction, "affine", np.diag([np.nan, 1, 2, 3, 4, 5]), "tags", "none")
+
+
+def test_a_correction_reads_back_as_it_was() -> None:
+    again = parse_correction(written())
+    for name in ("parameters", "centre", "half_size"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(CORRECTION, name))
+    assert json.loads(written())["covariance_px2"][0][0] is None
+
+
+def test_the_formula_of_the_document_is_the_one_that_is_applied() -> None:
+    document = json.loads(written())
+    place = np.array([100.0, 900.0])
+    t = (place - np.array(document["centre_px"])) / np.array(document["half_size_px"])
+    moved = place + np.array(document["parameters_px"]) @ [1.0, *t]
+    np.testing.assert_allclose(CORRECTION.apply(place[None])[0], moved)
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "says"),
+    [
+        ("amers-image-correction/1", "other/1", "expected a document of the format amers-image"),
+        ("499.5", '"a"', "centre_px should be 2 numbers"),
+        ("1.5", "NaN", "parameters_px should be 2 x 3 numbers"),
+        ("500.0", "-500.0", "half_size_px should be positive"),
+        ("1.5", "-600.0", "parameters_px fold or mirror the image"),
+    ],
+)
+def test_a_wrong_correction_is_refused_with_the_field(was: str, becomes: str, says: str) -> None:
+    assert was in written()
+    with pytest.raises(FormatError, match=says):
+        parse_correction(written().replace(was, becomes, 1))
+
+
+@pytest.mark.parametrize("size", range(0, 800, 40))
+def test_a_truncated_correction_is_a_format_error(size: int) -> None:
+    with pytest.raises(FormatError):
+        parse_correction(written()[: min(size, len(written()) - 3)])
+
+
+def test_an_rpc_that_no_longer_follows_the_model_is_refused_with_its_error() -> None:
+    shape, heights_m = (40_000, 2000), (50.0, 850.0)
+    target = np.array([5.4, 43.6, 300.0])
+    smooth, shaking = (
+        CorrectedModel(
+            pushbroom_over(target, shape, 0.5, 25.0, 110.0, heights_m, jitter_px=jitter_px),
+            replace(no_correction(shape), parameters=CORRECTION.parameters),
+        )
+        for jitter_px in (0.0, 3.0)
+    )
+    followed, refused = refined_rpc(smooth, shape), refined_rpc(shaking, shape)
+    assert followed.model is not None
+    assert followed.max_error_px < REFIT_LIMIT_PX < 0.1 < refused.max_error_px
+    assert refused.model is None
+
+
+def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
+    registered, tmp_path: Path
+) -> None:
+    measures = registered().measures
+    path = tmp_path / "residuals.gpkg"
+    exaggeration = exaggeration_for(measures)
+    for _ in range(2):
+        write_residual_layers(path, measures, "scene", exaggeration)
+    assert {name for name, _ in pyogrio.list_layers(path)} == {"residuals", "control_points"}
+    meta, _, geometry, values = pyogrio.raw.read(path, layer="residuals")
+    assert meta["crs"] == "EPSG:4979"
+    fields = dict(zip(meta["fields"], values, strict=True))
+    ends = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True).reshape(-1, 2, 3)
+    found = measures.matched
+    np.testing.assert_array_equal(ends[:, 0], measures.lon_lat_h[found])
+    np.testing.assert_array_equal(ends[:, 1, 2], measures.lon_lat_h[found, 2])
+    drawn_m = (ends[:, 1] - ends[:, 0])[:, :2] * metres_per_degree_at(ends[:, 0]) / exaggeration
+    np.testing.assert_allclose(drawn_m, measures.residual_m[found], atol=A_MICROMETRE)
+    assert set(fields["exaggeration"]) == {exaggeration}
+    assert set(fields["status"]) <= {"active", "deactivated"}
+    points = pyogrio.read_info(path, layer="control_points")
+    assert (points["features"], points["geometry_type"]) == (len(measures.point_id), "Point Z")
