@@ -1,17 +1,30 @@
 """Blocks: what is published, the quality of each, and their life for an administrator."""
 
-from typing import Any
+from typing import Annotated, Any
+from uuid import UUID
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Header, Request, Response
 from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
-from app.api.deps import Admin, PointsReader, ReadConnection, SettingsDep, StorageDep, WriteConnection
+from app.api.body import body_chunks
+from app.api.deps import (
+    Admin,
+    DatabaseDep,
+    PointsReader,
+    ReadConnection,
+    SettingsDep,
+    StorageDep,
+    WriteConnection,
+)
+from app.api.jobs import job_url, status_info
 from app.auth import Scope, allows
 from app.db.blocks import Block
 from app.db.tokens import Token
-from app.usecases import blocks
+from app.usecases import block_ingestion, blocks, jobs
+from app.usecases.block_ingestion import INGEST_BLOCK
+from app.usecases.blocks import Published
 from services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"])
@@ -19,14 +32,30 @@ router = APIRouter(tags=["blocks"])
 GEOJSON = "application/geo+json"
 
 
-class FolderToIngest(BaseModel):
-    """A block on the server.
+class BlockToIngest(BaseModel):
+    """A block to ingest: on the server, or uploaded before.
 
     Attributes:
         path: of its folder, below AMERS_INGEST_FOLDER.
+        upload: of an archive, as its upload replied.
+        publish: whether it becomes visible at once.
+        priority: of blocks over one place, the points of the greater one are served.
     """
 
-    path: str
+    model_config = ConfigDict(extra="forbid")
+
+    path: str | None = None
+    upload: UUID | None = None
+    publish: bool = False
+    priority: int = 0
+
+
+class Priority(BaseModel):
+    """How a block stands against others over the same place."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    priority: int
 
 
 @router.get("/collections/blocks/items")
@@ -55,46 +84,91 @@ def item(reference: str, connection: ReadConnection, caller: PointsReader) -> JS
     )
 
 
-@router.post("/blocks", status_code=201)
-def ingest(
-    body: FolderToIngest,
+BINARY_BODY = {
+    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+}
+
+
+@router.put("/blocks/uploads/{name}", status_code=201, openapi_extra={"requestBody": BINARY_BODY})
+def upload_block(
+    name: str,
     request: Request,
-    response: Response,
-    connection: WriteConnection,
+    database: DatabaseDep,
     storage: StorageDep,
     settings: SettingsDep,
     caller: Admin,
+) -> dict[str, str]:
+    """Upload a zip or tar of a block; the reply says how `POST /blocks` names it."""
+    length = request.headers.get("content-length", "")
+    announced = int(length) if length.isdigit() else None
+    upload_id = block_ingestion.receive_archive(
+        database, storage, settings, caller, name, body_chunks(request), announced
+    )
+    return {"upload": str(upload_id)}
+
+
+@router.post("/blocks", status_code=201)
+def ingest(
+    body: BlockToIngest,
+    request: Request,
+    response: Response,
+    connection: WriteConnection,
+    caller: Admin,
+    idempotency_key: Annotated[str | None, Header()] = None,
 ) -> dict[str, Any]:
-    """Check a block on the server and load it, staged; replies when it is done."""
-    folder = blocks.folder_to_ingest(settings.ingest_folder, body.path)
-    ingested = blocks.ingest_block(connection, storage, folder)
-    number = ingested.block.number
-    response.headers["Location"] = f"{request.base_url}collections/blocks/items/{number}"
-    return {"block": _properties(ingested.block), "quality": quality_document(ingested.quality)}
+    """Have a block checked and loaded, staged or published; the reply is a job to watch.
+
+    The same as an execution of the process `ingest-block`.
+    """
+    inputs = body.model_dump(mode="json", exclude_none=True)
+    job = jobs.execute(connection, caller, INGEST_BLOCK.id, inputs, idempotency_key)
+    response.headers["Location"] = job_url(request, job)
+    return status_info(request, job)
 
 
 @router.get("/blocks/{reference}/quality")
 def quality(reference: str, connection: ReadConnection, caller: PointsReader) -> dict[str, Any]:
-    """The quality figures of a block; `cells` list west, south, area in km2, number of points."""
+    """The quality figures of a block; `cells` list west, south, area in km2, number of points.
+
+    `accuracy` is what the producer of the block measured, and against what.
+    """
     block = _visible(connection, reference, caller)
-    return quality_document(blocks.find_quality(connection, str(block.number)))
+    report = blocks.block_report(connection, block)
+    return {**quality_document(report.quality), "accuracy": [vars(f) for f in report.accuracy]}
 
 
 @router.post("/blocks/{reference}/publish")
 def publish(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
     """Make a block visible, and the version of it that was visible before no longer."""
-    published = blocks.publish_block(connection, reference)
-    superseded = published.superseded
-    return {
-        "block": _properties(published.block),
-        "superseded": None if superseded is None else _properties(superseded),
-    }
+    return _published(blocks.publish_block(connection, reference))
+
+
+@router.post("/blocks/{reference}/restore")
+def restore(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+    """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
+    return _published(blocks.restore_block(connection, reference))
+
+
+@router.patch("/blocks/{reference}")
+def prioritise(
+    reference: str, body: Priority, connection: WriteConnection, caller: Admin
+) -> dict[str, Any]:
+    """Let a block win or lose against other blocks over the same place."""
+    return {"block": _properties(blocks.prioritise_block(connection, reference, body.priority))}
 
 
 @router.post("/blocks/{reference}/withdraw")
 def withdraw(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
     """Make a block invisible; it can be published again."""
     return {"block": _properties(blocks.withdraw_block(connection, reference))}
+
+
+def _published(published: Published) -> dict[str, Any]:
+    superseded = published.superseded
+    return {
+        "block": _properties(published.block),
+        "superseded": None if superseded is None else _properties(superseded),
+    }
 
 
 def _visible(connection: ReadConnection, reference: str, caller: Token | None) -> Block:

@@ -1,59 +1,175 @@
-"""Ingesting a block as a job, for blocks that no request would wait for."""
+"""Taking in blocks: archives that arrive, and the job that checks and loads a block."""
 
+import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 from typing import Any
+from uuid import UUID, uuid4
 
 from app.auth import Scope
-from app.db.engine import Connection
+from app.config import Settings
+from app.db import block_uploads
+from app.db.engine import Connection, Database
 from app.db.tokens import Token
-from app.usecases import blocks
+from app.errors import InputError, NotFound
+from app.storage import Storage
+from app.usecases import blocks, quotas
 from app.usecases.processes import Commit, Process, Work
+from app.usecases.scenes import clean_name
+from services.errors import FormatError
+from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
+from services.formats.block_json import BLOCK_JSON
+from services.quality.block import quality_document
+
+UPLOADS = "uploads"
+UNPACKED_TIMES = 4
+"""A block unpacks to at most so many times the largest upload."""
 
 
 @dataclass(frozen=True)
 class IngestBlock:
-    """What an administrator says to have a block ingested.
+    """What an administrator says to have a block ingested: a folder of the server, or an upload.
 
     Attributes:
         path: of the block's folder on the server, below AMERS_INGEST_FOLDER.
+        upload: id of an archive that was uploaded.
         publish: whether it becomes visible at once.
+        priority: of blocks over one place the points of the greater one are served.
     """
 
-    path: str
+    path: str | None = None
+    upload: UUID | None = None
     publish: bool = False
+    priority: int = 0
+
+
+def receive_archive(
+    database: Database,
+    storage: Storage,
+    settings: Settings,
+    caller: Token,
+    name: str,
+    chunks: Iterable[bytes],
+    announced_bytes: int | None = None,
+) -> UUID:
+    """Take in a zip or tar of a block; it is looked into by the job that ingests it, not here.
+
+    Returns:
+        The id by which an ingestion names it.
+
+    Raises:
+        TooLarge: more bytes than are accepted, or than the caller's quota leaves.
+        InputError: the name is none.
+    """
+    file_name = clean_name(name)
+    with database.transaction() as connection:
+        left = quotas.upload_allowance(connection, settings, caller, announced_bytes)
+    key = f"{UPLOADS}/{uuid4()}/{file_name}"
+    stored = storage.put(key, chunks, min(left, settings.upload_limit_bytes))
+    try:
+        with database.transaction() as connection:
+            return block_uploads.keep_upload(
+                connection, caller.id, file_name, key, stored.size_bytes, stored.sha256
+            )
+    except BaseException:
+        storage.delete(key)
+        raise
+
+
+def sweep_archives(connection: Connection, storage: Storage) -> list[str]:
+    """Remove the archives that nobody had ingested in time; returns their keys."""
+    unwanted = block_uploads.delete_unwanted(connection)
+    for key in unwanted:
+        storage.delete(key)
+    return unwanted
 
 
 def _check(connection: Connection, caller: Token, inputs: IngestBlock) -> None:
     """Whether there is such a folder is for the worker to see: it may have other disks than the API."""
+    if (inputs.path is None) == (inputs.upload is None):
+        raise InputError("inputs of ingest-block: either path or upload is expected")
+    if inputs.upload is not None and block_uploads.find_archive(connection, inputs.upload) is None:
+        raise NotFound(f"no uploaded block {inputs.upload}")
 
 
 def _run(work: Work) -> Commit:
     """The block is loaded in the transaction that ends the job: all of it is there, or nothing."""
     inputs: IngestBlock = work.inputs
-    folder = blocks.folder_to_ingest(work.settings.ingest_folder, inputs.path)
+    # Lives as long as the transaction may need it; goes with the attempt's process at the latest.
+    scratch = tempfile.TemporaryDirectory(prefix="amers-block-")
+    folder = (
+        blocks.folder_to_ingest(work.settings.ingest_folder, inputs.path)
+        if inputs.path is not None
+        else _unpacked(work, inputs.upload, Path(scratch.name))
+    )
 
     def commit(connection: Connection) -> dict[str, Any]:
-        block = blocks.ingest_block(connection, work.storage, folder, work.progress).block
+        with scratch:
+            ingested = blocks.ingest_block(
+                connection, work.storage, folder, work.progress, inputs.priority
+            )
+        block = ingested.block
         if inputs.publish:
             block = blocks.publish_block(connection, str(block.number)).block
+        figures = quality_document(ingested.quality)
         return {
             "number": block.number,
             "id": block.id,
             "version": block.version,
             "state": block.state,
             "points": block.n_points,
+            "quality": {name: value for name, value in figures.items() if name != "cells"},
         }
 
     return commit
 
 
+def _unpacked(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
+    """The folder of a block that came as an archive."""
+    assert upload_id is not None
+    with work.database.reading() as connection:
+        key = block_uploads.find_archive(connection, upload_id)
+    if key is None:
+        raise NotFound(f"no uploaded block {upload_id}")
+    work.progress(0.0, "unpacking the block")
+    archive = work.storage.fetch(key, scratch)
+    limits = ArchiveLimits(UNPACKED_TIMES * work.settings.upload_limit_bytes)
+    members = check_archive(archive, limits)
+    root = _root(archive.name, members)
+    folder = scratch / "block"
+    places = {}
+    for member in members:
+        place = folder / member.path.relative_to(root)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        places[member.path] = place
+    unpack_archive(archive, places, limits)
+    return folder
+
+
+def _root(name: str, members: tuple[Member, ...]) -> PurePosixPath:
+    """The folder of the archive that holds block.json and everything else."""
+    documents = [member.path for member in members if member.path.name == BLOCK_JSON]
+    if not documents:
+        raise FormatError(f"{name}: no {BLOCK_JSON} in it")
+    root = min(documents, key=lambda path: len(path.parts)).parent
+    outside = next((m.path for m in members if not m.path.is_relative_to(root)), None)
+    if outside is not None:
+        raise FormatError(f"{name}: {str(outside)[:200]} lies outside the folder of {BLOCK_JSON}")
+    return root
+
+
 INGEST_BLOCK = Process(
     id="ingest-block",
     title="Ingest a block",
-    description="Check a block of points on the server and load it into the store.",
+    description="Check a block of points, on the server or uploaded, and load it into the store.",
     scope=Scope.ADMIN,
     inputs=IngestBlock,
-    outputs={"id": "Name of the block.", "state": "Staged, or published."},
+    outputs={
+        "id": "Name of the block.",
+        "state": "Staged, or published.",
+        "quality": "Density, views a point, stated precision.",
+    },
     check=_check,
     run=_run,
 )

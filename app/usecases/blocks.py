@@ -16,7 +16,7 @@ from app.storage import Storage, chips_key
 from services.errors import FormatError
 from services.formats.block import BlockContents, block_member
 from services.formats.block_check import check_block
-from services.formats.block_json import BLOCK_JSON
+from services.formats.block_json import BLOCK_JSON, AccuracyFigure, parse_block_json
 from services.formats.chip_files import read_chip_file
 from services.quality.block import BlockQuality, block_quality
 from services.types import Progress, no_progress, part_of
@@ -37,6 +37,19 @@ class Ingested:
 
     block: Block
     quality: BlockQuality
+
+
+@dataclass(frozen=True)
+class BlockReport:
+    """How good a block is.
+
+    Attributes:
+        quality: of its points, told from themselves.
+        accuracy: as its producer states it, with what it was measured against.
+    """
+
+    quality: BlockQuality
+    accuracy: tuple[AccuracyFigure, ...]
 
 
 @dataclass(frozen=True)
@@ -215,6 +228,12 @@ def find_quality(connection: Connection, reference: str) -> BlockQuality:
     """
     block = find_block(connection, reference)
     return blocks.find_quality(connection, block.number)
+
+
+def block_report(connection: Connection, block: Block) -> BlockReport:
+    """How good a block is: our figures of its points, and what its producer measured."""
+    document = parse_block_json(blocks.find_document(connection, block.number))
+    return BlockReport(blocks.find_quality(connection, block.number), document.metadata.accuracy)
 
 
 def folder_to_ingest(allowed: Path | None, name: str) -> Path:

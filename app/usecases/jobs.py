@@ -3,7 +3,7 @@
 import logging
 import re
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
@@ -148,7 +148,9 @@ def error_details(error: AmersError, storage: Storage) -> dict[str, Any]:
     name = type(error).__name__
     title = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
     numbers = {key: value for key, value in vars(error).items() if isinstance(value, int | float | str)}
-    return {"type": "about:blank", "title": title, "detail": detail, "error": name, **numbers}
+    problems = [asdict(problem) for problem in getattr(error, "problems", ())]
+    told = {"problems": problems} if problems else {}
+    return {"type": "about:blank", "title": title, "detail": detail, "error": name, **numbers, **told}
 
 
 @dataclass

@@ -1,7 +1,10 @@
 """The life of a block, ingested to withdrawn, by use case, over HTTP and by command."""
 
 import json
+import shutil
+import zipfile
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
@@ -12,11 +15,14 @@ from shapely import Polygon
 from typer.testing import CliRunner
 
 from app.cli.main import app as commands
+from app.db import engine, jobs
 from app.db import points as point_store
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
 from app.storage import StoredChips
 from app.usecases import blocks
+from app.usecases.jobs import do_attempt
+from services.formats.block_json import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
 
@@ -34,7 +40,7 @@ def ingested(connection, storage, tmp_path):
 
 def visible(connection) -> int:
     connection.commit()
-    return point_store.point_features(connection, None, -1, 1000).returned
+    return len(point_store.control_points(connection, rectangle(*BOX)).points)
 
 
 def test_an_ingested_block_is_staged_and_invisible(connection, ingested):
@@ -207,24 +213,111 @@ def test_files_no_row_names_are_swept_and_others_stay(connection, storage, tmp_p
     assert len(storage.keys("chips")) == 1
 
 
+def ingested_by_job(client, settings, admin, body: dict) -> dict:
+    """What became of an ingestion asked for over HTTP, done by the code of a worker's process."""
+    asked = client.post("/blocks", json=body, headers=admin)
+    assert asked.status_code == 201, asked.text
+    job_id = UUID(asked.json()["jobID"])
+    assert asked.headers["Location"].endswith(f"/jobs/{job_id}")
+    ingesting = settings.model_copy(update={"ingest_folder": client.app.state.settings.ingest_folder})
+    with engine.opened(ingesting) as database:
+        with database.transaction() as connection:
+            job = jobs.claim(connection, job_id, "a worker", 30.0)
+        do_attempt(database, ingesting, job_id, job.attempt)
+    return client.get(f"/jobs/{job_id}", headers=admin).json()
+
+
+def archive_of(folder: Path, kind: str) -> bytes:
+    return Path(shutil.make_archive(str(folder), kind, folder.parent, folder.name)).read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_a_block_is_uploaded_as_an_archive_and_ingested_by_a_job(
+    client, settings, bearer, tmp_path, kind
+):
+    made = make_block(tmp_path / "calanques_v1")
+    admin = bearer("admin")
+    path = f"/blocks/uploads/calanques.{kind}"
+    assert client.put(path, content=b"x", headers=bearer("register")).status_code == 403
+    reply = client.put(path, content=archive_of(made.folder, kind), headers=admin)
+    assert reply.status_code == 201, reply.text
+    job = ingested_by_job(client, settings, admin, {**reply.json(), "publish": True, "priority": 2})
+    assert job["status"] == "successful", job
+    (feature,) = client.get("/collections/blocks/items", headers=admin).json()["features"]
+    assert feature["properties"]["state"] == "published"
+    assert feature["properties"]["n_points"] == 40
+
+
+def test_what_is_refused_of_a_block_is_listed_with_its_reasons(client, settings, bearer, tmp_path):
+    made = make_block(tmp_path / "calanques_v1")
+    with (made.folder / "chips/0000.npy").open("r+b") as chips:
+        chips.seek(9_000)
+        chips.write(b"\x01\x02")
+    (made.folder / "stray.txt").write_text("not listed")
+    admin = bearer("admin")
+    upload = client.put(
+        "/blocks/uploads/b.zip", content=archive_of(made.folder, "zip"), headers=admin
+    ).json()
+    job = ingested_by_job(client, settings, admin, upload)
+    assert job["status"] == "failed"
+    problems = job["error"]["problems"]
+    assert {problem["file"] for problem in problems} == {"chips/0000.npy", "stray.txt"}
+    assert all(problem["found"] and problem["expected"] for problem in problems)
+    assert client.get("/collections/blocks/items", headers=admin).json()["features"] == []
+
+
+def hostile_zip(path: Path, name: str) -> bytes:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("block/block.json", "{}")
+        archive.writestr(name, "x")
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("../../etc/x", "etc/x"), ("/etc/x", "etc/x"), ("elsewhere/x", "outside the folder")],
+)
+def test_an_archive_that_reaches_out_of_its_folder_is_refused(
+    client, settings, bearer, tmp_path, name, said
+):
+    admin = bearer("admin")
+    content = hostile_zip(tmp_path / "bad.zip", name)
+    upload = client.put("/blocks/uploads/bad.zip", content=content, headers=admin).json()
+    job = ingested_by_job(client, settings, admin, upload)
+    assert job["status"] == "failed"
+    assert said in job["message"]
+
+
+@pytest.mark.parametrize("body", [{}, {"path": "a", "upload": str(UUID(int=1))}, {"folder": "a"}])
+def test_an_ingestion_names_either_a_folder_or_an_upload(client, bearer, body):
+    assert client.post("/blocks", json=body, headers=bearer("admin")).status_code == 422
+
+
+def test_an_upload_that_is_not_there_is_not_ingested(client, bearer):
+    asked = client.post("/blocks", json={"upload": str(UUID(int=1))}, headers=bearer("admin"))
+    assert asked.status_code == 404
+
+
 def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_path):
     folder = tmp_path / "incoming"
     folder.mkdir()
     made = make_block(folder / "calanques_v1")
     admin, reader = bearer("admin"), bearer("read")
     with TestClient(create_app(settings.model_copy(update={"ingest_folder": folder}))) as client:
-        made_reply = client.post("/blocks", json={"path": "calanques_v1"}, headers=admin)
-        assert made_reply.status_code == 201, made_reply.text
-        assert made_reply.json()["block"]["state"] == "staged"
-        assert made_reply.json()["quality"]["points"] == len(made.points)
-        location = made_reply.headers["Location"]
+        job = ingested_by_job(client, settings, admin, {"path": "calanques_v1"})
+        assert job["status"] == "successful", job
+        results = client.get(f"/jobs/{job['jobID']}/results", headers=admin).json()
+        assert (results["state"], results["points"]) == ("staged", len(made.points))
+        assert results["quality"]["share_reaching_quarter"] == 1.0
+        location = f"/collections/blocks/items/{results['number']}"
         assert client.get(location, headers=admin).json()["properties"]["id"] == "calanques"
         assert client.get(location, headers=reader).status_code == 404
         assert client.get("/blocks/calanques/quality", headers=reader).status_code == 404
         assert client.post("/blocks/calanques/publish", headers=reader).status_code == 403
 
-        again = client.post("/blocks", json={"path": "calanques_v1"}, headers=admin)
-        assert again.status_code == 409
+        again = ingested_by_job(client, settings, admin, {"path": "calanques_v1"})
+        assert again["status"] == "failed"
+        assert "in the store already" in again["message"]
 
         assert (
             client.post("/blocks/calanques/publish", headers=admin).json()["block"]["state"]
@@ -233,6 +326,7 @@ def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_pa
         listed = client.get("/collections/blocks/items", headers=reader).json()
         assert [feature["properties"]["state"] for feature in listed["features"]] == ["published"]
         quality = client.get("/blocks/calanques/quality", headers=reader).json()
+        assert quality["accuracy"] == [vars(figure) for figure in made.metadata.accuracy]
         assert quality["cells"][0][3] + sum(cell[3] for cell in quality["cells"][1:]) == 40
         extent = client.get("/collections/points", headers=reader).json()["extent"]["spatial"]["bbox"][0]
         assert_allclose(extent, BOX)
@@ -243,6 +337,12 @@ def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_pa
             == "withdrawn"
         )
         assert client.get("/collections/blocks/items", headers=reader).json()["features"] == []
+        assert (
+            client.post("/blocks/calanques/restore", headers=admin).json()["block"]["state"]
+            == "published"
+        )
+        raised = client.patch("/blocks/calanques", json={"priority": 3}, headers=admin)
+        assert raised.json()["block"]["priority"] == 3
         assert client.post("/blocks/nothing/publish", headers=admin).status_code == 404
 
 
@@ -257,10 +357,10 @@ def test_only_folders_below_the_allowed_one_are_ingested_by_request(tmp_path, pa
         blocks.folder_to_ingest(allowed, path)
 
 
-def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client, bearer):
-    reply = client.post("/blocks", json={"path": "x"}, headers=bearer("admin"))
-    assert reply.status_code == 422
-    assert "AMERS_INGEST_FOLDER" in reply.json()["detail"]
+def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client, settings, bearer):
+    job = ingested_by_job(client, settings, bearer("admin"), {"path": "x"})
+    assert job["status"] == "failed"
+    assert "AMERS_INGEST_FOLDER" in job["message"]
 
 
 @pytest.fixture
