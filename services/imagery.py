@@ -8,8 +8,12 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import lon_lat_h_from_east_north_up
+from services.resampling import resample, spline_coefficients
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
+
+_MARGIN_PX = 6
+"""Pixels read around those asked for, so that the spline is not that of the window's border."""
 
 _NODE_PX = 10
 """Chip pixels between the places that go through the model."""
@@ -121,8 +125,12 @@ def low_pass(pixels: FloatImage, ratio: float) -> FloatImage:
     """Pixels blurred to the resolution of pixels `ratio` times larger; unchanged below 1."""
     if ratio <= 1.0:
         return pixels
-    sigma = BLUR_PER_RATIO * float(np.sqrt(ratio * ratio - 1.0))
-    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px(ratio), borderType=cv2.BORDER_REFLECT))
+
+
+def blur_px(ratio: float) -> float:
+    """Standard deviation of the low-pass for pixels `ratio` times larger, source pixels."""
+    return BLUR_PER_RATIO * float(np.sqrt(max(ratio * ratio - 1.0, 0.0)))
 
 
 def image_gsd_m(model: SensorModel, lon_lat_h: Array) -> float:
@@ -149,21 +157,27 @@ def chip_ground(lon_lat_h: Array, gsd_m: float, size: int) -> Array:
     return lon_lat_h_from_east_north_up(enu.reshape(-1, 3), lon_lat_h)
 
 
-def _image_positions(
-    model: SensorModel, lon_lat_h: Array, gsd_m: float, size: int
-) -> tuple[Array, Array]:
-    """Where a chip lies in an image: nodes round all of it (n, n, 2), and its pixels (size, size, 2).
+def chip_positions(model: SensorModel, lon_lat_h: Array, gsd_m: float, size: int) -> Array:
+    """Where the pixels of a chip lie in an image: (size, size, 2).
 
     Only nodes go through the model: a sensor is smooth, and bilinear positions between them are off by
     1.3e-5 px where the chip is four times coarser than the image.
+
+    Args:
+        model: of the image.
+        lon_lat_h: (3,) the point at the centre of the chip.
+        gsd_m: ground sampling of the chip.
+        size: odd number of pixels a side.
     """
     half = -(-(size // 2) // _NODE_PX)
     count = 2 * half + 1
     ground = chip_ground(lon_lat_h, gsd_m * _NODE_PX, count)
     nodes = model.project(ground).reshape(count, count, 2)
+    if not np.isfinite(nodes).all():
+        return np.full((size, size, 2), np.nan)
     pixel = (np.arange(size) - size // 2) / _NODE_PX
     weight = np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
-    return nodes, np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
 
 
 def render_chip(
@@ -175,8 +189,8 @@ def render_chip(
 ) -> FloatImage:
     """What an image shows around a point, in the geometry of a chip.
 
-    The image is low-passed to the resolution of the chip before it is resampled (bicubic); where the
-    image is coarser than the chip it is only resampled.
+    The image is low-passed to the resolution of the chip before it is resampled; where the image is
+    coarser than the chip it is only resampled.
 
     Args:
         source: the image, or a reduction of it.
@@ -188,35 +202,43 @@ def render_chip(
     Returns:
         (size, size) float32; NaN where the image shows nothing.
     """
-    nodes, line_sample = _image_positions(model, lon_lat_h, gsd_m, size)
-    if not np.isfinite(nodes).all():
-        return np.full((size, size), np.nan, dtype=np.float32)
-    ratio = gsd_m / image_gsd_m(model, lon_lat_h)
+    positions = chip_positions(model, lon_lat_h, gsd_m, size)
+    return sample_image(source, positions, gsd_m / image_gsd_m(model, lon_lat_h))
+
+
+def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: float) -> FloatImage:
+    """An image at many places near each other, at a resolution.
+
+    Only the window of these places is read. It is averaged over whole pixels and blurred down to the
+    resolution asked for, then resampled by a cubic spline.
+
+    Args:
+        source: the image, or a reduction of it.
+        line_sample: (rows, columns, 2) positions in the original image.
+        ratio: size of the pixels wanted over that of the original's; an image is never sharpened.
+
+    Returns:
+        (rows, columns) float32; NaN beyond the image, beside nodata and where a position is NaN.
+    """
     if isinstance(source, ReducedImage):
-        factor, reduced = source.factor, source.pixels
-        image: ImageSource = ArrayImage(reduced)
-        nodes = (nodes - (factor - 1) / 2.0) / factor
-        line_sample = (line_sample - (factor - 1) / 2.0) / factor
-        ratio /= factor
+        image: ImageSource = ArrayImage(source.pixels)
+        line_sample = (line_sample - (source.factor - 1) / 2.0) / source.factor
+        ratio /= source.factor
     else:
         image = source
+    nothing = np.full(line_sample.shape[:2], np.nan, dtype=np.float32)
+    placed = line_sample.reshape(-1, 2)
+    placed = placed[np.isfinite(placed).all(axis=1)]
+    if len(placed) == 0:
+        return nothing
     factor = max(1, int(ratio / 2.0))
-    margin = 4 * factor + int(2.0 * ratio)
-    corners = nodes.reshape(-1, 2)
-    first = np.floor(corners.min(axis=0)).astype(int) - margin
-    last = np.ceil(corners.max(axis=0)).astype(int) + margin + 1
-    if (last < 0).any() or (first > image.shape).any():
-        return np.full((size, size), np.nan, dtype=np.float32)
+    margin = _MARGIN_PX * factor + int(2.0 * ratio)
+    first = np.floor(placed.min(axis=0)).astype(int) - margin
+    last = np.ceil(placed.max(axis=0)).astype(int) + margin + 1
+    first, last = np.maximum(first, -margin), np.minimum(last, np.array(image.shape) + margin)
+    if (last <= 0).any() or (first >= image.shape).any() or (last - first < 4 * factor).any():
+        return nothing
     window = Window(int(first[0]), int(first[1]), *(int(v) for v in last - first))
-    pixels = low_pass(mean_pixels(image.read(window), factor), ratio / factor)
+    pixels = mean_pixels(image.read(window), factor)
     position = (line_sample - first - (factor - 1) / 2.0) / factor
-    return np.asarray(
-        cv2.remap(
-            pixels,
-            position[..., 1].astype(np.float32),
-            position[..., 0].astype(np.float32),
-            cv2.INTER_CUBIC,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=float("nan"),
-        )
-    )
+    return resample(spline_coefficients(pixels, blur_px(ratio / factor)), position)

@@ -34,18 +34,21 @@ class AdjustmentOptions:
         min_spread: an order beyond the shift is considered when the measures spread over the image
             with at least this standard deviation along each axis, in half sizes of the image (an even
             spread has 0.58).
+        tested_spread: parameters that the order leaves out are taken for zero when the measures spread
+            at least so far.
         min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
             this fraction.
         folds: of the cross-validation.
-        untested_px: what drift and skew may still be at the edge of the image, one standard deviation,
-            where the measures are too few or too close to each other to tell.
+        untested_px: what drift and skew may still be at the edge of the image where the order leaves
+            them out, one standard deviation, as far as the measures do not tell.
     """
 
     order: Order | None = None
     tolerance: float = 2.7
     min_points: int = 4
     points_per_parameter: float = 2.0
-    min_spread: float = 0.2
+    min_spread: float = 0.1
+    tested_spread: float = 0.2
     min_gain: float = 0.03
     folds: int = 5
     untested_px: float = 1.0
@@ -149,8 +152,10 @@ def adjust_scene(
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
     covariance = cofactor * max(sigma0, 1.0) ** 2
     covariance[[0, 3], [0, 3]] += common_sigma_px**2
-    if options.order is None and "affine" not in dict(validation):
-        covariance += problem.covariance_of_untested(active, free, options.untested_px)
+    tested = "affine" in dict(validation) and problem.spread(active) >= options.tested_spread
+    if options.order is None and not tested:
+        unit = max(sigma0, 1.0)
+        covariance += problem.covariance_of_fixed(active, free, unit, options.untested_px)
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,
@@ -194,10 +199,13 @@ class _Problem:
             cofactor[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
         return parameters, cofactor
 
-    def covariance_of_untested(self, active: BoolArray, free: BoolArray, untested_px: float) -> Array:
-        """Covariance (6, 6) that fixed parameters bring when they are not known to be zero.
+    def covariance_of_fixed(
+        self, active: BoolArray, free: BoolArray, sigma0: float, untested_px: float
+    ) -> Array:
+        """Covariance (6, 6) that fixed parameters bring: they are zero to what the measures can tell.
 
-        Left out of the fit, they bias the free ones and are missing where the measures do not reach.
+        Left out of the fit, they bias the free ones and are missing where the measures do not reach. Few
+        measures, or measures close together, tell little of them: they are then what `untested_px` says.
         """
         design = np.column_stack([np.ones(len(self.t)), self.t])[active]
         covariance = np.zeros((6, 6))
@@ -209,8 +217,14 @@ class _Problem:
             error = np.zeros((3, len(fixed)))
             error[free[k]] = np.linalg.solve((a * weight).T @ a, (a * weight).T @ design[:, fixed])
             error[fixed] = -np.eye(len(fixed))
-            covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = untested_px**2 * error @ error.T
+            told = (design @ error).T @ (design @ error * weight) / sigma0**2
+            of_fixed = np.linalg.inv(told + np.eye(len(fixed)) / untested_px**2)
+            covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = error @ of_fixed @ error.T
         return covariance
+
+    def spread(self, active: BoolArray) -> float:
+        """Standard deviation of the measures along the worse axis, half sizes of the image."""
+        return float(self.t[active].std(axis=0).min())
 
     def residual(self, parameters: Array) -> Array:
         """(n, 2) pixels."""
@@ -262,7 +276,7 @@ def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions
     start = problem.robust_solution(usable, _FREE["shift"])
     agreeing = usable & (problem.magnitude(start) <= 5.0 * max(problem.scale(start, usable), 1e-9))
     count = int(agreeing.sum())
-    spread = problem.t[agreeing].std(axis=0).min()
+    spread = problem.spread(agreeing)
     return [
         order
         for order in ORDERS

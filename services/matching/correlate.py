@@ -1,4 +1,4 @@
-"""A chip found in the scene: normalised correlation, its peak to a fraction of a pixel, its sigma."""
+"""A chip found in the scene: normalised correlation, then least squares for the place and its sigma."""
 
 import math
 from dataclasses import dataclass
@@ -6,12 +6,19 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from services.matching.least_squares import covariance_of, fit_chip
 from services.types import Array, FloatImage
 
 FOUND = ""
 
+INTERPOLATION_SIGMA_PX = 0.003
+"""What is left of an error where there is no noise at all."""
+
 _BLOCKED = -1.0
 """Score of places that cannot be judged."""
+
+_SUBPIXEL_LOSS = 0.1
+"""How much of its score a chip may lose half a pixel beside its place."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +30,14 @@ class CorrelationOptions:
         max_second: a second peak above this fraction of the first makes the place ambiguous.
         second_distance_px: how far from the first a second peak begins.
         min_contrast: standard deviation over mean below which a chip is flat.
+        max_sigma_px: a place known worse than this, along any direction, is ambiguous, chip pixels.
     """
 
     min_score: float = 0.8
     max_second: float = 0.9
     second_distance_px: int = 6
     min_contrast: float = 0.01
+    max_sigma_px: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,7 @@ class Peak:
         row_col: (2,) displacement of the chip from the centre of the patch, chip pixels.
         score: normalised correlation at the peak.
         sigma_px: one standard deviation a coordinate, chip pixels.
+        influence: (c, c, 2) of the squares of the chip on its place; see `least_squares.Fit`.
         reason: `FOUND`, or why the peak is not believed: "flat", "nodata", "low_score",
             "border_peak", "ambiguous".
     """
@@ -46,18 +56,18 @@ class Peak:
     row_col: Array
     score: float
     sigma_px: float
+    influence: Array
     reason: str
 
 
 def _rejected(reason: str, score: float = math.nan) -> Peak:
-    return Peak(np.full(2, np.nan), score, math.nan, reason)
+    return Peak(np.full(2, np.nan), score, math.nan, np.zeros((0, 0, 2)), reason)
 
 
 def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) -> Peak:
     """Find a chip in a larger patch of the same geometry.
 
-    Zero-mean normalised correlation in float32; a quadratic surface through the nine values round the
-    peak gives the fraction of a pixel.
+    Zero-mean normalised correlation in float32 finds the pixel, least squares its fraction.
 
     Args:
         patch: (s + 2 r, s + 2 r); NaN where there is nothing to see.
@@ -72,24 +82,46 @@ def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) 
     scores = correlation_map(patch, chip)
     if scores is None:
         return _rejected("nodata")
-    row, col = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    row, col = (int(v) for v in np.unravel_index(int(np.argmax(scores)), scores.shape))
     score = float(scores[row, col])
-    if score < options.min_score:
+    if score < options.min_score - _SUBPIXEL_LOSS:
         return _rejected("low_score", score)
     if row in (0, scores.shape[0] - 1) or col in (0, scores.shape[1] - 1):
         return _rejected("border_peak", score)
-    around = scores[row - 1 : row + 2, col - 1 : col + 2].astype(np.float64)
-    if around.min() <= _BLOCKED:
+    if scores[row - 1 : row + 2, col - 1 : col + 2].min() <= _BLOCKED:
         return _rejected("border_peak", score)
-    if _second_peak(scores, int(row), int(col), options.second_distance_px) > options.max_second * score:
+    if _second_peak(scores, row, col, options.second_distance_px) > options.max_second * score:
+        return _rejected("ambiguous" if score >= options.min_score else "low_score", score)
+    return place_chip(patch, chip, np.array([row, col], dtype=np.float64), score, options)
+
+
+def place_chip(
+    patch: FloatImage, chip: FloatImage, start: Array, score: float, options: CorrelationOptions
+) -> Peak:
+    """The place of a chip whose pixel is known.
+
+    Args:
+        patch, chip: as in `find_chip`.
+        start: (2,) row and column of the chip's first pixel in the patch.
+        score: normalised correlation there.
+        options: thresholds.
+    """
+    fit = fit_chip(patch, chip, start)
+    score = score if fit is None else max(score, fit.score)
+    if score < options.min_score:
+        return _rejected("low_score", score)
+    if fit is None:
         return _rejected("ambiguous", score)
-    offset, curvature = _quadratic_peak(around)
-    if curvature <= 0.0 or np.abs(offset).max() > 1.0:
+    covariance = covariance_of(fit.influence)
+    if not math.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)) <= options.max_sigma_px:
         return _rejected("ambiguous", score)
-    centre = (np.array(scores.shape) - 1) / 2.0
-    return Peak(
-        np.array([row, col]) + offset - centre, score, _peak_sigma(score, curvature, chip.size), FOUND
-    )
+    centre = (np.array(patch.shape) - chip.shape[0]) / 2.0
+    return Peak(fit.row_col - centre, score, sigma_of(covariance), fit.influence, FOUND)
+
+
+def sigma_of(covariance: Array) -> float:
+    """One standard deviation a coordinate (root mean square over both), pixels."""
+    return math.hypot(math.sqrt(np.trace(covariance) / 2.0), INTERPOLATION_SIGMA_PX)
 
 
 def correlation_map(patch: FloatImage, chip: FloatImage) -> FloatImage | None:
@@ -122,32 +154,3 @@ def _second_peak(scores: FloatImage, row: int, col: int, distance: int) -> float
     kept = scores.copy()
     kept[max(0, row - distance) : row + distance + 1, max(0, col - distance) : col + distance + 1] = -1.0
     return float(kept.max())
-
-
-_GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(9, 2)
-_QUADRATIC = np.linalg.pinv(
-    np.column_stack(
-        [np.ones(9), _GRID, _GRID[:, 0] ** 2 / 2.0, _GRID[:, 1] ** 2 / 2.0, _GRID[:, 0] * _GRID[:, 1]]
-    )
-)
-
-
-def _quadratic_peak(around: Array) -> tuple[Array, float]:
-    """Offset of the top of a quadratic through 3 x 3 scores, and its smaller curvature."""
-    _, by_row, by_col, row_row, col_col, row_col = (_QUADRATIC @ around.ravel()).tolist()
-    curvature = -(row_row + col_col) / 2.0 - math.hypot((row_row - col_col) / 2.0, row_col)
-    if curvature <= 0.0:
-        return np.zeros(2), curvature
-    determinant = row_row * col_col - row_col * row_col
-    offset = row_col * by_col - col_col * by_row, row_col * by_row - row_row * by_col
-    return np.array(offset) / determinant, curvature
-
-
-def _peak_sigma(score: float, curvature: float, pixels: int) -> float:
-    """Standard deviation of a correlation peak, pixels.
-
-    What chip and scene do not share has a variance of 2 (1 - score) and moves the peak by its square
-    root over the slope, `curvature * pixels` independent values of it. It is as smooth as the texture
-    itself, whose correlation length is `curvature ** -0.5`, so that pi / curvature pixels count as one.
-    """
-    return float(np.sqrt(2.0 * np.pi * max(1.0 - score, 1e-4) / pixels) / curvature)

