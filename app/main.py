@@ -11,14 +11,18 @@ from starlette.middleware.cors import CORSMiddleware
 from app.api import (
     blocks,
     collections,
+    features,
     jobs,
+    openapi,
     operations,
     points,
     processes,
     replies,
     scenes,
     system,
+    tiles,
     tokens,
+    uploads,
 )
 from app.api.body import BodyLimit
 from app.api.watch import RequestMetrics, Watch
@@ -35,8 +39,11 @@ ROUTERS: tuple[APIRouter, ...] = (
     system.router,
     collections.router,
     points.router,
+    tiles.router,
+    features.router,
     blocks.router,
     scenes.router,
+    uploads.router,
     processes.router,
     jobs.router,
     tokens.router,
@@ -59,6 +66,7 @@ CORS_HEADERS = (
     "X-Request-ID",
 )
 CORS_EXPOSED = (
+    "Amers-Scene",
     "Content-Crs",
     "Content-Disposition",
     "Link",
@@ -94,7 +102,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description=DESCRIPTION,
         version=version("amers"),
         lifespan=lifespan,
-        openapi_url="/api",
+        openapi_url=None,
         # Their pages load scripts from elsewhere.
         docs_url=None,
         redoc_url=None,
@@ -112,6 +120,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.metrics = RequestMetrics()
     app.add_middleware(Watch, metrics=app.state.metrics)
     replies.install(app)
+    openapi.install(app)
     for router in ROUTERS:
         app.include_router(router)
     return app

@@ -1,60 +1,223 @@
-"""The collections of the service, in the vocabulary of OGC API - Features."""
+"""The collections of the service and what can be asked of each, as OGC API - Features has it."""
 
 from typing import Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
 
-from app.api.deps import PointsReader, ReadConnection
-from app.errors import NotFound
-from app.usecases.blocks import published_bounds
+from app.api.deps import PointsReader, ReadConnection, SettingsDep
+from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
+from app.api.negotiation import (
+    DOCUMENTS,
+    FEATURES,
+    GEOJSON,
+    HTML,
+    JSON,
+    SCHEMA_JSON,
+    chosen_format,
+    refuse_unknown,
+)
+from app.api.pages import Cell, document_page, drawn
+from app.db.collections import Collection, Property, Viewer
+from app.db.engine import Connection
+from app.errors import NotAllowed
+from app.usecases import features
+from app.usecases.tiles import TILED
 
 router = APIRouter(tags=["collections"])
 
-CRS84H = "http://www.opengis.net/def/crs/OGC/0/CRS84h"
-GEOJSON = "application/geo+json"
-COLLECTIONS = {
-    "points": ("Control points", "3D ground control points with image chips, of all published blocks."),
-    "blocks": ("Blocks", "Productions of points, published as a whole."),
+REL = "http://www.opengis.net/def/rel/ogc/1.0"
+JSON_TYPES: dict[str, dict[str, str]] = {
+    "bigint": {"type": "integer"},
+    "real": {"type": "number"},
+    "double precision": {"type": "number"},
+    "text": {"type": "string"},
+    "boolean": {"type": "boolean"},
+    "date": {"type": "string", "format": "date"},
+    "timestamptz": {"type": "string", "format": "date-time"},
 }
 
 
 @router.get("/collections")
-def collections(request: Request, connection: ReadConnection, caller: PointsReader) -> dict[str, Any]:
-    """The collections there are."""
-    bounds = published_bounds(connection)
-    return {
-        "links": [_link(request, "self", "collections", "application/json")],
-        "collections": [_collection(request, name, bounds) for name in COLLECTIONS],
+def collections(
+    request: Request,
+    connection: ReadConnection,
+    caller: PointsReader,
+    settings: SettingsDep,
+    f: Format = None,
+) -> Response:
+    """The collections the caller may see."""
+    refuse_unknown(request, {"f"})
+    seen = []
+    for collection in features.COLLECTIONS.values():
+        try:
+            seen.append((collection, viewer_of(collection, caller, settings)))
+        except NotAllowed:
+            continue
+    document = {
+        "links": _self_links(request, "collections"),
+        "collections": [describe(request, connection, *one) for one in seen],
     }
+    if chosen_format(request, DOCUMENTS, f) == "json":
+        return JSONResponse(document)
+    rows = [
+        [
+            Cell(collection.title, f"{request.base_url}collections/{collection.id}?f=html"),
+            Cell(collection.description),
+        ]
+        for collection, _ in seen
+    ]
+    return document_page(
+        request, "Collections", "", document["links"], ("collection", "what it holds"), rows
+    )
 
 
-@router.get("/collections/{name}")
-def collection(
-    name: str, request: Request, connection: ReadConnection, caller: PointsReader
-) -> dict[str, Any]:
+@router.get("/collections/{collection}")
+def one_collection(
+    request: Request,
+    collection: CollectionDep,
+    viewer: ViewerDep,
+    connection: ReadConnection,
+    f: Format = None,
+) -> Response:
     """One collection."""
-    if name not in COLLECTIONS:
-        raise NotFound(f"no collection {name:.100}: there are {', '.join(COLLECTIONS)}")
-    return _collection(request, name, published_bounds(connection))
+    refuse_unknown(request, {"f"})
+    document = describe(request, connection, collection, viewer)
+    if chosen_format(request, DOCUMENTS, f) == "json":
+        return JSONResponse(document)
+    box = document.get("extent", {}).get("spatial", {}).get("bbox", [None])[0]
+    rows = [
+        [Cell(item.name), Cell(item.title), Cell(item.type), Cell(item.unit)]
+        for item in collection.queryables.values()
+    ]
+    return document_page(
+        request,
+        collection.title,
+        collection.description,
+        document["links"],
+        ("property", "what it is", "type", "unit"),
+        rows,
+        drawn([] if box is None else [_rectangle(box)]),
+    )
 
 
-def _collection(request: Request, name: str, bounds: tuple[float, ...] | None) -> dict[str, Any]:
-    title, description = COLLECTIONS[name]
-    extent = {"extent": {"spatial": {"bbox": [bounds], "crs": CRS84H}}} if bounds else {}
+@router.get("/collections/{collection}/queryables")
+def queryables(
+    request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
+) -> Response:
+    """What a filter may name, as a JSON Schema."""
+    members = {item.name: _schema(item) for item in collection.queryables.values()}
+    members["geometry"] = _geometry_schema(collection)
+    return _schema_reply(request, collection, "queryables", members, f)
+
+
+@router.get("/collections/{collection}/sortables")
+def sortables(
+    request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
+) -> Response:
+    """What features can be sorted by, as a JSON Schema."""
+    members = {item.name: _schema(item) for item in collection.queryables.values()}
+    return _schema_reply(request, collection, "sortables", members, f)
+
+
+@router.get("/collections/{collection}/schema")
+def schema(request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None) -> Response:
+    """The properties of a feature, as a JSON Schema with the roles of OGC API - Features - Part 5."""
+    members: dict[str, Any] = {}
+    for item in collection.queryables.values():
+        members[item.name] = _schema(item)
+    members[collection.key.name]["x-ogc-role"] = "id"
+    if collection.interval and collection.interval[0] != collection.interval[1]:
+        for name, end in zip(collection.interval, ("start", "end"), strict=True):
+            members[name]["x-ogc-role"] = f"primary-interval-{end}"
+    elif collection.interval:
+        members[collection.interval[0]]["x-ogc-role"] = "primary-instant"
+    members["geometry"] = {**_geometry_schema(collection), "x-ogc-role": "primary-geometry"}
+    return _schema_reply(request, collection, "schema", members, f)
+
+
+def describe(
+    request: Request, connection: Connection, collection: Collection, viewer: Viewer
+) -> dict[str, Any]:
+    """A collection as OGC API - Features describes it."""
+    box = features.extent(connection, collection, viewer)
+    spatial = {} if box is None else {"extent": {"spatial": {"bbox": [box], "crs": _CRS84}}}
+    path = f"collections/{collection.id}"
+    here = f"{request.base_url}{path}"
+    links = [
+        *_self_links(request, path),
+        *(
+            {"rel": "items", "href": f"{here}/items?f={name}", "type": kind, "title": f"Items, {name}"}
+            for name, kind in {"json": GEOJSON, **FEATURES}.items()
+        ),
+        {"rel": "describedby", "href": f"{here}/schema", "type": SCHEMA_JSON},
+        {"rel": f"{REL}/schema", "href": f"{here}/schema", "type": SCHEMA_JSON},
+        {"rel": f"{REL}/queryables", "href": f"{here}/queryables", "type": SCHEMA_JSON},
+        {"rel": f"{REL}/sortables", "href": f"{here}/sortables", "type": SCHEMA_JSON},
+    ]
+    if collection.id in TILED:
+        links.append({"rel": f"{REL}/tilesets-vector", "href": f"{here}/tiles", "type": JSON})
     return {
-        "id": name,
-        "title": title,
-        "description": description,
+        "id": collection.id,
+        "title": collection.title,
+        "description": collection.description,
         "itemType": "feature",
-        "crs": [CRS84H],
-        "storageCrs": CRS84H,
-        **extent,
-        "links": [
-            _link(request, "self", f"collections/{name}", "application/json"),
-            _link(request, "items", f"collections/{name}/items", GEOJSON),
-        ],
+        "crs": [crs.uri for crs in collection.crs],
+        "storageCrs": collection.storage_crs.uri,
+        **spatial,
+        "links": links,
     }
 
 
-def _link(request: Request, rel: str, path: str, kind: str) -> dict[str, str]:
-    return {"rel": rel, "href": f"{request.base_url}{path}", "type": kind}
+_CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+
+
+def _self_links(request: Request, path: str) -> list[dict[str, str]]:
+    href = f"{request.base_url}{path}"
+    return [
+        {"rel": "self", "href": href, "type": JSON, "title": "this document"},
+        {"rel": "alternate", "href": f"{href}?f=html", "type": HTML, "title": "this document"},
+    ]
+
+
+def _schema_reply(
+    request: Request, collection: Collection, name: str, members: dict[str, Any], f: str | None
+) -> Response:
+    refuse_unknown(request, {"f"})
+    path = f"collections/{collection.id}/{name}"
+    if chosen_format(request, {"json": SCHEMA_JSON, "html": HTML}, f) == "html":
+        rows = [
+            [Cell(key), Cell(value.get("title", "")), Cell(value.get("type", value.get("format", "")))]
+            for key, value in members.items()
+        ]
+        links = _self_links(request, path)
+        title = f"{collection.title}: {name}"
+        return document_page(request, title, "", links, ("property", "what it is", "type"), rows)
+    document = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"{request.base_url}{path}",
+        "type": "object",
+        "title": collection.title,
+        "properties": members,
+        "additionalProperties": False,
+    }
+    return JSONResponse(document, media_type=SCHEMA_JSON)
+
+
+def _schema(item: Property) -> dict[str, Any]:
+    said: dict[str, Any] = {"title": item.title, **JSON_TYPES[item.type]}
+    if item.choices:
+        said["enum"] = list(item.choices)
+    if item.unit:
+        said["x-ogc-unit"] = item.unit
+    return said
+
+
+def _geometry_schema(collection: Collection) -> dict[str, str]:
+    return {"title": "Geometry", "format": f"geometry-{collection.geometry_type.lower()}"}
+
+
+def _rectangle(box: list[float]) -> dict[str, Any]:
+    west, south, east, north = box
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    return {"type": "Polygon", "coordinates": [ring]}

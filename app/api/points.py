@@ -8,8 +8,13 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.encoders import jsonable_encoder
 
 from app.api.deps import ChipsDep, PointsReader, ReadConnection
-from app.db.points import PointDetail
+from app.api.features import CrsUri, Format
+from app.api.negotiation import GEOJSON, HTML, JSON, chosen_format, refuse_unknown
+from app.api.pages import features_page
+from app.db.collections import Viewer
+from app.db.points import POINTS, PointDetail
 from app.usecases import points
+from app.usecases.features import find_feature
 from services.formats.chip_images import (
     format_chip_png,
     format_chip_tiff,
@@ -19,7 +24,6 @@ from services.formats.chip_images import (
 
 router = APIRouter(prefix="/collections/points/items", tags=["points"])
 
-GEOJSON = "application/geo+json"
 PNG = "image/png"
 TIFF = "image/tiff; application=geotiff"
 NPZ = "application/x-npz"
@@ -27,49 +31,34 @@ CHIPS_NEVER_CHANGE = {"Cache-Control": "private, max-age=86400"}
 NOT_PROPERTIES = {"id", "lon_deg", "lat_deg", "height_m", "chip_key", "chip_row", "chip_count"}
 
 PointId = int
-Bbox = Annotated[
-    str | None,
-    Query(description="W,S,E,N in degrees; W greater than E crosses the antimeridian."),
-]
-Limit = Annotated[int, Query(ge=1, description="Most points on the page; 10,000 at most are given.")]
-PageToken = Annotated[str | None, Query(description="From the link `next` of the page before.")]
 
 
-@router.get("", response_class=Response, responses={200: {"content": {GEOJSON: {}}}})
-def items(
+@router.get(
+    "/{point_id}",
+    response_class=Response,
+    responses={200: {"description": "A point.", "content": {GEOJSON: {}, HTML: {}}}},
+)
+def item(
+    point_id: PointId,
     request: Request,
     connection: ReadConnection,
     caller: PointsReader,
-    bbox: Bbox = None,
-    limit: Limit = points.DEFAULT_LIMIT,
-    token: PageToken = None,
-) -> Response:
-    """A page of published points, as GeoJSON built by the database."""
-    box = None if bbox is None else points.parse_bbox(bbox)
-    page = points.query_points(connection, box, limit, token)
-    links = [{"rel": "self", "href": str(request.url), "type": GEOJSON}]
-    if page.next_token is not None:
-        following = str(request.url.include_query_params(token=page.next_token))
-        links.append({"rel": "next", "href": following, "type": GEOJSON})
-    rest = {
-        "numberMatched": page.matched.number,
-        "numberReturned": page.returned,
-        "amers:numberMatchedIsExact": page.matched.exact,
-        "links": links,
-    }
-    return Response(
-        f'{{"type":"FeatureCollection","features":[{page.features}],{json.dumps(rest)[1:]}',
-        media_type=GEOJSON,
-    )
-
-
-@router.get("/{point_id}")
-def item(
-    point_id: PointId, request: Request, connection: ReadConnection, caller: PointsReader
+    crs: CrsUri = None,
+    f: Format = None,
 ) -> Response:
     """One point, its views and the images they were cut from."""
+    refuse_unknown(request, {"crs", "f"})
     point = points.find_point(connection, point_id)
-    return Response(json.dumps(_feature(point, str(request.url))), media_type=GEOJSON)
+    feature = _feature(point, str(request.url.replace(query="")))
+    given = POINTS.storage_crs
+    if crs is not None:
+        text, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
+        feature["geometry"] = json.loads(text)["geometry"]
+    if chosen_format(request, {"json": GEOJSON, "html": HTML}, f) == "html":
+        shown = {**feature, "properties": {**feature["properties"], "views": len(point.views)}}
+        return features_page(request, POINTS, f"Point {point_id}", [shown], feature["links"])
+    headers = {"Content-Crs": f"<{given.uri}>"}
+    return Response(json.dumps(feature), media_type=GEOJSON, headers=headers)
 
 
 @router.get("/{point_id}/chips", response_class=Response)
@@ -121,7 +110,7 @@ def _feature(point: PointDetail, url: str) -> dict[str, Any]:
             "properties": properties,
             "links": [
                 {"rel": "self", "href": url, "type": GEOJSON},
-                {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": "application/json"},
+                {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},
             ],
         }
     )

@@ -1,39 +1,104 @@
-"""The landing page, what the service conforms to, and whether it lives."""
+"""The landing page, what the service conforms to, its description, and whether it lives."""
 
-from fastapi import APIRouter, Request
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import JSONResponse
 
 from app.api.deps import ReadConnection
+from app.api.features import Format
+from app.api.negotiation import DOCUMENTS, HTML, JSON, OPENAPI_JSON, chosen_format, refuse_unknown
+from app.api.pages import Cell, document_page
 
 router = APIRouter(tags=["system"])
 
+COMMON = "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/"
+FEATURES = "http://www.opengis.net/spec/ogcapi-features-"
+CQL2 = "http://www.opengis.net/spec/cql2/1.0/conf/"
+TILES = "http://www.opengis.net/spec/ogcapi-tiles-1/1.0/conf/"
 CONFORMS_TO = (
-    "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/core",
-    "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/landing-page",
-    "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/json",
-    "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/oas30",
+    *(f"{COMMON}{name}" for name in ("core", "landing-page", "json", "html")),
+    *(f"{FEATURES}1/1.0/conf/{name}" for name in ("core", "geojson", "html")),
+    f"{FEATURES}2/1.0/conf/crs",
+    *(
+        f"{FEATURES}3/1.0/conf/{name}"
+        for name in ("queryables", "queryables-query-parameters", "filter", "features-filter")
+    ),
+    *(
+        f"{CQL2}{name}"
+        for name in (
+            "cql2-text",
+            "cql2-json",
+            "basic-cql2",
+            "advanced-comparison-operators",
+            "case-insensitive-comparison",
+            "basic-spatial-functions",
+            "basic-spatial-functions-plus",
+            "spatial-functions",
+            "temporal-functions",
+            "property-property",
+            "arithmetic",
+        )
+    ),
+    *(f"{TILES}{name}" for name in ("core", "tileset", "tilesets-list", "geodata-tilesets", "mvt")),
 )
+REL = "http://www.opengis.net/def/rel/ogc/1.0/"
 LINKS = (
-    ("self", "", "application/json", "this document"),
-    ("service-desc", "api", "application/vnd.oai.openapi+json;version=3.1", "the API, machine readable"),
-    ("conformance", "conformance", "application/json", "what the service conforms to"),
+    ("self", "", JSON, "this document"),
+    ("alternate", "?f=html", HTML, "this document as a page"),
+    ("service-desc", "api", OPENAPI_JSON, "the API, machine readable"),
+    ("service-doc", "api?f=html", HTML, "the API, for people"),
+    ("conformance", "conformance", JSON, "what the service conforms to"),
+    (f"{REL}conformance", "conformance", JSON, "what the service conforms to"),
+    ("data", "collections", JSON, "the collections"),
+    (f"{REL}data", "collections", JSON, "the collections"),
+    (f"{REL}tiling-schemes", "tileMatrixSets", JSON, "the grids of tiles"),
+    (f"{REL}processes", "processes", JSON, "the processes"),
+    (f"{REL}job-list", "jobs", JSON, "the jobs"),
+    ("related", "map", HTML, "the map"),
 )
 
 
 @router.get("/")
-def landing(request: Request) -> dict[str, object]:
+def landing(request: Request, f: Format = None) -> Response:
     """What this is, and where everything begins."""
-    base = str(request.base_url)
+    refuse_unknown(request, {"f"})
+    title, description = request.app.title, request.app.description
     links = [
-        {"rel": rel, "href": base + path, "type": kind, "title": title}
-        for rel, path, kind, title in LINKS
+        {"rel": rel, "href": f"{request.base_url}{path}", "type": kind, "title": said}
+        for rel, path, kind, said in LINKS
     ]
-    return {"title": request.app.title, "description": request.app.description, "links": links}
+    if chosen_format(request, DOCUMENTS, f) == "json":
+        return JSONResponse({"title": title, "description": description, "links": links})
+    pages = {link["title"]: link for link in links if not link["rel"].startswith("http")}
+    return document_page(request, title, description, list(pages.values()))
 
 
 @router.get("/conformance")
-def conformance() -> dict[str, tuple[str, ...]]:
+def conformance(request: Request, f: Format = None) -> Response:
     """The conformance classes of OGC API that the service keeps."""
-    return {"conformsTo": CONFORMS_TO}
+    refuse_unknown(request, {"f"})
+    if chosen_format(request, DOCUMENTS, f) == "json":
+        return JSONResponse({"conformsTo": CONFORMS_TO})
+    rows = [[Cell(name)] for name in CONFORMS_TO]
+    return document_page(request, "Conformance", "", [], ("class",), rows)
+
+
+@router.get("/api", include_in_schema=False)
+def description(request: Request, f: Format = None) -> Response:
+    """The API in OpenAPI 3.1, or as a list of what can be asked."""
+    refuse_unknown(request, {"f"})
+    document: dict[str, Any] = request.app.openapi()
+    if chosen_format(request, {"json": OPENAPI_JSON, "html": HTML}, f) == "json":
+        return JSONResponse(document, media_type=OPENAPI_JSON)
+    rows = [
+        [Cell(method.upper()), Cell(path), Cell(operation.get("description", ""))]
+        for path, operations in document["paths"].items()
+        for method, operation in operations.items()
+    ]
+    title = f"{document['info']['title']} {document['info']['version']}"
+    columns = ("method", "path", "what it does")
+    return document_page(request, title, document["info"]["description"], [], columns, rows)
 
 
 @router.get("/healthz")

@@ -12,6 +12,7 @@ import typer
 from app.cli.output import AsJson, print_json
 from app.cli.store import transaction
 from app.usecases import points
+from app.usecases.features import parse_bbox
 
 app = typer.Typer(help="Control points of published blocks.", no_args_is_help=True)
 
@@ -40,17 +41,17 @@ def query(
     as_json: AsJson = False,
 ) -> None:
     """Write all points of a box; --json tells their number instead of writing to standard output."""
-    box = points.parse_bbox(bbox)
+    parse_bbox(bbox)
     with transaction() as connection:
         if as_json and output is None:
-            count = points.count_points(connection, box)
+            count = points.count_points(connection, bbox)
             print_json({"points": count.number, "exact": count.exact, "file": None})
             return
         with _written(output) as file:
             pieces = (
-                points.geojson(connection, box)
+                points.geojson(connection, bbox)
                 if form is PointFormat.GEOJSON
-                else points.csv(connection, box)
+                else points.csv(connection, bbox)
             )
             size = sum(file.write(piece) for piece in pieces)
     if as_json:

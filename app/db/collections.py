@@ -1,7 +1,7 @@
 """What a collection of features is: declared once for each, asked for by `app.db.features`.
 
-SQL in a declaration calls the row `t`, and may use `%(admin)s` and `%(viewer)s`: whether the caller is an
-administrator, and the id of the caller's token.
+SQL in a declaration calls the row `t`, and may use `%(admin)s` and `%(viewer)s`: whether the caller is
+an administrator, and the id of the caller's token.
 """
 
 from dataclasses import dataclass

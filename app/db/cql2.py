@@ -1,6 +1,6 @@
 """Filters: CQL2 parsed by its library, and made into SQL with parameters from what we allow.
 
-Sources: OGC 21-065r2, Common Query Language (CQL2); OGC 19-079r2, OGC API - Features - Part 3: Filtering.
+Sources: OGC 21-065r2, Common Query Language (CQL2); OGC 19-079r2, OGC API - Features, Part 3: Filtering.
 The library's own SQL is never used: it lets any function name through.
 """
 
@@ -22,7 +22,7 @@ from app.errors import InvalidParameter
 LONGEST_TEXT = 4_000
 """Characters of a filter in text; the parser works them off recursively."""
 DEEPEST_TEXT = 10
-"""Parentheses in each other in text: the parser's time on a wrong filter doubles with each, 10 ms here."""
+"""Parentheses in each other in text: each doubles the parser's time on a wrong filter, 10 ms here."""
 DEEPEST_JSON = 32
 MOST_NODES = 1_000
 MOST_VERTICES = 10_000
@@ -48,7 +48,7 @@ SPATIAL = {
     "s_crosses": "st_crosses",
     "s_contains": "st_contains",
 }
-# Of two intervals, a from {0} to {1} and b from {2} to {3}. Source: OGC 21-065r2, table of temporal relations.
+# Of two intervals, a from {0} to {1} and b from {2} to {3}.
 TEMPORAL = {
     "t_after": "{0} > {3}",
     "t_before": "{1} < {2}",
@@ -153,18 +153,19 @@ def check_size(document: Any) -> None:
     raise InvalidParameter(f"filter: deeper than {DEEPEST_JSON} levels")
 
 
-def translate(expression: Any, collection: Collection, crs: Crs) -> Condition:
+def translate(expression: Any, collection: Collection, crs: Crs, prefix: str = "f") -> Condition:
     """A filter as SQL.
 
     Args:
         expression: CQL2 JSON.
         collection: whose properties it may name.
         crs: of the coordinates in it.
+        prefix: of the names of its parameters.
 
     Raises:
         InvalidParameter: it names what there is not, or compares what cannot be compared.
     """
-    translator = _Translator(collection, crs)
+    translator = _Translator(collection, crs, prefix)
     sql = translator.boolean(expression)
     return Condition(f"({sql})", translator.parameters, _is_spatial(expression))
 
@@ -175,9 +176,8 @@ def geometry_condition(collection: Collection, geometry: Any, crs: Crs) -> Condi
     Raises:
         InvalidParameter: it is not a geometry that can be used.
     """
-    return translate(
-        {"op": "s_intersects", "args": [{"property": "geometry"}, geometry]}, collection, crs
-    )
+    meets = {"op": "s_intersects", "args": [{"property": "geometry"}, geometry]}
+    return translate(meets, collection, crs, prefix="g")
 
 
 @dataclass(frozen=True)
@@ -193,9 +193,10 @@ class _Value:
 class _Translator:
     """One translation: SQL comes back, parameters gather."""
 
-    def __init__(self, collection: Collection, crs: Crs) -> None:
+    def __init__(self, collection: Collection, crs: Crs, prefix: str) -> None:
         self.collection = collection
         self.crs = crs
+        self.prefix = prefix
         self.parameters: dict[str, Any] = {}
         self.nodes = 0
 
@@ -401,7 +402,7 @@ class _Translator:
         return found
 
     def _bind(self, value: Any, kind: str) -> str:
-        name = f"f{len(self.parameters)}"
+        name = f"{self.prefix}{len(self.parameters)}"
         self.parameters[name] = value
         return f"%({name})s::{kind}"
 

@@ -1,6 +1,5 @@
 """Control points of published blocks: by box, by outline, one by one."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any
@@ -12,32 +11,55 @@ from psycopg import sql
 
 from app.db.binary_copy import parse_copy
 from app.db.blocks import ID_BITS
+from app.db.collections import Collection, Property
 from app.db.engine import Connection
 from services.formats.block_tables import covariance_from_spread
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
-EXACT_COUNT = 10_000
-COORDINATE_DIGITS = 9
-"""Decimals of a degree in replies: a tenth of a millimetre."""
-
 PUBLISHED = "select number from block where state = 'published'"
 
-# Text of a feature, made by the database: five times faster than rows that become dictionaries and JSON.
-# Figures are finite by the constraints of the table; texts and dates are quoted by to_json.
-FEATURE = f"""format(
-    '{{"type":"Feature","id":%%s,"geometry":%%s,"properties":{{'
-    '"sigma_east_m":%%s,"sigma_north_m":%%s,"sigma_up_m":%%s,'
-    '"corr_east_north":%%s,"corr_east_up":%%s,"corr_north_up":%%s,'
-    '"n_views":%%s,"saliency":%%s,"typology":%%s,"first_view":%%s,"last_view":%%s,"block_number":%%s}}}}',
-    p.id, st_asgeojson(p.geom, {COORDINATE_DIGITS}, 0),
-    p.sigma_east_m, p.sigma_north_m, p.sigma_up_m, p.corr_east_north, p.corr_east_up, p.corr_north_up,
-    p.n_views, p.saliency, coalesce(to_json(p.typology)::text, 'null'),
-    coalesce(to_json(p.first_view)::text, 'null'), coalesce(to_json(p.last_view)::text, 'null'),
-    p.block_number)"""
+VISIBLE = f"t.superseded_by is null and t.block_number = any(array({PUBLISHED}))"
+"""Points of published blocks, but for those that a better block has at the same place."""
 
-CSV_COLUMNS = """p.id, st_x(p.geom) as lon_deg, st_y(p.geom) as lat_deg, st_z(p.geom) as height_m,
-    p.sigma_east_m, p.sigma_north_m, p.sigma_up_m, p.corr_east_north, p.corr_east_up, p.corr_north_up,
-    p.n_views, p.saliency, p.typology, p.first_view, p.last_view, b.id as block, b.version"""
+# Block by block along the primary key. Asked for more simply, the planner may read all unpublished
+# points on its way to the published ones.
+EVERYTHING = f"""select t.* from ({PUBLISHED} and number >= %(after)s >> {ID_BITS}) b
+    cross join lateral (
+        select * from point t where id > %(after)s and id >= b.number::bigint << {ID_BITS}
+            and id < (b.number::bigint + 1) << {ID_BITS} and t.superseded_by is null and {{condition}}
+        order by id limit %(limit)s + 1) t
+    order by b.number, t.id limit %(limit)s + 1"""
+
+POINTS = Collection(
+    id="points",
+    title="Control points",
+    description="3D ground control points with image chips, of all published blocks.",
+    source="point t",
+    key=Property("id", "bigint", "Identifier"),
+    properties=(
+        Property("sigma_east_m", "real", "Standard deviation eastwards", unit="m"),
+        Property("sigma_north_m", "real", "Standard deviation northwards", unit="m"),
+        Property("sigma_up_m", "real", "Standard deviation of the height", unit="m"),
+        Property("corr_east_north", "real", "Correlation of east and north"),
+        Property("corr_east_up", "real", "Correlation of east and height"),
+        Property("corr_north_up", "real", "Correlation of north and height"),
+        Property("n_views", "bigint", "Images that see the point"),
+        Property("saliency", "real", "How well its chips can be located, 0 to 1"),
+        Property("typology", "text", "What it is on the ground", nullable=True),
+        Property("first_view", "date", "Date of the first view", nullable=True),
+        Property("last_view", "date", "Date of the last view", nullable=True),
+        Property("block_number", "bigint", "Number of its block"),
+    ),
+    geometry_type="Point",
+    has_height=True,
+    visible=VISIBLE,
+    interval=("first_view", "last_view"),
+    everything=EVERYTHING,
+    total=(
+        "select coalesce(sum(n_points - n_superseded), 0)::bigint as n from block"
+        " where state = 'published'"
+    ),
+)
 
 POINT_KINDS = (
     ("id", "i8"),
@@ -61,39 +83,6 @@ VIEW_KINDS = (
     ("incidence", "f4"),
     ("azimuth", "f4"),
 )
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of longitude and latitude; `east` below `west` crosses the antimeridian."""
-
-    west: float
-    south: float
-    east: float
-    north: float
-
-
-@dataclass(frozen=True)
-class FeaturePage:
-    """Points as GeoJSON features.
-
-    Attributes:
-        features: separated by commas, without brackets.
-        returned: how many.
-        last_id: of the last one, where the next page goes on; None when there are no more.
-    """
-
-    features: str
-    returned: int
-    last_id: int | None
-
-
-@dataclass(frozen=True)
-class Count:
-    """How many points; an estimate beyond 10,000 unless `exact`."""
-
-    number: int
-    exact: bool
 
 
 @dataclass(frozen=True)
@@ -170,67 +159,6 @@ class StoredPoints:
 
     points: ControlPoints
     blocks: tuple[BlockVersion, ...]
-
-
-def point_features(connection: Connection, box: Box | None, after: int, limit: int) -> FeaturePage:
-    """A page of published points, in the order of their ids.
-
-    Args:
-        box: where; None for everywhere.
-        after: points with greater ids only.
-        limit: most points on the page.
-    """
-    where: dict[str, float] = {}
-    if box is None:
-        chosen = _everywhere()
-    else:
-        condition, where = _inside(box)
-        chosen = f"{_in_box(condition)} and id > %(after)s order by id limit %(limit)s + 1"
-    # The rows come in order, so the texts need no sort. Never prepared: the best way to a box depends
-    # on its size, and a plan for any box reads all of the world to find its first hundred points.
-    row = connection.execute(
-        f"""with p as materialized ({chosen})
-            select (select string_agg({FEATURE}, ',') from (select * from p limit %(limit)s) p)
-                       as features,
-                   (select count(*) from p) as found,
-                   (select id from p offset %(limit)s - 1 limit 1) as last_id""",
-        {**where, "after": after, "limit": limit},
-        prepare=False,
-    ).fetchone()
-    assert row is not None
-    more = row["found"] > limit
-    return FeaturePage(row["features"] or "", min(row["found"], limit), row["last_id"] if more else None)
-
-
-def count_points(connection: Connection, box: Box | None) -> Count:
-    """How many published points a box holds: exact up to 10,000, beyond as the planner estimates."""
-    if box is None:
-        row = connection.execute(
-            "select coalesce(sum(n_points), 0)::bigint as n from block where state = 'published'"
-        ).fetchone()
-        assert row is not None
-        return Count(row["n"], exact=True)
-    condition, parameters = _inside(box)
-    chosen = _in_box(condition)
-    row = connection.execute(
-        f"select count(*) as n from (select 1 from ({chosen}) p limit {EXACT_COUNT + 1}) few",
-        parameters,
-        prepare=False,
-    ).fetchone()
-    assert row is not None
-    if row["n"] <= EXACT_COUNT:
-        return Count(row["n"], exact=True)
-    return Count(max(EXACT_COUNT + 1, _estimated_count(connection, box)), exact=False)
-
-
-def points_csv(connection: Connection, box: Box) -> Iterator[bytes]:
-    """All published points of a box as CSV with a header, in pieces."""
-    condition, parameters = _inside(box)
-    statement = f"""copy (select {CSV_COLUMNS} from point p join block b on b.number = p.block_number
-        where b.state = 'published' and {condition} order by p.id) to stdout with (format csv, header)"""
-    with connection.cursor() as cursor, cursor.copy(statement, parameters) as copy:
-        for piece in copy:
-            yield bytes(piece)
 
 
 def find_point(connection: Connection, point_id: int) -> PointDetail | None:
@@ -315,6 +243,7 @@ def _points_query(area: sql.Literal, limit: int | None) -> sql.Composed:
                sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
                saliency, chip_file, chip_row
            from point where geom && {area}::geometry and st_intersects(geom, {area}::geometry)
+               and superseded_by is null
                and block_number = any(array(select number from block where state = 'published'))"""
     ).format(area=area)
     if limit is None:
@@ -388,66 +317,3 @@ def _on_the_map(outline: Array) -> shapely.Geometry:
     ]
     parts = shapely.union_all([shapely.intersection(part, world) for part in turned])
     return shapely.set_srid(parts, 4979)
-
-
-def _everywhere() -> str:
-    """Published points after an id, block by block along the primary key.
-
-    Asked for more simply, the planner may read all unpublished points on its way to the published ones.
-    """
-    return f"""select p.* from ({PUBLISHED} and number >= %(after)s >> {ID_BITS}) b
-        cross join lateral (
-            select * from point where id > %(after)s and id >= b.number::bigint << {ID_BITS}
-                and id < (b.number::bigint + 1) << {ID_BITS}
-            order by id limit %(limit)s + 1) p
-        order by b.number, p.id limit %(limit)s + 1"""
-
-
-def _in_box(condition: str) -> str:
-    return f"select p.* from point p where {condition} and block_number = any(array({PUBLISHED}))"
-
-
-def _estimated_count(connection: Connection, box: Box) -> int:
-    """What the planner expects in the box, by the share of all points that is published."""
-    condition, parameters = _near(box)
-    plan = connection.execute(
-        f"explain (format json) select 1 from point p where {condition}", parameters
-    ).fetchone()
-    share = connection.execute(
-        "select sum(n_points) filter (where state = 'published') / sum(n_points) as published from block"
-    ).fetchone()
-    assert plan is not None
-    assert share is not None
-    return int(plan["QUERY PLAN"][0]["Plan"]["Plan Rows"] * share["published"])
-
-
-def _near(box: Box) -> tuple[str, dict[str, float]]:
-    """The condition that a point lies in a box, as exact as the index is: single precision."""
-    east = 180.0 if box.east < box.west else box.east
-    parts = ["1"]
-    parameters = {"west1": box.west, "east1": east, "south": box.south, "north": box.north}
-    if box.east < box.west:
-        parts.append("2")
-        parameters |= {"west2": -180.0, "east2": box.east}
-    envelopes = (
-        f"p.geom && st_makeenvelope(%(west{i})s, %(south)s, %(east{i})s, %(north)s, 4979)" for i in parts
-    )
-    return f"({' or '.join(envelopes)})", parameters
-
-
-def _inside(box: Box) -> tuple[str, dict[str, float]]:
-    """The condition that a point lies in a box: by the index, then exactly.
-
-    The exact part is wrapped in `coalesce`, where the planner does not look: it would take four ranges
-    of unknown values for very selective, and read all the world to find its first hundred points.
-    """
-    near, parameters = _near(box)
-    exact = " or ".join(
-        f"st_x(p.geom) between %(west{i})s and %(east{i})s"
-        for i in ("1", "2")
-        if f"west{i}" in parameters
-    )
-    return (
-        f"{near} and coalesce(({exact}) and st_y(p.geom) between %(south)s and %(north)s, false)",
-        parameters,
-    )

@@ -1,112 +1,45 @@
 """Asking for control points: pages of a box, one point, its chips."""
 
-import base64
-import hashlib
 import math
-import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from app.db import points
+from app.db import features, points
 from app.db.engine import Connection
-from app.db.points import Box, Count, FeaturePage, PointDetail, PointView
-from app.errors import InputError, NotFound
+from app.db.features import Count, Reading
+from app.db.points import POINTS, PointDetail, PointView
+from app.errors import NotFound
+from app.usecases.features import MOST_FEATURES, everything_in
 from services.formats.chip_images import LabelledChips
 from services.types import Acquisition, ChipSource
 
-DEFAULT_LIMIT = 100
-MOST_POINTS = 10_000
-_TOKEN = struct.Struct(">qq8s")
+ALL = 2**40
 
 
-@dataclass(frozen=True)
-class PointPage:
-    """Points as GeoJSON features.
-
-    Attributes:
-        features: separated by commas, without brackets.
-        returned: how many.
-        matched: how many there are on all pages.
-        next_token: where the next page begins, None on the last one.
-    """
-
-    features: str
-    returned: int
-    matched: Count
-    next_token: str | None
-
-
-def parse_bbox(text: str) -> Box:
-    """A box out of `W,S,E,N` in degrees; west greater than east crosses the antimeridian.
-
-    Raises:
-        InputError: naming the value that cannot be used.
-    """
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(math.isfinite(value) for value in values):
-        raise InputError(f"bbox: {text!r:.100} found, four numbers W,S,E,N in degrees expected")
-    box = Box(*values)
-    for name, value, limit in (
-        ("west", box.west, 180.0),
-        ("south", box.south, 90.0),
-        ("east", box.east, 180.0),
-        ("north", box.north, 90.0),
-    ):
-        if abs(value) > limit:
-            raise InputError(f"bbox: {name} {value:g} found, {-limit:g} to {limit:g} expected")
-    if box.south > box.north:
-        raise InputError(f"bbox: south {box.south:g} is above north {box.north:g}")
-    return box
-
-
-def query_points(
-    connection: Connection, box: Box | None, limit: int = DEFAULT_LIMIT, token: str | None = None
-) -> PointPage:
-    """A page of published points.
-
-    Args:
-        box: where; None for everywhere.
-        limit: most points on the page; more than 10,000 are never given at once.
-        token: `next_token` of the page before.
-
-    Raises:
-        InputError: the limit is below 1, or the token is not one of this query.
-    """
-    if limit < 1:
-        raise InputError(f"limit: {limit} found, 1 to {MOST_POINTS} expected")
-    after, known = (-1, None) if token is None else _parse_token(token, box)
-    page = points.point_features(connection, box, after, min(limit, MOST_POINTS))
-    matched = known or _matched(connection, box, page)
-    next_token = None if page.last_id is None else _format_token(page.last_id, matched, box)
-    return PointPage(page.features, page.returned, matched, next_token)
-
-
-def count_points(connection: Connection, box: Box) -> Count:
+def count_points(connection: Connection, bbox: str) -> Count:
     """How many published points a box holds: exact up to 10,000, an estimate beyond."""
-    return points.count_points(connection, box)
+    return features.count(connection, everything_in(POINTS, bbox))
 
 
-def geojson(connection: Connection, box: Box) -> Iterator[bytes]:
+def geojson(connection: Connection, bbox: str) -> Iterator[bytes]:
     """All published points of a box as one FeatureCollection, in pieces."""
     yield b'{"type":"FeatureCollection","features":[\n'
-    after: int | None = -1
-    while after is not None:
-        page = points.point_features(connection, box, after, MOST_POINTS)
-        yield page.features.encode()
-        after = page.last_id
-        if after is not None:
-            yield b",\n"
+    yield from features.stream_geojson(connection, everything_in(POINTS, bbox), None, ALL, Reading())
     yield b"\n]}\n"
 
 
-def csv(connection: Connection, box: Box) -> Iterator[bytes]:
+def csv(connection: Connection, bbox: str) -> Iterator[bytes]:
     """All published points of a box as CSV with a header, in pieces."""
-    return points.points_csv(connection, box)
+    selection, after = everything_in(POINTS, bbox), None
+    yield features.csv_header(selection).encode() + b"\r\n"
+    while True:
+        page = features.page(connection, selection, "csv", after, MOST_FEATURES)
+        if page.body:
+            yield page.body + b"\r\n"
+        if page.last is None:
+            return
+        after = page.last
 
 
 def find_point(connection: Connection, point_id: int) -> PointDetail:
@@ -159,31 +92,3 @@ def _labelled(chips: ChipSource, point: PointDetail, views: tuple[PointView, ...
 
 def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-def _matched(connection: Connection, box: Box | None, page: FeaturePage) -> Count:
-    """How many match; a first page that holds them all has counted them already."""
-    if page.last_id is None:
-        return Count(page.returned, exact=True)
-    return points.count_points(connection, box)
-
-
-def _format_token(after: int, matched: Count, box: Box | None) -> str:
-    number = matched.number if matched.exact else -matched.number
-    packed = _TOKEN.pack(after, number, _seal(after, number, box))
-    return base64.urlsafe_b64encode(packed).decode()
-
-
-def _parse_token(token: str, box: Box | None) -> tuple[int, Count]:
-    try:
-        after, number, seal = _TOKEN.unpack(base64.b64decode(token, altchars=b"-_", validate=True))
-    except (ValueError, struct.error):
-        after, number, seal = 0, 0, b""
-    if seal != _seal(after, number, box):
-        raise InputError(f"token: {token!r:.100} is not of this query; follow the link `next`")
-    return after, Count(abs(number), exact=number >= 0)
-
-
-def _seal(after: int, number: int, box: Box | None) -> bytes:
-    """Ties a token to its query, against mistakes only: it allows nothing that the query does not."""
-    return hashlib.sha256(repr((after, number, box)).encode()).digest()[:8]

@@ -1,0 +1,42 @@
+"""Vector tiles of the collections that are looked at on a map."""
+
+from app.db import tiles
+from app.db.collections import Viewer
+from app.db.engine import Connection
+from app.errors import NotFound
+
+TILED = ("points", "density", "blocks")
+MOST_ZOOM = 24
+
+
+def tile(connection: Connection, collection: str, z: int, y: int, x: int, viewer: Viewer) -> bytes:
+    """A Mapbox vector tile whose layer has the name of the collection; no bytes where there is nothing.
+
+    Raises:
+        NotFound: the collection has no tiles, or there is no such tile.
+    """
+    refuse_untiled(collection)
+    if not 0 <= z <= MOST_ZOOM or not (0 <= x < 2**z and 0 <= y < 2**z):
+        raise NotFound(
+            f"no tile {z}/{y}/{x}: zooms are 0 to {MOST_ZOOM}, rows and columns 0 to 2^zoom - 1"
+        )
+    if collection == "points":
+        return tiles.point_tile(connection, z, x, y)
+    if collection == "density":
+        return tiles.density_tile(connection, z, x, y)
+    return tiles.block_tile(connection, z, x, y, viewer)
+
+
+def version(connection: Connection) -> str:
+    """Changes whenever what tiles show does."""
+    return tiles.version(connection)
+
+
+def refuse_untiled(collection: str) -> None:
+    """Refuse a collection without tiles.
+
+    Raises:
+        NotFound: it has none.
+    """
+    if collection not in TILED:
+        raise NotFound(f"no tiles of {collection}: there are tiles of {', '.join(TILED)}")

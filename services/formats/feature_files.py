@@ -1,0 +1,132 @@
+"""Features as columns, and the files of columns that other tools open: GeoParquet and GeoPackage."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pyogrio
+import pyproj
+import shapely
+
+KEYS = "keys"
+ARROW = {
+    "bigint": pa.int64(),
+    "real": pa.float32(),
+    "double precision": pa.float64(),
+    "text": pa.string(),
+    "boolean": pa.bool_(),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of properties: its name and SQL type."""
+
+    name: str
+    type: str
+
+
+@dataclass(frozen=True)
+class FeatureTable:
+    """Features as columns.
+
+    Attributes:
+        rows: properties, and WKB in the column `geometry`, longitude or east first.
+        geometry_type: as GeoPackage names it, with Z where there are heights.
+        srid: EPSG code of the coordinates.
+    """
+
+    rows: pa.Table
+    geometry_type: str
+    srid: int
+
+    def __len__(self) -> int:
+        return int(self.rows.num_rows)
+
+
+def read_feature_csv(
+    text: BytesIO, columns: Sequence[Column], geometry_type: str, srid: int, limit: int
+) -> tuple[FeatureTable, str | None]:
+    """CSV of features with a header, as columns.
+
+    Args:
+        text: columns `keys`, then x, y (and h) of points or hexadecimal `wkb`, then those of `columns`.
+        limit: rows beyond are left out.
+
+    Returns:
+        The features, and `keys` of the last of them when rows were left out.
+    """
+    types = {KEYS: pa.string(), "x": pa.float64(), "y": pa.float64(), "h": pa.float64()}
+    types |= {"wkb": pa.string(), **{column.name: ARROW[column.type] for column in columns}}
+    read = pa.csv.read_csv(
+        text,
+        convert_options=pa.csv.ConvertOptions(
+            column_types=types,
+            strings_can_be_null=True,
+            quoted_strings_can_be_null=False,
+            null_values=[""],
+            true_values=["t"],
+            false_values=["f"],
+        ),
+        parse_options=pa.csv.ParseOptions(newlines_in_values=True),
+    )
+    last = read[KEYS][limit - 1].as_py() if read.num_rows > limit else None
+    read = read.slice(0, limit)
+    has_height = "h" in read.column_names
+    if geometry_type == "Point":
+        axes = ("x", "y", "h") if has_height else ("x", "y")
+        shapes = shapely.points(*(read[axis].to_numpy() for axis in axes))
+    else:
+        shapes = shapely.from_wkb(read["wkb"].to_numpy(zero_copy_only=False))
+    geometry = pa.array(shapely.to_wkb(shapes, flavor="iso"), pa.binary())
+    rows = read.select([column.name for column in columns]).append_column("geometry", geometry)
+    return FeatureTable(rows, geometry_type + (" Z" if has_height else ""), srid), last
+
+
+def format_parquet(features: FeatureTable) -> bytes:
+    """Features as GeoParquet 1.1."""
+    shapes = shapely.from_wkb(features.rows["geometry"].to_numpy(zero_copy_only=False))
+    column = {
+        "encoding": "WKB",
+        "geometry_types": [features.geometry_type],
+        "crs": pyproj.CRS.from_epsg(features.srid).to_json_dict(),
+    }
+    if len(features):
+        column["bbox"] = shapely.total_bounds(shapes).tolist()
+    geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
+    out = BytesIO()
+    pq.write_table(
+        features.rows.replace_schema_metadata({"geo": json.dumps(geo)}), out, compression="zstd"
+    )
+    return out.getvalue()
+
+
+def format_geopackage(features: FeatureTable, layer: str) -> bytes:
+    """Features as a GeoPackage with one layer."""
+    return _written(features, layer, "GPKG", "features.gpkg")
+
+
+def format_flatgeobuf(features: FeatureTable, layer: str) -> bytes:
+    """Features as FlatGeobuf."""
+    return _written(features, layer, "FlatGeobuf", "features.fgb")
+
+
+def _written(features: FeatureTable, layer: str, driver: str, name: str) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="amers-features-") as folder:
+        path = Path(folder) / name
+        pyogrio.write_arrow(
+            features.rows,
+            path,
+            layer=layer,
+            driver=driver,
+            geometry_name="geometry",
+            geometry_type=features.geometry_type,
+            crs=f"EPSG:{features.srid}",
+        )
+        return path.read_bytes()

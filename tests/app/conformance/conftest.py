@@ -1,0 +1,46 @@
+"""A store for the abstract tests: a published block, and a staged one beside."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from app.usecases import blocks
+from tests.factories import make_block
+
+
+@pytest.fixture
+def made(connection, storage, tmp_path):
+    """A published block of 60 points; another of 10, staged, lies in the same place."""
+    made = make_block(tmp_path / "block", count=60)
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    staged = make_block(tmp_path / "staged", count=10, seed=5, name="staged")
+    blocks.ingest_block(connection, storage, staged.folder)
+    connection.commit()
+    return made
+
+
+@pytest.fixture
+def get(made, client, bearer) -> Callable[..., Any]:
+    """GET as a reader of the service; parameters by name."""
+    headers = bearer("read")
+
+    def get(path: str, accept: str | None = None, **parameters: Any) -> Any:
+        said = headers if accept is None else {**headers, "Accept": accept}
+        query = {name.replace("_", "-"): value for name, value in parameters.items()}
+        return client.get(path, params=query or None, headers=said)
+
+    return get
+
+
+@pytest.fixture
+def ids(get) -> Callable[..., list[int]]:
+    """The ids of the points that a question leaves."""
+
+    def ids(**parameters: Any) -> list[int]:
+        reply = get("/collections/points/items", limit=1000, **parameters)
+        assert reply.status_code == 200, reply.text
+        return [feature["id"] for feature in reply.json()["features"]]
+
+    return ids
