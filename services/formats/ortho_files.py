@@ -1,11 +1,16 @@
-"""Ortho-images with a corrected place on the map: beside the image, or in a copy of it."""
+"""Ortho-images written: rectified scenes, and delivered ones with a corrected place on the map."""
 
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
+import numpy as np
 import rasterio
+import rasterio.shutil
 from rasterio.transform import Affine
+from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
 from services.formats.raster import (
@@ -16,6 +21,8 @@ from services.formats.raster import (
     open_raster,
 )
 from services.map_grid import MapGrid
+from services.orthorectify import OrthoWindow
+from services.types import FloatImage
 
 
 def write_refined_ortho(image_path: Path, grid: MapGrid, folder: Path, copy: bool = False) -> list[Path]:
@@ -63,6 +70,84 @@ def write_refined_ortho(image_path: Path, grid: MapGrid, folder: Path, copy: boo
     ):
         file.transform = gdal_transform(grid)
     return [sidecar, target]
+
+
+def write_cog(
+    path: Path,
+    grid: MapGrid,
+    windows: Iterable[OrthoWindow],
+    bands: int,
+    dtype: str,
+    nodata: float,
+) -> float:
+    """Write an ortho-image as a cloud-optimised GeoTIFF with overviews, window by window.
+
+    Whole numbers are rounded, held to the range of their type and kept off `nodata`.
+
+    Args:
+        path: a file of that name is replaced, once the new one is whole.
+        grid: the map.
+        windows: all of them, in any order.
+        bands: how many.
+        dtype: of the pixels: uint8, uint16, int16 or float32.
+        nodata: where the scene shows nothing.
+
+    Returns:
+        The largest `error_px` of the windows.
+
+    Raises:
+        FormatError: when the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plain, whole = (path.with_name(f".{path.name}.{end}") for end in ("plain", "whole"))
+    error_px = 0.0
+    profile = {
+        "driver": "GTiff",
+        "height": grid.shape[0],
+        "width": grid.shape[1],
+        "count": bands,
+        "dtype": dtype,
+        "crs": grid.crs,
+        "transform": gdal_transform(grid),
+        "nodata": nodata,
+    }
+    tiles = {"tiled": True, "blockxsize": 512, "blockysize": 512, "BIGTIFF": "IF_SAFER"}
+    try:
+        with as_format_error(path, "a place to write to"), rasterio.Env(**OPTIONS):
+            with rasterio.open(plain, "w", **profile, **tiles) as file:
+                for done in windows:
+                    at = done.window
+                    place = RasterWindow(at.sample, at.line, at.samples, at.lines)
+                    file.write(_stored(done.pixels, np.dtype(dtype), nodata), window=place)
+                    error_px = max(error_px, done.error_px)
+            predictor = "FLOATING_POINT" if dtype == "float32" else "STANDARD"
+            rasterio.shutil.copy(
+                plain,
+                whole,
+                driver="COG",
+                COMPRESS="DEFLATE",
+                LEVEL=1,
+                PREDICTOR=predictor,
+                OVERVIEW_RESAMPLING="AVERAGE",
+                BIGTIFF="IF_SAFER",
+            )
+        whole.replace(path)
+    finally:
+        plain.unlink(missing_ok=True)
+        whole.unlink(missing_ok=True)
+    return error_px
+
+
+def _stored(pixels: FloatImage, dtype: np.dtype[Any], nodata: float) -> np.ndarray:
+    """Pixels as the file holds them."""
+    missing = np.isnan(pixels)
+    if dtype.kind == "f":
+        return np.where(missing, nodata, pixels).astype(dtype)
+    limits = np.iinfo(dtype)
+    rounded = np.clip(np.rint(np.where(missing, 0.0, pixels)), limits.min, limits.max)
+    beside = nodata + 1.0 if nodata < limits.max else nodata - 1.0
+    rounded[rounded == nodata] = beside
+    return np.where(missing, nodata, rounded).astype(dtype)
 
 
 def format_aux(grid: MapGrid) -> str:

@@ -1,0 +1,216 @@
+"""Scenes laid on maps: pixel by pixel where the model and the terrain have them."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from services import orthorectify as module
+from services.errors import CoverageError
+from services.formats.ortho_files import write_cog
+from services.imagery import ArrayImage
+from services.map_grid import MapGrid
+from services.ortho_mapping import hidden_ground, map_into_image
+from services.orthorectify import OrthoOptions, Window, choose_grid, orthorectify
+from services.scene import Scene
+from services.sensors.rpc_fit import fit_rpc
+from services.simulation.orbit import pushbroom_over
+from services.terrain import Terrain, meet
+from services.types import Acquisition, FloatImage
+
+the_tolerance_px = 0.1
+a_hundredth_of_a_pixel = 0.01
+a_micropixel = 1e-6
+
+SHAPE = (420, 380)
+GSD_M = 2.0
+DEM = MapGrid("EPSG:4326", np.array([5.19, 44.22]), np.array([[0.0, 1e-4], [-1e-4, 0.0]]), (320, 340))
+
+
+def terrain(relief_m: float = 120.0) -> Terrain:
+    line, sample = np.indices(DEM.shape)
+    waves = np.sin(line / 9.0) * np.cos(sample / 11.0) + 0.3 * np.sin((line - 2 * sample) / 5.0)
+    heights = (700.0 + relief_m * waves).astype(np.float32)
+    return Terrain(DEM, ArrayImage(heights))
+
+
+@cache
+def scene(incidence_deg: float = 25.0, azimuth_deg: float = 100.0) -> Scene:
+    lon, lat = DEM.lon_lat(np.array([[160.0, 170.0]]))[0]
+    true = pushbroom_over(
+        np.array([lon, lat, 700.0]), SHAPE, GSD_M, incidence_deg, azimuth_deg, (100.0, 1300.0)
+    )
+    model = fit_rpc(true, SHAPE, (100.0, 1300.0)).model
+    ramp = np.indices(SHAPE)[0].astype(np.float32)
+    return Scene(ArrayImage(ramp), model, Acquisition("a"), 5.0)
+
+
+def ramps() -> list[ArrayImage]:
+    """Images whose pixels tell where they are: rectified, they are the mapping itself."""
+    return [ArrayImage(axis.astype(np.float32)) for axis in np.indices(SHAPE)]
+
+
+def assembled(images: list[ArrayImage], ground: Terrain, grid: MapGrid, **changes: object) -> FloatImage:
+    out = np.zeros((len(images), *grid.shape), dtype=np.float32)
+    options = replace(OrthoOptions(), **changes)  # type: ignore[arg-type]
+    for done in orthorectify(images, scene().model, ground, grid, options):
+        at = done.window
+        assert done.error_px <= options.tolerance_px
+        out[:, at.line : at.line + at.lines, at.sample : at.sample + at.samples] = done.pixels
+    return out
+
+
+def expected(ground: Terrain, grid: MapGrid) -> np.ndarray:
+    """Line and sample by the model itself, at the height of each pixel."""
+    pixels = np.stack(np.indices(grid.shape), axis=-1).reshape(-1, 2).astype(np.float64)
+    lon_lat = grid.lon_lat(pixels)
+    line_sample = scene().model.project(np.column_stack([lon_lat, ground.height_m(lon_lat)]))
+    beyond = (line_sample < -0.5) | (line_sample > np.array(SHAPE) - 0.5)
+    line_sample[beyond.any(axis=1)] = np.nan
+    return np.clip(line_sample.reshape(*grid.shape, 2), 0.0, np.array(SHAPE) - 1.0).transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("kernel", ["bilinear", "cubic"])
+@pytest.mark.parametrize("crs", [None, "EPSG:4326", "EPSG:2154"])
+def test_every_map_pixel_shows_what_the_model_sees_there(kernel: str, crs: str | None) -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground, crs)
+    found, wanted = assembled(ramps(), ground, grid, kernel=kernel), expected(ground, grid)
+    inside = np.isfinite(wanted).all(axis=0)
+    assert inside.mean() > 0.5
+    seen = np.isfinite(found).all(axis=0)
+    # Only pixels on the very border may fall on either side of it.
+    assert (seen != inside).sum() <= 0.002 * inside.sum()
+    both = seen & inside
+    assert np.abs(found - wanted)[:, both].max() < a_hundredth_of_a_pixel
+
+
+def test_a_coarse_tolerance_is_kept_and_a_fine_one_too() -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    exact = map_into_image(scene().model, ground, grid, Window(100, 100, 200, 200), 1e-4)
+    rough = map_into_image(scene().model, ground, grid, Window(100, 100, 200, 200), the_tolerance_px)
+    assert exact is not None
+    assert rough is not None
+    assert exact.error_px <= 1e-4
+    assert np.nanmax(np.abs(exact.line_sample - rough.line_sample)) <= the_tolerance_px
+    wanted = expected(ground, grid)[:, 100:300, 100:300].transpose(1, 2, 0)
+    inside = np.isfinite(wanted) & (wanted > 0.0) & (wanted < np.array(SHAPE) - 1.0)
+    assert inside.mean() > 0.5
+    assert np.abs(exact.line_sample - wanted)[inside].max() < 5e-4
+
+
+def test_the_map_holds_all_the_ground_of_the_scene_and_little_more() -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    assert grid.crs == "EPSG:32631"
+    pixels = np.random.default_rng(1).uniform(-0.5, np.array(SHAPE) - 0.5, (500, 2))
+    met = meet(scene().model, pixels, ground)
+    assert grid.contains(grid.line_sample(met[:, :2])).all()
+    assert grid.shape[0] * grid.shape[1] < 2.2 * SHAPE[0] * SHAPE[1]
+    coarse = choose_grid(scene(), ground, gsd_m=7.0)
+    np.testing.assert_allclose(np.abs(coarse.step_xy[[0, 1], [1, 0]]), 7.0)
+    np.testing.assert_allclose((coarse.origin_xy / 7.0 - 0.5) % 1.0 % 1.0, 0.0, atol=1e-6)
+
+
+def test_small_windows_and_divided_ones_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    whole = assembled(ramps()[:1], ground, grid)
+    np.testing.assert_allclose(
+        assembled(ramps()[:1], ground, grid, window_px=100), whole, atol=2 * a_hundredth_of_a_pixel
+    )
+    monkeypatch.setattr(module, "MAX_READ_PIXELS", 10_000)
+    np.testing.assert_allclose(
+        assembled(ramps()[:1], ground, grid), whole, atol=2 * a_hundredth_of_a_pixel
+    )
+
+
+def test_a_coarser_map_shows_means_and_keeps_its_place() -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground, gsd_m=10.0)
+    found, wanted = assembled(ramps(), ground, grid), expected(ground, grid)
+    inside = np.isfinite(wanted).all(axis=0) & np.isfinite(found).all(axis=0)
+    inside &= ((wanted > 15.0) & (wanted < np.array(SHAPE)[:, None, None] - 16.0)).all(axis=0)
+    assert inside.sum() > 1000
+    assert np.abs(found - wanted)[:, inside].max() < the_tolerance_px
+    noise = ArrayImage(np.random.default_rng(1).normal(0.0, 100.0, SHAPE).astype(np.float32))
+    smooth = assembled([noise], ground, grid)
+    # Noise of pixels of 2 m in means over 10 m: a fifth or less.
+    assert np.nanstd(smooth) < 25.0
+
+
+def test_voids_of_image_and_terrain_show_nothing() -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    heights = np.array(ground.heights.read(Window(0, 0, *DEM.shape)))
+    heights[150:160, 160:170] = np.nan
+    holed = replace(ground, heights=ArrayImage(heights))
+    pixels = np.ones(SHAPE, np.float32)
+    pixels[200:220, 200:230] = np.nan
+    full = assembled([ArrayImage(np.ones(SHAPE, np.float32))], ground, grid)
+    less = assembled([ArrayImage(pixels)], ground, grid)
+    lost = np.isnan(less) & ~np.isnan(full)
+    line, sample = expected(ground, grid)
+    beside = (line > 199.0) & (line < 220.0) & (sample > 199.0) & (sample < 230.0)
+    assert beside.sum() > 400
+    # Positions on the very edge of the void may fall on either side of it.
+    assert (lost[0] != beside).sum() <= 3
+    lost = np.isnan(assembled([ArrayImage(np.ones(SHAPE, np.float32))], holed, grid)) & ~np.isnan(full)
+    # Ten nodes of some 8 by 11 m, in pixels of 2 m.
+    assert 1800 < lost.sum() < 4500
+
+
+def test_hidden_ground_is_that_which_no_line_of_sight_meets() -> None:
+    ground = terrain(300.0)
+    grid = choose_grid(scene(), ground)
+    window = Window(150, 150, 200, 200)
+    mapping = map_into_image(scene().model, ground, grid, window, the_tolerance_px)
+    assert mapping is not None
+    hidden = hidden_ground(scene().model, ground, grid, window, mapping.height_m)
+    met = meet(scene().model, mapping.line_sample.reshape(-1, 2), ground)
+    above_m = met[:, 2].reshape(hidden.shape) - mapping.height_m
+    inside = np.isfinite(above_m)
+    truly = above_m > 3.0
+    assert truly[inside].sum() > 1000
+    assert hidden[truly & inside].mean() > 0.98
+    assert hidden[inside & (np.abs(above_m) < 0.05)].mean() < 0.01
+
+
+def test_flat_ground_hides_nothing() -> None:
+    ground = terrain(0.0)
+    grid = choose_grid(scene(), ground)
+    window = Window(50, 50, 100, 100)
+    height_m = np.full((100, 100), 700.0, np.float32)
+    assert not hidden_ground(scene().model, ground, grid, window, height_m).any()
+
+
+def test_terrain_of_elsewhere_is_refused() -> None:
+    far = replace(terrain(), grid=replace(DEM, origin_xy=np.array([50.0, 10.0])))
+    with pytest.raises(CoverageError, match="does not reach"):
+        choose_grid(scene(), far)
+
+
+def test_an_ortho_image_is_a_cloud_optimised_geotiff_with_overviews(tmp_path: Path) -> None:
+    ground = terrain()
+    grid = choose_grid(scene(), ground)
+    done = list(orthorectify(ramps(), scene().model, ground, grid))
+    path = tmp_path / "ortho.tif"
+    error_px = write_cog(path, grid, done, 2, "uint16", 0.0)
+    assert error_px == max(window.error_px for window in done)
+    assert [file.name for file in tmp_path.iterdir()] == ["ortho.tif"]
+    with rasterio.open(path) as file:
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert file.overviews(1)
+        assert file.crs.to_epsg() == 32631
+        assert file.nodata == 0.0
+        stored = file.read()
+        x, y = file.transform @ (0.5, 0.5)
+    np.testing.assert_allclose([x, y], grid.origin_xy, atol=a_micropixel)
+    wanted = assembled(ramps(), ground, grid)
+    np.testing.assert_array_equal(stored == 0, np.isnan(wanted))
+    seen = np.isfinite(wanted)
+    np.testing.assert_allclose(stored[seen], np.maximum(np.rint(wanted[seen]), 1.0))
