@@ -1,9 +1,15 @@
-"""A limit on what a request may send, checked before anything is kept in memory."""
+"""Bodies of requests: a limit on what may be sent, and reading them piece by piece."""
 
+from collections.abc import Iterator
+
+from anyio import fail_after, from_thread
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-UPLOADS = ("/scenes",)
+UPLOADS = ("/scenes", "/uploads", "/blocks/uploads")
+STALLED_S = 60.0
+"""A sender that is silent for so long is gone."""
 
 
 class BodyLimit:
@@ -40,3 +46,22 @@ class BodyLimit:
             return message
 
         await self.app(scope, bounded, send)
+
+
+def body_chunks(request: Request) -> Iterator[bytes]:
+    """The body, chunk by chunk; endpoints run in threads, the body arrives in the event loop.
+
+    Raises:
+        ClientDisconnect: the sender is gone, or silent.
+    """
+    stream = request.stream()
+
+    async def following() -> bytes | None:
+        try:
+            with fail_after(STALLED_S):
+                return await anext(stream, None)
+        except TimeoutError:
+            raise ClientDisconnect from None
+
+    while (chunk := from_thread.run(following)) is not None:
+        yield chunk

@@ -2,14 +2,14 @@
 
 import re
 from base64 import b64decode
-from collections.abc import Iterator
 from email.message import Message
 from typing import Annotated, Any
 from uuid import UUID
 
-from anyio import from_thread
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
+from pydantic import BaseModel, Field
 
+from app.api.body import body_chunks
 from app.api.deps import DatabaseDep, ReadConnection, Registrar, SettingsDep, StorageDep, WriteConnection
 from app.db.scenes import SceneRow
 from app.errors import InputError
@@ -22,6 +22,18 @@ MOST_LISTED = 1000
 BINARY_BODY = {
     "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 }
+
+
+class SceneOnServer(BaseModel):
+    """A scene on the server.
+
+    Attributes:
+        path: of its image, below AMERS_SCENE_FOLDER; models lie beside it.
+        sigma_m: accuracy of its model, metres.
+    """
+
+    path: str = Field(min_length=1, max_length=1000)
+    sigma_m: float | None = Field(default=None, gt=0)
 
 
 @router.post("/scenes", status_code=status.HTTP_201_CREATED, openapi_extra={"requestBody": BINARY_BODY})
@@ -42,9 +54,9 @@ def upload_scene(
     `PUT /scenes/{id}/files/{name}`.
     """
     upload = _upload(request, name or _disposition_name(request))
-    scene = scenes.upload_scene(database, storage, caller, upload, settings.upload_limit_bytes, sigma_m)
+    scene = scenes.upload_scene(database, storage, settings, caller, upload, sigma_m)
     response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
-    return _scene(scene, [])
+    return _scene(scene)
 
 
 @router.put("/scenes/{scene_id}/files/{name}", openapi_extra={"requestBody": BINARY_BODY})
@@ -65,25 +77,37 @@ def upload_model(
     }
 
 
+@router.post("/scenes/reference", status_code=status.HTTP_201_CREATED)
+def refer_to_scene(
+    body: SceneOnServer,
+    request: Request,
+    response: Response,
+    connection: WriteConnection,
+    settings: SettingsDep,
+    caller: Registrar,
+) -> dict[str, Any]:
+    """Take in a scene that lies on the server, below the folder of `AMERS_SCENE_FOLDER`."""
+    scene = scenes.refer_to_scene(connection, settings, caller, body.path, body.sigma_m)
+    response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
+    return _scene(scene)
+
+
 @router.get("/scenes")
 def list_scenes(
     connection: ReadConnection,
-    storage: StorageDep,
     caller: Registrar,
     limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
 ) -> dict[str, Any]:
     """The caller's scenes, the newest first; everybody's for an administrator."""
     found = scenes.list_scenes(connection, caller, limit)
-    return {"scenes": [_scene(scene, scenes.model_names(storage, scene)) for scene in found]}
+    return {"scenes": [_scene(scene) for scene in found]}
 
 
 @router.get("/scenes/{scene_id}")
-def show_scene(
-    scene_id: UUID, connection: ReadConnection, storage: StorageDep, caller: Registrar
-) -> dict[str, Any]:
+def show_scene(scene_id: UUID, connection: ReadConnection, caller: Registrar) -> dict[str, Any]:
     """One scene."""
     scene = scenes.visible_scene(connection, caller, scene_id)
-    return _scene(scene, scenes.model_names(storage, scene))
+    return _scene(scene)
 
 
 @router.delete("/scenes/{scene_id}", status_code=status.HTTP_204_NO_CONTENT)
@@ -99,16 +123,19 @@ def remove_scene(
     after_commit.add_task(scenes.delete_files, storage, scene_id)
 
 
-def _scene(scene: SceneRow, models: list[str]) -> dict[str, Any]:
+def _scene(scene: SceneRow) -> dict[str, Any]:
     return {
         "id": scene.id,
         "name": scene.name,
         "state": scene.state,
         "file": scene.file_name,
-        "models": models,
+        "models": sorted(scene.models) if scene.state != "removed" else [],
         "size_bytes": scene.size_bytes,
         "sha256": scene.sha256,
         "sigma_m": scene.sigma_m,
+        "sensor": scene.sensor,
+        "acquired": scene.acquired_at,
+        "gsd_m": scene.gsd_m,
         "footprint": scene.footprint,
         "created": scene.created_at,
         "removed": scene.removed_at,
@@ -121,21 +148,10 @@ def _upload(request: Request, name: str | None) -> Upload:
     length = request.headers.get("content-length", "")
     return Upload(
         name=name,
-        chunks=_body(request),
+        chunks=body_chunks(request),
         size_bytes=int(length) if length.isdigit() else None,
         sha256=_announced_sha256(request),
     )
-
-
-def _body(request: Request) -> Iterator[bytes]:
-    """The body, chunk by chunk; endpoints run in threads, the body arrives in the event loop."""
-    stream = request.stream()
-
-    async def following() -> bytes | None:
-        return await anext(stream, None)
-
-    while (chunk := from_thread.run(following)) is not None:
-        yield chunk
 
 
 def _disposition_name(request: Request) -> str | None:

@@ -1,19 +1,22 @@
 """The table `scene`: images that were uploaded. Their files lie in the storage under `scenes/ID/`."""
 
+import math
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 from uuid import UUID, uuid4
 
 from psycopg.rows import class_row, scalar_row
+from psycopg.types.json import Jsonb
 
 from app.db.engine import Connection
-from services.types import Array
+from services.types import Acquisition, Array
 
 SceneState = Literal["uploading", "uploaded", "removed"]
 
 COLUMNS = """id, owner, name, state, file_name, file_key, size_bytes, sha256, sigma_m, created_at,
-    removed_at, st_asgeojson(footprint, 7)::json as footprint"""
+    removed_at, models, reference, acquired_at, sensor, gsd_m,
+    st_asgeojson(footprint, 7)::json as footprint"""
 LONGEST_UPLOAD_HOURS = 24
 
 
@@ -26,7 +29,9 @@ class SceneRow:
         file_name: of the image, as the storage has it.
         file_key, size_bytes, sha256: of the image; None while it is on its way, no key once removed.
         sigma_m: accuracy of the model as the owner states it, metres.
-        footprint: GeoJSON; None until the scene was registered once.
+        models: the files beside the image, name to size and checksum.
+        reference: path below AMERS_SCENE_FOLDER of an image that was not uploaded.
+        acquired_at, sensor, gsd_m, footprint: what the files say; None before a registration.
     """
 
     id: UUID
@@ -40,31 +45,70 @@ class SceneRow:
     sigma_m: float | None
     created_at: datetime
     removed_at: datetime | None
+    models: dict[str, dict[str, Any]]
+    reference: str | None
+    acquired_at: datetime | None
+    sensor: str | None
+    gsd_m: float | None
     footprint: dict[str, object] | None
 
 
 def begin_upload(
-    connection: Connection, owner: UUID | None, name: str, file_name: str, sigma_m: float | None
+    connection: Connection,
+    owner: UUID | None,
+    name: str,
+    file_name: str,
+    sigma_m: float | None,
+    announced_bytes: int | None = None,
 ) -> UUID:
     """A scene whose image is about to arrive."""
     scene_id = uuid4()
     connection.execute(
-        "insert into scene (id, owner, name, state, file_name, sigma_m)"
-        " values (%s, %s, %s, 'uploading', %s, %s)",
-        [scene_id, owner, name, file_name, sigma_m],
+        "insert into scene (id, owner, name, state, file_name, sigma_m, size_bytes)"
+        " values (%s, %s, %s, 'uploading', %s, %s, %s)",
+        [scene_id, owner, name, file_name, sigma_m, announced_bytes],
     )
     return scene_id
 
 
+def insert_reference(
+    connection: Connection, owner: UUID, name: str, path: str, sigma_m: float | None
+) -> SceneRow:
+    """A scene that stays where it lies, below the folder of the settings."""
+    with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
+        row = cursor.execute(
+            f"""insert into scene (id, owner, name, state, file_name, reference, sigma_m)
+                values (%s, %s, %s, 'uploaded', %s, %s, %s) returning {COLUMNS}""",
+            [uuid4(), owner, name, name, path, sigma_m],
+        ).fetchone()
+    assert row is not None
+    return row
+
+
+def add_model(connection: Connection, scene_id: UUID, name: str, size_bytes: int, sha256: str) -> bool:
+    """Note a file beside the image; False when the scene has no files any more."""
+    done = connection.execute(
+        """update scene set models = models || jsonb_build_object(%s::text, %s::jsonb)
+           where id = %s and state <> 'removed'""",
+        [name, Jsonb({"size_bytes": size_bytes, "sha256": sha256}), scene_id],
+    )
+    return done.rowcount == 1
+
+
 def finish_upload(
-    connection: Connection, scene_id: UUID, key: str, size_bytes: int, sha256: str
+    connection: Connection,
+    scene_id: UUID,
+    key: str,
+    size_bytes: int,
+    sha256: str,
 ) -> SceneRow | None:
     """The scene, now that its image is in the storage; None when it was given up meanwhile."""
     with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
         return cursor.execute(
-            f"""update scene set state = 'uploaded', file_key = %s, size_bytes = %s, sha256 = %s
+            f"""update scene set state = 'uploaded', file_key = %s, file_name = %s, size_bytes = %s,
+                    sha256 = %s
                 where id = %s and state = 'uploading' returning {COLUMNS}""",
-            [key, size_bytes, sha256, scene_id],
+            [key, key.rsplit("/", 1)[-1], size_bytes, sha256, scene_id],
         ).fetchone()
 
 
@@ -77,7 +121,8 @@ def give_up_old_uploads(connection: Connection) -> None:
     """Forget the scenes whose upload was cut off with the process that received it."""
     connection.execute(
         "delete from scene where state = 'uploading'"
-        " and created_at < now() - make_interval(hours => %s)",
+        " and created_at < now() - make_interval(hours => %s)"
+        " and not exists (select from upload where scene_id = scene.id and finished_at is null)",
         [LONGEST_UPLOAD_HOURS],
     )
 
@@ -108,6 +153,30 @@ def set_footprint(connection: Connection, scene_id: UUID, outline: Array) -> Non
     connection.execute(
         "update scene set footprint = st_geomfromtext(%s, 4326) where id = %s",
         [f"POLYGON(({ring}))", scene_id],
+    )
+
+
+def describe(
+    connection: Connection,
+    scene_id: UUID,
+    taken: Acquisition,
+    shape: tuple[int, int],
+    gsd_m: float,
+) -> None:
+    """Remember what the files of a scene say of it."""
+    angles = (taken.incidence_deg, taken.azimuth_deg, taken.sun_elevation_deg, taken.sun_azimuth_deg)
+    connection.execute(
+        """update scene set sensor = %s, acquired_at = %s, incidence_deg = %s, azimuth_deg = %s,
+               sun_elevation_deg = %s, sun_azimuth_deg = %s, lines = %s, samples = %s, gsd_m = %s
+           where id = %s""",
+        [
+            taken.sensor or None,
+            taken.acquired_at,
+            *(None if angle is None or math.isnan(angle) else angle for angle in angles),
+            *shape,
+            gsd_m,
+            scene_id,
+        ],
     )
 
 

@@ -21,14 +21,14 @@ from app.errors import Conflict, InputError
 from app.storage import Storage, StoredChips
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.registration_files import OUTPUTS, write_outputs
-from app.usecases.scenes import clean_name, folder_of, visible_scene
+from app.usecases.scenes import clean_name, local_image, visible_scene
 from services.formats.block import FolderChips
 from services.formats.block_check import check_block
 from services.formats.scenes import read_scene
 from services.registration import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
 from services.reports.report import BlockUsed, RegistrationReport
-from services.scene import scene_footprint
+from services.scene import Scene, scene_footprint, scene_gsd_m
 from services.types import Array, ChipSource, ControlPoints, Progress, no_progress
 
 METRES_PER_DEGREE = 111_320.0
@@ -92,10 +92,12 @@ class RegisteredScene:
     """What a registration made.
 
     Attributes:
+        scene: as read; its pixels are gone once its files are.
         footprint: (n, 2) lon, lat outline of the scene.
         files: the outputs, by name.
     """
 
+    scene: Scene
     registration: Registration
     report: RegistrationReport
     footprint: Array
@@ -141,7 +143,7 @@ def run_registration(
         options,
         started_at,
     )
-    return RegisteredScene(registration, report, footprint, paths)
+    return RegisteredScene(scene, registration, report, footprint, paths)
 
 
 def points_of_block(folder: Path) -> FindPoints:
@@ -207,13 +209,15 @@ def _run(work: Work) -> Commit:
     inputs: RegisterScene = work.inputs
     with work.database.transaction() as connection:
         scene = scenes.find_scene(connection, inputs.scene)
-    if scene is None or scene.file_key is None:
+    if scene is None or scene.state == "removed":
         raise Conflict(f"scene {inputs.scene} has been removed")
-    model = inputs.model and work.storage.path(f"{folder_of(scene.id)}/{inputs.model}")
-    files = SceneFiles(work.storage.path(scene.file_key), model or None, scene.sigma_m)
     find_points = points_of_store(work.database, work.storage)
-    with TemporaryDirectory(prefix="amers-") as folder:
+    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
+        image = local_image(work.storage, work.settings, scene, Path(scratch))
+        model = inputs.model and image.with_name(inputs.model)
+        files = SceneFiles(image, model or None, scene.sigma_m)
         made = run_registration(files, find_points, inputs.options, Path(folder), work.progress)
+        gsd_m = scene_gsd_m(made.scene)
         keys = {
             name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
             for name, path in made.files.items()
@@ -222,6 +226,8 @@ def _run(work: Work) -> Commit:
     def commit(connection: Connection) -> dict[str, Any]:
         record(connection, made, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
         scenes.set_footprint(connection, inputs.scene, made.footprint)
+        taken, shape = made.scene.acquisition, made.scene.image.shape
+        scenes.describe(connection, inputs.scene, taken, shape, gsd_m)
         return {"verdict": made.report.verdict, "files": keys}
 
     return commit

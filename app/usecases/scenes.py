@@ -4,15 +4,18 @@ import re
 import unicodedata
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from uuid import UUID
 
 from app.auth import Scope, allows
+from app.config import Settings
 from app.db import scenes
 from app.db.engine import Connection, Database
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.errors import Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage, StoredFile
+from app.usecases import quotas
 from services.errors import FormatError
 from services.formats.raster import DRIVER_OF_SIGNATURE
 
@@ -41,9 +44,9 @@ class Upload:
 def upload_scene(
     database: Database,
     storage: Storage,
-    owner: Token | None,
+    settings: Settings,
+    owner: Token,
     upload: Upload,
-    limit_bytes: int,
     sigma_m: float | None = None,
 ) -> SceneRow:
     """Take in the image of a new scene; it is looked into by the job that uses it, not here.
@@ -54,15 +57,18 @@ def upload_scene(
         sigma_m: accuracy of the scene's model as the sender states it, metres.
 
     Raises:
-        TooLarge: more bytes than the limit, announced or sent.
+        TooLarge: more bytes than the limit or the quota of the owner, announced or sent.
         FormatError: neither a TIFF, a JPEG 2000 nor a NITF by its first bytes.
         InputError: the name is none, or size or checksum are not as announced.
     """
     file_name = clean_name(upload.name)
-    _refuse_too_large(upload, limit_bytes)
-    owner_id = owner.id if owner else None
+    _refuse_too_large(upload, settings.upload_limit_bytes)
     with database.transaction() as connection:
-        scene_id = scenes.begin_upload(connection, owner_id, upload.name[-200:], file_name, sigma_m)
+        left = quotas.upload_allowance(connection, settings, owner, upload.size_bytes)
+        scene_id = scenes.begin_upload(
+            connection, owner.id, upload.name[-200:], file_name, sigma_m, upload.size_bytes
+        )
+    limit_bytes = min(left, settings.upload_limit_bytes)
     key = f"{folder_of(scene_id)}/{file_name}"
     try:
         image = _receive(storage, key, upload, _images_only(upload.chunks), limit_bytes)
@@ -89,17 +95,97 @@ def upload_model(
         InputError: not a kind of file that holds a model.
     """
     with database.reading() as connection:
-        scene = visible_scene(connection, caller, scene_id)
-    file_name = clean_name(upload.name)
-    if scene.state != "uploaded":
-        raise Conflict(f"the files of scene {scene_id} are {scene.state}")
+        file_name = model_name(visible_scene(connection, caller, scene_id), upload.name)
+    _refuse_too_large(upload, MODEL_LIMIT_BYTES)
+    key = f"{folder_of(scene_id)}/{file_name}"
+    stored = _receive(storage, key, upload, upload.chunks, MODEL_LIMIT_BYTES)
+    with database.transaction() as connection:
+        note_model(connection, scene_id, file_name, stored.size_bytes, stored.sha256)
+    return stored
+
+
+def model_name(scene: SceneRow, name: str) -> str:
+    """The name under which a file with the geometry of a scene lies beside its image.
+
+    Raises:
+        Conflict: the scene has no files of its own any more, or the name is that of its image.
+        InputError: not a kind of file that holds a model.
+    """
+    file_name = clean_name(name)
+    if scene.state == "removed" or scene.reference is not None:
+        state = "removed" if scene.reference is None else "where they were before"
+        raise Conflict(f"the files of scene {scene.id} are {state}")
     if not file_name.lower().endswith(MODEL_SUFFIXES):
         raise InputError(f"a model file ends in {', '.join(MODEL_SUFFIXES)}; {file_name} does not")
     if file_name == scene.file_name:
         raise Conflict(f"{file_name} is the image of the scene")
-    _refuse_too_large(upload, MODEL_LIMIT_BYTES)
-    key = f"{folder_of(scene_id)}/{file_name}"
-    return _receive(storage, key, upload, upload.chunks, MODEL_LIMIT_BYTES)
+    return file_name
+
+
+def note_model(
+    connection: Connection, scene_id: UUID, file_name: str, size_bytes: int, sha256: str
+) -> None:
+    """Remember a file that was laid beside an image.
+
+    Raises:
+        Conflict: the scene was removed meanwhile; the file is swept.
+    """
+    if not scenes.add_model(connection, scene_id, file_name, size_bytes, sha256):
+        raise Conflict(f"scene {scene_id} was removed meanwhile")
+
+
+def refer_to_scene(
+    connection: Connection, settings: Settings, owner: Token, path: str, sigma_m: float | None = None
+) -> SceneRow:
+    """Take in a scene that stays where it lies, below the folder the administrator has opened.
+
+    Raises:
+        InputError: no folder is open, or the path is not one of a file below it.
+    """
+    if settings.scene_folder is None:
+        raise InputError("scenes on the server cannot be used: AMERS_SCENE_FOLDER is not set")
+    found = referred_image(settings, path)
+    relative = found.relative_to(settings.scene_folder.resolve()).as_posix()
+    return scenes.insert_reference(connection, owner.id, found.name, relative, sigma_m)
+
+
+def referred_image(settings: Settings, path: str) -> Path:
+    """The file of a scene below AMERS_SCENE_FOLDER, all links followed and still below it.
+
+    Raises:
+        InputError: there is no such file there.
+    """
+    folder = (settings.scene_folder or Path("/nonexistent")).resolve()
+    try:
+        found = (folder / path).resolve()
+        usable = found.is_relative_to(folder) and found.is_file()
+    except (OSError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(f"path: {path[:200]!r} is no file below the folder of AMERS_SCENE_FOLDER")
+    with found.open("rb") as file:
+        refuse_strange(file.read(LONGEST_SIGNATURE))
+    return found
+
+
+def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: Path) -> Path:
+    """The image of a scene on this machine, with its models beside it.
+
+    Args:
+        scratch: a folder of the caller's, for copies when the storage is elsewhere.
+
+    Raises:
+        Conflict: the scene has no files any more.
+        InputError: a scene on the server is not where it was.
+    """
+    if scene.reference is not None and scene.state != "removed":
+        return referred_image(settings, scene.reference)
+    if scene.file_key is None:
+        raise Conflict(f"scene {scene.id} has been removed, or has not arrived yet")
+    for key in storage.keys(folder_of(scene.id)):
+        if key != scene.file_key:
+            storage.fetch(key, scratch)
+    return storage.fetch(scene.file_key, scratch)
 
 
 def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> SceneRow:
@@ -130,7 +216,7 @@ def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
     """
     scene = visible_scene(connection, caller, scene_id)
     if scene.state == "uploading":
-        raise Conflict(f"the image of scene {scene_id} is still arriving")
+        raise Conflict(f"the image of scene {scene_id} is still arriving; its upload can be ended")
     scenes.remove_scene(connection, scene_id)
 
 
@@ -138,12 +224,6 @@ def delete_files(storage: Storage, scene_id: UUID) -> None:
     """Delete the files of a scene that was removed."""
     for key in storage.keys(folder_of(scene_id)):
         storage.delete(key)
-
-
-def model_names(storage: Storage, scene: SceneRow) -> list[str]:
-    """The files beside the image of a scene."""
-    keys = storage.keys(folder_of(scene.id)) if scene.state == "uploaded" else []
-    return [name for key in keys if (name := key.rsplit("/", 1)[1]) != scene.file_name]
 
 
 def folder_of(scene_id: UUID) -> str:
@@ -192,7 +272,16 @@ def _images_only(chunks: Iterable[bytes]) -> Iterator[bytes]:
         head += chunk
         if len(head) >= LONGEST_SIGNATURE:
             break
-    if not head.startswith(tuple(DRIVER_OF_SIGNATURE)):
-        raise FormatError(f"the file begins with {head[:8]!r}: neither TIFF, JPEG 2000 nor NITF")
+    refuse_strange(head)
     yield head
     yield from rest
+
+
+def refuse_strange(head: bytes) -> None:
+    """Refuse a file that is no image by its first bytes.
+
+    Raises:
+        FormatError: it is not.
+    """
+    if not head.startswith(tuple(DRIVER_OF_SIGNATURE)):
+        raise FormatError(f"the file begins with {head[:8]!r}: neither TIFF, JPEG 2000 nor NITF")

@@ -15,8 +15,10 @@ from app.config import Settings
 from app.db import jobs, scenes
 from app.db.engine import Database
 from app.storage import Storage
+from app.usecases.block_ingestion import sweep_archives
 from app.usecases.blocks import sweep_storage
 from app.usecases.cleaning import remove_unnamed_files
+from app.usecases.uploads import sweep_uploads
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
@@ -77,12 +79,13 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     Raises:
         psycopg.errors.LockNotAvailable: an ingestion is under way; its files are swept another time.
     """
+    removed = sweep_uploads(database, storage)
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
-    removed = remove_unnamed_files(database, storage)
+    removed += remove_unnamed_files(database, storage)
     removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s)
     with database.transaction() as connection:
         connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
-        removed += sweep_storage(connection, storage)
+        removed += sweep_storage(connection, storage) + sweep_archives(connection, storage)
     for name in removed:
         log.info("removed %s, which nothing names", name)

@@ -1,0 +1,362 @@
+"""Uploads that are resumed: tus 1.0 as its own client speaks it, over lines that break."""
+
+import hashlib
+import io
+import socket
+import threading
+import time
+import zipfile
+from base64 import b64encode
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import UUID
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+from fastapi.testclient import TestClient
+from tusclient.client import TusClient
+
+from app.config import Settings
+from app.db import engine
+from app.main import create_app
+from app.storage import Storage
+from app.usecases.uploads import finished_block, sweep_uploads
+
+TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
+LIMIT_BYTES = 400_000
+TUS = {"Tus-Resumable": "1.0.0"}
+PIECE = {"Content-Type": "application/offset+octet-stream"}
+BREAKS = 10
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+@pytest.fixture
+def settings(dsn: str, tmp_path: Path) -> Settings:
+    """An installation that takes small uploads only."""
+    return Settings(database_url=dsn, data_folder=tmp_path / "data", upload_limit_bytes=LIMIT_BYTES)
+
+
+@pytest.fixture
+def me(bearer: Bearer) -> dict[str, str]:
+    return bearer("register") | TUS
+
+
+@contextmanager
+def listening(settings: Settings) -> Iterator[str]:
+    """The application behind a real socket."""
+    server = uvicorn.Server(uvicorn.Config(create_app(settings), port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        while not server.started:
+            time.sleep(0.02)
+        host, port = server.servers[0].sockets[0].getsockname()[:2]
+        yield f"http://{host}:{port}"
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def said(**values: str) -> dict[str, str]:
+    """The header with what is said about a file."""
+    pairs = (f"{name} {b64encode(value.encode()).decode()}" for name, value in values.items())
+    return {"Upload-Metadata": ",".join(pairs)}
+
+
+def begun(client: TestClient, me: dict[str, str], size: int, **values: str) -> httpx.Response:
+    return client.post("/uploads", headers=me | {"Upload-Length": str(size)} | said(**values))
+
+
+def piece(
+    client: TestClient, url: str, me: dict[str, str], start: int, data: bytes, **more: str
+) -> httpx.Response:
+    return client.patch(url, content=data, headers=me | PIECE | {"Upload-Offset": str(start)} | more)
+
+
+def whole(client: TestClient, me: dict[str, str], data: bytes, **values: str) -> httpx.Response:
+    """The reply to the only piece of an upload."""
+    reply = begun(client, me, len(data), **values)
+    assert reply.status_code == 201, reply.text
+    return piece(client, reply.headers["location"], me, 0, data)
+
+
+@contextmanager
+def breaking_line(url: str, me: dict[str, str], start: int, part: bytes) -> Iterator[None]:
+    """A line over which the rest of the file is announced and a part of it sent; then it breaks."""
+    host, port = url.split("/")[2].split(":")
+    path = "/" + url.split("/", 3)[3]
+    headers = {**me, **PIECE, "Upload-Offset": start, "Content-Length": len(TIFF) - start, "Host": host}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    with socket.create_connection((host, int(port))) as line:
+        line.sendall(f"PATCH {path} HTTP/1.1\r\n{lines}\r\n".encode() + part)
+        yield
+
+
+def test_an_upload_interrupted_and_resumed_ten_times_arrives_intact(
+    settings: Settings, me: dict[str, str], storage: Storage
+):
+    rng = np.random.default_rng(2)
+    with listening(settings) as base, httpx.Client(headers=me) as http:
+        tus = TusClient(f"{base}/uploads", headers=me)
+        metadata = {"filename": "a.tif", "sha256": hashlib.sha256(TIFF).hexdigest()}
+        uploader = tus.uploader(file_stream=io.BytesIO(TIFF), chunk_size=100_000, metadata=metadata)
+        uploader.set_url(uploader.create_url())
+        url, arrived = uploader.url, 0
+        for number in range(BREAKS):
+            sent = int(rng.integers(1, 20_000))
+            deadline = time.monotonic() + 20.0
+            with breaking_line(url, me, arrived, TIFF[arrived : arrived + sent]):
+                while int(http.head(url).headers["Upload-Offset"]) == arrived:
+                    assert time.monotonic() < deadline, f"break {number}: nothing of {sent} bytes came"
+                    time.sleep(0.01)
+            # Until the service notices that the line is gone.
+            while probe(http, url) == 423:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            arrived = int(http.head(url).headers["Upload-Offset"])
+        assert 0 < arrived < len(TIFF)
+        resumed = tus.uploader(file_stream=io.BytesIO(TIFF), chunk_size=100_000, url=url)
+        assert resumed.offset == arrived
+        resumed.upload()
+        told = http.get(url).json()
+        scene = http.get(f"{base}/scenes/{told['scene']}").json()
+    assert (told["state"], told["offset"]) == ("finished", len(TIFF))
+    assert (scene["state"], scene["sha256"]) == ("uploaded", metadata["sha256"])
+    assert storage.path(f"scenes/{scene['id']}/a.tif").read_bytes() == TIFF
+
+
+def probe(http: httpx.Client, url: str) -> int:
+    """The status of an empty piece where the file ends: 423 while the former sender holds it."""
+    start = http.head(url).headers["Upload-Offset"]
+    return http.patch(url, content=b"", headers=PIECE | {"Upload-Offset": start}).status_code
+
+
+def test_the_service_says_what_of_tus_it_speaks(client: TestClient, me: dict[str, str]):
+    told = client.options("/uploads").headers
+    assert told["tus-version"] == "1.0.0"
+    assert set(told["tus-extension"].split(",")) == {
+        "creation",
+        "termination",
+        "checksum",
+        "expiration",
+    }
+    assert int(told["tus-max-size"]) == LIMIT_BYTES
+    refused = client.post("/uploads", headers=me | {"Tus-Resumable": "0.2.2", "Upload-Length": "1"})
+    assert (refused.status_code, refused.headers["tus-version"]) == (412, "1.0.0")
+
+
+def test_an_image_and_the_file_with_its_model_become_one_scene(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    reply = begun(client, me, len(TIFF), filename="IMG.TIF", sigma_m="7.5")
+    assert reply.headers["upload-expires"]
+    scene = reply.headers["amers-scene"]
+    assert client.get(f"/scenes/{scene}", headers=me).json()["state"] == "uploading"
+    model = begun(client, me, 4, filename="RPC_IMG.XML", scene=scene)
+    assert piece(client, model.headers["location"], me, 0, b"<a/>").status_code == 204
+    url = reply.headers["location"]
+    assert piece(client, url, me, 0, TIFF[:1000]).headers["upload-offset"] == "1000"
+    asked = client.head(url, headers=me).headers
+    assert (asked["upload-offset"], asked["upload-length"]) == ("1000", str(len(TIFF)))
+    assert asked["cache-control"] == "no-store"
+    assert piece(client, url, me, 1000, TIFF[1000:]).status_code == 204
+    told = client.get(f"/scenes/{scene}", headers=me).json()
+    assert (told["state"], told["models"], told["sigma_m"]) == ("uploaded", ["RPC_IMG.XML"], 7.5)
+    assert storage.path(f"scenes/{scene}/RPC_IMG.XML").read_bytes() == b"<a/>"
+    assert list(storage.scratch().iterdir()) == []
+
+
+def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(
+    client: TestClient, me: dict[str, str]
+):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    piece(client, url, me, 0, TIFF[:100])
+    for start in (0, 99, 101):
+        assert piece(client, url, me, start, TIFF[start:200]).status_code == 409
+    reply = client.patch(url, content=b"x", headers=me | {"Upload-Offset": "100"})
+    assert reply.status_code == 415
+    assert piece(client, url, me, 100, TIFF).status_code == 413
+    assert client.head(url, headers=me).headers["upload-offset"] == "100"
+
+
+def test_a_piece_that_is_not_as_announced_is_thrown_away(client: TestClient, me: dict[str, str]):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    for algorithm in ("sha1", "sha256"):
+        start = int(client.head(url, headers=me).headers["upload-offset"])
+        data = TIFF[start : start + 100]
+        right = b64encode(hashlib.new(algorithm, data).digest()).decode()
+        wrong = b64encode(hashlib.new(algorithm, b"other").digest()).decode()
+        bad = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {wrong}"})
+        assert bad.status_code == 460
+        assert int(client.head(url, headers=me).headers["upload-offset"]) == start
+        good = piece(client, url, me, start, data, **{"Upload-Checksum": f"{algorithm} {right}"})
+        assert good.status_code == 204
+    for unknown in ("md5 AAAA", "sha1 AAAA", "sha256"):
+        assert piece(client, url, me, 200, b"x", **{"Upload-Checksum": unknown}).status_code == 400
+
+
+@pytest.mark.parametrize(
+    ("data", "metadata", "told"),
+    [
+        (b"<VRTDataset/>", {"filename": "a.tif"}, "neither TIFF"),
+        (TIFF, {"filename": "a.tif", "sha256": "0" * 64}, "sha256"),
+        (b"PK\3\4garbage", {"filename": "a.zip"}, "broken archive"),
+    ],
+)
+def test_a_file_that_is_not_what_it_should_be_is_refused_and_forgotten(
+    client: TestClient,
+    me: dict[str, str],
+    storage: Storage,
+    data: bytes,
+    metadata: dict[str, str],
+    told: str,
+):
+    reply = begun(client, me, len(data), **metadata)
+    refused = piece(client, reply.headers["location"], me, 0, data)
+    assert refused.status_code == 422
+    assert told in refused.json()["detail"]
+    assert client.head(reply.headers["location"], headers=me).status_code == 404
+    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+    assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("size", "metadata", "status"),
+    [
+        (0, {"filename": "a.tif"}, 422),
+        (10, {}, 422),
+        (LIMIT_BYTES + 1, {"filename": "a.tif"}, 413),
+        (10, {"filename": "a.tif", "sha256": "abc"}, 422),
+        (10, {"filename": "a.tif", "sigma_m": "-1"}, 422),
+        (10, {"filename": "a.tif", "sigma_m": "nan"}, 422),
+        (10, {"filename": "a.tif", "purpose": "virus"}, 422),
+        (10, {"filename": "a.xml", "scene": "1"}, 422),
+        (10, {"filename": "a.xml", "scene": str(UUID(int=1))}, 404),
+        (10, {"filename": "a.xml", "purpose": "model"}, 422),
+        (10, {"filename": "a.zip", "purpose": "block"}, 403),
+        (10, {"filename": "..."}, 422),
+    ],
+)
+def test_an_upload_that_can_have_no_place_is_refused_before_it_begins(
+    client: TestClient, me: dict[str, str], size: int, metadata: dict[str, str], status: int
+):
+    reply = begun(client, me, size, **metadata)
+    assert reply.status_code == status, reply.text
+    assert client.get("/scenes", headers=me).json() == {"scenes": []}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return out.getvalue()
+
+
+def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    files = {"p/IMG_1.TIF": TIFF, "p/RPC_1.XML": b"<a/>", "p/READ.ME": b"x", "q/RPC_2.XML": b"<b/>"}
+    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    assert reply.status_code == 204, reply.text
+    scene = client.get(f"/scenes/{reply.headers['amers-scene']}", headers=me).json()
+    assert (scene["file"], scene["models"]) == ("IMG_1.TIF", ["RPC_1.XML"])
+    assert scene["sha256"] == hashlib.sha256(TIFF).hexdigest()
+    assert storage.keys("scenes") == [f"scenes/{scene['id']}/{n}" for n in ("IMG_1.TIF", "RPC_1.XML")]
+
+
+@pytest.mark.parametrize(
+    ("files", "told"),
+    [
+        ({"../IMG.TIF": TIFF}, "not accepted"),
+        ({"a.tif": TIFF, "b.tif": TIFF[:9]}, "a.tif, b.tif"),
+        ({"readme": b"x"}, "none"),
+        ({"a.tif": b"<VRTDataset/>"}, "neither TIFF"),
+        ({"a.tif": TIFF, "zeros": bytes(LIMIT_BYTES)}, "unpacks to more"),
+    ],
+)
+def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
+    client: TestClient, me: dict[str, str], storage: Storage, files: dict[str, bytes], told: str
+):
+    reply = whole(client, me, zipped(files), filename="delivery.zip")
+    assert reply.status_code == 422
+    assert told in reply.json()["detail"]
+    assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
+
+
+def test_an_upload_of_somebody_else_does_not_exist(
+    client: TestClient, me: dict[str, str], bearer: Bearer
+):
+    url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
+    stranger = bearer("register") | TUS
+    assert client.head(url, headers=stranger).status_code == 404
+    assert piece(client, url, stranger, 0, TIFF).status_code == 404
+    assert client.delete(url, headers=stranger).status_code == 404
+    assert client.head(url, headers=TUS).status_code == 401
+
+
+def test_an_upload_that_is_ended_or_expires_leaves_nothing(
+    client: TestClient, me: dict[str, str], storage: Storage
+):
+    first, second = (begun(client, me, len(TIFF), filename="a.tif") for _ in range(2))
+    piece(client, first.headers["location"], me, 0, TIFF[:100])
+    piece(client, second.headers["location"], me, 0, TIFF[:100])
+    assert client.delete(first.headers["location"], headers=me).status_code == 204
+    assert client.head(first.headers["location"], headers=me).status_code == 404
+    database = client.app.state.database  # type: ignore[attr-defined]
+    sweep_uploads(database, storage)
+    assert client.head(second.headers["location"], headers=me).status_code == 200
+    with database.transaction() as connection:
+        connection.execute("update upload set expires_at = now() - interval '1 minute'")
+    assert client.head(second.headers["location"], headers=me).status_code == 404
+    sweep_uploads(database, storage)
+    assert list(storage.scratch().iterdir()) == []
+
+
+def test_two_senders_of_one_file_do_not_mix(settings: Settings, me: dict[str, str]):
+    with listening(settings) as base, httpx.Client(headers=me) as http:
+        length = {"Upload-Length": str(len(TIFF))}
+        url = http.post(f"{base}/uploads", headers=length | said(filename="a.tif")).headers["location"]
+        halfway, go_on = threading.Event(), threading.Event()
+
+        def slow() -> Iterator[bytes]:
+            yield TIFF[:1000]
+            halfway.set()
+            go_on.wait(20.0)
+            yield TIFF[1000:]
+
+        replies: list[int] = []
+
+        def send() -> None:
+            headers = me | PIECE | {"Upload-Offset": "0"}
+            replies.append(httpx.patch(url, content=slow(), headers=headers, timeout=30.0).status_code)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        assert halfway.wait(20.0)
+        deadline = time.monotonic() + 20.0
+        while (status := probe(http, url)) != 423:
+            assert time.monotonic() < deadline, status
+        go_on.set()
+        sender.join()
+        assert replies == [204]
+        assert http.get(url).json()["state"] == "finished"
+
+
+def test_a_block_that_has_arrived_is_there_to_be_ingested(
+    client: TestClient, bearer: Bearer, storage: Storage, dsn: str
+):
+    admin = bearer("admin") | TUS
+    reply = begun(client, admin, 100, filename="block.zip", purpose="block")
+    url = reply.headers["location"]
+    assert piece(client, url, admin, 0, bytes(100)).status_code == 204
+    from app.db.tokens import list_tokens
+
+    with engine.connect(dsn) as connection:
+        caller = list_tokens(connection)[0]
+        key = finished_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
+    assert storage.size(key) == 100
