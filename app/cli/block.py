@@ -10,8 +10,11 @@ from app.cli.progress import shown_progress
 from app.cli.store import transaction
 from app.config import read_settings
 from app.db.blocks import Block
-from app.storage import open_storage
+from app.errors import InputError
+from app.storage import StoredChips, open_storage
 from app.usecases import blocks
+from app.usecases.block_export import ExportBlock, export_block
+from app.usecases.blocks import Published
 from services.quality.block import BlockQuality, Distribution, quality_document
 
 app = typer.Typer(help="Productions of points.", no_args_is_help=True)
@@ -23,6 +26,7 @@ Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or 
 def ingest(
     path: Annotated[Path, typer.Argument(help="Folder of the block.")],
     publish: Annotated[bool, typer.Option("--publish", help="Make it visible at once.")] = False,
+    priority: Annotated[int, typer.Option(help="Over the same place the greater one wins.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Check a block entirely and load it, staged."""
@@ -30,7 +34,7 @@ def ingest(
     storage = open_storage(settings)
     with transaction(settings) as connection:
         with shown_progress() as progress:
-            ingested = blocks.ingest_block(connection, storage, path, progress)
+            ingested = blocks.ingest_block(connection, storage, path, progress, priority)
         block = ingested.block
         if publish:
             block = blocks.publish_block(connection, str(block.number)).block
@@ -60,11 +64,16 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
 def quality(reference: Reference, as_json: AsJson = False) -> None:
     """Show the quality figures of a block; with --json also the density of every cell."""
     with transaction() as connection:
-        figures = blocks.find_quality(connection, reference)
+        report = blocks.block_report(connection, blocks.find_block(connection, reference))
     if as_json:
-        print_json(quality_document(figures))
-    else:
-        show_one(_figures(figures), as_json=False)
+        stated = [vars(figure) for figure in report.accuracy]
+        print_json({**quality_document(report.quality), "accuracy": stated})
+        return
+    stated_lines = {
+        f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
+        for figure in report.accuracy
+    }
+    show_one({**_figures(report.quality), **stated_lines}, as_json=False)
 
 
 @app.command()
@@ -72,12 +81,52 @@ def publish(reference: Reference, as_json: AsJson = False) -> None:
     """Make a block visible, and the version of it that was visible before no longer."""
     with transaction() as connection:
         published = blocks.publish_block(connection, reference)
-    old = published.superseded
-    record = {
-        **_record(published.block),
-        "superseded": None if old is None else f"{old.id}@{old.version}",
-    }
-    show_one(record, as_json=as_json)
+    show_one(_published(published), as_json=as_json)
+
+
+@app.command()
+def restore(reference: Reference, as_json: AsJson = False) -> None:
+    """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
+    with transaction() as connection:
+        published = blocks.restore_block(connection, reference)
+    show_one(_published(published), as_json=as_json)
+
+
+@app.command()
+def prioritise(
+    reference: Reference,
+    priority: Annotated[int, typer.Argument(help="-1000 to 1000; 0 unless said otherwise.")],
+    as_json: AsJson = False,
+) -> None:
+    """Let a block win or lose against other blocks over the same place."""
+    with transaction() as connection:
+        block = blocks.prioritise_block(connection, reference, priority)
+    show_one(_record(block), as_json=as_json)
+
+
+@app.command()
+def export(
+    bbox: Annotated[str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses 180.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to make.")],
+    name: Annotated[str, typer.Option("--id", help="Name of the new block.")] = "extract",
+    version: Annotated[str, typer.Option(help="Version of the new block.")] = "1",
+    title: Annotated[str, typer.Option(help="Title of the new block.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write the points that are served in a box, with their chips, into a new block folder."""
+    try:
+        west, south, east, north = (float(part) for part in bbox.split(","))
+    except ValueError:
+        raise InputError(f"--bbox: {bbox!r:.100} found, four numbers W,S,E,N expected") from None
+    settings = read_settings()
+    chips = StoredChips(open_storage(settings))
+    inputs = ExportBlock((west, south, east, north), name, version, title)
+    try:
+        with transaction(settings) as connection, shown_progress() as progress:
+            written = export_block(connection, chips, inputs, output, progress=progress)
+    finally:
+        chips.close()
+    show_one({"block": output, "points": written}, as_json=as_json)
 
 
 @app.command()
@@ -88,13 +137,23 @@ def withdraw(reference: Reference, as_json: AsJson = False) -> None:
     show_one(_record(block), as_json=as_json)
 
 
+def _published(published: Published) -> Row:
+    old = published.superseded
+    return {
+        **_record(published.block),
+        "superseded": None if old is None else f"{old.id}@{old.version}",
+    }
+
+
 def _record(block: Block) -> Row:
     return {
         "number": block.number,
         "id": block.id,
         "version": block.version,
         "state": block.state,
+        "priority": block.priority,
         "points": block.n_points,
+        "points superseded": block.n_superseded,
         "views": block.n_views,
         "title": block.title,
         "created_at": block.created_at,

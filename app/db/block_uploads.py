@@ -34,11 +34,6 @@ def find_archive(connection: Connection, upload_id: UUID) -> str | None:
     return found
 
 
-def delete_upload(connection: Connection, upload_id: UUID) -> None:
-    """Forget an archive that was ingested."""
-    connection.execute("delete from upload where id = %s", [upload_id])
-
-
 def delete_unwanted(connection: Connection) -> list[str]:
     """Forget archives that nobody asked for in time and no open job names; returns their keys."""
     with connection.cursor(row_factory=scalar_row) as cursor:

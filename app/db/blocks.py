@@ -10,7 +10,7 @@ import shapely
 from app.db.engine import Connection
 from services.formats.block import BlockContents
 from services.quality.block import BlockQuality, parse_quality_document, quality_document
-from services.types import Array
+from services.types import Array, IntArray
 
 BlockState = Literal["staged", "published", "withdrawn"]
 
@@ -170,6 +170,15 @@ def read_block_row(connection: Connection, number: int) -> Block:
     row = connection.execute(f"select {COLUMNS} from block where number = %s", [number]).fetchone()
     assert row is not None
     return _block(row)
+
+
+def find_typology(connection: Connection, point_ids: IntArray) -> list[str | None]:
+    """What kind of detail each of some points is, in the order given; they must exist."""
+    rows = connection.execute(
+        "select id, typology from point where id = any(%s)", [point_ids.tolist()]
+    ).fetchall()
+    found = {row["id"]: row["typology"] for row in rows}
+    return [found[point_id] for point_id in point_ids.tolist()]
 
 
 def storage_keys(connection: Connection) -> set[str]:

@@ -18,11 +18,14 @@ from app.db.jobs import Job, LostJob
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NotFound
 from app.storage import Storage, open_storage
+from app.usecases.block_export import EXPORT_BLOCK
 from app.usecases.block_ingestion import INGEST_BLOCK
 from app.usecases.processes import Process, Work
 from app.usecases.registration import REGISTER_SCENE
 
-PROCESSES: dict[str, Process] = {process.id: process for process in (REGISTER_SCENE, INGEST_BLOCK)}
+PROCESSES: dict[str, Process] = {
+    process.id: process for process in (REGISTER_SCENE, INGEST_BLOCK, EXPORT_BLOCK)
+}
 LONGEST_KEY = 200
 REPORT_EVERY_S = 0.5
 

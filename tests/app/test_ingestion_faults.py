@@ -16,7 +16,7 @@ import pytest
 
 from app.db import binary_copy, engine
 from app.db.embedded import Cluster
-from app.db.points import count_points
+from app.db.gauges import read_gauges
 from app.storage import Storage
 from app.usecases import blocks
 from services.errors import FormatError
@@ -230,7 +230,7 @@ def test_postgresql_killed_in_the_middle_of_an_ingestion_leaves_nothing(
                 "point": 2000,
                 "view": 4000,
             }
-            assert count_points(connection, None).number == 2000
+            assert read_gauges(connection).points == 2000
             assert blocks.sweep_storage(connection, storage) == []
 
 

@@ -1,0 +1,140 @@
+"""Points of the store as a block again, that ingests again as the same points."""
+
+import zipfile
+from uuid import UUID
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from app.db import engine, jobs
+from app.db import points as point_store
+from app.errors import InputError, NotFound
+from app.storage import StoredChips
+from app.usecases import blocks
+from app.usecases.block_export import ExportBlock, export_block
+from app.usecases.jobs import do_attempt
+from services.formats.block_check import check_block
+from services.formats.block_json import rectangle
+from services.types import point_chips
+from tests.factories import BOX, make_block
+
+COLUMNS = """st_asewkb(geom) as place, sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north,
+    corr_east_up, corr_north_up, n_views, saliency, typology, first_view, last_view, chip_count"""
+
+
+@pytest.fixture
+def chips(storage):
+    chips = StoredChips(storage)
+    yield chips
+    chips.close()
+
+
+def rows(connection, number: int) -> list:
+    points = connection.execute(
+        f"select {COLUMNS} from point where block_number = %s order by id", [number]
+    ).fetchall()
+    views = connection.execute(
+        """select v.view, v.gsd_m, v.incidence_deg, v.azimuth_deg, i.image_id, i.sensor, i.acquired_at
+           from view v join image i on i.block_number = v.point_id >> 26 and i.image = v.image
+           where v.point_id >> 26 = %s order by v.point_id, v.view""",
+        [number],
+    ).fetchall()
+    return [points, views]
+
+
+def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same_chips(
+    connection, storage, chips, tmp_path
+):
+    made = make_block(tmp_path / "block")
+    first = blocks.ingest_block(connection, storage, made.folder).block
+    blocks.publish_block(connection, "calanques")
+    written = export_block(connection, chips, ExportBlock(BOX, id="copy"), tmp_path / "copy")
+    assert written == 40
+    second = blocks.ingest_block(connection, storage, tmp_path / "copy").block
+
+    assert rows(connection, second.number) == rows(connection, first.number)
+    assert (np.load(tmp_path / "copy/chips/0000.npy") == np.load(made.folder / "chips/0000.npy")).all()
+    report = blocks.block_report(connection, second)
+    assert report.accuracy == made.metadata.accuracy
+    assert report.quality.points == 40
+
+
+def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, storage, chips, tmp_path):
+    half = (BOX[0], BOX[1], (BOX[0] + BOX[2]) / 2, BOX[3])
+    for name, kind, seed in (("a", np.uint8, 1), ("b", np.uint16, 2)):
+        folder = make_block(tmp_path / name, 30, seed, name, n_images=3, dtype=kind).folder
+        blocks.ingest_block(connection, storage, folder)
+        blocks.publish_block(connection, name)
+    expected = point_store.control_points(connection, rectangle(*half))
+
+    written = export_block(connection, chips, ExportBlock(half), tmp_path / "out")
+
+    contents = check_block(tmp_path / "out")
+    assert written == len(contents.points) == len(expected.points) > 10
+    assert contents.document.metadata.provenance.sources == ("a@1", "b@1")
+    images = [image.image_id for image in contents.document.images]
+    assert len(set(images)) == len(images) == 6
+    by_place = {tuple(place): row for row, place in enumerate(expected.points.lon_lat_h)}
+    with_chips = np.load(tmp_path / "out/chips/0000.npy")
+    assert with_chips.dtype == np.uint16
+    for row, place in enumerate(contents.points.lon_lat_h):
+        source = by_place[tuple(place)]
+        first = int(contents.points.chip_row[row])
+        assert (with_chips[first : first + 6] == point_chips(expected.points, chips, source)).all()
+        assert_allclose(
+            contents.points.covariance_m2[row],
+            expected.points.covariance_m2[source],
+            rtol=1e-6,
+            atol=1e-9,
+        )
+
+
+@pytest.mark.parametrize(
+    ("said", "error", "named"),
+    [
+        ({"bbox": (5.0, 44.0, 6.0, 43.0)}, InputError, "bbox"),
+        ({"bbox": (5.0, 43.0, 600.0, 44.0)}, InputError, "bbox"),
+        ({"bbox": (50.0, 43.0, 51.0, 44.0)}, NotFound, "no points"),
+        ({"bbox": BOX, "id": "../x"}, InputError, "cannot name a block"),
+        ({"bbox": BOX, "id": "x", "version": ""}, InputError, "cannot name a block"),
+    ],
+)
+def test_an_export_that_cannot_be_is_refused_and_writes_nothing(
+    connection, storage, chips, tmp_path, said, error, named
+):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    blocks.publish_block(connection, "calanques")
+    with pytest.raises(error, match=named):
+        export_block(connection, chips, ExportBlock(**said), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp_path):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    blocks.publish_block(connection, "calanques")
+    with pytest.raises(InputError, match="more than 4 points"):
+        export_block(connection, chips, ExportBlock(BOX), tmp_path / "out", most=4)
+
+
+def test_a_block_is_exported_by_a_job_as_an_archive(
+    client, settings, connection, storage, bearer, tmp_path
+):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    blocks.publish_block(connection, "calanques")
+    connection.commit()
+    reader = bearer("read")
+    asked = client.post(
+        "/processes/export-block/execution", json={"inputs": {"bbox": list(BOX)}}, headers=reader
+    )
+    assert asked.status_code == 201, asked.text
+    job_id = UUID(asked.json()["jobID"])
+    with engine.opened(settings) as database:
+        with database.transaction() as own:
+            job = jobs.claim(own, job_id, "a worker", 30.0)
+        do_attempt(database, settings, job_id, job.attempt)
+    reply = client.get(f"/jobs/{job_id}/results/block.zip", headers=reader)
+    assert reply.status_code == 200, reply.text
+    (tmp_path / "block.zip").write_bytes(reply.content)
+    zipfile.ZipFile(tmp_path / "block.zip").extractall(tmp_path / "out")
+    assert len(check_block(tmp_path / "out/block").points) == 5
