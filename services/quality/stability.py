@@ -8,7 +8,6 @@ import numpy as np
 from services.adjustment.scene import SceneAdjustment
 from services.errors import ComputationError
 from services.quality.accuracy import CIRCULAR_CE90, Statistics, normal_ce90, statistics
-from services.sensors.correction import ImageCorrection
 from services.types import Array, BoolArray, Measures
 
 Refit = Callable[[BoolArray], SceneAdjustment]
@@ -36,7 +35,8 @@ class Displacement:
 
     Attributes:
         place: "top left", "top right", "bottom right", "bottom left" or "centre".
-        median_px, max_px, median_m, max_m: over the draws.
+        median_px, max_px, median_m, max_m: length, over the draws.
+        x_m, y_m: along samples and lines in the first draw: one redone adjustment, as it is published.
     """
 
     place: str
@@ -44,6 +44,8 @@ class Displacement:
     max_px: float
     median_m: float
     max_m: float
+    x_m: float
+    y_m: float
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ def measure_stability(
             correction = refit(kept).correction
         except ComputationError:
             continue
-        moved.append(_distance_px(correction, adjustment.correction, places))
+        moved.append(correction.apply(places) - adjustment.correction.apply(places))
         held_out.append(measures.line_sample[held] - correction.apply(measures.predicted[held]))
     residual = np.concatenate(held_out) if held_out else np.empty((0, 2))
     return Stability(
@@ -161,17 +163,21 @@ def image_places(shape: tuple[int, int]) -> Array:
     )
 
 
-def _distance_px(a: ImageCorrection, b: ImageCorrection, line_sample: Array) -> Array:
-    """Distance (n,) between the positions two corrections give."""
-    return np.asarray(np.linalg.norm(a.apply(line_sample) - b.apply(line_sample), axis=1))
-
-
 def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
-    """Median and largest displacement over the draws (d, 5)."""
-    median, largest = np.median(moved_px, axis=0), moved_px.max(axis=0)
+    """Lengths over the draws, and the first, of displacements (d, 5, 2) in line and sample."""
+    length_px = np.linalg.norm(moved_px, axis=2)
+    median, largest = np.median(length_px, axis=0), length_px.max(axis=0)
     return tuple(
-        Displacement(place, float(m), float(top), float(m * gsd_m), float(top * gsd_m))
-        for place, m, top in zip(PLACES, median, largest, strict=True)
+        Displacement(
+            place=place,
+            median_px=float(median[k]),
+            max_px=float(largest[k]),
+            median_m=float(median[k] * gsd_m),
+            max_m=float(largest[k] * gsd_m),
+            x_m=float(moved_px[0, k, 1] * gsd_m),
+            y_m=float(moved_px[0, k, 0] * gsd_m),
+        )
+        for k, place in enumerate(PLACES)
     )
 
 

@@ -180,7 +180,7 @@ def funnel(summary: RegistrationSummary) -> Figure:
 
 
 def residuals_along(summary: RegistrationSummary) -> Figure:
-    """Residuals of the active points against their line and their sample: what a drift would leave."""
+    """Residuals of the active points against line and sample: what drift and jitter leave."""
     figure = Figure(figsize=(WIDTH_IN, 3.8), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", sharey="row")
     active = summary.measures.active
@@ -206,6 +206,40 @@ def residuals_along(summary: RegistrationSummary) -> Figure:
                 axes.set_xlabel(place_name)
             if j == 0:
                 axes.set_ylabel(f"{residual_name}, px")
+    return figure
+
+
+def residuals_by_height(summary: RegistrationSummary) -> Figure:
+    """Residuals of the active points on the ground against their height, along and across the view."""
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    measures = summary.measures
+    azimuth = np.radians(summary.acquisition.azimuth_deg)
+    names = ("along the view", "across the view") if np.isfinite(azimuth) else ("north", "east")
+    north_first = np.nan_to_num(azimuth)
+    away = np.array([-np.sin(north_first), -np.cos(north_first)])
+    if not np.isfinite(azimuth):
+        away = -away
+    across = np.array([-away[1], away[0]]) if np.isfinite(azimuth) else np.array([1.0, 0.0])
+    height_m = measures.lon_lat_h[measures.active, 2]
+    for axes, name, direction in zip(panels, names, (away, across), strict=True):
+        residual_m = measures.residual_m[measures.active] @ direction
+        style(axes)
+        axes.axhline(0.0, color=QUIET, linewidth=0.7)
+        axes.scatter(
+            height_m,
+            residual_m,
+            s=7,
+            color=ACTIVE,
+            alpha=0.7,
+            linewidths=0,
+            rasterized=len(height_m) > MANY_POINTS,
+        )
+        axes.plot(*_running_median(height_m, residual_m), color=DEACTIVATED, linewidth=1.4)
+        axes.locator_params(axis="x", nbins=4)
+        axes.set_xlabel("height, m")
+        axes.set_title(name, color=INK, fontsize=TEXT_PT, loc="left")
+    panels[0].set_ylabel("residual, m")
     return figure
 
 
@@ -293,10 +327,14 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
         )
 
 
-def _running_median(position: Array, value: Array, bins: int = 8) -> tuple[Array, Array]:
-    """Medians of equal parts of the points in order of position; empty with too few of them."""
+def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
+    """Medians of equal parts of the points in order of position; empty with too few of them.
+
+    Parts of six points or more, 40 at most: many points show what oscillates, few still show a slope.
+    """
     finite = np.isfinite(position) & np.isfinite(value)
-    if finite.sum() < 3 * bins:
+    bins = min(40, int(finite.sum()) // 6)
+    if bins < 4:
         return np.empty(0), np.empty(0)
     order = np.argsort(position[finite])
     parts = zip(

@@ -13,8 +13,9 @@ from markupsafe import Markup
 from services.quality.qualification import Criterion
 from services.reports import figures
 from services.reports.drawing import svg
+from services.reports.published import published_tables
 from services.reports.report import ChipPair, RegistrationReport, RegistrationSummary
-from services.reports.tables import ABSENT, criterion_words, number, percent, quantile
+from services.reports.tables import ABSENT, criterion_way, criterion_words, number, percent, quantile
 from services.types import Array, ChipArray
 
 PAIRS_PER_GROUP = 4
@@ -53,6 +54,7 @@ def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str
         figures.residual_histograms,
         figures.funnel,
         figures.residuals_along,
+        figures.residuals_by_height,
         figures.predicted_map,
     )
     return page.render(
@@ -61,6 +63,8 @@ def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str
         unmet=unmet_criteria(report),
         figures={draw.__name__: Markup(svg(draw, summary)) for draw in drawn},
         gallery=choose_pairs(summary.gallery),
+        published=published_tables(report),
+        unused=unused_points(summary),
         options=list(flat_options(report.options)),
         centre=_centre_words(report.scene.footprint_lon_lat),
     )
@@ -80,6 +84,7 @@ def _environment() -> Environment:
         percent=percent,
         quantile=quantile,
         words=criterion_words,
+        way=criterion_way,
         margin=margin_words,
         chip=chip_uri,
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
@@ -91,6 +96,11 @@ def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
     """Criteria that are not met, those that cost the most first."""
     unmet = [criterion for criterion in report.criteria if not criterion.passed]
     return sorted(unmet, key=lambda criterion: criterion.needed_for == "good")
+
+
+def unused_points(summary: RegistrationSummary) -> int:
+    """Points the scene could show that were not even looked for: others stand for them."""
+    return int((summary.measures.reason == "not_tried").sum())
 
 
 def choose_pairs(

@@ -22,6 +22,18 @@ CRITERION_NAMES = {
     "predicted_ce90_px": ("Predicted CE90, worst place", "px", 2),
 }
 
+CRITERION_WAYS = {
+    "active_points": "points kept by the final adjustment",
+    "coverage_percent": "cells of the image with an active point, of all cells",
+    "active_of_matched": "active points, of those matched",
+    "residual_std_px": "standard deviation of the active residuals, n - 1, the worse of x and y",
+    "displacement_px": "adjustment redone on a part of the points: median over the draws, worst of four "
+    "corners and centre",
+    "predicted_ce90_px": "covariance of the correction carried over the image: radius that holds 90 % "
+    "of its normal law, largest of the grid",
+}
+"""How the value of each criterion is calculated."""
+
 REASON_WORDS = {
     "not_tried": "not tried: others stand for it",
     "no_chip": "no chip at this sampling",
@@ -67,7 +79,7 @@ def quantile(found: Quantile, unit: str = "m") -> str:
 
 def criterion_words(criterion: Criterion) -> tuple[str, str, str]:
     """Name, value and limit of a criterion, for people."""
-    name, unit, decimals = CRITERION_NAMES[criterion.name]
+    name, unit, decimals = CRITERION_NAMES.get(criterion.name, (criterion.name.replace("_", " "), "", 3))
     limit = f"{criterion.comparison} {number(criterion.limit, decimals, unit)}"
     return name, number(criterion.value, decimals, unit), limit
 
@@ -91,6 +103,11 @@ def format_tables(report: RegistrationReport, width: int = 100) -> str:
     text = io.StringIO()
     Console(file=text, width=width, no_color=True, force_terminal=False).print(report_tables(report))
     return text.getvalue()
+
+
+def criterion_way(criterion: Criterion) -> str:
+    """How the value of a criterion is calculated, for people."""
+    return CRITERION_WAYS.get(criterion.name, "")
 
 
 def equipment_table(report: RegistrationReport) -> Table:

@@ -21,6 +21,7 @@ DRAWN = [
     figures.residual_histograms,
     figures.funnel,
     figures.residuals_along,
+    figures.residuals_by_height,
     figures.predicted_map,
 ]
 VOID = {"meta", "img", "br", "link", "input", "hr"}

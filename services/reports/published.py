@@ -1,0 +1,119 @@
+"""The tables that are published for scenes registered on SRP, in their columns and by their definitions.
+
+Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment), 3 and 5 (residuals), 6
+(displacement of corners and centre with 80 % of the points) and 7 (points held out).
+"""
+
+import math
+from dataclasses import dataclass
+
+from services.reports.report import RegistrationReport
+
+ABSENT = math.nan
+
+
+@dataclass(frozen=True)
+class PublishedTable:
+    """A table of one row.
+
+    Attributes:
+        title: what it shows, with its unit.
+        columns: as published.
+        values: NaN where a single scene has none.
+        decimals: of each value.
+        note: what the figures are and what they do not show.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    values: tuple[float, ...]
+    decimals: tuple[int, ...]
+    note: str
+
+
+def published_tables(report: RegistrationReport) -> tuple[PublishedTable, ...]:
+    """The five tables of one scene."""
+    return (
+        _equipment(report),
+        _image_residuals(report),
+        _ground_residuals(report),
+        _displacements(report),
+        _held_out(report),
+    )
+
+
+def _equipment(report: RegistrationReport) -> PublishedTable:
+    found = report.equipment
+    return PublishedTable(
+        "Equipment",
+        ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app"),
+        (
+            100.0 * found.active_of_matched,
+            100.0 * found.active_of_visible,
+            found.active,
+            found.matched,
+            found.visible,
+        ),
+        (1, 1, 0, 0, 0),
+        "Popini: points the scene could show. Spatio: matched. Actif: kept by the adjustment. "
+        "Pct_app: Actif / Spatio. Pct_app-ini: Actif / Popini, which counts points left unused too.",
+    )
+
+
+def _image_residuals(report: RegistrationReport) -> PublishedTable:
+    """Mean and spread of the image residuals in metres; lengths are of the vectors (x, y)."""
+    x, y, gsd_m = report.image_residuals_px.x, report.image_residuals_px.y, report.scene.gsd_m
+    return PublishedTable(
+        "Image residuals, m",
+        ("dx_app", "dy_app", "dxy_app", "ectx_app", "ecty_app", "ectxy_app"),
+        tuple(
+            gsd_m * value
+            for value in (x.mean, y.mean, math.hypot(x.mean, y.mean))
+            + (x.std, y.std, math.hypot(x.std, y.std))
+        ),
+        (2,) * 6,
+        "Means and standard deviations along samples (x) and lines (y), pixels times the ground "
+        "sampling; xy is the length of the two.",
+    )
+
+
+def _ground_residuals(report: RegistrationReport) -> PublishedTable:
+    east, north = report.ground_residuals_m.east, report.ground_residuals_m.north
+    return PublishedTable(
+        "Ground residuals, m",
+        ("dx_amer", "dy_amer", "ectx_amer", "ecty_amer", "dZ_amer", "ectZ_amer"),
+        (east.mean, north.mean, east.std, north.std, ABSENT, ABSENT),
+        (2,) * 6,
+        "The image residuals carried to the ground at each point's height, east and north. In the "
+        "published tables points move too, within a block of images; one scene keeps them where they "
+        "are and says nothing of Z.",
+    )
+
+
+def _displacements(report: RegistrationReport) -> PublishedTable:
+    places = report.stability.displacements
+    moved = [value for place in places for value in (place.x_m, place.y_m)] or [ABSENT] * 10
+    names = tuple(f"d{axis}{corner}" for corner in "0123c" for axis in "XY")
+    return PublishedTable(
+        f"Displacement with {100 * report.stability.kept_share:.0f} % of the points, m",
+        (*names, "Incidence (°)"),
+        (*moved, report.scene.acquisition.incidence_deg),
+        (*(2,) * 10, 1),
+        report.stability.note
+        or "Corners clockwise from the first line and sample, then the centre, along samples (X) and "
+        "lines (Y), in the first draw. It shows how well the solution repeats, not how right it is: an "
+        "error that all points share moves nothing.",
+    )
+
+
+def _held_out(report: RegistrationReport) -> PublishedTable:
+    x, y = report.stability.held_out_m.x, report.stability.held_out_m.y
+    return PublishedTable(
+        f"Points held out ({100 * (1 - report.stability.kept_share):.0f} %), m",
+        ("POP", "dX_moy", "dX_ect", "dY_moy", "dY_ect", "dXY_moy", "dXY_ect", "Incidence (°)"),
+        (report.stability.held_out_per_draw, x.mean, x.std, y.mean, y.std)
+        + (math.hypot(x.mean, y.mean), math.hypot(x.std, y.std), report.scene.acquisition.incidence_deg),
+        (0, *(2,) * 6, 1),
+        f"POP points in each of {report.stability.draws} draws, the figures over all of them. They come "
+        "from the same base as the points that were used: a control that is nearly independent.",
+    )

@@ -1,0 +1,72 @@
+"""The published tables: their columns, and their definitions held against the published figures."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from services.reports.published import published_tables
+from services.reports.report import build_report
+
+
+def values(table):
+    return dict(zip(table.columns, table.values, strict=True))
+
+
+def test_the_tables_have_the_published_columns(report):
+    equipment, image, ground, moved, held_out = published_tables(report)
+    assert equipment.columns == ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app")
+    assert image.columns == ("dx_app", "dy_app", "dxy_app", "ectx_app", "ecty_app", "ectxy_app")
+    assert ground.columns[-2:] == ("dZ_amer", "ectZ_amer")
+    assert " ".join(moved.columns).startswith("dX0 dY0 dX1 dY1 dX2 dY2 dX3 dY3 dXc dYc")
+    assert held_out.columns[:3] == ("POP", "dX_moy", "dX_ect")
+    for table in (equipment, image, ground, moved, held_out):
+        assert len(table.columns) == len(table.values) == len(table.decimals)
+
+
+def test_a_published_row_comes_out_of_its_own_counts_and_components(summarised):
+    """S7PX--2017021834832683CP: 494 of 526 of 997; P1BPX-2019080641037699CP: -2.9, 1.3, 3.4, 2.0."""
+    report = build_report(summarised())
+    counts = replace(
+        report.equipment,
+        visible=997,
+        matched=526,
+        active=494,
+        active_of_matched=494 / 526,
+        active_of_visible=494 / 997,
+    )
+    residuals = report.image_residuals_px
+    residuals = replace(
+        residuals,
+        x=replace(residuals.x, mean=-5.8, std=6.8),
+        y=replace(residuals.y, mean=2.6, std=4.0),
+    )
+    equipment, image, *_ = published_tables(
+        replace(report, equipment=counts, image_residuals_px=residuals)
+    )
+    published_percent = (93.9, 49.5)
+    assert equipment.values[:2] == pytest.approx(published_percent, abs=0.05)
+    assert report.scene.gsd_m == 0.5
+    published_m = (-2.9, 1.3, 3.2, 3.4, 2.0, 3.9)
+    assert image.values == pytest.approx(published_m, abs=0.05)
+
+
+def test_displacements_are_those_of_one_draw_with_their_signs(report):
+    moved = values(published_tables(report)[3])
+    for k, place in enumerate(report.stability.displacements):
+        corner = "0123c"[k]
+        length_m = math.hypot(moved[f"dX{corner}"], moved[f"dY{corner}"])
+        assert 0.0 < length_m <= place.max_m * (1.0 + 1e-12)
+        assert (moved[f"dX{corner}"], moved[f"dY{corner}"]) == (place.x_m, place.y_m)
+    assert moved["Incidence (°)"] == report.scene.acquisition.incidence_deg
+
+
+def test_a_scene_without_draws_has_dashes_and_the_reason(summarised):
+    report = build_report(summarised(n=5, lost=1, wrong=0))
+    table = published_tables(report)[3]
+    assert all(math.isnan(value) for value in table.values[:10])
+    assert table.note == report.stability.note != ""
+
+
+def test_a_single_scene_says_nothing_of_heights(report):
+    assert math.isnan(values(published_tables(report)[2])["dZ_amer"])
