@@ -9,7 +9,7 @@ from types import FrameType
 
 import typer
 
-from app.cli import block, db, demo, points, production, scene, serve, token, worker
+from app.cli import audit, block, db, demo, points, production, scene, serve, token, worker
 from app.errors import AmersError, ComputationError
 
 EXIT_REFUSED = 2
@@ -31,6 +31,7 @@ app.add_typer(token.app, name="token")
 app.command("demo")(demo.demo)
 app.command("serve")(serve.serve)
 app.command("worker")(worker.worker)
+app.command("audit")(audit.audit)
 
 
 def main() -> None:

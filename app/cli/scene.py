@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from app.config import read_settings
 from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
+from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorectification
 from app.usecases.registration import (
     SceneFiles,
     points_of_block,
@@ -21,6 +23,7 @@ from app.usecases.registration import (
     record,
     run_registration,
 )
+from services.orthorectify import OrthoOptions
 from services.registration import RegistrationOptions
 from services.reports.document import report_document
 from services.types import Progress
@@ -52,7 +55,10 @@ def register(
         Path, typer.Option("-o", "--output", help="Folder; one inside it for each of several scenes.")
     ] = Path("registered"),
     server: Annotated[str | None, typer.Option(help="Let this service do it.")] = None,
-    token: Annotated[str | None, typer.Option(help="For the service.")] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="AMERS_TOKEN", help="For the service; better in the environment."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Refine the model of scenes on control points: report, points and refined model go into a folder.
@@ -77,6 +83,50 @@ def register(
         raise typer.Exit(1) from failure
     _show([outcome for outcome in outcomes if isinstance(outcome, dict)], as_json, len(scenes))
     _raise_worst([outcome for outcome in outcomes if isinstance(outcome, AmersError)])
+
+
+@app.command()
+def ortho(
+    scene: Annotated[Path, typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    dem: Annotated[Path, typer.Option(help="GeoTIFF with the heights of the ground.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The GeoTIFF to write.")],
+    model: Annotated[
+        Path | None,
+        typer.Option(help="File of the model, refined perhaps, if it is not found by itself."),
+    ] = None,
+    vertical: Annotated[
+        str | None,
+        typer.Option(help="What the heights are counted from: ellipsoid, EGM96, EGM2008, EPSG:…"),
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    fill_px: Annotated[
+        int, typer.Option(help="Fill voids of the terrain from so many nodes away.", min=0, max=50)
+    ] = 0,
+    crs: Annotated[
+        str | None, typer.Option(help="Of the map; by default the UTM zone of the centre.")
+    ] = None,
+    gsd_m: Annotated[
+        float | None, typer.Option(help="Ground sampling; by default that of the scene.", min=0.001)
+    ] = None,
+    kernel: Annotated[str, typer.Option(help="cubic or bilinear.")] = "cubic",
+    tolerance_px: Annotated[
+        float, typer.Option(help="How far positions may be from the model's, pixels.", min=1e-4)
+    ] = 0.1,
+    hide: Annotated[
+        bool, typer.Option("--hide", help="Leave out ground that other ground hides from the sensor.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Lay a scene on a map through its model and a terrain: a cloud-optimised GeoTIFF with overviews."""
+    if kernel not in ("cubic", "bilinear"):
+        raise InputError(f"--kernel: expected cubic or bilinear, found {kernel}")
+    options = OrthoOptions("cubic" if kernel == "cubic" else "bilinear", tolerance_px, hide)
+    terrain = TerrainFile(dem, vertical, geoid, fill_px)
+    with shown_progress() as progress:
+        made = run_orthorectification(
+            scene, model, terrain, output, OrthoMap(crs, gsd_m), options, progress
+        )
+    show_one(asdict(made), as_json=as_json)
 
 
 def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:

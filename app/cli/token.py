@@ -16,16 +16,23 @@ app = typer.Typer(help="Who may call the API.", no_args_is_help=True)
 def create(
     name: Annotated[str, typer.Argument(help="What the token is called, for people.")],
     scope: Annotated[
-        list[str], typer.Option(help="read, register or admin; may be given several times.")
+        list[str], typer.Option(help="read, register, monitor or admin; may be given several times.")
     ],
     days: Annotated[
         int | None, typer.Option(help="How long it is valid; for ever if not given.")
+    ] = None,
+    upload_quota_bytes: Annotated[
+        int | None,
+        typer.Option(help="What its scenes may take at once; as the settings say if not given."),
+    ] = None,
+    job_quota: Annotated[
+        int | None, typer.Option(help="Its open jobs at once; as the settings say if not given.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a token and print its secret, this once."""
     with transaction() as connection:
-        new = tokens.create_token(connection, name, scope, days)
+        new = tokens.create_token(connection, name, scope, days, upload_quota_bytes, job_quota)
     record = {**_record(new.token), "secret": new.secret}
     if as_json:
         show_one(record, as_json=True)
@@ -61,4 +68,7 @@ def _record(token: Token) -> Row:
         "created_at": token.created_at,
         "expires_at": token.expires_at,
         "revoked_at": token.revoked_at,
+        "subject": token.subject,
+        "upload_quota_bytes": token.upload_quota_bytes,
+        "job_quota": token.job_quota,
     }

@@ -24,7 +24,9 @@ class Installation:
 
 def installation_figures(connection: Connection, data_folder: Path) -> Installation:
     """The figures of an installation at this moment."""
-    disk = shutil.disk_usage(data_folder)
+    # The folder is made by the first who writes into it.
+    there = next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
+    disk = shutil.disk_usage(there)
     return Installation(gauges.read_gauges(connection), disk.free, disk.total)
 
 

@@ -1,0 +1,234 @@
+"""What is recorded, watched and logged, what a token may have, and who may ask for it."""
+
+import json
+import logging
+from uuid import UUID
+
+import psycopg
+import pytest
+from fastapi.testclient import TestClient
+from prometheus_client.parser import text_string_to_metric_families
+
+from app import logs
+from app.db import engine, jobs, scenes
+from app.db.audit import list_changes
+from app.errors import TooLarge, TooMany
+from app.main import create_app
+from app.origin import Origin, working_for
+from app.usecases import blocks, quotas
+from app.usecases.tokens import create_token
+from tests.factories import make_block
+
+
+def changes(connection, **chosen) -> list:
+    """The recorded changes, the oldest first."""
+    found = {"before": None, "kind": None, "subject": None, **chosen}
+    return list_changes(connection, 1000, **found)[::-1]
+
+
+def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
+    connection, storage, tmp_path
+):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    blocks.publish_block(connection, "calanques")
+    blocks.withdraw_block(connection, "calanques")
+    found = changes(connection, kind="block", subject="calanques@1")
+    assert [change.action for change in found] == ["created", "changed", "changed"]
+    assert found[0].before is None
+    assert [(change.after or {})["state"] for change in found] == ["staged", "published", "withdrawn"]
+    assert found[2].before is not None
+    assert found[2].before["state"] == "published"
+    assert found[0].actor_name.endswith("on the command line")
+
+
+@pytest.mark.parametrize(
+    "statement", ["update audit set actor_name = 'x'", "delete from audit", "truncate audit"]
+)
+def test_the_record_only_grows(connection, statement):
+    create_token(connection, "a", ["read"])
+    with pytest.raises(psycopg.errors.InsufficientPrivilege, match="only grows"):
+        connection.execute(statement)
+
+
+def test_a_change_over_the_api_names_caller_and_request(client, connection, bearer):
+    admin = bearer("admin")
+    made = client.post(
+        "/tokens",
+        json={"name": "office", "scopes": ["read"], "days": 3},
+        headers={**admin, "X-Request-ID": "morning-1"},
+    )
+    assert made.headers["X-Request-ID"] == "morning-1"
+    found = changes(connection, kind="token", subject=made.json()["id"])
+    (change,) = found
+    assert (change.actor_name, change.request_id) == ("a token to admin", "morning-1")
+    assert "secret_hash" not in (change.after or {})
+    listed = client.get("/audit", params={"kind": "token", "limit": 1}, headers=admin).json()
+    assert listed["changes"][0]["subject"] == made.json()["id"]
+    assert any(link["rel"] == "next" for link in listed["links"])
+
+
+def test_the_progress_of_a_job_is_no_change_and_its_states_are(connection):
+    job = jobs.create(connection, "register-scene", {})
+    attempt = jobs.claim(connection, job.id, "w", 30.0)
+    jobs.report(connection, job.id, attempt.attempt, 10, "on the way")
+    jobs.succeed(connection, job.id, attempt.attempt, {})
+    found = changes(connection, kind="job")
+    assert [(change.after or {})["state"] for change in found] == ["accepted", "running", "successful"]
+
+
+def test_work_of_a_job_is_recorded_with_the_owner_of_the_job(dsn, connection):
+    owner = create_token(connection, "owner", ["register"]).token
+    job = jobs.create(connection, "ingest-block", {}, owner.id)
+    connection.commit()
+    with working_for(Origin(actor_name="worker 7", job_id=job.id)), engine.connect(dsn) as own:
+        scenes.begin_upload(own, owner.id, "a", "a.tif", None)
+    (change,) = changes(connection, kind="scene")
+    assert (change.actor, change.actor_name, change.job_id) == (owner.id, "worker 7", job.id)
+
+
+@pytest.mark.parametrize("path", ["/audit", "/tokens"])
+def test_the_record_and_the_tokens_are_for_administrators(client, bearer, path):
+    assert client.get(path).status_code == 401
+    assert client.get(path, headers=bearer("register")).status_code == 403
+    assert client.get(path, headers=bearer("admin")).status_code == 200
+
+
+def test_an_administrator_makes_lists_and_revokes_tokens_over_the_api(client, bearer):
+    admin = bearer("admin")
+    body = {"name": "office", "scopes": ["register"], "job_quota": 2}
+    made = client.post("/tokens", json=body, headers=admin)
+    assert made.status_code == 201
+    token = made.json()
+    own = {"Authorization": f"Bearer {token['secret']}"}
+    assert client.get("/tokens/self", headers=own).json()["scopes"] == ["register"]
+    listed = client.get("/tokens", headers=admin).json()["tokens"]
+    assert token["id"] in [one["id"] for one in listed]
+    assert "secret" not in json.dumps(listed)
+    revoked = client.delete(f"/tokens/{token['id']}", headers=admin)
+    assert revoked.json()["revoked_at"] is not None
+    assert client.get("/tokens/self", headers=own).status_code == 401
+    assert client.get("/tokens/self").status_code == 401
+    assert client.delete(f"/tokens/{token['id']}", headers=admin).status_code == 404
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"name": "x", "scopes": ["everything"]},
+        {"name": "", "scopes": ["read"]},
+        {"name": "x", "scopes": []},
+        {"name": "x", "scopes": ["read"], "days": 0},
+        {"name": "x", "scopes": ["read"], "job_quota": -1},
+        {"name": "x", "scopes": ["read"], "upload_quota_bytes": 2**63},
+        {"name": "x", "scopes": ["read"], "surprise": 1},
+    ],
+)
+def test_a_token_that_makes_no_sense_is_not_made_over_the_api(client, bearer, body):
+    assert client.post("/tokens", json=body, headers=bearer("admin")).status_code == 422
+
+
+def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
+    few = create_token(connection, "few", ["register"], job_quota=1).token
+    quotas.require_free_job(connection, settings, few)
+    job = jobs.create(connection, "register-scene", {}, few.id)
+    with pytest.raises(TooMany, match="has 1 jobs that have not ended, 1 are allowed"):
+        quotas.require_free_job(connection, settings, few)
+    jobs.dismiss(connection, job.id)
+    quotas.require_free_job(connection, settings, few)
+
+
+def test_a_token_uploads_no_more_bytes_than_its_quota(connection, settings):
+    small = create_token(connection, "small", ["register"], upload_quota_bytes=1000).token
+    assert quotas.upload_allowance(connection, settings, small, 1000) == 1000
+    scene_id = scenes.begin_upload(connection, small.id, "a", "a.tif", None)
+    scenes.finish_upload(connection, scene_id, "scenes/a/a.tif", 900, "0" * 64)
+    assert quotas.upload_allowance(connection, settings, small) == 100
+    with pytest.raises(TooLarge, match="900 of 1000 bytes are used"):
+        quotas.upload_allowance(connection, settings, small, 101)
+    scenes.remove_scene(connection, scene_id)
+    assert quotas.upload_allowance(connection, settings, small) == 1000
+
+
+def families(text: str) -> dict:
+    return {family.name: family for family in text_string_to_metric_families(text)}
+
+
+def test_metrics_tell_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
+    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 7).folder)
+    blocks.publish_block(connection, "calanques")
+    jobs.create(connection, "register-scene", {})
+    connection.commit()
+    client.get("/healthz")
+    client.get("/no/such/thing")
+    client.request("ODD", "/healthz")
+    found = families(client.get("/metrics", headers=bearer("monitor")).text)
+    value = {name: family.samples[0].value for name, family in found.items() if family.samples}
+    assert value["amers_points_published"] == 7
+    assert value["amers_queue_length"] == 1
+    assert value["amers_oldest_waiting_job_seconds"] > 0
+    assert 0 < value["amers_disk_free_bytes"] < value["amers_disk_total_bytes"]
+    assert value["amers_database_bytes"] > 1_000_000
+    (waiting,) = found["amers_jobs"].samples
+    assert waiting.labels == {"kind": "register-scene", "state": "accepted"}
+    counts = {
+        (sample.labels["method"], sample.labels["route"], sample.labels["status"]): sample.value
+        for sample in found["amers_request_duration_seconds"].samples
+        if sample.name.endswith("_count")
+    }
+    assert counts["GET", "/healthz", "200"] == 1
+    assert counts["GET", "none", "404"] == 1
+    assert not any(method == "ODD" for method, _, _ in counts)
+
+
+def test_metrics_are_closed_until_a_setting_opens_them(client, settings, bearer):
+    assert client.get("/metrics").status_code == 401
+    assert client.get("/metrics", headers=bearer("read")).status_code == 403
+    client.app.state.settings = settings.model_copy(update={"public_metrics": True})
+    assert client.get("/metrics").status_code == 200
+
+
+@pytest.mark.parametrize("sent", ["with blank", "x" * 65, "é", "a/b"])
+def test_a_request_id_that_is_none_is_replaced(client, sent):
+    given = client.get("/healthz", headers={"X-Request-ID": sent.encode()}).headers["X-Request-ID"]
+    assert UUID(given)
+
+
+def test_an_unexpected_error_names_its_request(client):
+    @client.app.get("/broken")
+    def broken() -> None:
+        raise KeyError("the inside")
+
+    reply = client.get("/broken", headers={"X-Request-ID": "find-me"})
+    assert (reply.status_code, reply.headers["X-Request-ID"]) == (500, "find-me")
+
+
+def test_pages_of_other_sites_may_call_only_where_a_setting_names_them(settings):
+    asked = {"Origin": "https://map.example", "Access-Control-Request-Method": "GET"}
+    with TestClient(create_app(settings)) as closed:
+        assert "access-control-allow-origin" not in closed.options("/healthz", headers=asked).headers
+    chosen = settings.model_copy(update={"cors_origins": ("https://map.example",)})
+    with TestClient(create_app(chosen)) as opened:
+        reply = opened.options("/healthz", headers=asked)
+        assert reply.headers["access-control-allow-origin"] == "https://map.example"
+        other = opened.options("/healthz", headers={**asked, "Origin": "https://evil.example"})
+        assert "access-control-allow-origin" not in other.headers
+
+
+def record(message: str, **extra) -> logging.LogRecord:
+    made = logging.makeLogRecord({"name": "amers", "levelname": "INFO", "msg": message, **extra})
+    return made
+
+
+def test_a_line_of_the_log_carries_request_job_and_caller():
+    job_id, actor = UUID(int=1), UUID(int=2)
+    with working_for(Origin(actor=actor, request_id="r-1", job_id=job_id)):
+        line = json.loads(logs.Lines("json").format(record("done", status=200)))
+        plain = logs.Lines("text").format(record("done", status=200, path="a b"))
+    assert (line["request_id"], line["job_id"], line["actor"]) == ("r-1", str(job_id), str(actor))
+    assert (line["message"], line["status"]) == ("done", 200)
+    assert plain.endswith(f'done request_id=r-1 job_id={job_id} actor={actor} status=200 path="a b"')
+
+
+def test_what_somebody_sends_never_looks_like_a_line_of_the_log():
+    line = logs.Lines("text").format(record("name\n2026-01-01 INFO forged"))
+    assert "\n" not in line
