@@ -22,7 +22,6 @@ ARTEFACTS = ROOT / "tests" / "artefacts"
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
 patience_ms = 90_000
-map_patience_ms = 60_000
 chip_px = 101
 points_of_the_block = 40
 vector_colour = np.array([0xB3, 0x26, 0x1E])
@@ -116,6 +115,11 @@ def tab_to(page: Page, name: str) -> None:
     raise AssertionError(f"the Tab key does not lead to {name}")
 
 
+def until_drawn(page: Page) -> None:
+    """Wait for the map to have drawn all it has been given."""
+    expect(page.locator("#map")).to_have_attribute("aria-busy", "false")
+
+
 def vectors_drawn_px(page: Page) -> int:
     """Pixels of the map in the colour of the residuals."""
     picture = imread(io.BytesIO(page.locator("#map").screenshot()))[:, :, :3]
@@ -151,11 +155,7 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     assert f"{found['visible']}, {found['matched']}, {found['active']}" in figures
     assert page.locator(".badge").first.inner_text() == report["verdict"]
     assert page.locator("tbody tr").count() == len(report["criteria"])
-    page.wait_for_function("document.querySelector('#map canvas')")
-    deadline = map_patience_ms
-    while vectors_drawn_px(page) < enough_px and deadline > 0:
-        page.wait_for_timeout(500)
-        deadline -= 500
+    until_drawn(page)
     page.screenshot(path=ARTEFACTS / "report.png")
     assert vectors_drawn_px(page) >= enough_px
 
@@ -187,6 +187,7 @@ def test_an_administrator_withdraws_a_block_and_publishes_it_again(
     state = page.locator(".badge")
     expect(state).to_have_text("published")
     assert served() == points_of_the_block
+    until_drawn(page)
     page.screenshot(path=ARTEFACTS / "block.png")
     page.get_by_role("button", name="Withdraw").click()
     expect(state).to_have_text("withdrawn")
@@ -207,6 +208,7 @@ def test_a_point_shows_all_its_chips(visit, secret):
     page = visit("#/points", secret)
     points = page.get_by_role("list", name="Points in view").get_by_role("link")
     expect(points).to_have_count(points_of_the_block)
+    until_drawn(page)
     page.screenshot(path=ARTEFACTS / "points.png")
     points.first.click()
     expect(page.get_by_role("heading", name="Point")).to_be_visible()
@@ -217,16 +219,15 @@ def test_a_point_shows_all_its_chips(visit, secret):
     )
     widths = chips.evaluate_all("(all) => all.map((chip) => chip.naturalWidth)")
     assert widths == [chip_px] * 4
+    until_drawn(page)
     page.screenshot(path=ARTEFACTS / "point.png")
 
 
-def test_a_wrong_token_is_refused_in_the_words_of_the_service(visit, browser, service):
-    page = browser.new_page()
-    page.goto(f"{service.url}/map#/access")
+def test_a_wrong_token_is_refused_in_the_words_of_the_service(visit):
+    page = visit("#/access")
     page.get_by_label("Token").fill("wrong")
     page.get_by_role("button", name="Sign in").click()
     expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
-    page.close()
 
 
 VIEWS = ("points", "scenes", "blocks", "block/1", "access")

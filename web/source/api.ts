@@ -10,7 +10,6 @@ export const BASE = new URL(".", location.href.replace(/[?#].*$/, "")).href;
 export type Verdict = "good" | "uncertain" | "failed" | (string & {});
 
 export interface BlockProperties {
-  number: number;
   id: string;
   version: string;
   title: string;
@@ -20,6 +19,7 @@ export interface BlockProperties {
   created_at: string;
   state_changed_at: string;
 }
+/** Its id is the number of the version, that of its properties the name of the block. */
 export type BlockFeature = Feature<Polygon, BlockProperties>;
 
 export interface View {

@@ -33,6 +33,8 @@ export class Atlas {
       return;
     }
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
+    map.on("dataloading", () => container.setAttribute("aria-busy", "true"));
+    map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
       const { x, y } = event.point;
       const [found] = map.queryRenderedFeatures(
@@ -47,12 +49,6 @@ export class Atlas {
     map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
     map.on("mouseleave", "points", () => (map.getCanvas().style.cursor = ""));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", (scheme) => this.repaint(scheme.matches));
-  }
-
-  /** Resolves when everything asked for is drawn. */
-  async idle(): Promise<void> {
-    await this.ready;
-    if (this.map && !this.map.areTilesLoaded()) await this.map.once("idle");
   }
 
   bounds(): Bounds {

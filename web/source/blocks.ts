@@ -1,6 +1,6 @@
 // Blocks: what there is, how good each is, and its publication by an administrator.
 
-import { type BlockFeature, type BlockProperties, get, type Page, post } from "./api";
+import { type BlockFeature, get, type Page, post } from "./api";
 import { badge, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { announce, type ShowView } from "./place";
 
@@ -32,7 +32,7 @@ export const showBlocks: ShowView = async ({ panel, atlas, signal }) => {
     h("h1", { tabindex: -1 }, "Blocks"),
     h("p", {}, "A block is one production of points, published and withdrawn as a whole."),
     features.length === 0 ? h("p", { class: "quiet" }, "There is none yet.") : null,
-    h("ul", { class: "list" }, ...features.map(({ properties }) => row(properties))),
+    h("ul", { class: "list" }, ...features.map(row)),
   );
 };
 
@@ -87,11 +87,11 @@ export const showBlock: ShowView = async (place, number) => {
   }
 };
 
-function row(block: BlockProperties): HTMLElement {
+function row({ id, properties: block }: BlockFeature): HTMLElement {
   return h(
     "li",
     {},
-    h("a", { href: `#/block/${block.number}` }, block.title || block.id),
+    h("a", { href: `#/block/${id}` }, block.title || block.id),
     badge(block.state),
     h("span", { class: "quiet" }, `${block.id}@${block.version} · ${plural(block.n_points, "point")}`),
   );
