@@ -330,11 +330,13 @@ def _scatter_reasons(axes: Axes, summary: RegistrationSummary) -> None:
 def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
     """Medians of equal parts of the points in order of position; empty with too few of them.
 
-    Parts of six points or more, 40 at most: many points show what oscillates, few still show a slope.
+    Four parts at least and 40 at most, of a dozen points where there are so many: few points show a
+    slope, many show what oscillates, and neither shows noise for it.
     """
     finite = np.isfinite(position) & np.isfinite(value)
-    bins = min(40, int(finite.sum()) // 6)
-    if bins < 4:
+    n = int(finite.sum())
+    bins = min(40, max(4, n // 12))
+    if n < 6 * bins:
         return np.empty(0), np.empty(0)
     order = np.argsort(position[finite])
     parts = zip(
