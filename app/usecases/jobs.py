@@ -14,17 +14,19 @@ from app.auth import Scope, allows, require
 from app.config import Settings
 from app.db import jobs
 from app.db.engine import Connection, Database
-from app.db.jobs import Job, LostJob
+from app.db.jobs import Job, JobFilter, LostJob
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NotFound
 from app.storage import Storage, open_storage
+from app.usecases import quotas
 from app.usecases.block_export import EXPORT_BLOCK
 from app.usecases.block_ingestion import INGEST_BLOCK
+from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work
 from app.usecases.registration import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
-    process.id: process for process in (REGISTER_SCENE, INGEST_BLOCK, EXPORT_BLOCK)
+    process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)
 }
 LONGEST_KEY = 200
 REPORT_EVERY_S = 0.5
@@ -46,6 +48,7 @@ def find_process(process_id: str) -> Process:
 
 def execute(
     connection: Connection,
+    settings: Settings,
     caller: Token,
     process_id: str,
     given: dict[str, Any],
@@ -56,6 +59,7 @@ def execute(
     Raises:
         NotFound: no such process, or an input that is not there for this caller.
         NotAllowed: the caller's token lacks the scope.
+        TooMany: the caller has as many jobs as he may have at once.
         InputError: the inputs are not those of the process, or the key came with other ones before.
     """
     process = find_process(process_id)
@@ -69,6 +73,7 @@ def execute(
         if known is not None:
             return _same_request(known, process_id, inputs)
     process.check(connection, caller, parsed)
+    quotas.require_free_job(connection, settings, caller)
     job = jobs.create(connection, process_id, inputs, caller.id, idempotency_key)
     if job is not None:
         return job
@@ -97,9 +102,23 @@ def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
     return job
 
 
-def list_jobs(connection: Connection, caller: Token, limit: int) -> list[Job]:
-    """The caller's newest jobs; everybody's for an administrator."""
-    return jobs.newest(connection, None if allows(caller, Scope.ADMIN) else caller.id, limit)
+def list_jobs(
+    connection: Connection, caller: Token, wanted: JobFilter, limit: int, after: UUID | None = None
+) -> list[Job]:
+    """The caller's newest jobs, or those that follow one of them; everybody's for an administrator.
+
+    Raises:
+        NotFound: the job to follow is none of the caller's.
+    """
+    if after is not None:
+        visible_job(connection, caller, after)
+    owner = None if allows(caller, Scope.ADMIN) else caller.id
+    return jobs.newest(connection, owner, wanted, limit, after)
+
+
+def queue_position(connection: Connection, job: Job) -> int | None:
+    """How many jobs are to be begun before this one and with it; None when it does not wait."""
+    return jobs.position(connection, job) if job.state == "accepted" else None
 
 
 def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:

@@ -1,0 +1,245 @@
+"""Laying a scene on a map through its model and a terrain."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+
+from app.auth import Scope
+from app.db import scenes
+from app.db.engine import Connection
+from app.db.tokens import Token
+from app.errors import Conflict, InputError
+from app.usecases.processes import Commit, Process, Work
+from app.usecases.scenes import clean_name, local_image, visible_scene
+from services.formats.bands import one_band
+from services.formats.dem import read_dem
+from services.formats.ortho_files import write_cog
+from services.formats.raster import RasterImage
+from services.formats.scenes import read_scene
+from services.orthorectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
+from services.types import Progress, no_progress
+
+ORTHO_NAME = "ortho.tif"
+_KEPT_TYPES = ("uint8", "uint16", "int16", "float32")
+
+
+@dataclass(frozen=True)
+class TerrainFile:
+    """A terrain on the disk.
+
+    Attributes:
+        dem: heights on a map.
+        vertical: what they are counted from, when the file does not say; see `read_dem`.
+        geoid: grid file of the geoid, if PROJ has none.
+        fill_px: voids are filled from heights at most so many nodes away.
+    """
+
+    dem: Path
+    vertical: str | None = None
+    geoid: Path | None = None
+    fill_px: int = 0
+
+
+@dataclass(frozen=True)
+class OrthoMap:
+    """The map that is made.
+
+    Attributes:
+        crs: reference system; by default the UTM zone of the centre.
+        gsd_m: ground sampling; by default that of the scene.
+    """
+
+    crs: str | None = None
+    gsd_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Orthorectified:
+    """What was made.
+
+    Attributes:
+        path: of the image.
+        crs: of its map.
+        lines, samples, bands: its size.
+        gsd_m: ground sampling.
+        seen: share of its pixels that show something.
+        error_px: largest difference from the scene's model where the mapping was checked.
+        vertical: how the vertical datum of the terrain is known.
+    """
+
+    path: Path
+    crs: str
+    lines: int
+    samples: int
+    bands: int
+    gsd_m: float
+    seen: float
+    error_px: float
+    vertical: str
+
+
+@dataclass(frozen=True)
+class OrthorectifyScene:
+    """What a user says to have a scene rectified.
+
+    Attributes:
+        scene: id of an uploaded scene.
+        dem: name of the file with the terrain that was uploaded beside its image.
+        model: name of the uploaded file with its model, refined perhaps; by default it is found.
+        vertical: what the heights are counted from, when the file does not say.
+        geoid: name of an uploaded grid file of the geoid.
+        fill_px: voids are filled from heights at most so many nodes away.
+        map: that is made.
+        options: of the rectification.
+    """
+
+    scene: UUID
+    dem: str
+    model: str | None = None
+    vertical: str | None = None
+    geoid: str | None = None
+    fill_px: int = 0
+    map: OrthoMap = field(default_factory=OrthoMap)
+    options: OrthoOptions = field(default_factory=OrthoOptions)
+
+
+_SAME = OrthoMap()
+_USUAL = OrthoOptions()
+
+
+def run_orthorectification(
+    image: Path,
+    model: Path | None,
+    terrain: TerrainFile,
+    output: Path,
+    ortho_map: OrthoMap = _SAME,
+    options: OrthoOptions = _USUAL,
+    progress: Progress = no_progress,
+) -> Orthorectified:
+    """Write a scene as a cloud-optimised GeoTIFF on a map, with all its bands.
+
+    Pixels keep their type where that is 8 or 16 bits or real; else they become real.
+
+    Args:
+        image: of the scene.
+        model: file of its model, if it is not found by itself.
+        terrain: the ground.
+        output: a file of that name is replaced.
+        ortho_map: that is made.
+        options: how.
+        progress: told where the work stands.
+
+    Raises:
+        InputError: the scene or the terrain cannot be used.
+        ComputationError: the model cannot be followed within the tolerance.
+    """
+    if ortho_map.gsd_m is not None and not ortho_map.gsd_m > 0.0:
+        raise InputError(f"gsd_m: {ortho_map.gsd_m:g} given, more than 0 expected")
+    if output.resolve() in (image.resolve(), terrain.dem.resolve()):
+        raise InputError(f"{output}: what was delivered would be written over")
+    scene = read_scene(image, model, sigma_m=1.0)
+    first = scene.image
+    assert isinstance(first, RasterImage)
+    ground = read_dem(terrain.dem, terrain.vertical, terrain.geoid, terrain.fill_px)
+    bands = [replace(first, mix=one_band(band)) for band in _data_bands(first)]
+    grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
+    dtype = first.dataset.dtypes[0]
+    dtype = dtype if dtype in _KEPT_TYPES else "float32"
+    nodata = first.dataset.nodata
+    if nodata is None:
+        nodata = float("nan") if dtype == "float32" else 0.0
+    seen = _Counted()
+    windows = seen.counted(orthorectify(bands, scene.model, ground, grid, options, progress))
+    error_px = write_cog(output, grid, windows, len(bands), dtype, float(nodata))
+    share = seen.pixels / (grid.shape[0] * grid.shape[1] * len(bands))
+    gsd_m = float(abs(np.linalg.det(grid.step_xy))) ** 0.5
+    if grid.is_geographic:
+        gsd_m *= 111_320.0
+    first.close()
+    return Orthorectified(
+        output,
+        ortho_map.crs or grid.crs,
+        *grid.shape,
+        len(bands),
+        gsd_m,
+        share,
+        error_px,
+        ground.vertical,
+    )
+
+
+@dataclass
+class _Counted:
+    """Counts the pixels that show something, on their way into the file."""
+
+    pixels: int = 0
+
+    def counted(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
+        for done in windows:
+            self.pixels += int(np.isfinite(done.pixels).sum())
+            yield done
+
+
+def _data_bands(image: RasterImage) -> list[int]:
+    """The bands that are not a mask of the others."""
+    colours = [colour.name for colour in image.dataset.colorinterp]
+    return [band for band, colour in enumerate(colours, start=1) if colour != "alpha"]
+
+
+def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> None:
+    scene = visible_scene(connection, caller, inputs.scene)
+    if scene.state != "uploaded":
+        raise Conflict(f"scene {inputs.scene} cannot be rectified: its image is {scene.state}")
+    for name in ("dem", "model", "geoid"):
+        given = getattr(inputs, name)
+        if given is not None and given != clean_name(given):
+            raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
+
+
+def _run(work: Work) -> Commit:
+    """Rectify an uploaded scene; the image is in the storage before the job says so."""
+    inputs: OrthorectifyScene = work.inputs
+    with work.database.transaction() as connection:
+        scene = scenes.find_scene(connection, inputs.scene)
+    if scene is None or scene.state == "removed":
+        raise Conflict(f"scene {inputs.scene} has been removed")
+    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
+        image = local_image(work.storage, work.settings, scene, Path(scratch))
+        made = run_orthorectification(
+            image,
+            image.with_name(inputs.model) if inputs.model else None,
+            TerrainFile(
+                image.with_name(inputs.dem),
+                inputs.vertical,
+                image.with_name(inputs.geoid) if inputs.geoid else None,
+                inputs.fill_px,
+            ),
+            Path(folder) / ORTHO_NAME,
+            inputs.map,
+            inputs.options,
+            work.progress,
+        )
+        key = work.storage.put_file(f"{work.attempt_folder}/{ORTHO_NAME}", made.path).key
+
+    def commit(connection: Connection) -> dict[str, Any]:
+        said = {"lines": made.lines, "samples": made.samples, "seen": made.seen}
+        return {**said, "error_px": made.error_px, "files": {ORTHO_NAME: key}}
+
+    return commit
+
+
+ORTHORECTIFY = Process(
+    id="orthorectify",
+    title="Rectify a scene",
+    description="Lay an uploaded scene on a map through its model and a terrain uploaded beside it.",
+    scope=Scope.REGISTER,
+    inputs=OrthorectifyScene,
+    outputs={ORTHO_NAME: "The scene on the map, a cloud-optimised GeoTIFF."},
+    check=_check,
+    run=_run,
+)

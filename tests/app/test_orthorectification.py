@@ -1,0 +1,125 @@
+"""Rectifying scenes from the command line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+import rasterio.vrt
+import rasterio.warp
+from rasterio.transform import from_origin
+from typer.testing import CliRunner
+
+from app.cli.main import app
+from app.errors import AmersError
+from services.formats.raster import write_raster
+from services.formats.rpc_text import parse_rpc_text
+
+MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
+a_pixel = 1.0
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def write_inputs(folder: Path) -> tuple[Path, Path]:
+    """An image that shows its own lines, and level ground under it."""
+    lon, lat, height_m = (float(number) for number in MODEL.ground_offset)
+    line, sample = (int(number) for number in MODEL.image_offset)
+    model = type(MODEL)(
+        **{**vars(MODEL), "image_offset": MODEL.image_offset - [line - 150, sample - 200]}
+    )
+    pixels = np.repeat(np.arange(1, 301, dtype=np.uint16)[:, None], 400, axis=1)
+    write_raster(folder / "scene.tif", pixels, model)
+    heights = np.full((40, 40), height_m, np.float32)
+    with rasterio.open(
+        folder / "dem.tif",
+        "w",
+        driver="GTiff",
+        height=40,
+        width=40,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
+        transform=from_origin(lon - 0.02, lat + 0.02, 0.001, 0.001),
+    ) as file:
+        file.write(heights, 1)
+    return folder / "scene.tif", folder / "dem.tif"
+
+
+def ortho(*words: object) -> dict:
+    done = CliRunner().invoke(app, ["scene", "ortho", *(str(word) for word in words), "--json"])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    said: dict = json.loads(done.stdout)
+    return said
+
+
+def test_a_scene_is_laid_on_a_map_by_one_command(tmp_path: Path) -> None:
+    scene, dem = write_inputs(tmp_path)
+    said = ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "out" / "ortho.tif")
+    assert said["error_px"] < 0.1
+    assert 0.4 < said["seen"] <= 1.0
+    with rasterio.open(tmp_path / "out" / "ortho.tif") as file:
+        assert (file.height, file.width, file.count) == (said["lines"], said["samples"], said["bands"])
+        row, column = file.height // 2, file.width // 2
+        x, y = file.transform @ (column + 0.5, row + 0.5)
+        shown = int(file.read(1)[row, column])
+        crs = file.crs
+    lon, lat = rasterio.warp.transform(crs, "EPSG:4326", [x], [y])
+    expected = MODEL.project(np.array([[lon[0], lat[0], MODEL.ground_offset[2]]]))[0, 0]
+    line = expected - int(MODEL.image_offset[0]) + 150
+    assert shown == pytest.approx(line + 1.0, abs=a_pixel)
+
+
+def test_heights_without_a_datum_and_files_written_over_are_refused(tmp_path: Path) -> None:
+    scene, dem = write_inputs(tmp_path)
+    with pytest.raises(AmersError, match=r"dem\.tif.*does not say"):
+        ortho(scene, "--dem", dem, "-o", tmp_path / "ortho.tif")
+    with pytest.raises(AmersError, match="written over"):
+        ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", scene)
+    with pytest.raises(AmersError, match="cubic or bilinear"):
+        ortho(scene, "--dem", dem, "--kernel", "lanczos", "-o", tmp_path / "ortho.tif")
+
+
+@pytest.mark.real_data
+def test_two_views_of_one_place_lie_on_each_other_once_rectified(
+    real_data: Path, tmp_path: Path
+) -> None:
+    """Their models disagree by up to a pixel; relief of 190 m, 12.8 degrees apart, is some 85 px."""
+    folder = real_data / "phr_calanques_triplet"
+    dem = folder / "expected_output" / "dsm.tif"
+    words = ["--dem", dem, "--vertical", "ellipsoid", "--fill-px", 10, "--crs", "EPSG:32631"]
+    words += ["--gsd-m", 0.5, "--hide"]
+    images = []
+    for view in ("01", "03"):
+        path = tmp_path / f"{view}.tif"
+        ortho(folder / f"img_{view}.tif", *words, "-o", path)
+        with (
+            rasterio.open(path) as file,
+            rasterio.vrt.WarpedVRT(
+                file,
+                crs=file.crs,
+                transform=from_origin(698100.0, 4792940.0, 0.5, 0.5),
+                width=640,
+                height=640,
+            ) as vrt,
+        ):
+            images.append(vrt.read(1).astype(np.float32))
+    seen = (images[0] > 0) & (images[1] > 0)
+    assert seen.mean() > 0.5
+    found = []
+    for row in range(40, 560, 40):
+        for column in range(40, 560, 40):
+            if seen[row : row + 40, column : column + 40].all():
+                patch = images[0][row : row + 40, column : column + 40]
+                chip = images[1][row + 8 : row + 32, column + 8 : column + 32]
+                score = cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED)
+                if score.max() > 0.8:
+                    found.append(np.unravel_index(score.argmax(), score.shape))
+    assert len(found) > 30
+    off = np.array(found) - 8.0
+    assert np.abs(np.median(off, axis=0)).max() <= 2 * a_pixel
+    assert np.median(np.abs(off - np.median(off, axis=0))) <= a_pixel
