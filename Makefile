@@ -7,7 +7,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
 
-.PHONY: demo test check serve bench postgis page chromium
+.PHONY: demo test check serve bench bench-registration postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
@@ -26,6 +26,9 @@ serve: postgis page
 
 bench: postgis
 	set -e; for script in benchmarks/[a-z]*.py; do $(BIN)/python -m benchmarks.$$(basename $$script .py); done
+
+bench-registration: $(READY)
+	$(BIN)/python -m benchmarks.stress
 
 postgis: $(READY)
 	@scripts/ensure-postgis
