@@ -293,10 +293,9 @@ def measure_points(world: World, repeats: int) -> list[PointOutcome]:
 def matched(image: ImageSource, scene: SimulatedView, points: ControlPoints, chips: MemoryChips) -> None:
     """Search all points in an image."""
     plan = scene.geometry.plan
-    direction_deg = plan.incidence_deg, plan.azimuth_deg
     options = MatchingOptions()
     found = match_points(
-        image, scene.geometry.rpc, points, chips, GSD_M, RADIUS_PX, direction_deg, options
+        image, scene.geometry.rpc, points, chips, GSD_M, RADIUS_PX, scene.geometry.acquisition, options
     )
     assert (found.reason == "").sum() > len(points) / 2
 

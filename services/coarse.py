@@ -14,7 +14,6 @@ from services.matching.predict import inside, spread_over_image
 from services.passes import (
     Pass,
     adjust_on,
-    direction_deg,
     model_uncertainty_m,
     reasons_in_words,
     search_radius_px,
@@ -79,7 +78,13 @@ def search_coarsely(
     """
     gsd_m, rows = _usable_chips(scene, points, float(uncertainty_m.max()), options.enough)
     line_sample = model.project(points.lon_lat_h[rows])
-    best = spread_over_image(line_sample, points.saliency[rows], scene.image.shape, options.points)
+    best = spread_over_image(
+        line_sample,
+        points.lon_lat_h[rows, 2],
+        points.saliency[rows] * points.health[rows],
+        scene.image.shape,
+        options.points,
+    )
     few = points.take(np.sort(rows[best]))
     radius_px = search_radius_px(uncertainty_m, gsd_m, options.max_search_px)
     correlation = replace(matching.correlation, min_score=options.min_score, max_second=1.0)
@@ -87,7 +92,7 @@ def search_coarsely(
     progress(0.0, "coarse search")
     image = _image_for(scene, gsd_m, len(few), radius_px)
     matches = match_points(
-        image, model, few, chips, gsd_m, radius_px, direction_deg(scene), matching, progress
+        image, model, few, chips, gsd_m, radius_px, scene.acquisition, matching, progress
     )
 
     consensus = vote(matches.displacement_m, 3.0 * gsd_m, radius_px * gsd_m)

@@ -40,11 +40,6 @@ def search_radius_px(uncertainty_m: Array, gsd_m: float, largest: int) -> int:
     return int(np.clip(np.ceil(3.0 * np.percentile(uncertainty_m, 95) / gsd_m) + 2, 4, largest))
 
 
-def direction_deg(scene: Scene) -> tuple[float, float]:
-    """Incidence and azimuth of the scene, degrees."""
-    return scene.acquisition.incidence_deg, scene.acquisition.azimuth_deg
-
-
 def adjust_on(
     scene: Scene,
     points: ControlPoints,

@@ -14,7 +14,6 @@ from services.matching.predict import inside, spread_over_image
 from services.passes import (
     Pass,
     adjust_on,
-    direction_deg,
     model_uncertainty_m,
     reasons_in_words,
     search_radius_px,
@@ -43,7 +42,7 @@ class RegistrationOptions:
     """How a scene is registered.
 
     Attributes:
-        max_points: how many points are tried at most, well spread over the image.
+        max_points: how many points are tried at most, well spread over the image; 0 for all.
         fine_passes: how many times the finest chips are searched, each time through the last model.
         seed: of the random draws of the stability test.
         coarse, matching, adjustment, qualification: of the stages.
@@ -59,9 +58,9 @@ class RegistrationOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no registration can be made with."""
-        for name in ("max_points", "fine_passes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: {getattr(self, name)} given, 1 or more expected")
+        for name, least in (("max_points", 0), ("fine_passes", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: {getattr(self, name)} given, {least} or more expected")
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ def register_scene(
             chips,
             fine_m,
             radius_px,
-            direction_deg(scene),
+            scene.acquisition,
             options.matching,
             part,
         )
@@ -225,8 +224,15 @@ def _choose_points(
             f"even with {margin_px:.0f} px of margin for its accuracy of {scene.sigma_m:g} m"
         )
     spread_m2 = np.trace(points.covariance_m2[visible], axis1=1, axis2=2)
-    preference = points.saliency[visible] / (1.0 + spread_m2 / np.median(spread_m2))
-    best = spread_over_image(predicted[visible], preference, scene.image.shape, options.max_points)
+    preference = points.saliency[visible] * points.health[visible]
+    preference /= 1.0 + spread_m2 / max(float(np.median(spread_m2)), 1e-12)
+    best = spread_over_image(
+        predicted[visible],
+        points.lon_lat_h[visible, 2],
+        preference,
+        scene.image.shape,
+        options.max_points or len(visible),
+    )
     return visible, np.sort(visible[best])
 
 

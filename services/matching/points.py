@@ -10,9 +10,10 @@ from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, r
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
-from services.matching.predict import choose_views
+from services.matching.views import Likeness, choose_views
 from services.sensors.base import SensorModel
 from services.types import (
+    Acquisition,
     Array,
     BoolArray,
     ChipSource,
@@ -38,11 +39,13 @@ class MatchingOptions:
     Attributes:
         max_views: how many views of a point are tried.
         agreement_px: views of a point agree when their measures are this near, in chip pixels.
+        likeness: which views are tried first.
         correlation: when a correlation peak is believed.
     """
 
     max_views: int = 4
     agreement_px: float = 0.7
+    likeness: Likeness = field(default_factory=Likeness)
     correlation: CorrelationOptions = field(default_factory=CorrelationOptions)
 
 
@@ -81,7 +84,7 @@ def match_points(
     chips: ChipSource,
     gsd_m: float,
     radius_px: int,
-    direction_deg: tuple[float, float],
+    scene: Acquisition,
     options: MatchingOptions,
     progress: Progress = no_progress,
 ) -> PointMatches:
@@ -97,7 +100,7 @@ def match_points(
         chips: of the points.
         gsd_m: ground sampling of the chips to use.
         radius_px: how far to search, chip pixels.
-        direction_deg: incidence and azimuth from the ground to the scene's sensor.
+        scene: how it was taken.
         options: thresholds.
         progress: told the fraction of the points done.
     """
@@ -108,12 +111,13 @@ def match_points(
     views = np.zeros(n, dtype=np.int64)
     reason = np.full(n, "", dtype="<U16")
     scene_gsd_m = np.full(n, np.nan)
+    chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
     offsets: dict[int, list[Array]] = {}
     seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
         if done % 64 == 0:
             progress(done / n, f"searching {n} points with chips of {gsd_m:g} m")
-        numbers = choose_views(points, row, gsd_m, *direction_deg, options.max_views)
+        numbers = chosen.row[chosen.start[row] : chosen.start[row + 1]] - points.views.start[row]
         if len(numbers) == 0:
             reason[row] = "no_chip"
             continue

@@ -1,8 +1,8 @@
-"""Where points should be in a scene, which of them to try, and with which of their views."""
+"""Where points should be in a scene, and which of them to try."""
 
 import numpy as np
 
-from services.types import Array, BoolArray, ControlPoints, IntArray
+from services.types import Array, BoolArray, IntArray
 
 
 def inside(line_sample: Array, shape: tuple[int, int], margin_px: Array | float = 0.0) -> BoolArray:
@@ -15,15 +15,20 @@ def inside(line_sample: Array, shape: tuple[int, int], margin_px: Array | float 
 
 
 def spread_over_image(
-    line_sample: Array, preference: Array, shape: tuple[int, int], count: int
+    line_sample: Array,
+    height_m: Array,
+    preference: Array,
+    shape: tuple[int, int],
+    count: int,
 ) -> IntArray:
     """A well-distributed choice of points.
 
     The image is cut into about `count` / 2 square cells; the best point of every cell comes first, then
-    the second best of every cell, and so on.
+    the second best of every cell, and so on. Within a cell low, middle and high ground take turns.
 
     Args:
         line_sample: (n, 2) positions.
+        height_m: (n,).
         preference: (n,) larger is better.
         shape: lines and samples of the image.
         count: how many to choose at most.
@@ -36,7 +41,13 @@ def spread_over_image(
     side = np.sqrt(shape[0] * shape[1] / max(1.0, count / 2.0))
     cell = np.floor(line_sample / side).astype(np.int64)
     key = cell[:, 0] * 1_000_003 + cell[:, 1]
-    return np.lexsort((-preference, rank_in_group(key, preference)))[:count]
+    third = np.searchsorted(np.quantile(height_m, [1 / 3, 2 / 3]), height_m)
+    turn = rank_in_group(key * 3 + third, preference)
+    # The best of every third of the heights comes before the second best of any.
+    order = np.lexsort((-preference, turn))
+    place = np.empty(len(order))
+    place[order] = np.arange(len(order))
+    return np.lexsort((-preference, rank_in_group(key, -place)))[:count]
 
 
 def rank_in_group(group: IntArray, preference: Array) -> IntArray:
@@ -47,37 +58,3 @@ def rank_in_group(group: IntArray, preference: Array) -> IntArray:
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order)) - start
     return rank
-
-
-def choose_views(
-    points: ControlPoints, row: int, gsd_m: float, incidence_deg: float, azimuth_deg: float, count: int
-) -> IntArray:
-    """The views of one point, at one ground sampling, that look most like the scene.
-
-    Args:
-        points: the points.
-        row: the point.
-        gsd_m: ground sampling of the chips wanted.
-        incidence_deg, azimuth_deg: direction from the ground to the scene's sensor.
-        count: how many views at most.
-
-    Returns:
-        Numbers of the views within the point, nearest direction first.
-    """
-    views = points.views
-    rows = np.arange(views.start[row], views.start[row + 1])
-    rows = rows[np.isclose(views.gsd_m[rows], gsd_m)]
-    difference = (
-        _unit(views.incidence_deg[rows], views.azimuth_deg[rows])
-        @ _unit(np.array([incidence_deg]), np.array([azimuth_deg])).T
-    )
-    nearest = np.argsort(-np.nan_to_num(difference[:, 0], nan=-1.0), kind="stable")
-    return np.asarray(rows[nearest[:count]] - views.start[row])
-
-
-def _unit(incidence_deg: Array, azimuth_deg: Array) -> Array:
-    """Unit vectors (n, 3) east, north, up."""
-    incidence, azimuth = np.radians(incidence_deg), np.radians(azimuth_deg)
-    return np.column_stack(
-        [np.sin(incidence) * np.sin(azimuth), np.sin(incidence) * np.cos(azimuth), np.cos(incidence)]
-    )

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from services.adjustment.scene import SceneAdjustment
+from services.matching.consensus import vote
 from services.quality.accuracy import Statistics, statistics
 from services.quality.stability import (
     ImageResiduals,
@@ -37,6 +38,9 @@ class QualificationOptions:
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
+        good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
+        good_rival_share: largest share, of the active points, of deactivated ones that agree among
+            themselves on another place: two stories told by as many points are not one truth.
         usable_active_points: fewest active points.
         coverage_cells: cells of the coverage along each side of the image.
         grid: nodes of the predicted accuracy along each side of the image.
@@ -50,6 +54,8 @@ class QualificationOptions:
     good_residual_std_px: float = 1.0
     good_displacement_px: float = 0.5
     good_ce90_px: float = 1.0
+    good_unit_weight: float = 3.0
+    good_rival_share: float = 0.3
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
@@ -66,12 +72,14 @@ class Equipment:
 
     Attributes:
         visible: points the scene could show (Popini).
+        unused: of these, points that were not tried because others stand for them.
         matched: found, and their views agree (Spatio).
         active: used by the final adjustment (Actif).
         active_of_matched, active_of_visible: ratios, 0 to 1; NaN over nothing.
     """
 
     visible: int
+    unused: int
     matched: int
     active: int
     active_of_matched: float
@@ -182,6 +190,10 @@ def qualify(
     predicted = predict_accuracy(adjustment, shape, gsd_m, options.grid, frame_sigma_m)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     criteria = compare(equipment, residuals, stability, predicted, coverage, options)
+    criteria += (
+        _at_most("unit_weight", adjustment.sigma0, options.good_unit_weight, "good"),
+        _at_most("rival_share", rival_share(measures), options.good_rival_share, "good"),
+    )
     return Qualification(
         verdict=verdict_of(criteria),
         criteria=criteria,
@@ -200,11 +212,26 @@ def count_equipment(measures: Measures) -> Equipment:
     matched, active = int(measures.matched.sum()), int(measures.active.sum())
     return Equipment(
         visible=visible,
+        unused=int((measures.reason == "not_tried").sum()),
         matched=matched,
         active=active,
         active_of_matched=active / matched if matched else float("nan"),
         active_of_visible=active / visible if visible else float("nan"),
     )
+
+
+def rival_share(measures: Measures) -> float:
+    """The largest group of deactivated points that agree on another place, over the active points.
+
+    They agree when their residuals are as near each other as those of the active points are to zero.
+    """
+    active = measures.residual_px[measures.active]
+    if len(active) == 0:
+        return float("nan")
+    apart = measures.residual_px[measures.matched & ~measures.active]
+    tolerance_px = 3.0 * float(np.sqrt((active**2).mean())) + 0.5
+    rivals = vote(apart, tolerance_px, float(np.abs(apart).max(initial=tolerance_px)))
+    return int(rivals.agreeing.sum()) / len(active)
 
 
 def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
