@@ -21,11 +21,11 @@ from rich.table import Table
 
 from app.db import binary_copy as binary
 from app.db import engine
+from app.db.collections import Viewer
 from app.db.embedded import Cluster
 from app.db.engine import Connection
 from app.db.ingestion import POINT_COLUMNS
-from app.db.points import Box
-from app.usecases.points import query_points
+from app.usecases.features import Box, Question, find_collection, page, understand
 from services.formats.hilbert import hilbert_order
 from services.geodesy import metres_per_degree
 
@@ -33,6 +33,7 @@ RESULTS = Path(__file__).parent / "results"
 CENTRE_LAT_DEG = 44.0
 POINTS_PER_KM2 = 0.5
 BLOCK = 1
+SECRET = b"of pages"
 
 ROWS = """
 select p.id, st_x(p.geom) as lon, st_y(p.geom) as lat, st_z(p.geom) as h,
@@ -132,7 +133,8 @@ def measure(
     for turn in range(repeats + 5):
         west, south = rng.uniform(0.0, 1.0 - part, 2) * side_deg
         south += CENTRE_LAT_DEG - side_deg[1] / 2.0
-        box = Box(west, south, west + part * side_deg[0], south + part * side_deg[1])
+        corners = west, south, west + part * side_deg[0], south + part * side_deg[1]
+        box = Box(*map(float, corners))
         in_sql, sql_s = timed(lambda box=box: in_database(connection, box))
         in_python, python_s = timed(lambda box=box: in_rows(connection, box))
         if turn == 0:
@@ -154,9 +156,11 @@ def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
 
 def in_database(connection: Connection, box: Box) -> bytes:
     """The way of the service."""
-    page = query_points(connection, box, 10_000)
-    rest = f'"numberReturned":{page.returned},"numberMatched":{page.matched.number}'
-    return f'{{"type":"FeatureCollection","features":[{page.features}],{rest}}}'.encode()
+    bbox = f"{box.west!r},{box.south!r},{box.east!r},{box.north!r}"
+    asked = understand(find_collection("points"), Viewer(), Question(10_000, bbox=bbox), SECRET)
+    found = page(connection, asked, "geojson", SECRET)
+    rest = f'"numberReturned":{found.returned},"numberMatched":{found.matched.number}'
+    return b'{"type":"FeatureCollection","features":[' + found.body + f"],{rest}}}".encode()
 
 
 def in_rows(connection: Connection, box: Box) -> bytes:

@@ -1,7 +1,7 @@
 """Features of every collection: pages of items in six formats, one item, search by POST."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -16,7 +16,12 @@ from app.db.collections import Collection, Viewer
 from app.db.engine import Database
 from app.usecases import features
 from app.usecases.features import Answer, Asked, Question
-from services.formats.feature_files import format_flatgeobuf, format_geopackage, format_parquet
+from services.formats.feature_files import (
+    FeatureTable,
+    format_flatgeobuf,
+    format_geopackage,
+    format_parquet,
+)
 
 router = APIRouter(tags=["features"])
 
@@ -65,6 +70,11 @@ def _secret(request: Request, database: DatabaseDep) -> bytes:
 
 
 SecretDep = Annotated[bytes, Depends(_secret)]
+FILES: dict[str, Callable[[FeatureTable, str], bytes]] = {
+    "fgb": format_flatgeobuf,
+    "parquet": format_parquet,
+    "gpkg": format_geopackage,
+}
 Format = Annotated[str | None, Query(description=f"Format: {', '.join(FEATURES)}.")]
 CrsUri = Annotated[str | None, Query(description="URI of the reference system of the reply.")]
 
@@ -234,17 +244,12 @@ def _answer(
             _chain(first, pieces), media_type=GEOJSON, headers=_headers(asked, FEATURES["json"])
         )
     with database.reading() as connection:
-        if form in ("parquet", "gpkg"):
+        if form in FILES:
             table, answer = features.table(connection, asked, secret)
-            layer = asked.selection.collection.id
-            body = format_parquet(table) if form == "parquet" else format_geopackage(table, layer)
+            body = FILES[form](table, asked.selection.collection.id)
         else:
-            kind: Any = {"csv": "csv", "fgb": "fgb"}.get(form, "geojson")
-            answer = features.page(connection, asked, kind, secret)
+            answer = features.page(connection, asked, "csv" if form == "csv" else "geojson", secret)
             body = answer.body
-            if form == "fgb" and not body:
-                table, _ = features.table(connection, asked, secret)
-                body = format_flatgeobuf(table, asked.selection.collection.id)
     links = _links(request, asked, answer, next_link, form)
     headers = _headers(asked, FEATURES[form], links, answer)
     if form == "html":

@@ -269,6 +269,9 @@ class _Translator:
         left, right = self._scalar(args[0]), self._scalar(args[1])
         if (left.kind, right.kind) != ("text", "text"):
             raise InvalidParameter("filter: like: texts expected")
+        pattern = right.literal
+        if pattern is None or (len(pattern) - len(pattern.rstrip("\\"))) % 2:
+            raise InvalidParameter("filter: like: a pattern that does not end with one \\ expected")
         return f"({left.sql} like {right.sql})"
 
     def _is_null(self, op: str, args: list[Any]) -> str:
@@ -335,7 +338,7 @@ class _Translator:
             inner = self._scalar(args[0])
             if inner.kind != "text":
                 raise InvalidParameter("filter: casei: a text expected")
-            return _Value(f"lower({inner.sql})", "text")
+            return _Value(f"lower({inner.sql})", "text", literal=inner.literal)
         if op not in ARITHMETIC:
             raise InvalidParameter(f"filter: no operator or function {op!r:.60} here")
         if op == "-" and len(args) == 1:

@@ -26,7 +26,7 @@ METRE_DIGITS = 4
 ROWS_AT_ONCE = 1_000
 FEW = "(select * from t limit %(limit)s) t"
 
-Text = Literal["geojson", "csv", "fgb"]
+Text = Literal["geojson", "csv"]
 Key = tuple[Any, ...]
 
 
@@ -69,7 +69,7 @@ class Page:
     """Some features in a format.
 
     Attributes:
-        body: without what stands around features; none for an empty page in a binary format.
+        body: without what stands around features.
         returned: how many.
         last: where the next page goes on: the values that order features, of the last one; None when
             there are no more.
@@ -106,12 +106,12 @@ def page(
     """A page of features, in one piece.
 
     Args:
-        kind: features separated by commas; lines of CSV without a header; a whole FlatGeobuf file.
+        kind: features separated by commas; lines of CSV without a header.
         after: `last` of the page before, None for the first.
         limit: most features.
     """
     chosen, parameters = _chosen(selection, after, limit)
-    body = {"geojson": _geojson_body, "csv": _csv_body, "fgb": _fgb_body}[kind](selection)
+    body = _geojson_body(selection) if kind == "geojson" else _csv_body(selection)
     row = connection.execute(
         f"""with t as materialized ({chosen})
             select ({body}) as body,
@@ -121,10 +121,10 @@ def page(
         prepare=False,
     ).fetchone()
     assert row is not None
-    content = row["body"] or b""
-    body_bytes = content.encode() if isinstance(content, str) else bytes(content)
     more = row["found"] > limit
-    return Page(body_bytes, min(row["found"], limit), tuple(row["last"]) if more else None)
+    return Page(
+        (row["body"] or "").encode(), min(row["found"], limit), tuple(row["last"]) if more else None
+    )
 
 
 def stream_geojson(
@@ -332,16 +332,6 @@ def _csv_body(selection: Selection) -> str:
         position = [f"'\"' || st_astext({geometry}, {DEGREE_DIGITS}) || '\"'"]
     values = [_csv(collection.key), *position, *(_csv(item) for item in selection.properties)]
     return f"select string_agg(concat_ws(',', {', '.join(values)}), e'\\r\\n') from {FEW}"
-
-
-def _fgb_body(selection: Selection) -> str:
-    collection = selection.collection
-    columns = [f"{from_storage(collection.geometry, selection.crs)} as geom"]
-    columns += [
-        f"{_plain(item)} as {_quoted(item.name)}" for item in (collection.key, *selection.properties)
-    ]
-    rows = f"select {', '.join(columns)} from {FEW}"
-    return f"select st_asflatgeobuf(f, false, 'geom') from ({rows}) f"
 
 
 def _json(item: Property) -> str:

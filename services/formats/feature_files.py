@@ -1,4 +1,4 @@
-"""Features as columns, and the files of columns that other tools open: GeoParquet and GeoPackage."""
+"""Features as columns, and the files that other tools open: GeoParquet, GeoPackage, FlatGeobuf."""
 
 import json
 import tempfile
@@ -89,8 +89,8 @@ def read_feature_csv(
     return FeatureTable(rows, geometry_type + (" Z" if has_height else ""), srid), last
 
 
-def format_parquet(features: FeatureTable) -> bytes:
-    """Features as GeoParquet 1.1."""
+def format_parquet(features: FeatureTable, layer: str) -> bytes:
+    """Features as GeoParquet 1.1, which has no name for its layer."""
     shapes = shapely.from_wkb(features.rows["geometry"].to_numpy(zero_copy_only=False))
     column = {
         "encoding": "WKB",
@@ -113,11 +113,11 @@ def format_geopackage(features: FeatureTable, layer: str) -> bytes:
 
 
 def format_flatgeobuf(features: FeatureTable, layer: str) -> bytes:
-    """Features as FlatGeobuf."""
-    return _written(features, layer, "FlatGeobuf", "features.fgb")
+    """Features as FlatGeobuf, in the order they have, which an index in the file would change."""
+    return _written(features, layer, "FlatGeobuf", "features.fgb", SPATIAL_INDEX="NO")
 
 
-def _written(features: FeatureTable, layer: str, driver: str, name: str) -> bytes:
+def _written(features: FeatureTable, layer: str, driver: str, name: str, **options: str) -> bytes:
     with tempfile.TemporaryDirectory(prefix="amers-features-") as folder:
         path = Path(folder) / name
         pyogrio.write_arrow(
@@ -128,5 +128,6 @@ def _written(features: FeatureTable, layer: str, driver: str, name: str) -> byte
             geometry_name="geometry",
             geometry_type=features.geometry_type,
             crs=f"EPSG:{features.srid}",
+            **options,
         )
         return path.read_bytes()

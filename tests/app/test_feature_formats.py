@@ -1,0 +1,191 @@
+"""Formats of features and tiles, opened by programs that are not ours."""
+
+import io
+import json
+
+import geopandas
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pyogrio.raw import read as read_features
+
+from app.usecases import blocks, features
+from tests.factories import make_block
+
+ITEMS = "/collections/points/items"
+TILES = "/collections/{}/tiles/WebMercatorQuad/{}/{}/{}"
+a_tenth_of_a_millimetre_deg = 1e-9
+
+
+@pytest.fixture
+def made(connection, storage, tmp_path):
+    """A published block of 60 points."""
+    made = make_block(tmp_path / "block", count=60)
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    connection.commit()
+    return made
+
+
+@pytest.fixture
+def get(made, client, bearer):
+    headers = bearer("read")
+    return lambda path, **parameters: client.get(path, params=parameters or None, headers=headers)
+
+
+@pytest.mark.parametrize("form", ["fgb", "parquet", "gpkg"])
+def test_a_file_of_points_opens_with_heights_reference_system_and_properties(get, made, tmp_path, form):
+    reply = get(ITEMS, f=form)
+    assert reply.status_code == 200, reply.text
+    assert reply.headers["ogc-numberreturned"] == "60"
+    path = tmp_path / f"points.{form}"
+    path.write_bytes(reply.content)
+    frame = geopandas.read_parquet(path) if form == "parquet" else geopandas.read_file(path)
+    assert frame.crs.to_epsg() == 4979
+    found = np.column_stack([frame.geometry.x, frame.geometry.y, frame.geometry.z])
+    assert_allclose(found, made.points.lon_lat_h, rtol=0, atol=0)
+    assert frame["id"].tolist() == (2**26 + np.arange(60)).tolist()
+    assert_allclose(frame["saliency"], made.points.saliency, rtol=1e-7)
+    assert frame["typology"].isna().sum() == 15
+    assert str(frame["first_view"][0])[:10] == "2023-03-01"
+
+
+@pytest.mark.parametrize("form", ["fgb", "parquet", "gpkg", "csv"])
+def test_a_file_without_features_opens_too(get, tmp_path, form):
+    path = tmp_path / f"none.{form}"
+    path.write_bytes(get(ITEMS, f=form, bbox="0,0,1,1").content)
+    if form == "csv":
+        assert path.read_text().startswith("id,lon_deg,lat_deg,height_m")
+    elif form == "parquet":
+        assert len(geopandas.read_parquet(path)) == 0
+    else:
+        assert len(read_features(path)[1] if read_features(path)[1] is not None else []) == 0
+
+
+@pytest.mark.parametrize("name", ["blocks", "density"])
+@pytest.mark.parametrize("form", ["fgb", "parquet", "gpkg"])
+def test_outlines_open_as_polygons(get, tmp_path, name, form):
+    path = tmp_path / f"outlines.{form}"
+    path.write_bytes(get(f"/collections/{name}/items", f=form).content)
+    frame = geopandas.read_parquet(path) if form == "parquet" else geopandas.read_file(path)
+    assert frame.crs.to_epsg() == 4326
+    assert set(frame.geom_type) == {"Polygon"}
+    assert_allclose(frame.total_bounds, [5.2, 43.2, 5.3, 43.3], atol=1e-9)
+    assert frame["n_points"].sum() == 60
+
+
+@pytest.mark.parametrize("form", ["csv", "fgb", "parquet", "gpkg"])
+def test_pages_of_files_follow_each_other_by_the_header_link(get, form):
+    reply, returned = get(ITEMS, f=form, limit=25), []
+    while True:
+        returned.append(int(reply.headers["ogc-numberreturned"]))
+        assert reply.headers["ogc-numbermatched"] == "60"
+        following = reply.links.get("next")
+        if following is None:
+            break
+        assert following["type"] == reply.headers["content-type"].replace("; charset=utf-8", "")
+        reply = get(following["url"])
+    assert returned == [25, 25, 10]
+
+
+def test_a_format_is_chosen_by_the_header_accept(client, bearer, made):
+    for accept, kind in (
+        ("application/flatgeobuf", "application/flatgeobuf"),
+        ("text/csv;q=0.5, application/geo+json", "application/geo+json"),
+        ("application/json", "application/geo+json"),
+        ("image/png, */*", "application/geo+json"),
+        ("text/html,application/xhtml+xml,*/*;q=0.8", "text/html"),
+    ):
+        reply = client.get(ITEMS, headers={**bearer("read"), "Accept": accept})
+        assert reply.headers["content-type"].startswith(kind), accept
+
+
+def test_a_large_page_is_streamed_and_says_the_same(get, monkeypatch):
+    whole = get(ITEMS, limit=50).json()
+    monkeypatch.setattr(features, "LARGEST_TEXT", 10)
+    monkeypatch.setattr("app.db.features.ROWS_AT_ONCE", 7)
+    streamed = get(ITEMS, limit=50).json()
+    assert streamed["features"] == whole["features"]
+    for member in ("numberMatched", "numberReturned", "links"):
+        assert streamed[member] == whole[member]
+    assert get(ITEMS, limit=60).json()["numberReturned"] == 60
+    assert "next" not in [link["rel"] for link in get(ITEMS, limit=60).json()["links"]]
+    assert get(ITEMS, limit=50, bbox="0,0,1,1").json()["features"] == []
+
+
+def test_density_is_what_is_published_and_goes_when_it_is_withdrawn(get, connection):
+    cells = get("/collections/density/items").json()["features"]
+    assert sum(cell["properties"]["n_points"] for cell in cells) == 60
+    cell = cells[0]["properties"]
+    assert cell["points_per_km2"] == pytest.approx(cell["n_points"] / cell["area_km2"])
+    assert cell["area_km2"] == pytest.approx(90.2, abs=0.1)
+    blocks.withdraw_block(connection, "calanques")
+    connection.commit()
+    assert get("/collections/density/items").json()["features"] == []
+    levels = connection.execute("select count(*) as n from density_cell").fetchone()
+    assert levels == {"n": 0}
+
+
+def tile_of(lon, lat, z):
+    x = int((lon + 180.0) / 360.0 * 2**z)
+    mercator = np.arcsinh(np.tan(np.radians(lat))) / np.pi
+    return int((1.0 - mercator) / 2.0 * 2**z), x
+
+
+@pytest.mark.parametrize(("name", "z"), [("points", 8), ("points", 3), ("density", 0), ("blocks", 6)])
+def test_a_tile_holds_what_lies_there_in_a_layer_of_the_collection(get, made, tmp_path, name, z):
+    y, x = tile_of(5.25, 43.25, z)
+    reply = get(TILES.format(name, z, y, x))
+    assert reply.headers["content-type"] == "application/vnd.mapbox-vector-tile"
+    path = tmp_path / "tile.mvt"
+    path.write_bytes(reply.content)
+    meta, _, geometry, values = read_features(path, layer=name)
+    fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+    if (name, z) == ("points", 8):
+        assert sorted(fields["id"]) == (2**26 + np.arange(60)).tolist()
+        assert len(geometry) == 60
+    else:
+        assert sum(fields["n_points"]) == 60
+    assert get(TILES.format(name, z, (y + 3) % 2**z, x)).content in (
+        b"",
+        reply.content if z == 0 else b"",
+    )
+
+
+def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, connection):
+    headers = bearer("read")
+    path = TILES.format("points", 8, *tile_of(5.25, 43.25, 8))
+    first = client.get(path, headers=headers)
+    again = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    blocks.withdraw_block(connection, "calanques")
+    connection.commit()
+    after = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
+    assert (after.status_code, after.content) == (200, b"")
+
+
+def test_tilesets_are_described_and_tiles_that_are_not_there_are_not_found(get):
+    listed = get("/collections/points/tiles").json()["tilesets"]
+    assert [one["dataType"] for one in listed] == ["vector"]
+    one = get("/collections/points/tiles/WebMercatorQuad").json()
+    assert one["layers"][0]["id"] == "points"
+    grid = get("/tileMatrixSets/WebMercatorQuad").json()
+    assert grid["tileMatrices"][0]["cellSize"] == pytest.approx(156543.03392804097)
+    for path in (
+        TILES.format("points", 8, 256, 0),
+        TILES.format("points", 25, 0, 0),
+        TILES.format("points", 0, 0, 0).replace("Web", "World"),
+    ):
+        assert get(path).status_code == 404, path
+
+
+def test_pages_for_people_show_no_more_than_text(get, connection):
+    connection.execute("update block set title = '<script>alert(1)</script>'")
+    connection.commit()
+    page = get("/collections/blocks/items", f="html").text
+    assert "&lt;script&gt;" in page
+    assert "<script>" not in page
+    assert json.loads(get("/collections/blocks/items").text)["features"][0]["properties"]["title"]
+    assert (
+        io.StringIO(get("/collections/blocks/items", f="csv").text).readline().startswith("number,wkt")
+    )
