@@ -2,11 +2,13 @@
 
 import hashlib
 import secrets
+from dataclasses import replace
 from enum import StrEnum
 
-from app.db.engine import Connection
-from app.db.tokens import Token, find_valid_token
+from app.db.engine import Connection, Database
+from app.db.tokens import Token, find_subject, find_valid_token, keep_subject
 from app.errors import NotAllowed
+from app.oidc import Identity
 
 SECRET_BYTES = 32
 
@@ -48,6 +50,22 @@ def authenticate(connection: Connection, secret: str) -> Token:
     if token is None:
         raise NotAllowed("the token is unknown, expired or revoked", known=False)
     return token
+
+
+def authenticate_identity(database: Database, identity: Identity) -> Token:
+    """The row that stands for an identity, with the scopes its issuer gives it now.
+
+    Raises:
+        NotAllowed: an administrator has revoked it here.
+    """
+    with database.reading() as connection:
+        known = find_subject(connection, identity.subject)
+    if known is None:
+        with database.transaction() as connection:
+            known = keep_subject(connection, identity.subject, identity.name, identity.scopes)
+    if known.revoked_at is not None:
+        raise NotAllowed("the token is unknown, expired or revoked", known=False)
+    return replace(known, scopes=identity.scopes)
 
 
 def allows(token: Token, scope: Scope) -> bool:

@@ -45,6 +45,11 @@ class Settings(BaseSettings):
         quota_jobs: how many jobs of one token may wait or run at once.
         public_metrics: metrics can be read without a token.
         cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*`: all.
+        oidc_issuer: an OpenID Connect issuer whose tokens are accepted beside our own; none: none are.
+        oidc_audience: whom such a token must be for.
+        oidc_keys_url: where the issuer's keys are; none: where its discovery document says.
+        oidc_claim: the claim that says what a token allows.
+        oidc_scopes: values of that claim, each with the scope of ours that it stands for.
         log_format: lines for people (`text`) or for programs (`json`).
         log_level: the least grave events that are logged.
     """
@@ -71,6 +76,18 @@ class Settings(BaseSettings):
     quota_jobs: int = Field(default=100, ge=0)
     public_metrics: bool = False
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
+    oidc_issuer: str | None = None
+    oidc_audience: str = "amers"
+    oidc_keys_url: str | None = None
+    oidc_claim: str = "scope"
+    oidc_scopes: dict[str, Literal["read", "register", "monitor", "admin"]] = Field(
+        default={
+            "amers:read": "read",
+            "amers:register": "register",
+            "amers:monitor": "monitor",
+            "amers:admin": "admin",
+        }
+    )
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 

@@ -28,6 +28,7 @@ from app.api.body import BodyLimit
 from app.api.watch import RequestMetrics, Watch
 from app.config import Settings, read_settings
 from app.db import engine
+from app.oidc import Issuer
 from app.storage import StoredChips, open_storage
 from app.web import page
 
@@ -118,6 +119,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         expose_headers=CORS_EXPOSED,
     )
     app.state.metrics = RequestMetrics()
+    app.state.issuer = None if chosen.oidc_issuer is None else Issuer(chosen)
     app.add_middleware(Watch, metrics=app.state.metrics)
     replies.install(app)
     openapi.install(app)

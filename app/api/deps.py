@@ -6,11 +6,12 @@ from typing import Annotated
 from fastapi import Depends, Header, Request
 
 from app import origin
-from app.auth import Scope, authenticate, require
+from app.auth import Scope, authenticate, authenticate_identity, require
 from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.tokens import Token
 from app.errors import NotAllowed
+from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
 
 
@@ -50,7 +51,7 @@ ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
 
 
 def _caller(
-    database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
+    request: Request, database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
 ) -> Token | None:
     """The caller's token, None when none was sent; one that is sent but wrong is refused."""
     if authorization is None:
@@ -58,8 +59,12 @@ def _caller(
     kind, _, secret = authorization.partition(" ")
     if kind.lower() != "bearer" or not secret.strip():
         raise NotAllowed("the Authorization header must read `Bearer TOKEN`", known=False)
-    with database.reading() as connection:
-        caller = authenticate(connection, secret.strip())
+    issuer: Issuer | None = request.app.state.issuer
+    if issuer is not None and looks_like_jwt(secret.strip()):
+        caller = authenticate_identity(database, issuer.identify(secret.strip()))
+    else:
+        with database.reading() as connection:
+            caller = authenticate(connection, secret.strip())
     here = origin.current()
     here.actor, here.actor_name = caller.id, caller.name
     return caller
