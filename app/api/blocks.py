@@ -1,11 +1,9 @@
-"""Blocks: what is published, the quality of each, and their life for an administrator."""
+"""Blocks: the quality of each, and their life for an administrator."""
 
 from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Header, Request, Response
-from fastapi.encoders import jsonable_encoder
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
 
 from app.api.body import body_chunks
@@ -28,8 +26,6 @@ from app.usecases.blocks import Published
 from services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"])
-
-GEOJSON = "application/geo+json"
 
 
 class BlockToIngest(BaseModel):
@@ -56,32 +52,6 @@ class Priority(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     priority: int
-
-
-@router.get("/collections/blocks/items")
-def items(connection: ReadConnection, caller: PointsReader) -> JSONResponse:
-    """The published blocks; all of them for an administrator."""
-    found = (
-        blocks.list_blocks(connection)
-        if _is_admin(caller)
-        else blocks.list_blocks(connection, ("published",))
-    )
-    page = {
-        "type": "FeatureCollection",
-        "features": [_feature(block) for block in found],
-        "numberMatched": len(found),
-        "numberReturned": len(found),
-        "links": [],
-    }
-    return JSONResponse(jsonable_encoder(page), media_type=GEOJSON)
-
-
-@router.get("/collections/blocks/items/{reference}")
-def item(reference: str, connection: ReadConnection, caller: PointsReader) -> JSONResponse:
-    """One block, by number, ID or ID@VERSION."""
-    return JSONResponse(
-        jsonable_encoder(_feature(_visible(connection, reference, caller))), media_type=GEOJSON
-    )
 
 
 BINARY_BODY = {
@@ -113,6 +83,7 @@ def ingest(
     request: Request,
     response: Response,
     connection: WriteConnection,
+    settings: SettingsDep,
     caller: Admin,
     idempotency_key: Annotated[str | None, Header()] = None,
 ) -> dict[str, Any]:
@@ -121,7 +92,7 @@ def ingest(
     The same as an execution of the process `ingest-block`.
     """
     inputs = body.model_dump(mode="json", exclude_none=True)
-    job = jobs.execute(connection, caller, INGEST_BLOCK.id, inputs, idempotency_key)
+    job = jobs.execute(connection, settings, caller, INGEST_BLOCK.id, inputs, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     return status_info(request, job)
 
@@ -184,13 +155,3 @@ def _is_admin(caller: Token | None) -> bool:
 
 def _properties(block: Block) -> dict[str, Any]:
     return {name: value for name, value in vars(block).items() if name != "outline"}
-
-
-def _feature(block: Block) -> dict[str, Any]:
-    ring = [*block.outline.tolist(), block.outline[0].tolist()]
-    return {
-        "type": "Feature",
-        "id": block.number,
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-        "properties": _properties(block),
-    }
