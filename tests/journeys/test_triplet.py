@@ -102,7 +102,7 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     assert median_residual_px(list(models.values()), tracks) < three_tenths_of_a_pixel
     assert done["verdict"] in ("good", "usable")
     assert np.allclose(np.array(done["shift_px"]), -injected_shift_px, atol=2.0)
-    for name in ("report.json", "report.html", "control_points.geojson", scene.name):
+    for name in ("report.json", "report.html", "control_points.geojson", f"{scene.stem}_RPC.TXT"):
         assert (out / name).stat().st_size > 0
 
 
