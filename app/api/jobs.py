@@ -8,7 +8,7 @@ from fastapi.responses import FileResponse, JSONResponse
 
 from app.api.deps import ReadConnection, Reader, StorageDep, WriteConnection
 from app.api.replies import problem
-from app.db.jobs import Job
+from app.db.jobs import Job, JobFilter, JobState
 from app.errors import NotFound
 from app.usecases import jobs
 from app.usecases.registration_files import media_type
@@ -26,22 +26,31 @@ def list_jobs(
     request: Request,
     connection: ReadConnection,
     caller: Reader,
+    process_id: Annotated[list[str] | None, Query(alias="processID")] = None,
+    status: Annotated[list[JobState] | None, Query()] = None,
     limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
+    after: Annotated[UUID | None, Query(description="From the link `next`.")] = None,
 ) -> dict[str, Any]:
     """The caller's jobs, the newest first; everybody's for an administrator."""
-    found = jobs.list_jobs(connection, caller, limit)
-    return {
-        "jobs": [status_info(request, job) for job in found],
-        "links": [{"rel": "self", "href": str(request.url), "type": "application/json"}],
-    }
+    wanted = JobFilter(tuple(process_id or ()), tuple(status or ()))
+    found = jobs.list_jobs(connection, caller, wanted, limit + 1, after)
+    page = found[:limit]
+    links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
+    if len(found) > limit:
+        following = str(request.url.include_query_params(after=page[-1].id))
+        links.append({"rel": "next", "href": following, "type": "application/json"})
+    return {"jobs": [status_info(request, job) for job in page], "links": links}
 
 
 @router.get("/jobs/{job_id}")
 def show_job(
     job_id: UUID, request: Request, connection: ReadConnection, caller: Reader
 ) -> dict[str, Any]:
-    """Where a job stands."""
-    return status_info(request, jobs.visible_job(connection, caller, job_id))
+    """Where a job stands; while it waits, `amers:queuePosition` says how many come before it, and it."""
+    job = jobs.visible_job(connection, caller, job_id)
+    position = jobs.queue_position(connection, job)
+    info = status_info(request, job)
+    return info if position is None else {**info, "amers:queuePosition": position}
 
 
 @router.delete("/jobs/{job_id}")
@@ -62,7 +71,7 @@ def show_results(
         return problem(409, **{"detail": "the job failed", **_told(job.error)})
     if job.state != "successful":
         title = f"The job is {job.state}"
-        return problem(404, job.message, title=title, error=f"{EXCEPTIONS}/result-not-ready")
+        return problem(404, job.message, title=title, type=f"{EXCEPTIONS}/result-not-ready")
     results = dict(job.results or {})
     names = results.pop("files", {})
     here = job_url(request, job)
@@ -98,6 +107,9 @@ def status_info(request: Request, job: Job) -> dict[str, Any]:
     if job.state == "successful":
         results = {"rel": "http://www.opengis.net/def/rel/ogc/1.0/results", "href": f"{here}/results"}
         links.append({**results, "type": "application/json"})
+    if "scene" in job.inputs:
+        scene = f"{request.base_url}scenes/{job.inputs['scene']}"
+        links.append({"rel": "related", "href": scene, "type": "application/json", "title": "scene"})
     return {
         "jobID": job.id,
         "processID": job.kind,
@@ -105,6 +117,7 @@ def status_info(request: Request, job: Job) -> dict[str, Any]:
         "status": job.state,
         "progress": job.progress,
         "message": job.message,
+        "inputs": job.inputs,
         "created": job.created_at,
         "started": job.started_at,
         "finished": job.finished_at,

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response, status
 
-from app.api.deps import Reader, WriteConnection
+from app.api.deps import Reader, SettingsDep, WriteConnection
 from app.api.jobs import job_url, status_info
 from app.usecases import jobs
 from app.usecases.processes import Process
@@ -65,6 +65,7 @@ def execute(
     request: Request,
     response: Response,
     connection: WriteConnection,
+    settings: SettingsDep,
     caller: Reader,
     idempotency_key: Annotated[str | None, Header()] = None,
 ) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def execute(
 
     The same request with the same `Idempotency-Key` asks for it once.
     """
-    job = jobs.execute(connection, caller, process_id, body.inputs, idempotency_key)
+    job = jobs.execute(connection, settings, caller, process_id, body.inputs, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     response.headers["Preference-Applied"] = "respond-async"
     return status_info(request, job)

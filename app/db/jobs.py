@@ -66,6 +66,18 @@ class Job:
     results: dict[str, Any] | None
 
 
+@dataclass(frozen=True)
+class JobFilter:
+    """Which jobs are wanted; empty: all.
+
+    Attributes:
+        kinds: processes.
+    """
+
+    kinds: tuple[str, ...] = ()
+    states: tuple[JobState, ...] = ()
+
+
 def create(
     connection: Connection,
     kind: str,
@@ -114,14 +126,46 @@ def find_by_key(connection: Connection, owner: UUID | None, idempotency_key: str
     )
 
 
-def newest(connection: Connection, owner: UUID | None, limit: int) -> list[Job]:
-    """The last jobs of an owner, or of everybody for None; newest first."""
+def newest(
+    connection: Connection,
+    owner: UUID | None,
+    wanted: JobFilter,
+    limit: int,
+    after: UUID | None = None,
+) -> list[Job]:
+    """The last jobs of an owner, or of everybody for None; newest first.
+
+    Args:
+        after: the page begins behind this job.
+    """
     with connection.cursor(row_factory=class_row(Job)) as cursor:
         return cursor.execute(
-            f"""select {COLUMNS} from job where %(owner)s::uuid is null or owner = %(owner)s
-                order by created_at desc, id limit %(limit)s""",
-            {"owner": owner, "limit": limit},
+            f"""select {COLUMNS} from job
+                where (%(owner)s::uuid is null or owner = %(owner)s)
+                  and (%(kinds)s::text[] is null or kind = any(%(kinds)s))
+                  and (%(states)s::text[] is null or state = any(%(states)s))
+                  and (%(after)s::uuid is null
+                       or (created_at, id) < (select created_at, id from job where id = %(after)s))
+                order by created_at desc, id desc limit %(limit)s""",
+            {
+                "owner": owner,
+                "kinds": list(wanted.kinds) or None,
+                "states": list(wanted.states) or None,
+                "limit": limit,
+                "after": after,
+            },
         ).fetchall()
+
+
+def position(connection: Connection, job: Job) -> int:
+    """How many waiting jobs are as old as a job or older, itself among them."""
+    with connection.cursor(row_factory=scalar_row) as cursor:
+        cursor.execute(
+            "select count(*) from job where state = 'accepted' and (created_at, id) <= (%s, %s)",
+            [job.created_at, job.id],
+        )
+        found = cursor.fetchone()
+    return max(int(found or 0), 1)
 
 
 def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> Job | None:

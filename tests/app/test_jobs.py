@@ -13,6 +13,7 @@ from app.config import Settings
 from app.db import engine, jobs, registrations, scenes
 from app.db.engine import Connection, Database
 from app.db.jobs import Job, LostJob
+from app.main import create_app
 from app.storage import Storage
 from app.worker.attempt import FAILURES_ALLOWED
 from app.worker.sweep import sweep_files, sweep_jobs
@@ -111,7 +112,8 @@ def test_a_request_for_work_becomes_a_job_in_the_queue(
     job = reply.json()
     assert (job["status"], job["progress"], job["processID"]) == ("accepted", 0, "register-scene")
     assert reply.headers["location"] == job["links"][0]["href"]
-    assert client.get(reply.headers["location"], headers=me).json() == job
+    told = client.get(reply.headers["location"], headers=me).json()
+    assert told == {**job, "amers:queuePosition": 1}
     with engine.connect(dsn) as connection:
         assert queue_entries(connection, UUID(job["jobID"])) == 1
         stored = jobs.find(connection, UUID(job["jobID"]))
@@ -382,3 +384,60 @@ def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Dat
     assert storage.keys("results") == sorted(
         f"results/{job.id}/2/report.json" for job in (done, running)
     )
+
+
+# Many jobs
+
+
+def test_jobs_are_listed_page_by_page_and_by_kind_and_state(
+    client: TestClient, me: dict[str, str], scene: str
+):
+    def asked() -> str:
+        return str(client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"])
+
+    made = [asked() for _ in range(5)]
+    client.delete(f"/jobs/{made[0]}", headers=me)
+    seen, url = [], "/jobs?limit=2"
+    while url:
+        page = client.get(url, headers=me).json()
+        seen += [job["jobID"] for job in page["jobs"]]
+        url = next((link["href"] for link in page["links"] if link["rel"] == "next"), "")
+    assert seen == made[::-1]
+
+    def listed(query: str) -> list[str]:
+        return [job["jobID"] for job in client.get(f"/jobs?{query}", headers=me).json()["jobs"]]
+
+    assert listed("status=dismissed") == [made[0]]
+    assert listed("status=dismissed&status=accepted") == made[::-1]
+    assert listed("processID=ingest-block") == []
+    assert client.get("/jobs?status=lost", headers=me).status_code == 400
+
+
+def test_a_waiting_job_says_its_place_in_the_queue_and_its_scene(
+    client: TestClient, me: dict[str, str], scene: str, database: Database
+):
+    first, second = (
+        client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"]
+        for _ in range(2)
+    )
+    told = client.get(f"/jobs/{second}", headers=me).json()
+    assert told["amers:queuePosition"] == 2
+    assert told["inputs"]["scene"] == scene
+    assert any(
+        link["rel"] == "related" and link["href"].endswith(f"/scenes/{scene}") for link in told["links"]
+    )
+    claimed(database, UUID(first))
+    assert client.get(f"/jobs/{second}", headers=me).json()["amers:queuePosition"] == 1
+    assert "amers:queuePosition" not in client.get(f"/jobs/{first}", headers=me).json()
+
+
+def test_a_token_has_no_more_jobs_at_once_than_its_quota(
+    settings: Settings, me: dict[str, str], scene: str
+):
+    few = settings.model_copy(update={"quota_jobs": 1})
+    with TestClient(create_app(few)) as client:
+        first = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me)
+        assert first.status_code == 201
+        assert client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).status_code == 429
+        client.delete(first.headers["location"], headers=me)
+        assert client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).status_code == 201
