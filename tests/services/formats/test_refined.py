@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 import pyogrio
 import pytest
+import rasterio
 import shapely
+from rasterio.transform import Affine
 
 from services.errors import FormatError
 from services.formats.correction_json import format_correction, parse_correction
+from services.formats.refined import write_refined
 from services.formats.residual_layers import exaggeration_for, write_residual_layers
+from services.formats.scenes import read_scene
 from services.geodesy import metres_per_degree_at
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
@@ -104,3 +108,22 @@ def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
     assert set(fields["status"]) <= {"active", "deactivated"}
     points = pyogrio.read_info(path, layer="control_points")
     assert (points["features"], points["geometry_type"]) == (len(measures.point_id), "Point Z")
+
+
+def test_a_scene_on_a_map_is_delivered_as_the_place_it_has(registered, tmp_path: Path) -> None:
+    path = tmp_path / "map.tif"
+    with rasterio.open(
+        path, "w", "GTiff", 60, 50, 1, "EPSG:32631", Affine(10.0, 0.0, 5e5, 0.0, -10.0, 48e5), np.uint8
+    ) as file:
+        file.write(np.ones((1, 50, 60), np.uint8))
+    scene = read_scene(path, sigma_m=10.0)
+    shape = scene.image.shape
+    correction = replace(no_correction(shape), parameters=CORRECTION.parameters)
+    model = CorrectedModel(scene.model, correction)
+    adjustment = replace(registered().adjustment, correction=correction, order="affine")
+    left = write_refined(path, None, model, adjustment, shape, tmp_path / "out", copy_image=True)
+    assert [file.name for file in left.files] == ["correction.json", "map.tif.aux.xml", "map.tif"]
+    assert left.max_error_px == 0.0
+    corner = np.array([[-0.5, -0.5]])
+    placed = read_scene(tmp_path / "out" / "map.tif", sigma_m=10.0).model
+    assert np.abs(placed.project(model.locate(corner, np.zeros(1))) - corner).max() < A_MICROMETRE
