@@ -12,6 +12,9 @@ from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
 
+KNOWN_SHARE = 0.25
+"""A parameter left out is taken for zero when the measures tell it to this share of what it may be."""
+
 Order = Literal["shift", "drift", "affine"]
 
 _FREE = {
@@ -34,8 +37,6 @@ class AdjustmentOptions:
         min_spread: an order beyond the shift is considered when the measures spread over the image
             with at least this standard deviation along each axis, in half sizes of the image (an even
             spread has 0.58).
-        tested_spread: parameters that the order leaves out are taken for zero when the measures spread
-            at least so far.
         min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
             this fraction.
         folds: of the cross-validation.
@@ -48,7 +49,6 @@ class AdjustmentOptions:
     min_points: int = 4
     points_per_parameter: float = 2.0
     min_spread: float = 0.1
-    tested_spread: float = 0.2
     min_gain: float = 0.03
     folds: int = 5
     untested_px: float = 1.0
@@ -67,6 +67,8 @@ class SceneAdjustment:
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
+        point_sigma_px: what the points' own accuracy lets expect of the active residuals, one standard
+            deviation a coordinate, pixels.
     """
 
     correction: ImageCorrection
@@ -76,6 +78,7 @@ class SceneAdjustment:
     residual_px: Array
     active: BoolArray
     sigma0: float
+    point_sigma_px: float
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
@@ -152,8 +155,7 @@ def adjust_scene(
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
     covariance = cofactor * max(sigma0, 1.0) ** 2
     covariance[[0, 3], [0, 3]] += common_sigma_px**2
-    tested = "affine" in dict(validation) and problem.spread(active) >= options.tested_spread
-    if options.order is None and not tested:
+    if options.order is None:
         unit = max(sigma0, 1.0)
         covariance += problem.covariance_of_fixed(active, free, unit, options.untested_px)
     return SceneAdjustment(
@@ -164,6 +166,7 @@ def adjust_scene(
         residual_px=np.where(usable[:, None], residual, np.nan),
         active=active,
         sigma0=sigma0,
+        point_sigma_px=float(np.sqrt(np.diagonal(covariance_px2, 0, 1, 2)[active].mean())),
     )
 
 
@@ -219,6 +222,8 @@ class _Problem:
             error[fixed] = -np.eye(len(fixed))
             told = (design @ error).T @ (design @ error * weight) / sigma0**2
             of_fixed = np.linalg.inv(told + np.eye(len(fixed)) / untested_px**2)
+            known = np.diagonal(of_fixed) < (KNOWN_SHARE * untested_px) ** 2
+            of_fixed[known] = of_fixed[:, known] = 0.0
             covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = error @ of_fixed @ error.T
         return covariance
 

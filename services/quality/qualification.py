@@ -34,7 +34,7 @@ class QualificationOptions:
         good_coverage_percent: smallest coverage of the image by active points.
         good_active_of_matched: smallest share of matched points that the adjustment keeps.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate.
+            of the worse coordinate, without the part that the points' stated accuracy explains.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
@@ -189,7 +189,8 @@ def qualify(
     )
     predicted = predict_accuracy(adjustment, shape, gsd_m, options.grid, frame_sigma_m)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
-    criteria = compare(equipment, residuals, stability, predicted, coverage, options)
+    std_px = unexplained_px(residuals, adjustment.point_sigma_px)
+    criteria = compare(equipment, std_px, stability, predicted, coverage, options)
     criteria += (
         _at_most("unit_weight", adjustment.sigma0, options.good_unit_weight, "good"),
         _at_most("rival_share", rival_share(measures), options.good_rival_share, "good"),
@@ -218,6 +219,15 @@ def count_equipment(measures: Measures) -> Equipment:
         active_of_matched=active / matched if matched else float("nan"),
         active_of_visible=active / visible if visible else float("nan"),
     )
+
+
+def unexplained_px(residuals: ImageResiduals, point_sigma_px: float) -> float:
+    """Standard deviation of the worse coordinate without what the points' own accuracy explains.
+
+    Points of 3 m are no fault of a scene of 0.5 m pixels: many of them still tell its model well.
+    """
+    std = float(np.maximum(residuals.x.std, residuals.y.std))
+    return float(np.sqrt(np.maximum(std**2 - point_sigma_px**2, 0.0)))
 
 
 def rival_share(measures: Measures) -> float:
@@ -250,14 +260,13 @@ def image_coverage(line_sample: Array, shape: tuple[int, int], cells: int) -> Co
 
 def compare(
     equipment: Equipment,
-    residuals: ImageResiduals,
+    std_px: float,
     stability: Stability,
     predicted: PredictedAccuracy,
     coverage: Coverage,
     options: QualificationOptions,
 ) -> tuple[Criterion, ...]:
     """Hold the figures against the thresholds."""
-    std_px = float(np.maximum(residuals.x.std, residuals.y.std))
     moved_px = max((place.median_px for place in stability.displacements), default=float("nan"))
     good = (
         _at_least("active_points", equipment.active, options.good_active_points, "good"),
