@@ -73,10 +73,10 @@ def refused(reply, status: int) -> dict:
     return problem
 
 
-def test_the_landing_page_links_to_what_there_is(client):
-    page = client.get("/").json()
+def test_the_landing_page_links_to_what_there_is(client, bearer):
+    page, headers = client.get("/").json(), bearer("register")
     for link in page["links"]:
-        assert client.get(link["href"]).status_code == 200, link
+        assert client.get(link["href"], headers=headers).status_code == 200, link
 
 
 def test_a_ready_service_has_a_database_that_answers(client):
