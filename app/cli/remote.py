@@ -1,7 +1,6 @@
 """A service of Amers, as a command asks it: upload, execute, watch, download."""
 
 import json
-import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ import httpx
 from app.errors import AmersError, ComputationError, InputError
 from app.usecases.registration import SceneFiles
 from services import errors
-from services.formats.rpc_files import read_rpc
+from services.formats.scenes import model_files
 from services.types import Progress
 
 CHUNK_BYTES = 1 << 20
@@ -124,10 +123,7 @@ def _files_beside(files: SceneFiles) -> list[Path]:
     Raises:
         FormatError: the scene has no usable model.
     """
-    delivered = read_rpc(files.image, files.model)
-    product = delivered.path.with_name(re.sub("^RPC_", "DIM_", delivered.path.name, flags=re.I))
-    paths = dict.fromkeys([delivered.path, product])
-    return [path for path in paths if path.is_file() and path.resolve() != files.image.resolve()]
+    return model_files(files.image, files.model)
 
 
 def _chunks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:
