@@ -87,7 +87,8 @@ def main() -> None:
         "stress",
         {"summary": summary(results), "nominal": summary(nominal), "factors": by_factor(results)},
     )
-    draw_figure(results, FACTORS, RESULTS / "stress.png")
+    if results:
+        draw_figure(results, FACTORS, RESULTS / "stress.png")
 
 
 def fingerprint() -> str:
