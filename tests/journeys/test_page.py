@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 from tests.app.flat_world import FlatWorld, make_flat_world
-from tests.serving import Service
+from tests.serving import Service, until
 
 ROOT = Path(__file__).parents[2]
 BUILT = ROOT / "app" / "web" / "built" / "index.html"
@@ -155,9 +155,9 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     assert f"{found['visible']}, {found['matched']}, {found['active']}" in figures
     assert page.locator(".badge").first.inner_text() == report["verdict"]
     assert page.locator("tbody tr").count() == len(report["criteria"])
+    assert until(lambda: vectors_drawn_px(page) >= enough_px)
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "report.png")
-    assert vectors_drawn_px(page) >= enough_px
 
     tab_to(page, "Open the report")
     with page.context.expect_page() as opened:
@@ -230,17 +230,23 @@ def test_a_wrong_token_is_refused_in_the_words_of_the_service(visit):
     expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
 
 
-VIEWS = ("points", "scenes", "blocks", "block/1", "access")
+VIEWS = {
+    "points": "Control points",
+    "scenes": "Scenes",
+    "blocks": "Blocks",
+    "block/1": "Test block flat",
+    "access": "Signed in",
+}
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_view_fits_a_phone_and_can_be_used_by_everybody(visit, administrator, scheme):
     """No sideways scrolling, and no finding of axe-core: contrast, names, roles, order."""
     page = visit("#/points", administrator, PHONE, scheme)
-    for view in VIEWS:
+    for view, heading in VIEWS.items():
         page.evaluate(f"location.hash = '#/{view}'")
-        page.wait_for_load_state("networkidle")
-        expect(page.locator("#panel h1")).to_be_visible()
+        expect(page.locator("#panel h1")).to_have_text(heading)
+        until_drawn(page)
         page.screenshot(path=ARTEFACTS / f"phone-{view.replace('/', '-')}-{scheme}.png")
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"], view
         page.evaluate(AXE.read_text(encoding="utf-8"))

@@ -55,7 +55,7 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
       "Standard deviation east, north, up": [properties.sigma_east_m, properties.sigma_north_m, properties.sigma_up_m]
         .map((sigma) => figure(sigma))
         .join(", ")
-        .concat(" m"),
+        .concat("\u00a0m"),
       Saliency: figure(properties.saliency),
       Block: properties.block,
     }),

@@ -1,7 +1,7 @@
 // Uploads that survive a lost connection: tus 1.0, piece by piece.
 
 import { type HttpResponse, Upload } from "tus-js-client";
-import { address, authorization, call, Refused, type Scene } from "./api";
+import { address, authorization, call, Refused } from "./api";
 
 const PIECE_BYTES = 8 * 1024 * 1024;
 const RETRY_MS = [0, 1000, 3000, 5000, 10000, 20000, 30000];
@@ -43,17 +43,7 @@ export function uploadScene(image: File, sigmaM: string, progress: (sent: number
     if (previous) upload.resumeFromPreviousUpload(previous);
     upload.start();
   });
-  return { done: done.catch(plainly(image, sigmaM)), pause: () => void upload.abort(), resume: () => upload.start() };
-}
-
-/** For a service without resumable uploads: the file in one request; any other error stays what it is. */
-function plainly(image: File, sigmaM: string): (error: unknown) => Promise<string> {
-  return async (error) => {
-    if (!(error instanceof Refused) || error.status !== 404) throw error;
-    const query = new URLSearchParams({ name: image.name, ...(sigmaM ? { sigma_m: sigmaM } : {}) });
-    const reply = await call(`scenes?${query}`, { method: "POST", body: image });
-    return ((await reply.json()) as Scene).id;
-  };
+  return { done, pause: () => void upload.abort(), resume: () => upload.start() };
 }
 
 /** Upload a file with the model of a scene beside its image. */
