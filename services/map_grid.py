@@ -41,6 +41,13 @@ class MapGrid:
         """Whether the reference system itself names northings or latitudes first; grids never do."""
         return _horizontal(self.crs).axis_info[0].direction.lower() == "north"
 
+    @property
+    def gsd_m(self) -> float:
+        """Distance of the pixels at the centre: side of the square as large as one of them, metres."""
+        centre = (np.array([self.shape], dtype=np.float64) - 1.0) / 2.0
+        lon_lat_h = np.column_stack([self.lon_lat(centre), [0.0]])
+        return float(abs(np.linalg.det(self.derivative(lon_lat_h)[0])) ** -0.5)
+
     def xy(self, line_sample: Array) -> Array:
         """Map positions (n, 2) of pixel positions (n, 2)."""
         return np.asarray(self.origin_xy + line_sample @ self.step_xy.T)

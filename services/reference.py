@@ -6,7 +6,7 @@ import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions
 from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery import ImageSource, ReducedImage, reduce_image
+from services.imagery import ImageSource, ReducedImage, image_gsd_m, reduce_image, render_chip
 from services.matching.consensus import vote
 from services.matching.dense import DenseOptions, Places, Reference, match_places, places_seen
 from services.matching.points import PointMatches
@@ -17,8 +17,10 @@ from services.registration import Registration, RegistrationOptions, agreement, 
 from services.scene import Scene, scene_gsd_m
 from services.sensors.correction import CorrectedModel, no_correction
 from services.types import (
+    Acquisition,
     Array,
     BoolArray,
+    ChipArray,
     ControlPoints,
     Progress,
     Views,
@@ -102,7 +104,7 @@ def register_on_reference(
         image = _image_at(scene, factor, len(places.cell), radius_px, options.dense.window_px)
         part = part_of(progress, min(0.25 * len(passes), 0.8), 0.15)
         matches = match_places(image, model, reference, places, radius_px, options.dense, part)
-        ground = _as_points(places, reference)
+        ground = homologous_points(places.lon_lat_h, reference)
         level_m = factor * gsd_m
         if not passes:
             agreeing = _first_consensus(matches, level_m, radius_px, options)
@@ -232,19 +234,59 @@ def _first_consensus(
     return consensus.agreeing
 
 
-def _as_points(places: Places, reference: Reference) -> ControlPoints:
-    """The ground of places as control points that have no chips."""
-    n = len(places.cell)
-    nothing, none = np.zeros(0), np.zeros(0, dtype=np.int64)
+def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
+    """Places on the ground (n, 3) as control points, whose one chip is cut from the reference.
+
+    `ReferenceChips` reads the chips.
+    """
+    n = len(lon_lat_h)
+    gsd_m = [image_gsd_m(reference.model, ground) for ground in lon_lat_h]
+    unknown = np.full(n, np.nan)
     variance = np.array([reference.sigma_m, reference.sigma_m, reference.height_sigma_m]) ** 2
+    rows = np.arange(n)
     return ControlPoints(
-        id=np.arange(n),
-        lon_lat_h=places.lon_lat_h,
+        id=rows,
+        lon_lat_h=lon_lat_h,
         covariance_m2=np.tile(np.diag(variance), (n, 1, 1)),
         saliency=np.ones(n),
         health=np.ones(n),
-        views=Views(np.zeros(n + 1, dtype=np.int64), nothing, none, nothing, nothing, nothing, ()),
+        views=Views(
+            start=np.arange(n + 1),
+            gsd_m=np.array(gsd_m),
+            image=np.zeros(n, dtype=np.int64),
+            incidence_deg=unknown,
+            azimuth_deg=unknown,
+            health=np.ones(n),
+            images=(Acquisition("reference"),),
+        ),
         chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=np.zeros(n, dtype=np.int64),
-        chip_files=(),
+        chip_row=rows,
+        chip_files=("reference",),
     )
+
+
+@dataclass(frozen=True)
+class ReferenceChips:
+    """Chips of homologous points, cut from the reference when they are asked for.
+
+    Attributes:
+        reference: what they are cut from.
+        lon_lat_h: (n, 3) the points, by their rows.
+    """
+
+    reference: Reference
+    lon_lat_h: Array
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """Chips (count, 101, 101) uint16, each stretched over all values; 0 is nodata."""
+        return np.stack([self._chip(ground) for ground in self.lon_lat_h[row : row + count]])
+
+    def _chip(self, ground: Array) -> ChipArray:
+        gsd_m = image_gsd_m(self.reference.model, ground)
+        pixels = render_chip(self.reference.image, self.reference.model, ground, gsd_m)
+        seen = np.isfinite(pixels)
+        if not seen.any():
+            return np.zeros(pixels.shape, dtype=np.uint16)
+        low, high = float(pixels[seen].min()), float(pixels[seen].max())
+        stretched = 1.0 + (pixels - low) * (65534.0 / max(high - low, 1e-12))
+        return np.where(seen, stretched, 0.0).astype(np.uint16)

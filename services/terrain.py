@@ -44,9 +44,7 @@ class Terrain:
     @property
     def posting_m(self) -> float:
         """Distance of the nodes at the centre of the grid: side of the square as large as a cell."""
-        centre = (np.array([self.grid.shape], dtype=np.float64) - 1.0) / 2.0
-        lon_lat_h = np.column_stack([self.grid.lon_lat(centre), [0.0]])
-        return float(abs(np.linalg.det(self.grid.derivative(lon_lat_h)[0])) ** -0.5)
+        return self.grid.gsd_m
 
     def height_m(self, lon_lat: Array) -> Array:
         """Height (n,) at longitudes and latitudes (n, 2), metres above the ellipsoid.

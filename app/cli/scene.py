@@ -16,6 +16,7 @@ from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
 from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorectification
+from app.usecases.reference import ReferenceFiles
 from app.usecases.registration import (
     SceneFiles,
     points_of_block,
@@ -45,6 +46,17 @@ def register(
     block: Annotated[
         Path | None, typer.Option(help="Take the points from this block folder; no database.")
     ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Ortho-image to register on; beside --block, where the block has no point."),
+    ] = None,
+    dem: Annotated[
+        Path | None, typer.Option(help="GeoTIFF with the heights of the ground of the reference.")
+    ] = None,
+    vertical: Annotated[
+        str | None, typer.Option(help="What these heights are counted from: ellipsoid, EGM96, EPSG:…")
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the model, metres.", min=0.01)
     ] = None,
@@ -63,8 +75,12 @@ def register(
 ) -> None:
     """Refine the model of scenes on control points: report, points and refined model go into a folder.
 
-    Points come from the store unless --block or --server says otherwise.
+    Points come from the store unless --block, --reference or --server says otherwise.
     """
+    if reference is not None and server is not None:
+        raise InputError("--reference and --server exclude each other")
+    if dem is not None and reference is None:
+        raise InputError("--dem is the ground of a --reference")
     if block is not None and server is not None:
         raise InputError("--block and --server exclude each other")
     if model is not None and len(scenes) > 1:
@@ -73,7 +89,9 @@ def register(
     if len(set(names)) < len(names):
         raise InputError("several scenes of the same name would write into the same folder")
     try:
-        with _registrar(block, server, token) as do:
+        terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
+        held = None if reference is None else ReferenceFiles(reference, terrain)
+        with _registrar(block, held, server, token) as do:
             outcomes = [
                 _one(do, SceneFiles(scene, model, sigma_m), folder)
                 for scene, folder in _folders(scenes, output)
@@ -135,10 +153,12 @@ def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
 
 
 @contextmanager
-def _registrar(block: Path | None, server: str | None, token: str | None) -> Iterator[Register]:
-    """How scenes are registered: on a block folder, on the store, or by a service."""
-    if block is not None:
-        yield _on_block(block)
+def _registrar(
+    block: Path | None, reference: ReferenceFiles | None, server: str | None, token: str | None
+) -> Iterator[Register]:
+    """How scenes are registered: on a block folder, a reference, the store, or by a service."""
+    if block is not None or reference is not None:
+        yield _on_files(block, reference)
     elif server is not None:
         with Service(server, token or "") as service:
             yield service.register
@@ -147,11 +167,12 @@ def _registrar(block: Path | None, server: str | None, token: str | None) -> Ite
             yield do
 
 
-def _on_block(block: Path) -> Register:
-    find_points = points_of_block(block)
+def _on_files(block: Path | None, reference: ReferenceFiles | None) -> Register:
+    find_points = None if block is None else points_of_block(block)
 
     def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
-        made = run_registration(files, find_points, RegistrationOptions(), folder, progress)
+        options = RegistrationOptions()
+        made = run_registration(files, find_points, options, folder, progress, reference)
         return report_document(made.report)
 
     return do

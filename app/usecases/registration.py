@@ -20,11 +20,19 @@ from app.db.tokens import Token
 from app.errors import Conflict, InputError
 from app.storage import Storage, StoredChips
 from app.usecases.processes import Commit, Process, Work
+from app.usecases.reference import ReferenceFiles, read_reference
 from app.usecases.registration_files import OUTPUTS, write_outputs
 from app.usecases.scenes import clean_name, local_image, visible_scene
+from services.errors import CoverageError
 from services.formats.block import FolderChips
 from services.formats.block_check import check_block
 from services.formats.scenes import read_scene
+from services.reference import (
+    ReferenceChips,
+    ReferenceOptions,
+    homologous_points,
+    register_on_reference,
+)
 from services.registration import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
 from services.reports.report import BlockUsed, RegistrationReport
@@ -106,12 +114,21 @@ class RegisteredScene:
 
 def run_registration(
     files: SceneFiles,
-    find_points: FindPoints,
+    find_points: FindPoints | None,
     options: RegistrationOptions,
     folder: Path,
     progress: Progress = no_progress,
+    reference: ReferenceFiles | None = None,
 ) -> RegisteredScene:
     """Register one scene and write what came out of it into a folder.
+
+    Args:
+        files: the scene.
+        find_points: the control points; None registers on the reference only.
+        options: thresholds.
+        folder: made when missing.
+        progress: told where the work stands.
+        reference: what the scene is registered on where there is no control point.
 
     Raises:
         InputError: the scene cannot be used.
@@ -120,15 +137,13 @@ def run_registration(
     started_at = datetime.now(UTC)
     scene = read_scene(files.image, files.model, files.sigma_m)
     footprint = scene_footprint(scene)
-    progress(0.0, "looking for points")
-    found = find_points(_grown(footprint, REACH_SIGMAS * scene.sigma_m))
-    registration = register_scene(
+    registration, found = _registered(
         scene,
-        found.points,
-        found.chips,
+        footprint,
+        find_points,
+        reference,
         options,
         lambda fraction, message: progress(0.9 * fraction, message),
-        found.frame_sigma_m,
     )
     progress(0.9, "writing the report")
     report, paths = write_outputs(
@@ -144,6 +159,39 @@ def run_registration(
         started_at,
     )
     return RegisteredScene(scene, registration, report, footprint, paths)
+
+
+def _registered(
+    scene: Scene,
+    footprint: Array,
+    find_points: FindPoints | None,
+    reference: ReferenceFiles | None,
+    options: RegistrationOptions,
+    progress: Progress,
+) -> tuple[Registration, FoundPoints]:
+    """A registration and the points it was made on: control points, or else places of a reference."""
+    if find_points is not None:
+        progress(0.0, "looking for points")
+        found = find_points(_grown(footprint, REACH_SIGMAS * scene.sigma_m))
+        try:
+            registration = register_scene(
+                scene, found.points, found.chips, options, progress, found.frame_sigma_m
+            )
+            return registration, found
+        except CoverageError:
+            if reference is None:
+                raise
+    if reference is None:
+        raise InputError("neither control points nor a reference to register the scene on")
+    held = read_reference(reference)
+    of_reference = ReferenceOptions(
+        seed=options.seed, adjustment=options.adjustment, qualification=options.qualification
+    )
+    registration = register_on_reference(scene, held, of_reference, progress)
+    lon_lat_h = registration.measures.lon_lat_h
+    points, chips = homologous_points(lon_lat_h, held), ReferenceChips(held, lon_lat_h)
+    block = BlockUsed(reference.image.name, "reference image")
+    return registration, FoundPoints(points, chips, (block,), held.frame_sigma_m)
 
 
 def points_of_block(folder: Path) -> FindPoints:

@@ -1,0 +1,80 @@
+"""Scenes registered from the command line on a reference image, where there is no control point."""
+
+import json
+from pathlib import Path
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+
+from app.cli.main import main
+from services.imagery import ArrayImage, sample_image
+
+SHIFT_PX = np.array([5.3, -3.6])
+SHIFT_ALLOWED_PX = 0.1
+SIZE = 420
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A reference on a map, and the same ground as a scene whose map is a few pixels off."""
+    folder = tmp_path_factory.mktemp("reference")
+    ground = cv2.GaussianBlur(np.random.default_rng(4).normal(size=(512, 512)), (0, 0), 1.5)
+    ground = (500.0 + 80.0 * ground / ground.std()).astype(np.float32)
+    pixel = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij"), -1) + 40.0
+    written = []
+    for name, moved in (("reference", np.zeros(2)), ("scene", SHIFT_PX)):
+        seen = sample_image(ArrayImage(ground), pixel - moved, 1.0)
+        path = folder / f"{name}.tif"
+        profile = {"driver": "GTiff", "width": SIZE, "height": SIZE, "count": 1, "dtype": "uint16"}
+        with rasterio.open(
+            path, "w", crs="EPSG:32632", transform=Affine(10, 0, 5e5, 0, -10, 5e6), **profile
+        ) as file:
+            file.write(np.clip(seen, 1, 65535).astype(np.uint16), 1)
+        written.append(path)
+    return written[0], written[1]
+
+
+def run(*arguments: str | Path) -> int:
+    with (
+        patch("sys.argv", ["amers", *(str(argument) for argument in arguments)]),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_scene_is_registered_on_a_reference_without_any_database(
+    images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference, scene = images
+    asked = ["scene", "register", scene, "--reference", reference, "--sigma-m", "40", "--json"]
+    assert run(*asked, "-o", tmp_path) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["verdict"] == "good"
+    assert np.abs(np.array(said["shift_px"]) - SHIFT_PX).max() < SHIFT_ALLOWED_PX
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["blocks"] == [{"id": "reference.tif", "version": "reference image"}]
+    assert {"report.html", "correction.json", "control_points.geojson"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
+
+
+def test_terrain_without_a_reference_is_a_mistake(images: tuple[Path, Path], tmp_path: Path) -> None:
+    reference, scene = images
+    assert run("scene", "register", scene, "--dem", reference, "-o", tmp_path / "none") == 2
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_reference_that_lies_on_no_map_is_refused_by_name(
+    images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = tmp_path / "plain.tif"
+    with rasterio.open(plain, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8") as file:
+        file.write(np.full((64, 64), 7, np.uint8), 1)
+    asked = ["scene", "register", images[1], "--reference", plain, "--sigma-m", "40", "-o", tmp_path]
+    assert run(*asked) == 2
+    assert "plain.tif: expected an ortho-image on a map" in capsys.readouterr().err
