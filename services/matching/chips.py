@@ -28,7 +28,10 @@ class RefinementOptions:
 
     radius_px: int = 6
     min_sigma_px: float = 0.03
-    correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.7))
+    # Along the parallax relief blurs a place; the rays say how much that matters.
+    correlation: CorrelationOptions = field(
+        default_factory=lambda: CorrelationOptions(min_score=0.7, max_sigma_px=2.0)
+    )
 
 
 def refine_on_chips(
