@@ -292,7 +292,6 @@ def measure_points(world: World, repeats: int) -> list[PointOutcome]:
 
 def matched(image: ImageSource, scene: SimulatedView, points: ControlPoints, chips: MemoryChips) -> None:
     """Search all points in an image."""
-    plan = scene.geometry.plan
     options = MatchingOptions()
     found = match_points(
         image, scene.geometry.rpc, points, chips, GSD_M, RADIUS_PX, scene.geometry.acquisition, options

@@ -1,4 +1,4 @@
-"""Pixels between pixels: cubic splines through an image, exact at its pixels, at any fraction between."""
+"""Pixels between pixels: cubic splines through an image, exact at its pixels, at any fraction."""
 
 from functools import lru_cache
 

@@ -1,7 +1,8 @@
-"""Density cells of what is published, kept as blocks are published and withdrawn; a secret that signs pages.
+"""Density cells of what is published, kept as blocks come and go; a secret that signs pages.
 
-Counting points cell by cell takes seconds where there are millions, and a map asks for the world at once: the
-counts are kept in cells of 0.1 degree and in six coarser levels, from the quality figures of the blocks.
+Counting points cell by cell takes seconds where there are millions, and a map asks for the world at
+once: the counts are kept in cells of 0.1 degree and in six coarser levels, from the quality figures of
+the blocks.
 """
 
 from alembic import op
@@ -35,7 +36,7 @@ $$
 """
 
 # A cell of level k is 0.1 * 2^k degrees wide; columns count from 180 W, rows from the south pole.
-# Rows are changed in the order of their keys, so that two publications wait for and never block each other.
+# Rows are changed in the order of their keys, so that two publications wait and never deadlock.
 ADD_DENSITY = """
 create function add_density(quality jsonb, sign int) returns void language sql as $$
     with listed as (
@@ -88,8 +89,8 @@ create table installation (
 """
 
 SECRET = """
-insert into installation (page_secret) select sha256(decode(
-    replace(gen_random_uuid()::text || gen_random_uuid()::text || gen_random_uuid()::text, '-', ''), 'hex'))
+insert into installation (page_secret) select sha256(decode(replace(
+    gen_random_uuid()::text || gen_random_uuid()::text || gen_random_uuid()::text, '-', ''), 'hex'))
 """
 
 UP = (

@@ -128,12 +128,11 @@ def test_reading_connections_have_a_role_that_can_only_select(dsn, tmp_path):
                 database.reading() as connection,
             ):
                 connection.execute(statement)
-        with (
-            pytest.raises(psycopg.errors.InsufficientPrivilege),
-            database.reading() as connection,
-        ):
+        with database.reading() as connection:
             connection.execute("set transaction read write")
-            connection.execute("delete from token")
+            with pytest.raises(psycopg.errors.InsufficientPrivilege):
+                connection.execute("delete from token")
+            connection.rollback()
 
 
 def test_a_transaction_is_kept_whole_or_not_at_all(dsn, tmp_path):
