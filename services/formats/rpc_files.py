@@ -21,6 +21,9 @@ from services.formats.rpc_text import (
 )
 from services.sensors.rpc import RpcModel, check_rpc
 
+_RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
+"""Where RPC00A has the terms of RPC00B; source: NGA STDI-0002."""
+
 Convention = Literal["tags", "text", "rpb", "dimap"]
 
 _MAX_TEXT_BYTES = 20_000_000
@@ -164,6 +167,9 @@ def has_rpc(image: RasterImage) -> bool:
 def _find_model(image: RasterImage) -> tuple[RpcModel, Path, Convention]:
     tags = image.dataset.tags(ns="RPC")
     if tags:
+        records = image.dataset.tags(ns="TRE")
+        if "RPC00A" in records and "RPC00B" not in records:
+            tags = {**tags, **_rpc00a_coefficients(records["RPC00A"])}
         return _parse_tags(tags, image.path.name), image.path, "tags"
     names, found = _files_beside(image)
     if found:
@@ -193,6 +199,18 @@ def _read_model_file(path: Path) -> tuple[RpcModel, Path, Convention]:
     if re.search(r"\bBEGIN_GROUP\b", text):
         return parse_rpb(text, path.name), path, "rpb"
     return parse_rpc_text(text, path.name), path, "text"
+
+
+def _rpc00a_coefficients(record: str) -> dict[str, str]:
+    """The coefficients of an RPC00A record in the order of RPC00B.
+
+    Read from the record itself: GDAL mistakes four of the terms of the second degree.
+    """
+    starts = {"LINE_NUM": 81, "LINE_DEN": 321, "SAMP_NUM": 561, "SAMP_DEN": 801}
+    return {
+        f"{name}_COEFF": " ".join(record[start + 12 * i : start + 12 * (i + 1)] for i in _RPC00A_ORDER)
+        for name, start in starts.items()
+    }
 
 
 def _parse_tags(tags: dict[str, str], source: str) -> RpcModel:

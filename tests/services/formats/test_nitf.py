@@ -1,4 +1,4 @@
-"""RPC00B in NITF files, as raw bytes of the standard."""
+"""RPC00B and RPC00A in NITF files, as raw bytes of the standard."""
 
 from pathlib import Path
 
@@ -17,6 +17,9 @@ GROUND = (5.2, 44.2, 600.0), (0.05, 0.04, 500.0)
 TERMS_B = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0)]
 TERMS_B += [(0, 2, 0), (0, 0, 2), (1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0)]
 TERMS_B += [(0, 1, 2), (2, 0, 1), (0, 2, 1), (0, 0, 3)]
+# RPC00A: the product of all three before the squares, the third degree by falling powers.
+TERMS_A = [*TERMS_B[:7], (1, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2), (3, 0, 0), (2, 1, 0), (2, 0, 1)]
+TERMS_A += [(1, 2, 0), (0, 3, 0), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3)]
 
 
 def coefficients() -> list[dict[tuple[int, int, int], float]]:
@@ -72,8 +75,11 @@ def expected(lon_lat_h: np.ndarray) -> np.ndarray:
     return np.column_stack([1000.0 + 1000.0 * sums[0] / sums[1], 1200.0 + 1200.0 * sums[2] / sums[3]])
 
 
-def test_a_record_is_read_as_the_standard_has_it(tmp_path: Path) -> None:
-    delivered = read_rpc(write_nitf(tmp_path / "a.ntf", "RPC00B", TERMS_B))
+@pytest.mark.parametrize(("name", "terms"), [("RPC00B", TERMS_B), ("RPC00A", TERMS_A)])
+def test_a_record_is_read_as_the_standard_has_it(
+    tmp_path: Path, name: str, terms: list[tuple[int, int, int]]
+) -> None:
+    delivered = read_rpc(write_nitf(tmp_path / "a.ntf", name, terms))
     model = delivered.model
     assert isinstance(model, RpcModel)
     ground = np.array(GROUND[0]) + np.random.default_rng(1).uniform(-0.9, 0.9, (200, 3)) * np.array(
