@@ -17,20 +17,27 @@ CRITERION_NAMES = {
     "active_points": ("Active points", "", 0),
     "coverage_percent": ("Coverage of the image", "%", 0),
     "active_of_matched": ("Active / matched", "", 2),
-    "residual_std_px": ("Residual, standard deviation", "px", 2),
+    "residual_std_px": ("Unexplained residual, standard deviation", "px", 2),
     "displacement_px": ("Displacement with fewer points", "px", 2),
     "predicted_ce90_px": ("Predicted CE90, worst place", "px", 2),
+    "unit_weight": ("Residuals over what is expected", "", 2),
+    "rival_share": ("Points that tell another story", "", 2),
 }
 
 CRITERION_WAYS = {
     "active_points": "points kept by the final adjustment",
     "coverage_percent": "cells of the image with an active point, of all cells",
     "active_of_matched": "active points, of those matched",
-    "residual_std_px": "standard deviation of the active residuals, n - 1, the worse of x and y",
+    "residual_std_px": "standard deviation of the active residuals, n - 1, the worse of x and y, "
+    "without what the accuracy stated for the points explains",
     "displacement_px": "adjustment redone on a part of the points: median over the draws, worst of four "
     "corners and centre",
     "predicted_ce90_px": "covariance of the correction carried over the image: radius that holds 90 % "
     "of its normal law, largest of the grid",
+    "unit_weight": "root of the weighted squares of the active residuals over the degrees of freedom: "
+    "one when the stated sigmas are true",
+    "rival_share": "largest group of deactivated points that agree on another place, over the "
+    "active points",
 }
 """How the value of each criterion is calculated."""
 
