@@ -178,8 +178,8 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     assert count(few) == Count(10_000, exact=True)
     estimate = count(all_of_them)
     assert not estimate.exact
-    assert estimate.number == pytest.approx(13_050, rel=0.3)
-    assert estimate.number > 10_001
+    assert estimate.number == pytest.approx(10_050, rel=0.2)
+    assert estimate.number >= 10_001
     assert count(None) == Count(10_050, exact=True)
 
 
