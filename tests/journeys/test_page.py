@@ -214,11 +214,8 @@ def test_a_point_shows_all_its_chips(visit, secret):
     expect(page.get_by_role("heading", name="Point")).to_be_visible()
     chips = page.get_by_role("list", name="Chips").get_by_role("img")
     expect(chips).to_have_count(4)
-    page.wait_for_function(
-        "[...document.querySelectorAll('.chips img')].every((chip) => chip.naturalWidth)"
-    )
-    widths = chips.evaluate_all("(all) => all.map((chip) => chip.naturalWidth)")
-    assert widths == [chip_px] * 4
+    for chip in chips.all():
+        expect(chip).to_have_js_property("naturalWidth", chip_px)
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "point.png")
 
