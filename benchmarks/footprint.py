@@ -22,10 +22,12 @@ from rich.table import Table
 from app.db import binary_copy as binary
 from app.db import engine
 from app.db.collections import Viewer
+from app.db.conditions import Box
 from app.db.embedded import Cluster
 from app.db.engine import Connection
 from app.db.ingestion import POINT_COLUMNS
-from app.usecases.features import Box, Question, find_collection, page, understand
+from app.usecases.features import find_collection, page
+from app.usecases.questions import Question, understand
 from services.formats.hilbert import hilbert_order
 from services.geodesy import metres_per_degree
 

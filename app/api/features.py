@@ -15,7 +15,8 @@ from app.auth import Scope, allows, require
 from app.db.collections import Collection, Viewer
 from app.db.engine import Database
 from app.usecases import features
-from app.usecases.features import Answer, Asked, Question
+from app.usecases.features import Answer
+from app.usecases.questions import DEFAULT_LIMIT, Asked, Question, understand
 from services.formats.feature_files import (
     FeatureTable,
     format_flatgeobuf,
@@ -83,7 +84,7 @@ def _question(
     limit: Annotated[
         int,
         Query(ge=1, description="Most features on the page.", json_schema_extra={"maximum": 10_000}),
-    ] = features.DEFAULT_LIMIT,
+    ] = DEFAULT_LIMIT,
     token: Annotated[str | None, Query(description="From the link `next` of the page before.")] = None,
     bbox: Annotated[
         str | None,
@@ -142,7 +143,7 @@ class Search(BaseModel):
     datetime: str | None = None
     sortby: str | None = None
     properties: str | None = None
-    limit: int = Field(features.DEFAULT_LIMIT, ge=1)
+    limit: int = Field(DEFAULT_LIMIT, ge=1)
     token: str | None = None
     f: str | None = None
 
@@ -167,9 +168,7 @@ def items(
     equal = tuple(
         (name, value) for name, value in request.query_params.items() if name in collection.queryables
     )
-    asked = features.understand(
-        collection, viewer, Question(**{**vars(question), "equal": equal}), secret
-    )
+    asked = understand(collection, viewer, Question(**{**vars(question), "equal": equal}), secret)
     return _answer(request, database, asked, form, secret, _next_of_query(request))
 
 
@@ -185,7 +184,7 @@ def search(
     """The same by POST; the next page is asked for with the `token` of the link `next`."""
     refuse_unknown(request, set())
     said = body.model_dump(exclude={"f"})
-    asked = features.understand(collection, viewer, Question(**said), secret)
+    asked = understand(collection, viewer, Question(**said), secret)
     form = chosen_format(request, FEATURES, body.f)
 
     def next_link(token: str) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from app.cli.output import AsJson, print_json
+from app.cli.output import AsJson, print_json, show, show_one
 from app.cli.store import transaction
-from app.usecases import points
-from app.usecases.features import parse_bbox
+from app.usecases import history, points
+from app.usecases.questions import parse_bbox
 
 app = typer.Typer(help="Control points of published blocks.", no_args_is_help=True)
 
@@ -56,6 +56,43 @@ def query(
             size = sum(file.write(piece) for piece in pieces)
     if as_json:
         print_json({"file": output, "size_bytes": size})
+
+
+@app.command()
+def suspensions(
+    suspended: Annotated[
+        bool, typer.Option("--suspended", help="Those that are suspended, not those proposed.")
+    ] = False,
+    limit: Annotated[int, typer.Option(help="Most points shown.")] = 100,
+    as_json: AsJson = False,
+) -> None:
+    """List the points that fail where others serve, the worst first: proposed for suspension."""
+    with transaction() as connection:
+        found = history.list_histories(connection, "suspended" if suspended else "proposed", limit)
+    show([vars(point) for point in found], as_json=as_json)
+
+
+@app.command()
+def suspend(
+    point: Annotated[int, typer.Argument(help="Identifier of the point.")],
+    because: Annotated[str, typer.Option(help="Why; it is recorded.")],
+    as_json: AsJson = False,
+) -> None:
+    """Serve a point no longer, neither to registrations nor to readers."""
+    with transaction() as connection:
+        found = history.suspend_point(connection, point, because)
+    show_one(vars(found), as_json=as_json)
+
+
+@app.command()
+def reinstate(
+    point: Annotated[int, typer.Argument(help="Identifier of the point.")],
+    as_json: AsJson = False,
+) -> None:
+    """Serve a suspended point again; its history begins anew."""
+    with transaction() as connection:
+        found = history.reinstate_point(connection, point)
+    show_one(vars(found), as_json=as_json)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import psycopg
 
 from app.db.collections import Collection, Property, Viewer
-from app.db.cql2 import ANYTHING, Condition
+from app.db.conditions import ANYTHING, Condition
 from app.db.crs import Crs, from_storage, in_own_order
 from app.db.engine import Connection
 

@@ -10,7 +10,8 @@ from app.db.engine import Connection
 from app.db.features import Count, Reading
 from app.db.points import POINTS, PointDetail, PointView
 from app.errors import NotFound
-from app.usecases.features import MOST_FEATURES, everything_in
+from app.usecases.features import everything_in
+from app.usecases.questions import MOST_FEATURES
 from services.formats.chip_images import LabelledChips
 from services.types import Acquisition, ChipSource
 

@@ -1,0 +1,152 @@
+"""Filters read within bounds before anything in them is used: CQL2 by its library, geometries, times.
+
+Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946, RFC 3339.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from datetime import UTC, date, datetime
+from typing import Any
+
+import cql2
+import shapely
+
+from app.db.crs import Crs
+from app.errors import InvalidParameter
+
+LONGEST_TEXT = 4_000
+"""Characters of a filter in text; the parser works them off recursively."""
+DEEPEST_TEXT = 10
+"""Parentheses in each other in text: each doubles the parser's time on a wrong filter, 10 ms here."""
+DEEPEST_JSON = 32
+MOST_NODES = 1_000
+MOST_VERTICES = 10_000
+QUOTED = re.compile(r"'(?:[^'\\]|\\.|'')*'|\"[^\"]*\"")
+
+
+def parse_text(text: str) -> Any:
+    """A filter in CQL2 text as CQL2 JSON.
+
+    Raises:
+        InvalidParameter: it is not CQL2, too long or too deep.
+    """
+    if len(text) > LONGEST_TEXT:
+        raise InvalidParameter(
+            f"filter: {len(text)} characters, {LONGEST_TEXT} at most; send it by POST as cql2-json"
+        )
+    depth = deepest = 0
+    for character in QUOTED.sub("", text):
+        depth += (character == "(") - (character == ")")
+        deepest = max(deepest, depth)
+        if depth < 0:
+            break
+    if depth != 0:
+        raise InvalidParameter("filter: parentheses do not match")
+    if deepest > DEEPEST_TEXT:
+        raise InvalidParameter(f"filter: parentheses {deepest} deep, {DEEPEST_TEXT} at most in text")
+    return _parsed(cql2.parse_text, text)
+
+
+def parse_json(text: str) -> Any:
+    """A filter in CQL2 JSON, checked by the library.
+
+    Raises:
+        InvalidParameter: it is not CQL2, too large or too deep.
+    """
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InvalidParameter(f"filter: not JSON: {error!s:.200}") from None
+    check_size(found)
+    return _parsed(cql2.parse_json, text)
+
+
+def check_size(document: Any) -> None:
+    """Refuse a document that is too deep or has too many parts, without recursion.
+
+    Raises:
+        InvalidParameter: with the limit.
+    """
+    level, vertices, nodes = [document], 0, 0
+    for _ in range(DEEPEST_JSON):
+        below: list[Any] = []
+        for part in level:
+            inside = list(part.values()) if isinstance(part, dict) else part
+            if not isinstance(inside, list):
+                continue
+            is_position = bool(inside) and all(isinstance(value, int | float) for value in inside)
+            vertices, nodes = vertices + is_position, nodes + (not is_position) * len(inside)
+            below += [] if is_position else inside
+        level = below
+        if vertices > MOST_VERTICES or nodes > MOST_NODES + 2 * MOST_VERTICES:
+            raise InvalidParameter(
+                f"filter: too large: {MOST_NODES} parts and {MOST_VERTICES} positions at most"
+            )
+        if not level:
+            return
+    raise InvalidParameter(f"filter: deeper than {DEEPEST_JSON} levels")
+
+
+def parse_instant(text: Any, where: str) -> datetime:
+    """An instant out of RFC 3339; a date is its first moment, UTC.
+
+    Raises:
+        InvalidParameter: naming the value and `where` it stood.
+    """
+    try:
+        if not isinstance(text, str) or len(text) > 40:
+            raise ValueError
+        if len(text) == 10:
+            day = date.fromisoformat(text)
+            return datetime(day.year, day.month, day.day, tzinfo=UTC)
+        instant = datetime.fromisoformat(text)
+    except ValueError:
+        raise InvalidParameter(
+            f"{where}: {text!r:.60} found, a date or time such as 2024-05-06T07:08:09Z expected"
+        ) from None
+    return instant if instant.tzinfo else instant.replace(tzinfo=UTC)
+
+
+def parse_geometry(node: dict[str, Any], crs: Crs) -> bytes:
+    """A GeoJSON geometry, or a bbox, as WKB with longitude or east first.
+
+    Raises:
+        InvalidParameter: it is not a valid geometry within the bounds of its reference system.
+    """
+    try:
+        shape = _box(node["bbox"]) if "bbox" in node else shapely.from_geojson(json.dumps(node))
+    except (shapely.errors.ShapelyError, TypeError, ValueError) as error:
+        raise InvalidParameter(f"filter: not a GeoJSON geometry: {error!s:.200}") from None
+    shape = shapely.force_2d(shape)
+    if crs.lat_first:
+        shape = shapely.transform(shape, lambda position: position[:, ::-1])
+    coordinates = shapely.get_coordinates(shape)
+    limit = (180.0, 90.0) if crs.in_degrees else (2.1e7, 2.6e8)
+    if not len(coordinates) or not (abs(coordinates) <= limit).all():
+        raise InvalidParameter(
+            f"filter: a geometry is empty or beyond {limit[0]:g} and {limit[1]:g}, the bounds of its crs"
+        )
+    if not shapely.is_valid(shape):
+        raise InvalidParameter(f"filter: geometry: {shapely.is_valid_reason(shape):.200}")
+    return bytes(shapely.to_wkb(shape))
+
+
+def _box(values: Any) -> Any:
+    if not isinstance(values, list) or len(values) not in (4, 6):
+        raise ValueError("a bbox has four or six numbers")
+    west, south, *_ = values
+    east, north = values[len(values) // 2 : len(values) // 2 + 2]
+    if west <= east:
+        return shapely.box(west, south, east, north)
+    sides = [shapely.box(west, south, 180.0, north), shapely.box(-180.0, south, east, north)]
+    return shapely.multipolygons(sides)
+
+
+def _parsed(parse: Callable[[str], Any], text: str) -> Any:
+    try:
+        return parse(text).to_json()
+    except (cql2.ParseError, cql2.ValidationError, ValueError, OverflowError) as error:
+        lines = [line.strip() for line in str(error).splitlines()]
+        said = " ".join(line for line in lines if line and line not in ("|", "^---"))
+        raise InvalidParameter(f"filter: not CQL2: {said:.300}") from None
