@@ -191,7 +191,9 @@ def qualified(
     row_of_tried = np.searchsorted(visible, chosen)
 
     def refit(held: BoolArray) -> SceneAdjustment:
-        fixed = replace(options.adjustment, order=adjustment.order)
+        fixed = options.adjustment
+        if fixed.order is None:
+            fixed = replace(fixed, order="affine", slope_px=adjustment.slope_px)
         return adjust_on(scene, tried, matches, held[row_of_tried], fixed)
 
     qualification = qualify(

@@ -1,7 +1,7 @@
 """The least squares: the image correction of one scene from points on known ground."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,9 +11,6 @@ from services.errors import NotEnoughPoints
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
-
-KNOWN_SHARE = 0.25
-"""A parameter left out is taken for zero when the measures tell it to this share of what it may be."""
 
 Order = Literal["shift", "drift", "affine"]
 
@@ -30,7 +27,8 @@ class AdjustmentOptions:
     """How a scene is adjusted.
 
     Attributes:
-        order: of the correction; None lets cross-validation choose.
+        order: of the correction; None lets cross-validation say which one is needed, and estimates drift
+            and skew as far as the measures tell them whatever it says.
         tolerance: a measure leaves when its residual exceeds so many standard deviations.
         min_points: fewer active measures than this are not an adjustment.
         points_per_parameter: an order is considered from so many measures a parameter on.
@@ -40,8 +38,9 @@ class AdjustmentOptions:
         min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
             this fraction.
         folds: of the cross-validation.
-        untested_px: what drift and skew may still be at the edge of the image where the order leaves
-            them out, one standard deviation, as far as the measures do not tell.
+        untested_px: what drift and skew are expected to be at the edge of the image before anything is
+            measured, one standard deviation; the measures may say more, never less.
+        slope_px: the same where the order is given; infinity leaves them to the measures.
     """
 
     order: Order | None = None
@@ -52,6 +51,7 @@ class AdjustmentOptions:
     min_gain: float = 0.03
     folds: int = 5
     untested_px: float = 1.0
+    slope_px: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -60,25 +60,27 @@ class SceneAdjustment:
 
     Attributes:
         correction: of the scene's model.
-        order: how many parameters were free.
+        order: the simplest that predicts held-out measures as well as any, or the one that was given.
         validation_px: every order tried, with its cross-validated residual (rms distance, pixels).
-        covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that were
-            found not to be needed, not for those that could not be tested.
+        slope_px: standard deviation at the edge of the image that drift and skew were expected to have.
+        covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that a given
+            order leaves out.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
-        point_sigma_px: what the points' own accuracy lets expect of the active residuals, one standard
-            deviation a coordinate, pixels.
+        point_sigma_px: (2,) what the points' own accuracy lets expect of the active residuals, one
+            standard deviation of line and sample.
     """
 
     correction: ImageCorrection
     order: Order
     validation_px: tuple[tuple[Order, float], ...]
+    slope_px: float
     covariance: Array
     residual_px: Array
     active: BoolArray
     sigma0: float
-    point_sigma_px: float
+    point_sigma_px: Array
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
@@ -104,6 +106,10 @@ def adjust_scene(
     Weighted least squares on `line_sample - model.project(lon_lat_h)`. Weights come from each
     measure's own sigma and from its point's covariance seen in the image. Robust weights find a first
     solution; then the worst measure beyond tolerance leaves, one at a time, until all agree.
+
+    Drift and skew too small to be seen beside the errors of the points are still there. They are not
+    held at zero but expected to be small: how small is learned from how they come out (empirical
+    Bayes), and their covariance says what is left open.
 
     Args:
         model: as delivered.
@@ -136,37 +142,35 @@ def adjust_scene(
     problem = _Problem(t, np.where(usable[:, None], misfit, 0.0), variance)
 
     order, validation = _choose_order(problem, usable, options)
-    free = _FREE[order]
-    start = problem.robust_solution(usable, free)
+    start = problem.robust_solution(usable, _FREE[order])
     scale = max(problem.scale(start, usable), 1e-9)
+    agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
+    free, slope_px = _FREE[order], options.slope_px
+    if options.order is None:
+        free = _FREE["affine"]
+        slope_px = problem.likeliest_slope_px(agreeing, max(scale, 1.0), options.untested_px)
 
     def magnitude(active: BoolArray) -> Array:
-        parameters, _ = problem.solution(active, free)
+        parameters, _ = problem.solution(active, free, slope_px)
         # The scale of the robust start: one that followed the survivors would shrink with them.
         return np.asarray(problem.magnitude(parameters) / scale)
 
-    agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
     active = deactivate(magnitude, agreeing, options.tolerance, options.min_points)
-    parameters, cofactor = problem.solution(active, free)
-    residual = problem.residual(parameters)
-    freedom = 2 * int(active.sum()) - int(free.sum())
-    chi2 = float((residual[active] ** 2 / variance[active]).sum())
-    sigma0 = float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
+    sigma0 = problem.sigma0(active, free, slope_px)
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
-    covariance = cofactor * max(sigma0, 1.0) ** 2
+    honest = replace(problem, variance=variance * max(sigma0, 1.0) ** 2)
+    parameters, covariance = honest.solution(active, free, slope_px)
     covariance[[0, 3], [0, 3]] += common_sigma_px**2
-    if options.order is None:
-        unit = max(sigma0, 1.0)
-        covariance += problem.covariance_of_fixed(active, free, unit, options.untested_px)
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,
         validation_px=validation,
+        slope_px=slope_px,
         covariance=covariance,
-        residual_px=np.where(usable[:, None], residual, np.nan),
+        residual_px=np.where(usable[:, None], problem.residual(parameters), np.nan),
         active=active,
         sigma0=sigma0,
-        point_sigma_px=float(np.sqrt(np.diagonal(covariance_px2, 0, 1, 2)[active].mean())),
+        point_sigma_px=np.sqrt(np.diagonal(covariance_px2, 0, 1, 2)[active].mean(axis=0)),
     )
 
 
@@ -185,47 +189,52 @@ class _Problem:
     variance: Array
 
     def solution(
-        self, active: BoolArray, free: BoolArray, weights: Array | None = None
+        self,
+        active: BoolArray,
+        free: BoolArray,
+        slope_px: float = np.inf,
+        weights: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Parameters (2, 3) and their cofactor matrix (6, 6)."""
+        """Parameters (2, 3), drift and skew expected to be within `slope_px`, and their covariance (6, 6)."""
         design = np.column_stack([np.ones(len(self.t)), self.t])[active]
         parameters = np.zeros((2, 3))
-        cofactor = np.zeros((6, 6))
+        covariance = np.zeros((6, 6))
         for k in range(2):
             columns = np.flatnonzero(free[k])
             weight = 1.0 / self.variance[active, k]
             if weights is not None:
                 weight = weight * weights[active]
             a = design[:, columns]
-            inverse = np.linalg.pinv((a * weight[:, None]).T @ a)
+            expected = np.diag(np.where(columns > 0, slope_px**-2.0, 0.0))
+            inverse = np.linalg.pinv((a * weight[:, None]).T @ a + expected, hermitian=True)
             parameters[k, columns] = inverse @ (a.T @ (weight * self.misfit[active, k]))
-            cofactor[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
-        return parameters, cofactor
+            covariance[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
+        return parameters, covariance
 
-    def covariance_of_fixed(
-        self, active: BoolArray, free: BoolArray, sigma0: float, untested_px: float
-    ) -> Array:
-        """Covariance (6, 6) that fixed parameters bring: they are zero to what the measures can tell.
+    def likeliest_slope_px(self, active: BoolArray, unit: float, least_px: float) -> float:
+        """Spread of drift and skew under which they are likeliest to come out as they do.
 
-        Left out of the fit, they bias the free ones and are missing where the measures do not reach. Few
-        measures, or measures close together, tell little of them: they are then what `untested_px` says.
+        Args:
+            active: (n,) measures.
+            unit: standard deviation of unit weight.
+            least_px: smallest spread.
         """
-        design = np.column_stack([np.ones(len(self.t)), self.t])[active]
-        covariance = np.zeros((6, 6))
-        for k in range(2):
-            fixed = np.flatnonzero(~free[k])
-            weight = 1.0 / self.variance[active, k][:, None]
-            a = design[:, free[k]]
-            # Error of all parameters per unit of the fixed ones.
-            error = np.zeros((3, len(fixed)))
-            error[free[k]] = np.linalg.solve((a * weight).T @ a, (a * weight).T @ design[:, fixed])
-            error[fixed] = -np.eye(len(fixed))
-            told = (design @ error).T @ (design @ error * weight) / sigma0**2
-            of_fixed = np.linalg.inv(told + np.eye(len(fixed)) / untested_px**2)
-            known = np.diagonal(of_fixed) < (KNOWN_SHARE * untested_px) ** 2
-            of_fixed[known] = of_fixed[:, known] = 0.0
-            covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = error @ of_fixed @ error.T
-        return covariance
+        parameters, covariance = self.solution(active, _FREE["affine"])
+        slope = parameters[:, 1:].ravel()
+        variance = unit**2 * np.diagonal(covariance)[[1, 2, 4, 5]]
+        spread_px = least_px * np.geomspace(1.0, 1000.0, 121)
+        total = variance + spread_px[:, None] ** 2
+        likelihood = -(np.log(total) + slope**2 / total).sum(axis=1)
+        return float(spread_px[np.argmax(likelihood)])
+
+    def sigma0(self, active: BoolArray, free: BoolArray, slope_px: float) -> float:
+        """Standard deviation of unit weight; 1 where nothing is redundant."""
+        parameters, covariance = self.solution(active, free, slope_px)
+        chi2 = float((self.residual(parameters)[active] ** 2 / self.variance[active]).sum())
+        # A parameter that is known beforehand is no parameter of the measures.
+        known = np.diagonal(covariance)[[1, 2, 4, 5]].sum() / slope_px**2
+        freedom = 2 * int(active.sum()) - int(free.sum()) + known
+        return float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
 
     def spread(self, active: BoolArray) -> float:
         """Standard deviation of the measures along the worse axis, half sizes of the image."""
@@ -251,7 +260,7 @@ class _Problem:
         for _ in range(20):
             scale = max(self.scale(parameters, active), 1e-9)
             weights = cauchy_weights(self.magnitude(parameters) / scale)
-            updated, _ = self.solution(active, free, weights)
+            updated, _ = self.solution(active, free, weights=weights)
             if np.abs(updated - parameters).max() < 1e-4:
                 return updated
             parameters = updated

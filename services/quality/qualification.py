@@ -7,7 +7,7 @@ import numpy as np
 
 from services.adjustment.scene import SceneAdjustment
 from services.matching.consensus import vote
-from services.quality.accuracy import Statistics, statistics
+from services.quality.accuracy import Statistics, normal_ce90, statistics
 from services.quality.stability import (
     ImageResiduals,
     PredictedAccuracy,
@@ -34,10 +34,13 @@ class QualificationOptions:
         good_coverage_percent: smallest coverage of the image by active points.
         good_active_of_matched: smallest share of matched points that the adjustment keeps.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate, without the part that the points' stated accuracy explains.
+            of the worse coordinate, without the part that the points' stated accuracy and chance explain.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
+        good_ce90_of_points, usable_ce90_of_points: the same as a share of the points' own CE90, where that
+            allows more: points coarser than the pixels still make a model several times better than
+            they are.
         good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
         good_rival_share: largest share, of the active points, of deactivated ones that agree among
             themselves on another place: two stories told by as many points are not one truth.
@@ -54,12 +57,14 @@ class QualificationOptions:
     good_residual_std_px: float = 1.0
     good_displacement_px: float = 0.5
     good_ce90_px: float = 1.0
+    good_ce90_of_points: float = 0.25
     good_unit_weight: float = 3.0
     good_rival_share: float = 0.3
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
     usable_ce90_px: float = 3.0
+    usable_ce90_of_points: float = 0.5
     coverage_cells: int = 5
     grid: int = 7
     draws: int = 10
@@ -190,7 +195,8 @@ def qualify(
     predicted = predict_accuracy(adjustment, shape, gsd_m, options.grid, frame_sigma_m)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     std_px = unexplained_px(residuals, adjustment.point_sigma_px)
-    criteria = compare(equipment, std_px, stability, predicted, coverage, options)
+    points_ce90_px = float(normal_ce90(np.diag(adjustment.point_sigma_px**2)[None])[0])
+    criteria = compare(equipment, std_px, stability, predicted, points_ce90_px, coverage, options)
     criteria += (
         _at_most("unit_weight", adjustment.sigma0, options.good_unit_weight, "good"),
         _at_most("rival_share", rival_share(measures), options.good_rival_share, "good"),
@@ -221,13 +227,20 @@ def count_equipment(measures: Measures) -> Equipment:
     )
 
 
-def unexplained_px(residuals: ImageResiduals, point_sigma_px: float) -> float:
+def unexplained_px(residuals: ImageResiduals, point_sigma_px: Array) -> float:
     """Standard deviation of the worse coordinate without what the points' own accuracy explains.
 
-    Points of 3 m are no fault of a scene of 0.5 m pixels: many of them still tell its model well.
+    Points of 3 m are no fault of a scene of 0.5 m pixels: many of them still tell its model well. Of n
+    residuals the variance is known to sqrt(2 / n): two such deviations are what chance explains.
+
+    Args:
+        residuals: of the active points.
+        point_sigma_px: (2,) line and sample.
     """
-    std = float(np.maximum(residuals.x.std, residuals.y.std))
-    return float(np.sqrt(np.maximum(std**2 - point_sigma_px**2, 0.0)))
+    variance = np.array([residuals.y.std, residuals.x.std]) ** 2
+    chance = 1.0 + 2.0 * np.sqrt(2.0 / max(residuals.x.n, 1))
+    left = np.maximum(variance - chance * point_sigma_px**2, 0.0)
+    return float(np.sqrt(left.max()))
 
 
 def rival_share(measures: Measures) -> float:
@@ -263,10 +276,13 @@ def compare(
     std_px: float,
     stability: Stability,
     predicted: PredictedAccuracy,
+    points_ce90_px: float,
     coverage: Coverage,
     options: QualificationOptions,
 ) -> tuple[Criterion, ...]:
     """Hold the figures against the thresholds."""
+    good_px = max(options.good_ce90_px, options.good_ce90_of_points * points_ce90_px)
+    usable_px = max(options.usable_ce90_px, options.usable_ce90_of_points * points_ce90_px)
     moved_px = max((place.median_px for place in stability.displacements), default=float("nan"))
     good = (
         _at_least("active_points", equipment.active, options.good_active_points, "good"),
@@ -276,13 +292,13 @@ def compare(
         ),
         _at_most("residual_std_px", std_px, options.good_residual_std_px, "good"),
         _at_most("displacement_px", moved_px, options.good_displacement_px, "good"),
-        _at_most("predicted_ce90_px", predicted.worst_px, options.good_ce90_px, "good"),
+        _at_most("predicted_ce90_px", predicted.worst_px, good_px, "good"),
     )
     usable = (
         _at_least("active_points", equipment.active, options.usable_active_points, "usable"),
         _at_most("residual_std_px", std_px, options.usable_residual_std_px, "usable"),
         _at_most("displacement_px", moved_px, options.usable_displacement_px, "usable"),
-        _at_most("predicted_ce90_px", predicted.worst_px, options.usable_ce90_px, "usable"),
+        _at_most("predicted_ce90_px", predicted.worst_px, usable_px, "usable"),
     )
     return good + usable
 

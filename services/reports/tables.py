@@ -29,11 +29,11 @@ CRITERION_WAYS = {
     "coverage_percent": "cells of the image with an active point, of all cells",
     "active_of_matched": "active points, of those matched",
     "residual_std_px": "standard deviation of the active residuals, n - 1, the worse of x and y, "
-    "without what the accuracy stated for the points explains",
+    "without what the accuracy stated for the points and chance explain",
     "displacement_px": "adjustment redone on a part of the points: median over the draws, worst of four "
     "corners and centre",
     "predicted_ce90_px": "covariance of the correction carried over the image: radius that holds 90 % "
-    "of its normal law, largest of the grid",
+    "of its normal law, largest of the grid; points coarser than the pixels allow a share of their own",
     "unit_weight": "root of the weighted squares of the active residuals over the degrees of freedom: "
     "one when the stated sigmas are true",
     "rival_share": "largest group of deactivated points that agree on another place, over the "

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from services.errors import NotEnoughPoints
+from services.quality.accuracy import CIRCULAR_CE90
 from services.quality.qualification import (
     QualificationOptions,
     count_equipment,
@@ -198,6 +199,18 @@ def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
     found = qualified(registered(), replace(DEFAULT, **{field: limit}))
     assert failed(found) == {lost}
     assert found.verdict == ("usable" if lost[1] == "good" else "failed")
+
+
+def test_points_coarser_than_the_pixels_allow_a_share_of_their_own_accuracy(registered):
+    """Residuals of 3 px from points of 3 px are no fault of the model; from points of 1 px they are."""
+    scene = registered(n=400, noise_px=3.0)
+    for sigma_px, lost in ((3.0, set()), (1.0, {"residual_std_px"})):
+        known = replace(scene.adjustment, point_sigma_px=np.full(2, sigma_px))
+        criteria = qualified(replace(scene, adjustment=known)).criteria
+        assert lost == {c.name for c in criteria if not c.passed and c.name == "residual_std_px"}
+        limit = {c.needed_for: c.limit for c in criteria if c.name == "predicted_ce90_px"}
+        assert limit["good"] == pytest.approx(max(1.0, 0.25 * CIRCULAR_CE90 * sigma_px))
+        assert limit["usable"] == pytest.approx(max(3.0, 0.5 * CIRCULAR_CE90 * sigma_px))
 
 
 def test_two_stories_told_by_many_points_are_not_good(registered):
