@@ -8,7 +8,7 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import lon_lat_h_from_east_north_up
-from services.resampling import resample, spline_coefficients
+from services.resampling import extent, resample, spline_coefficients
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
 
@@ -173,11 +173,15 @@ def chip_positions(model: SensorModel, lon_lat_h: Array, gsd_m: float, size: int
     count = 2 * half + 1
     ground = chip_ground(lon_lat_h, gsd_m * _NODE_PX, count)
     nodes = model.project(ground).reshape(count, count, 2)
-    if not np.isfinite(nodes).all():
-        return np.full((size, size, 2), np.nan)
     pixel = (np.arange(size) - size // 2) / _NODE_PX
     weight = np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
-    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+    missing = ~np.isfinite(nodes).all(axis=2)
+    if missing.any():
+        nodes[missing] = 0.0
+    positions = np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+    if missing.any():
+        positions[weight @ missing @ weight.T > 0.0] = np.nan
+    return positions
 
 
 def render_chip(
@@ -227,14 +231,13 @@ def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: 
     else:
         image = source
     nothing = np.full(line_sample.shape[:2], np.nan, dtype=np.float32)
-    placed = line_sample.reshape(-1, 2)
-    placed = placed[np.isfinite(placed).all(axis=1)]
-    if len(placed) == 0:
+    low, high = extent(line_sample)
+    if not (high >= low).all():
         return nothing
     factor = max(1, int(ratio / 2.0))
     margin = _MARGIN_PX * factor + int(2.0 * ratio)
-    first = np.floor(placed.min(axis=0)).astype(int) - margin
-    last = np.ceil(placed.max(axis=0)).astype(int) + margin + 1
+    first = np.floor(low).astype(int) - margin
+    last = np.ceil(high).astype(int) + margin + 1
     first, last = np.maximum(first, -margin), np.minimum(last, np.array(image.shape) + margin)
     if (last <= 0).any() or (first >= image.shape).any() or (last - first < 4 * factor).any():
         return nothing

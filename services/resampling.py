@@ -56,6 +56,11 @@ def spline_coefficients(pixels: FloatImage, blur_px: float = 0.0) -> FloatImage:
     return np.asarray(found)
 
 
+def extent(line_sample: Array) -> tuple[Array, Array]:
+    """Lowest and highest (2,) of the positions (..., 2) that are finite; inf and -inf of none."""
+    return _extent(np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2))
+
+
 def _mean_of(pixels: FloatImage, missing: np.ndarray) -> float:
     return 0.0 if missing.all() else float(pixels[~missing].mean())
 
@@ -84,6 +89,17 @@ def spline_weights(t: float) -> tuple[np.float32, np.float32, np.float32, np.flo
         np.float32(2.0 / 3.0 - s * s * (2.0 - s) / 2.0),
         np.float32(t * t * t / 6.0),
     )
+
+
+@njit(cache=True)
+def _extent(line_sample: Array) -> tuple[Array, Array]:
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for k in range(len(line_sample)):
+        line, sample = line_sample[k, 0], line_sample[k, 1]
+        if np.isfinite(line) and np.isfinite(sample):
+            low[0], high[0] = min(low[0], line), max(high[0], line)
+            low[1], high[1] = min(low[1], sample), max(high[1], sample)
+    return low, high
 
 
 @njit(cache=True, error_model="numpy")

@@ -19,6 +19,10 @@ REACH_CELLS = 5
 """Squares this far apart have nothing to do with each other; fewer in a small chip."""
 
 
+_SUMS = {"reassoc", "contract", "nsz", "arcp"}
+"""What the compiler may do to sums to fill vector registers; NaN and infinity stay what they are."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """A chip laid on a patch.
@@ -119,7 +123,7 @@ def _fit(
     return r, c, score, influence
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=_SUMS)
 def _design(chip: FloatImage) -> tuple[FloatImage, Array]:
     """Gradients of the chip without its own grey values and mean, and their normal matrix inverted."""
     side = chip.shape[0] - 2
@@ -156,7 +160,7 @@ def _design(chip: FloatImage) -> tuple[FloatImage, Array]:
     return gradients, inverse
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=_SUMS)
 def _interpolated(
     coefficients: FloatImage, row: float, col: float, out: FloatImage, derivative: int
 ) -> None:
@@ -196,7 +200,7 @@ def _taps(t: float, out: FloatImage, derivative: bool) -> None:
         out[0], out[1], out[2], out[3] = spline_weights(t)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=_SUMS)
 def _projected(
     at: FloatImage, chip: FloatImage, gradients: FloatImage, inverse: Array
 ) -> tuple[float, float, float]:
@@ -221,7 +225,7 @@ def _projected(
     return product / square, r, c
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=_SUMS)
 def _influence(
     coefficients: FloatImage, chip: FloatImage, gradients: FloatImage, row: float, col: float
 ) -> tuple[float, Array]:
@@ -267,7 +271,7 @@ def _influence(
     return score, influence
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=_SUMS)
 def _bartlett(influence: Array, reach: int, covariance: Array) -> None:
     """Sum over all squares `reach` wide, whole or not, of the products of their sums."""
     cells = influence.shape[0]

@@ -204,7 +204,7 @@ def test_nodata_stays_missing_and_does_not_spread_far() -> None:
     assert np.abs(missing).max() <= 10
 
 
-def test_a_model_that_cannot_say_gives_a_missing_chip() -> None:
+def test_where_a_model_cannot_say_a_chip_misses_that_part_and_no_more() -> None:
     @dataclass(frozen=True)
     class Lost(PlaneModel):
         def project(self, lon_lat_h: Array) -> Array:
@@ -212,7 +212,12 @@ def test_a_model_that_cannot_say_gives_a_missing_chip() -> None:
             found[0] = np.nan
             return found
 
-    assert np.isnan(render_chip(noise_image(), Lost(), point_at(0.0, 0.0), 1.0)).all()
+    chip = render_chip(noise_image(), Lost(), point_at(0.0, 0.0), 1.0)
+    whole = render_chip(noise_image(), PlaneModel(), point_at(0.0, 0.0), 1.0)
+    told = np.ones(chip.shape, dtype=bool)
+    told[:10, :10] = False
+    assert np.isnan(chip[~told]).all()
+    np.testing.assert_array_equal(chip[told], whole[told])
 
 
 def test_windows_reach_beyond_the_image_with_nan() -> None:
