@@ -28,9 +28,10 @@ class RefinementOptions:
 
     radius_px: int = 6
     min_sigma_px: float = 0.03
-    # Along the parallax relief blurs a place; the rays say how much that matters.
+    # Steep ground looks different from two sides: half of it in common tells a place among the few that
+    # are left. Along the parallax it is blurred then; the rays say how much that matters.
     correlation: CorrelationOptions = field(
-        default_factory=lambda: CorrelationOptions(min_score=0.7, max_sigma_px=2.0)
+        default_factory=lambda: CorrelationOptions(min_score=0.5, max_sigma_px=2.0)
     )
 
 
@@ -60,7 +61,7 @@ def refine_on_chips(
     """
     whole = np.stack(
         [
-            chip_inside(model, scene.image.shape, lon_lat_h, gsd_m, options.radius_px)
+            chip_inside(model, scene.image.shape, lon_lat_h, gsd_m)
             for scene, model in zip(scenes, models, strict=True)
         ]
     )

@@ -14,7 +14,7 @@ what_features_allow_px = 0.11
     ("folder", "images", "delivered_px", "least_points"),
     [
         ("phr_gizeh_pair", ("img1.tif", "img2.tif"), (0.2, 0.4), 100),
-        ("phr_ventoux_pair", ("left_image.tif", "right_image.tif"), (2.0, 3.0), 15),
+        ("phr_ventoux_pair", ("left_image.tif", "right_image.tif"), (2.0, 3.0), 30),
     ],
 )
 def test_a_real_pair_becomes_a_block_whose_rays_meet(
