@@ -3,14 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from services.adjustment.scene import AdjustmentOptions
 from services.conventions import CHIP_CENTRE
-from services.errors import NoConsensus
+from services.errors import InputError, NoConsensus
 from services.imagery import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import vote
 from services.matching.points import MatchingOptions, match_points
-from services.matching.predict import inside, spread_over_image
+from services.matching.predict import spread_over_image
 from services.passes import (
     Pass,
     adjust_on,
@@ -30,11 +31,12 @@ class CoarseOptions:
 
     Attributes:
         max_fine_radius_px: up to this many pixels of the finest chips no coarse stage is needed.
-        points: how many are tried.
-        enough: chips of a ground sampling are used when the scene shows so many of them whole.
+        points: so many are tried that the scene should show as many whole, wherever it lies.
+        enough: chips of a ground sampling are used when the scene should show so many of them whole.
         min_score: normalised correlation below which a chip is not found here, where the consensus of
             many decides.
-        max_search_px: how far a chip is searched at most, chip pixels.
+        max_search_px: how far a chip is searched at most, pixels; farther, it is degraded.
+        max_reduction: how many times a chip is degraded at most; less than 25 pixels of one tell little.
         max_false_alarms: a consensus that chance would give more often than this is refused.
     """
 
@@ -43,7 +45,36 @@ class CoarseOptions:
     enough: int = 12
     min_score: float = 0.5
     max_search_px: int = 400
+    max_reduction: int = 4
     max_false_alarms: float = 1e-4
+
+    def __post_init__(self) -> None:
+        """Refuse what no search can be made with."""
+        for name in ("points", "max_search_px", "max_reduction"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: {getattr(self, name)} given, 1 or more expected")
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What is searched, and how.
+
+    Attributes:
+        gsd_m: ground sampling of the chips, as they are stored.
+        reduction: how many times they are degraded.
+        radius_px: how far they are searched, pixels of the degraded chips.
+        rows: the points to try.
+    """
+
+    gsd_m: float
+    reduction: int
+    radius_px: int
+    rows: IntArray
+
+    @property
+    def level_m(self) -> float:
+        """Ground sampling of the degraded chips."""
+        return self.gsd_m * self.reduction
 
 
 def search_coarsely(
@@ -76,61 +107,117 @@ def search_coarsely(
     Raises:
         NoConsensus: when the points found do not agree beyond chance.
     """
-    gsd_m, rows = _usable_chips(scene, points, float(uncertainty_m.max()), options.enough)
-    line_sample = model.project(points.lon_lat_h[rows])
-    best = spread_over_image(
-        line_sample,
-        points.lon_lat_h[rows, 2],
-        points.saliency[rows] * points.health[rows],
-        scene.image.shape,
-        options.points,
-    )
-    few = points.take(np.sort(rows[best]))
-    radius_px = search_radius_px(uncertainty_m, gsd_m, options.max_search_px)
+    search = _planned(scene, model, points, uncertainty_m, options)
+    few, level_m, radius_px = points.take(search.rows), search.level_m, search.radius_px
     correlation = replace(matching.correlation, min_score=options.min_score, max_second=1.0)
     matching = replace(matching, correlation=correlation)
     progress(0.0, "coarse search")
-    image = _image_for(scene, gsd_m, len(few), radius_px)
+    image = _image_for(scene, level_m, len(few), radius_px)
     matches = match_points(
-        image, model, few, chips, gsd_m, radius_px, scene.acquisition, matching, progress
+        image,
+        model,
+        few,
+        chips,
+        search.gsd_m,
+        radius_px,
+        scene.acquisition,
+        matching,
+        progress,
+        search.reduction,
     )
 
-    consensus = vote(matches.displacement_m, 3.0 * gsd_m, radius_px * gsd_m)
+    reach_m = _reach_m(scene, search)
+    consensus = vote(matches.displacement_m, 3.0 * level_m, reach_m)
     if consensus.false_alarms > options.max_false_alarms:
         found = int((matches.reason == "").sum())
         raise NoConsensus(
             f"the coarse search does not agree on one correction: {len(few)} points tried within "
-            f"{radius_px * gsd_m:.0f} m, {found} found, {int(consensus.agreeing.sum())} of them within "
-            f"{3.0 * gsd_m:g} m of each other (chance alone: {consensus.false_alarms:.2g} times); "
-            + reasons_in_words(matches.reason)
+            f"{radius_px * level_m:.0f} m, {found} found, {int(consensus.agreeing.sum())} of them "
+            f"within {3.0 * level_m:g} m of each other (chance alone: {consensus.false_alarms:.2g} "
+            "times); " + reasons_in_words(matches.reason)
         )
     enough = replace(adjustment, min_points=min(3, int(consensus.agreeing.sum())))
     adjusted = adjust_on(scene, few, matches, consensus.agreeing, enough)
     corrected = CorrectedModel(scene.model, adjusted.correction)
-    after_m = np.hypot(model_uncertainty_m(corrected, points, adjusted), gsd_m / 2.0)
-    return corrected, after_m, summarised("coarse", gsd_m, radius_px, matches, consensus.agreeing)
+    after_m = np.hypot(model_uncertainty_m(corrected, points, adjusted), level_m / 2.0)
+    return corrected, after_m, summarised("coarse", level_m, radius_px, matches, consensus.agreeing)
 
 
-def _usable_chips(
-    scene: Scene, points: ControlPoints, uncertainty_m: float, enough: int
-) -> tuple[float, IntArray]:
-    """The coarsest chips that the scene shows whole wherever it may lie, and the points that have them.
+def _planned(
+    scene: Scene,
+    model: CorrectedModel,
+    points: ControlPoints,
+    uncertainty_m: Array,
+    options: CoarseOptions,
+) -> _Search:
+    """The coarsest chips of which the scene should show enough, and the points to try with them.
 
-    Large chips near the border, or in a small scene, are not shown whole: where fewer than `enough` are,
-    finer ones have to be searched further.
+    Large chips near the border, or in a small scene, are rarely shown whole: finer ones are searched
+    farther then, degraded where that would be too far.
     """
-    line_sample = scene.model.project(points.lon_lat_h)
+    line_sample = model.project(points.lon_lat_h)
+    best: tuple[float, float, Array] | None = None
     for gsd_m in np.unique(points.views.gsd_m)[::-1]:
-        reach_m = np.sqrt(2.0) * CHIP_CENTRE * gsd_m + 3.0 * uncertainty_m
-        whole = inside(line_sample, scene.image.shape, -reach_m / scene_gsd_m(scene))
-        rows = np.flatnonzero(_has_chip(points, gsd_m) & whole)
-        if len(rows) >= enough:
-            return float(gsd_m), rows
-    finest_m = float(points.views.gsd_m.min())
-    return finest_m, np.flatnonzero(_has_chip(points, finest_m))
+        shown = _chance_of_being_shown(scene, points, line_sample, float(gsd_m), uncertainty_m)
+        shown[~has_chip(points, float(gsd_m))] = 0.0
+        if best is None or shown.sum() > best[1]:
+            best = float(gsd_m), float(shown.sum()), shown
+        if best[1] >= options.enough:
+            break
+    assert best is not None
+    gsd_m, _, shown = best
+    reduction = 1
+    while reduction < options.max_reduction and (
+        search_radius_px(uncertainty_m, gsd_m * reduction, 10**9) > options.max_search_px
+    ):
+        reduction += 1
+    radius_px = search_radius_px(uncertainty_m, gsd_m * reduction, options.max_search_px)
+    rows = np.flatnonzero(shown > 0.0)
+    preference = (points.saliency * points.health * shown)[rows]
+    order = rows[
+        spread_over_image(
+            line_sample[rows], points.lon_lat_h[rows, 2], preference, scene.image.shape, len(rows)
+        )
+    ]
+    count = int(np.searchsorted(np.cumsum(shown[order]), options.points)) + 1
+    return _Search(gsd_m, reduction, radius_px, np.sort(order[:count]))
 
 
-def _has_chip(points: ControlPoints, gsd_m: float) -> BoolArray:
+def _chance_of_being_shown(
+    scene: Scene, points: ControlPoints, line_sample: Array, gsd_m: float, uncertainty_m: Array
+) -> Array:
+    """Chance (n,) that the scene shows the chips of points whole, its error being normal.
+
+    Args:
+        scene: where it is does not count, only its size.
+        points: on the ground.
+        line_sample: (n, 2) where they are expected.
+        gsd_m: ground sampling of the chips.
+        uncertainty_m: (n,) standard deviation of that.
+    """
+    middle = points.lon_lat_h[len(points) // 2 : len(points) // 2 + 1]
+    derivative = np.abs(scene.model.project_derivative(middle)[0, :, :2])
+    reach_px = CHIP_CENTRE * gsd_m * derivative.sum(axis=1)
+    sigma_px = (uncertainty_m / scene_gsd_m(scene))[:, None]
+    room_px = np.array(scene.image.shape) - 1.0 - reach_px
+    inside = ndtr((room_px - line_sample) / sigma_px) - ndtr((reach_px - line_sample) / sigma_px)
+    return np.asarray(np.nan_to_num(np.maximum(inside, 0.0)).prod(axis=1))
+
+
+def _reach_m(scene: Scene, search: _Search) -> float:
+    """Half side of the square where a chip may be found: where it is looked for and the scene is."""
+    gsd_m = scene_gsd_m(scene)
+    room_m = [
+        min(
+            2.0 * search.radius_px * search.level_m,
+            max(size * gsd_m - CHIP_CENTRE * 2.0 * search.gsd_m, 0.0),
+        )
+        for size in scene.image.shape
+    ]
+    return max(float(np.sqrt(room_m[0] * room_m[1])) / 2.0, search.level_m)
+
+
+def has_chip(points: ControlPoints, gsd_m: float) -> BoolArray:
     """Which points (n,) have a chip of a ground sampling."""
     count = np.concatenate([[0], np.cumsum(np.isclose(points.views.gsd_m, gsd_m))])
     return np.asarray(count[points.views.start[1:]] > count[points.views.start[:-1]])

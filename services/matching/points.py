@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.conventions import CHIP_SIZE
+from services.conventions import CHIP_CENTRE
 from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
@@ -87,6 +87,7 @@ def match_points(
     scene: Acquisition,
     options: MatchingOptions,
     progress: Progress = no_progress,
+    reduction: int = 1,
 ) -> PointMatches:
     """Search every point around where a model expects it.
 
@@ -99,12 +100,14 @@ def match_points(
         points: all of them are tried.
         chips: of the points.
         gsd_m: ground sampling of the chips to use.
-        radius_px: how far to search, chip pixels.
+        radius_px: how far to search, pixels of the chips as they are searched.
         scene: how it was taken.
         options: thresholds.
         progress: told the fraction of the points done.
+        reduction: chips are degraded to so many times their ground sampling before they are searched.
     """
     n = len(points)
+    level_m, size = gsd_m * reduction, 2 * (CHIP_CENTRE // reduction + radius_px) + 1
     displacement_m = np.full((n, 2), np.nan)
     sigma_m = np.full(n, np.nan)
     score = np.full(n, np.nan)
@@ -116,20 +119,21 @@ def match_points(
     seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
         if done % 64 == 0:
-            progress(done / n, f"searching {n} points with chips of {gsd_m:g} m")
+            progress(done / n, f"searching {n} points with chips of {level_m:g} m")
         numbers = chosen.row[chosen.start[row] : chosen.start[row + 1]] - points.views.start[row]
         if len(numbers) == 0:
             reason[row] = "no_chip"
             continue
         ground = points.lon_lat_h[row]
-        patch = render_chip(image, model, ground, gsd_m, CHIP_SIZE + 2 * radius_px)
+        patch = render_chip(image, model, ground, level_m, size)
         if not np.isfinite(patch).any():
             reason[row] = "nodata"
             continue
         scene_gsd_m[row] = image_gsd_m(model, ground)
         stack = point_chips(points, chips, row)
+        ratio = scene_gsd_m[row] / gsd_m
         peaks = [
-            find_chip(patch, _as_seen(stack[number], scene_gsd_m[row] / gsd_m), options.correlation)
+            find_chip(patch, _as_seen(stack[number], ratio, reduction), options.correlation)
             for number in numbers
         ]
         row_col, sigma, agreeing, reason[row] = _combined(peaks, options.agreement_px)
@@ -140,8 +144,8 @@ def match_points(
                 offsets.setdefault(image_number, []).append(peak.row_col - row_col)
         views[row] = agreeing.sum()
         score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
-        displacement_m[row] = row_col[1] * gsd_m, -row_col[0] * gsd_m
-        sigma_m[row] = sigma * gsd_m
+        displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
+        sigma_m[row] = sigma * level_m
     moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     return PointMatches(
         model.project(moved),
@@ -151,7 +155,7 @@ def match_points(
         views,
         reason,
         np.zeros(n, dtype=bool),
-        common_sigma(list(offsets.values())) * gsd_m,
+        common_sigma(list(offsets.values())) * level_m,
         _view_measures(seen),
     )
 
@@ -192,9 +196,14 @@ def chip_pixels(chip: np.ndarray) -> FloatImage:
     return pixels
 
 
-def _as_seen(chip: np.ndarray, ratio: float) -> FloatImage:
-    """A chip at the resolution of a scene whose pixels are `ratio` times larger."""
-    return low_pass(chip_pixels(chip), ratio)
+def _as_seen(chip: np.ndarray, ratio: float, reduction: int) -> FloatImage:
+    """A chip at the resolution of a scene whose pixels are `ratio` times larger, degraded or not.
+
+    Every `reduction`-th pixel is kept, the centre among them.
+    """
+    seen = low_pass(chip_pixels(chip), max(ratio, float(reduction)))
+    first = CHIP_CENTRE % reduction
+    return np.ascontiguousarray(seen[first::reduction, first::reduction])
 
 
 def _tile_order(line_sample: Array) -> Sequence[int]:
