@@ -1,5 +1,7 @@
 """The errors of the doors and the store; those of the science are in `services.errors`."""
 
+import errno
+
 from services.errors import AmersError, ComputationError, InputError
 
 __all__ = [
@@ -12,7 +14,10 @@ __all__ = [
     "NotFound",
     "TooLarge",
     "TooMany",
+    "is_no_room",
 ]
+DISK_FULL = "53100"
+"""What PostgreSQL calls it."""
 
 
 class InvalidParameter(InputError):
@@ -33,6 +38,13 @@ class TooLarge(AmersError):
 
 class TooMany(AmersError):
     """More at once than the caller may have; later it may be possible."""
+
+
+def is_no_room(error: BaseException) -> bool:
+    """Whether an error says that a disk is full, that of the files or that of the database."""
+    return (
+        isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    ) or getattr(error, "sqlstate", None) == DISK_FULL
 
 
 class NotAllowed(AmersError):

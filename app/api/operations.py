@@ -35,7 +35,9 @@ def audit(
     connection: ReadConnection,
     caller: Admin,
     limit: Annotated[int, Query(ge=1, le=operations.MOST_CHANGES)] = 100,
-    before: Annotated[int | None, Query(description="Changes with smaller ids only.")] = None,
+    before: Annotated[
+        int | None, Query(le=2**63 - 1, description="Changes with smaller ids only.")
+    ] = None,
     kind: Annotated[str | None, Query(description="token, block, scene or job.")] = None,
     subject: Annotated[str | None, Query(description="Id of one of them.", max_length=300)] = None,
 ) -> dict[str, Any]:

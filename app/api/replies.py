@@ -1,5 +1,6 @@
 """Errors into replies: the only place that knows both. Replies are RFC 9457 problem details."""
 
+import logging
 from http import HTTPStatus
 from typing import Any
 
@@ -21,6 +22,7 @@ from app.errors import (
     NotFound,
     TooLarge,
     TooMany,
+    is_no_room,
 )
 
 PROBLEM_JSON = "application/problem+json"
@@ -37,6 +39,8 @@ HTTP_STATUS: dict[type[Exception], int] = {
 RETRY_SECONDS = "5"
 HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
 
+log = logging.getLogger(__name__)
+
 
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem reply."""
@@ -44,6 +48,8 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _not_routed)
     app.add_exception_handler(psycopg.OperationalError, _unavailable)
+    app.add_exception_handler(psycopg.DataError, _unusable)
+    app.add_exception_handler(OSError, _no_room)
     app.add_exception_handler(PoolTimeout, _unavailable)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -104,7 +110,25 @@ def _not_routed(request: Request, error: Exception) -> JSONResponse:
     return problem(error.status_code, str(error.detail), headers=headers)
 
 
+def _unusable(request: Request, error: Exception) -> JSONResponse:
+    """A value that no column holds: a NUL in a text, a number beyond 64 bits."""
+    first_line = str(error).partition("\n")[0]
+    log.warning("%s %s: %s", request.method, request.url.path, first_line)
+    detail = f"a value of this request cannot be used: {first_line}"
+    return problem(400, detail, error=InvalidParameter.__name__)
+
+
+def _no_room(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s %s broke off", request.method, request.url.path, exc_info=error)
+    if not is_no_room(error):
+        return _unexpected(request, error)
+    detail = "a disk of the service is full; nothing of this was kept that is not whole: try again later"
+    return problem(507, detail, headers={"Retry-After": RETRY_SECONDS})
+
+
 def _unavailable(request: Request, error: Exception) -> JSONResponse:
+    if is_no_room(error):
+        return _no_room(request, error)
     if isinstance(error, psycopg.errors.QueryCanceled):
         return problem(503, "the database stopped this request: it took too long; ask for less")
     return problem(

@@ -33,7 +33,7 @@ class SceneOnServer(BaseModel):
     """
 
     path: str = Field(min_length=1, max_length=1000)
-    sigma_m: float | None = Field(default=None, gt=0)
+    sigma_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
 
 @router.post("/scenes", status_code=status.HTTP_201_CREATED, openapi_extra={"requestBody": BINARY_BODY})
@@ -45,7 +45,9 @@ def upload_scene(
     settings: SettingsDep,
     caller: Registrar,
     name: Annotated[str | None, Query(description="Name of the file.")] = None,
-    sigma_m: Annotated[float | None, Query(gt=0, description="Accuracy of its model, metres.")] = None,
+    sigma_m: Annotated[
+        float | None, Query(gt=0, allow_inf_nan=False, description="Accuracy of its model, metres.")
+    ] = None,
 ) -> dict[str, Any]:
     """Upload the image of a scene as the body of the request: GeoTIFF, JPEG 2000 or NITF.
 

@@ -22,6 +22,7 @@ from app.config import Settings
 from app.db import jobs
 from app.db.engine import Database
 from app.db.jobs import Job, LostJob
+from app.errors import is_no_room
 from app.origin import Origin, working_for
 from app.storage import UNFINISHED
 
@@ -32,6 +33,8 @@ LONGEST_BEAT_S = 2.0
 """A lease is renewed at least this often, which is also how soon a dismissed job is noticed."""
 OUT_OF_MEMORY = 77
 """Exit code of a process that met its memory limit."""
+NO_ROOM = 78
+"""Exit code of a process that found a disk full."""
 
 LIMITED_LIBRARIES = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -98,6 +101,10 @@ class Attempts:
         except TooLong:
             allowed_s = self.settings.job_seconds
             self._fail(job, "Time limit", f"stopped after the {allowed_s:g} s that a job may take")
+        except OSError as error:
+            if not is_no_room(error):
+                raise
+            self._settle(job, NO_ROOM)
         else:
             self._settle(job, code)
 
@@ -110,6 +117,8 @@ class Attempts:
         if code == OUT_OF_MEMORY:
             allowed = f"{self.settings.job_memory_bytes / 2**20:.0f} MiB"
             self._fail(job, "Memory limit", f"needs more memory than the {allowed} that a job may take")
+        elif failures >= FAILURES_ALLOWED and code == NO_ROOM:
+            self._fail(job, "No room", f"a disk of the service was full, {failures} attempts broke off")
         elif failures >= FAILURES_ALLOWED:
             self._fail(
                 job,

@@ -2,7 +2,8 @@
 
 Started as `python -m app.worker.run JOB ATTEMPT WORKER_PID MEMORY_BYTES`.
 
-Exit codes: 0 the outcome is written or no longer wanted, 77 out of memory, anything else: it broke off.
+Exit codes: 0 the outcome is written or no longer wanted, 77 out of memory, 78 a disk is
+full, anything else: it broke off.
 """
 
 import ctypes
@@ -20,9 +21,10 @@ from app import logs
 from app.config import read_settings
 from app.db.engine import pooled
 from app.db.jobs import LostJob
+from app.errors import is_no_room
 from app.origin import Origin, working_for
 from app.usecases.jobs import do_attempt
-from app.worker.attempt import OUT_OF_MEMORY
+from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY
 
 PR_SET_PDEATHSIG = 1
 CV_NO_MEMORY = -4
@@ -50,6 +52,11 @@ def main(arguments: list[str]) -> int:
         if error.code == CV_NO_MEMORY:
             return OUT_OF_MEMORY
         raise
+    except Exception as error:
+        if not is_no_room(error):
+            raise
+        log.exception("a disk is full")
+        return NO_ROOM
     return 0
 
 
