@@ -1,0 +1,180 @@
+"""An installation with something to lose, and what shows that nothing of it was touched or told."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import httpx
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine, jobs
+from app.db.engine import Database
+from app.main import create_app
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.jobs import do_attempt
+from app.usecases.tokens import create_token
+from tests.app.flat_world import SIGMA_M, FlatWorld
+from tests.factories import make_block
+
+CANARY = "canary-7f3a91-must-never-be-seen"
+LIMIT_BYTES = 5_000_000
+BODY_LIMIT_BYTES = 200_000
+LEFT_BY_JOBS = ("audit", "job", "upload", "scene", "procrastinate_jobs", "procrastinate_events")
+LEFT_BY_JOBS += ("scenes", "blocks", "uploads")
+"""Tables and folders in which a file that a job refuses leaves what it was: file, job, reason."""
+
+
+@dataclass(frozen=True)
+class Besieged:
+    """A running application with points, scenes and secrets.
+
+    Attributes:
+        client: without a token.
+        database, settings: of the application.
+        headers: of callers by scope; `other` is the owner of `names["others_scene"]`.
+        names: ids that cases put into their requests.
+        outside: a folder that holds the canary and is no part of the installation.
+    """
+
+    client: TestClient
+    database: Database
+    settings: Settings
+    headers: dict[str, dict[str, str]]
+    names: dict[str, str]
+    outside: Path
+    looked: list[str] = field(default_factory=list)
+
+    def digest(self, without: tuple[str, ...] = ("audit",)) -> str:
+        """Checksum of all rows and all files."""
+        with self.database.transaction() as connection:
+            tables = connection.execute(
+                "select tablename as name from pg_tables"
+                " where schemaname = 'public' and tablename <> 'spatial_ref_sys' order by 1"
+            ).fetchall()
+            sums = connection.execute(
+                " union all ".join(
+                    f"select '{name}' as name, md5(string_agg(t::text, '|' order by t::text)) as sum"
+                    f" from {name} t"
+                    for name in (table["name"] for table in tables)
+                    if name not in without
+                )
+            ).fetchall()
+        found = hashlib.sha256(repr(sorted(map(str, sums))).encode())
+        folder = self.settings.data_folder / "storage"
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and path.relative_to(folder).parts[0] not in without:
+                content = hashlib.sha256(path.read_bytes()).hexdigest()
+                found.update(f"{path.relative_to(folder)} {content}\n".encode())
+        self.looked.append(found.hexdigest())
+        return self.looked[-1]
+
+    def known_digest(self) -> str:
+        """That of the last look, whatever a test that has failed did since."""
+        if not self.looked:
+            self.digest()
+        return self.looked[-1]
+
+    def filled(self, text: str) -> str:
+        """A text of a case with the ids of this installation in it."""
+        for name, value in self.names.items():
+            text = text.replace(f"<{name}>", value)
+        return text
+
+    def outcome(self, reply: httpx.Response) -> dict[str, Any]:
+        """The job that a reply names, after one attempt at it by the code of a worker's process."""
+        job_id = UUID(reply.json()["jobID"])
+        with self.database.transaction() as connection:
+            job = jobs.claim(connection, job_id, "a worker", 60.0)
+        assert job is not None
+        do_attempt(self.database, self.settings, job_id, job.attempt)
+        told = self.client.get(f"/jobs/{job_id}", headers=self.headers["admin"])
+        document: dict[str, Any] = told.json()
+        return document
+
+
+@contextmanager
+def besieged(dsn: str, folder: Path, world: FlatWorld) -> Iterator[Besieged]:
+    """A started installation: a published and a staged block, scenes of two owners, a canary."""
+    outside = folder / "outside"
+    outside.mkdir()
+    (outside / "canary.txt").write_text(CANARY)
+    inside = folder / "ingest"
+    inside.mkdir()
+    (inside / "way-out").symlink_to(outside)
+    scenes = folder / "scenes"
+    scenes.mkdir()
+    (scenes / "link.tif").symlink_to(outside / "canary.txt")
+    (scenes / "text.tif").write_text("not an image")
+    settings = Settings(
+        database_url=dsn,
+        data_folder=folder / "data",
+        upload_limit_bytes=LIMIT_BYTES,
+        body_limit_bytes=BODY_LIMIT_BYTES,
+        ingest_folder=inside,
+        scene_folder=scenes,
+    )
+    storage = Storage(settings.data_folder / "storage")
+    headers = {}
+    with engine.connect(dsn) as connection:
+        published = ingest_block(connection, storage, world.block).block
+        publish_block(connection, str(published.number))
+        ingest_block(connection, storage, make_block(folder / "staged", count=5, name="staged").folder)
+        for role in ("read", "register", "other", "monitor", "admin"):
+            scope = "register" if role == "other" else role
+            headers[role] = _bearer(create_token(connection, role, [scope]).secret)
+        revoked = create_token(connection, "revoked", ["admin"])
+        connection.execute("update token set revoked_at = now() where id = %s", [revoked.token.id])
+        expired = create_token(connection, "expired", ["admin"], 1)
+        connection.execute(
+            "update token set expires_at = now() - interval '1 second' where id = %s", [expired.token.id]
+        )
+    headers |= {"nobody": {}, "revoked": _bearer(revoked.secret), "expired": _bearer(expired.secret)}
+    app = create_app(settings)
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield Besieged(
+            client, app.state.database, settings, headers, _names(client, headers, world), outside
+        )
+
+
+def _bearer(secret: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {secret}"}
+
+
+def _names(client: TestClient, headers: dict[str, dict[str, str]], world: FlatWorld) -> dict[str, str]:
+    image = world.tagged.read_bytes()
+    post: Callable[..., httpx.Response] = client.post
+    found = {
+        f"{whose}_scene": post(
+            f"/scenes?name=a.tif&sigma_m={SIGMA_M}", content=image, headers=me
+        ).json()["id"]
+        for whose, me in (("own", headers["register"]), ("others", headers["other"]))
+    }
+    said = {"Tus-Resumable": "1.0.0", "Upload-Length": "100", "Upload-Metadata": "filename YS50aWY="}
+    for whose, role in (("own", "register"), ("others", "other")):
+        begun = post("/uploads", headers=headers[role] | said)
+        found[f"{whose}_upload"] = begun.headers["location"].rsplit("/", 1)[1]
+    body = {"inputs": {"scene": found["others_scene"]}}
+    job = post("/processes/register-scene/execution", json=body, headers=headers["other"])
+    found["others_job"] = job.json()["jobID"]
+    items = client.get("/collections/points/items?limit=1", headers=headers["read"]).json()
+    found["point"] = str(items["features"][0]["id"])
+    secret = headers["read"]["Authorization"].split()[1]
+    found["secret"] = secret
+    found["secret_cut"] = secret[:-1]
+    found["secret_but_one"] = secret[:-1] + ("A" if secret[-1] != "A" else "B")
+    blocks = client.get("/collections/blocks/items", headers=headers["admin"]).json()["features"]
+    staged = next(one for one in blocks if one["properties"]["state"] == "staged")
+    found["staged"] = str(staged["properties"].get("number", staged["id"]))
+    return found
+
+
+def told(reply: httpx.Response) -> str:
+    """All that a caller is told: headers and body."""
+    return json.dumps(dict(reply.headers)) + reply.content.decode(errors="replace")
