@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import ndtr
 
 from services.adjustment.scene import AdjustmentOptions
+from services.chip_choice import chance_of_being_shown, has_chip
 from services.conventions import CHIP_CENTRE
 from services.errors import InputError, NoConsensus
 from services.imagery import ImageSource, ReducedImage, reduce_image
@@ -22,7 +22,7 @@ from services.passes import (
 )
 from services.scene import Scene, scene_gsd_m
 from services.sensors.correction import CorrectedModel
-from services.types import Array, BoolArray, ChipSource, ControlPoints, IntArray, Progress
+from services.types import Array, ChipSource, ControlPoints, IntArray, Progress
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def _planned(
     line_sample = model.project(points.lon_lat_h)
     best: tuple[float, float, Array] | None = None
     for gsd_m in np.unique(points.views.gsd_m)[::-1]:
-        shown = _chance_of_being_shown(scene, points, line_sample, float(gsd_m), uncertainty_m)
+        shown = chance_of_being_shown(scene, points, line_sample, float(gsd_m), uncertainty_m)
         shown[~has_chip(points, float(gsd_m))] = 0.0
         if best is None or shown.sum() > best[1]:
             best = float(gsd_m), float(shown.sum()), shown
@@ -183,27 +183,6 @@ def _planned(
     return _Search(gsd_m, reduction, radius_px, np.sort(order[:count]))
 
 
-def _chance_of_being_shown(
-    scene: Scene, points: ControlPoints, line_sample: Array, gsd_m: float, uncertainty_m: Array
-) -> Array:
-    """Chance (n,) that the scene shows the chips of points whole, its error being normal.
-
-    Args:
-        scene: where it is does not count, only its size.
-        points: on the ground.
-        line_sample: (n, 2) where they are expected.
-        gsd_m: ground sampling of the chips.
-        uncertainty_m: (n,) standard deviation of that.
-    """
-    middle = points.lon_lat_h[len(points) // 2 : len(points) // 2 + 1]
-    derivative = np.abs(scene.model.project_derivative(middle)[0, :, :2])
-    reach_px = CHIP_CENTRE * gsd_m * derivative.sum(axis=1)
-    sigma_px = (uncertainty_m / scene_gsd_m(scene))[:, None]
-    room_px = np.array(scene.image.shape) - 1.0 - reach_px
-    inside = ndtr((room_px - line_sample) / sigma_px) - ndtr((reach_px - line_sample) / sigma_px)
-    return np.asarray(np.nan_to_num(np.maximum(inside, 0.0)).prod(axis=1))
-
-
 def _reach_m(scene: Scene, search: _Search) -> float:
     """Half side of the square where a chip may be found: where it is looked for and the scene is."""
     gsd_m = scene_gsd_m(scene)
@@ -215,12 +194,6 @@ def _reach_m(scene: Scene, search: _Search) -> float:
         for size in scene.image.shape
     ]
     return max(float(np.sqrt(room_m[0] * room_m[1])) / 2.0, search.level_m)
-
-
-def has_chip(points: ControlPoints, gsd_m: float) -> BoolArray:
-    """Which points (n,) have a chip of a ground sampling."""
-    count = np.concatenate([[0], np.cumsum(np.isclose(points.views.gsd_m, gsd_m))])
-    return np.asarray(count[points.views.start[1:]] > count[points.views.start[:-1]])
 
 
 def _image_for(scene: Scene, gsd_m: float, n_points: int, radius_px: int) -> ImageSource | ReducedImage:
