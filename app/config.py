@@ -35,6 +35,7 @@ class Settings(BaseSettings):
         pool_size: most connections one API process opens for reading, and again for writing.
         read_timeout_seconds: longest time the database may spend on one statement of a reading request.
         job_memory_bytes, job_seconds: what one job may use before it is stopped.
+        result_days: how long the files that jobs made are kept; none: for ever.
         lease_seconds: how long a job waits for a silent worker before another takes it over.
         storage_url: a bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; none: the
             data folder.
@@ -66,6 +67,7 @@ class Settings(BaseSettings):
     read_timeout_seconds: float = Field(default=10.0, gt=0)
     job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
+    result_days: float | None = Field(default=None, gt=0)
     lease_seconds: float = Field(default=30.0, gt=0)
     storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")
     scene_folder: Path | None = None

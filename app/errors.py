@@ -10,8 +10,11 @@ __all__ = [
     "Conflict",
     "InputError",
     "InvalidParameter",
+    "NoSuchJob",
+    "NoSuchProcess",
     "NotAllowed",
     "NotFound",
+    "StorageOutage",
     "TooLarge",
     "TooMany",
     "is_no_room",
@@ -26,6 +29,18 @@ class InvalidParameter(InputError):
 
 class NotFound(AmersError):
     """There is no such thing, or not for this caller."""
+
+
+class NoSuchProcess(NotFound):
+    """There is no process of that name."""
+
+
+class NoSuchJob(NotFound):
+    """There is no job of that number, or not for this caller."""
+
+
+class StorageOutage(Exception):
+    """The storage does not answer: nobody's fault, so that work which meets this is tried again."""
 
 
 class Conflict(AmersError):

@@ -1,39 +1,71 @@
 """OGC API - Processes: what the service can be asked to do, and asking."""
 
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Request, Response, status
+from fastapi import APIRouter, Header, Query, Request, Response, status
+from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Reader, SettingsDep, WriteConnection
 from app.api.jobs import job_url, status_info
+from app.errors import InputError
 from app.usecases import jobs
 from app.usecases.processes import Process
+from app.usecases.registration_files import media_type
 
 router = APIRouter(tags=["processes"])
 
 VERSION = "1.0.0"
+JSON = "application/json"
+OGC = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
+CONFORMS_TO = tuple(
+    f"{OGC}{name}" for name in ("core", "ogc-process-description", "json", "job-list", "dismiss")
+)
+QUALIFIERS = {"value", "mediaType", "encoding", "schema", "format"}
+"""Members of an input whose value is told with what it is."""
+SCENES = ("scenes/", "collections/scenes/items/")
 
 
-@dataclass(frozen=True)
-class Execute:
+class OutputAsked(BaseModel):
+    """How one output shall be told."""
+
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+
+    transmission_mode: Literal["value", "reference"] = Field("value", alias="transmissionMode")
+    format: dict[str, Any] | None = Field(None, description="Each output has one format: its own.")
+
+
+class Execute(BaseModel):
     """The body of an execution.
 
     Attributes:
         inputs: those of the process, by name.
+        outputs: those wanted, by name, files by value unless said otherwise; all of them, files by
+            reference, if there is none.
+        response: results in one document, or as they are.
     """
 
-    inputs: dict[str, Any] = field(default_factory=dict)
+    model_config = ConfigDict(extra="forbid")
+
+    inputs: dict[str, Any] = Field(default_factory=dict)
+    outputs: dict[str, OutputAsked] | None = None
+    response: Literal["document", "raw"] = "document"
 
 
 @router.get("/processes")
-def list_processes(request: Request) -> dict[str, Any]:
+def list_processes(
+    request: Request,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Most processes on the page.")] = 10,
+    offset: Annotated[int, Query(ge=0, le=1000, description="From the link `next`.")] = 0,
+) -> dict[str, Any]:
     """The processes, in short."""
     base = str(request.base_url)
-    return {
-        "processes": [_summary(base, process) for process in jobs.PROCESSES.values()],
-        "links": [{"rel": "self", "href": f"{base}processes", "type": "application/json"}],
-    }
+    every = list(jobs.PROCESSES.values())
+    links = [{"rel": "self", "href": str(request.url), "type": JSON}]
+    if offset + limit < len(every):
+        following = str(request.url.include_query_params(offset=offset + limit))
+        links.append({"rel": "next", "href": following, "type": JSON})
+    page = every[offset : offset + limit]
+    return {"processes": [_summary(base, process) for process in page], "links": links}
 
 
 @router.get("/processes/{process_id}")
@@ -41,20 +73,21 @@ def describe_process(process_id: str, request: Request) -> dict[str, Any]:
     """One process with its inputs and outputs."""
     process = jobs.find_process(process_id)
     schema = process.input_schema()
-    definitions = schema.get("$defs", {})
     required = schema.get("required", [])
     inputs = {
         name: {
             "title": name,
+            **({"description": process.input_text(name)} if process.input_text(name) else {}),
             "minOccurs": 1 if name in required else 0,
-            "schema": {**member, "$defs": definitions} if "$ref" in str(member) else member,
+            "schema": _inlined(member, schema.get("$defs", {})),
         }
         for name, member in schema["properties"].items()
     }
     outputs = {
-        name: {"title": text, "schema": {"type": "string", "format": "uri"}}
-        for name, text in process.outputs.items()
+        name: {"title": value["title"], "schema": value} for name, value in process.values.items()
     }
+    for name, text in process.outputs.items():
+        outputs[name] = {"title": name, "description": text, "schema": _file_schema(request, name)}
     return {**_summary(str(request.base_url), process), "inputs": inputs, "outputs": outputs}
 
 
@@ -68,32 +101,79 @@ def execute(
     settings: SettingsDep,
     caller: Reader,
     idempotency_key: Annotated[str | None, Header()] = None,
+    prefer: Annotated[str | None, Header()] = None,
 ) -> dict[str, Any]:
-    """Ask for work; the answer is a job to watch.
+    """Ask for work; the answer is a job to watch, whatever `Prefer` says.
 
     The same request with the same `Idempotency-Key` asks for it once.
     """
-    job = jobs.execute(connection, settings, caller, process_id, body.inputs, idempotency_key)
+    inputs = {name: _plain(request, name, value) for name, value in body.inputs.items()}
+    asked = body.outputs
+    outputs = None if asked is None else {name: one.transmission_mode for name, one in asked.items()}
+    job = jobs.execute(
+        connection, settings, caller, process_id, inputs, idempotency_key, outputs, body.response
+    )
     response.headers["Location"] = job_url(request, job)
-    response.headers["Preference-Applied"] = "respond-async"
+    if "respond-async" in (prefer or ""):
+        response.headers["Preference-Applied"] = "respond-async"
     return status_info(request, job)
+
+
+def _plain(request: Request, name: str, value: Any) -> Any:
+    """The value of an input that is told as such, with what it is, or as a link to something of ours.
+
+    Raises:
+        InputError: the link leads elsewhere; nothing is fetched.
+    """
+    if not isinstance(value, dict):
+        return value
+    if "value" in value and value.keys() <= QUALIFIERS:
+        return value["value"]
+    if "href" not in value:
+        return value
+    path = str(value["href"]).removeprefix(str(request.base_url))
+    known = next((path.removeprefix(start) for start in SCENES if path.startswith(start)), "")
+    if not known or "/" in known:
+        raise InputError(f"inputs.{name}.href: only scenes of this service are taken by reference")
+    return known
+
+
+def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
+    """A JSON Schema that needs no definitions from elsewhere; ours never name themselves."""
+    if isinstance(schema, list):
+        return [_inlined(item, definitions) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    rest = {key: _inlined(value, definitions) for key, value in schema.items() if key != "$ref"}
+    if "$ref" in schema:
+        named = definitions[schema["$ref"].rsplit("/", 1)[1]]
+        return {**_inlined(named, definitions), **rest}
+    return rest
+
+
+def _file_schema(request: Request, name: str) -> dict[str, Any]:
+    """What a file of the results holds."""
+    kind = media_type(name)
+    if name == "report.json":
+        return {"$ref": f"{request.base_url}schemas/report.json", "contentMediaType": kind}
+    if kind in (JSON, "application/geo+json"):
+        return {"type": "object", "contentMediaType": kind}
+    encoded = {} if kind.startswith("text/") else {"contentEncoding": "base64"}
+    return {"type": "string", "contentMediaType": kind, **encoded}
 
 
 def _summary(base: str, process: Process) -> dict[str, Any]:
     here = f"{base}processes/{process.id}"
+    execute = "http://www.opengis.net/def/rel/ogc/1.0/execute"
     return {
         "id": process.id,
         "title": process.title,
         "description": process.description,
         "version": VERSION,
         "jobControlOptions": ["async-execute", "dismiss"],
-        "outputTransmission": ["reference"],
+        "outputTransmission": ["value", "reference"],
         "links": [
-            {"rel": "self", "href": here, "type": "application/json"},
-            {
-                "rel": "http://www.opengis.net/def/rel/ogc/1.0/execute",
-                "href": f"{here}/execution",
-                "type": "application/json",
-            },
+            {"rel": "self", "href": here, "type": JSON, "title": "its description"},
+            {"rel": execute, "href": f"{here}/execution", "type": JSON, "title": "where to ask for it"},
         ],
     }

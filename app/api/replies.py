@@ -18,8 +18,11 @@ from app.errors import (
     Conflict,
     InputError,
     InvalidParameter,
+    NoSuchJob,
+    NoSuchProcess,
     NotAllowed,
     NotFound,
+    StorageOutage,
     TooLarge,
     TooMany,
     is_no_room,
@@ -36,6 +39,11 @@ HTTP_STATUS: dict[type[Exception], int] = {
     TooMany: 429,
     AmersError: 500,
 }
+OGC_EXCEPTIONS = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
+PROBLEM_TYPES: dict[type[Exception], str] = {
+    NoSuchJob: f"{OGC_EXCEPTIONS}no-such-job",
+    NoSuchProcess: f"{OGC_EXCEPTIONS}no-such-process",
+}
 RETRY_SECONDS = "5"
 HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
 
@@ -51,6 +59,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(psycopg.DataError, _unusable)
     app.add_exception_handler(OSError, _no_room)
     app.add_exception_handler(PoolTimeout, _unavailable)
+    app.add_exception_handler(StorageOutage, _storage_unavailable)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -90,7 +99,8 @@ def _refused(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, AmersError)
     status = status_of(error)
     headers = HEADERS.get(status)
-    return problem(status, str(error), headers=headers, error=type(error).__name__)
+    kind = {"type": PROBLEM_TYPES[type(error)]} if type(error) in PROBLEM_TYPES else {}
+    return problem(status, str(error), headers=headers, error=type(error).__name__, **kind)
 
 
 def _malformed(request: Request, error: Exception) -> JSONResponse:
@@ -133,6 +143,13 @@ def _unavailable(request: Request, error: Exception) -> JSONResponse:
         return problem(503, "the database stopped this request: it took too long; ask for less")
     return problem(
         503, "the database does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
+    )
+
+
+def _storage_unavailable(request: Request, error: Exception) -> JSONResponse:
+    log.warning("%s", error)
+    return problem(
+        503, "the storage of files does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
     )
 
 

@@ -16,9 +16,11 @@ from psycopg.types.json import Jsonb
 from app.db.engine import Connection
 
 JobState = Literal["accepted", "running", "successful", "failed", "dismissed"]
+Response = Literal["document", "raw"]
 
 QUEUE = "amers"
 TASK = "amers:job"
+DURATION_S = "extract(epoch from coalesce(finished_at, clock_timestamp()) - started_at)"
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 SWEEP_LOCK = 0x414D4552
 """Advisory lock that keeps two workers from sweeping at once."""
@@ -26,8 +28,8 @@ SWEEP_LOCK = 0x414D4552
 queue = procrastinate.App(connector=procrastinate.SyncPsycopgConnector())
 """Only writes queue entries, through the connection of the caller's transaction; it is never opened."""
 
-COLUMNS = """id, kind, state, progress, message, inputs, owner, attempt, failures, created_at,
-    started_at, finished_at, updated_at, error, results"""
+COLUMNS = """id, kind, state, progress, message, inputs, outputs, response, owner, attempt, failures,
+    created_at, claimed_at, started_at, finished_at, updated_at, error, results, results_removed_at"""
 
 
 class LostJob(Exception):
@@ -42,11 +44,15 @@ class Job:
         kind: the process that was asked for.
         progress: percent.
         inputs: what it was asked with.
+        outputs: name of each output asked for, to how it shall be sent; None: all of them.
+        response: whether results are told in a document or sent as they are.
         owner: the token that asked; None for the command line.
         attempt: number of the last claim.
         failures: attempts that ended without an outcome: a crash, an outage, a lost worker.
+        claimed_at, started_at: when the last attempt began, and the first.
         error: problem details of a failure.
         results: what a successful job made.
+        results_removed_at: when the files of the results went.
     """
 
     id: UUID
@@ -55,15 +61,19 @@ class Job:
     progress: int
     message: str
     inputs: dict[str, Any]
+    outputs: dict[str, str] | None
+    response: Response
     owner: UUID | None
     attempt: int
     failures: int
     created_at: datetime
+    claimed_at: datetime | None
     started_at: datetime | None
     finished_at: datetime | None
     updated_at: datetime
     error: dict[str, Any] | None
     results: dict[str, Any] | None
+    results_removed_at: datetime | None
 
 
 @dataclass(frozen=True)
@@ -72,10 +82,16 @@ class JobFilter:
 
     Attributes:
         kinds: processes.
+        since, until: when they were asked for.
+        min_duration_s, max_duration_s: from the beginning of the first attempt to the end, or to now.
     """
 
     kinds: tuple[str, ...] = ()
     states: tuple[JobState, ...] = ()
+    since: datetime | None = None
+    until: datetime | None = None
+    min_duration_s: float | None = None
+    max_duration_s: float | None = None
 
 
 def create(
@@ -84,6 +100,8 @@ def create(
     inputs: dict[str, Any],
     owner: UUID | None = None,
     idempotency_key: str | None = None,
+    outputs: dict[str, str] | None = None,
+    response: Response = "document",
 ) -> Job | None:
     """A new accepted job, in the queue once the transaction is committed.
 
@@ -92,10 +110,12 @@ def create(
     """
     job = _one(
         connection,
-        f"""insert into job (id, kind, state, progress, message, inputs, owner, idempotency_key)
-            values (%s, %s, 'accepted', 0, 'waiting for a worker', %s, %s, %s)
+        f"""insert into job (id, kind, state, progress, message, inputs, outputs, response, owner,
+                idempotency_key)
+            values (%s, %s, 'accepted', 0, 'waiting for a worker', %s, %s, %s, %s, %s)
             on conflict (owner, idempotency_key) do nothing returning {COLUMNS}""",
-        (uuid4(), kind, Jsonb(inputs), owner, idempotency_key),
+        (uuid4(), kind, Jsonb(inputs), None if outputs is None else Jsonb(outputs), response)
+        + (owner, idempotency_key),
     )
     if job is not None:
         enqueue(connection, job.id)
@@ -144,6 +164,10 @@ def newest(
                 where (%(owner)s::uuid is null or owner = %(owner)s)
                   and (%(kinds)s::text[] is null or kind = any(%(kinds)s))
                   and (%(states)s::text[] is null or state = any(%(states)s))
+                  and created_at between coalesce(%(since)s::timestamptz, '-infinity')
+                                     and coalesce(%(until)s::timestamptz, 'infinity')
+                  and (%(least)s::float8 is null or {DURATION_S} >= %(least)s)
+                  and (%(most)s::float8 is null or {DURATION_S} <= %(most)s)
                   and (%(after)s::uuid is null
                        or (created_at, id) < (select created_at, id from job where id = %(after)s))
                 order by created_at desc, id desc limit %(limit)s""",
@@ -151,21 +175,14 @@ def newest(
                 "owner": owner,
                 "kinds": list(wanted.kinds) or None,
                 "states": list(wanted.states) or None,
+                "since": wanted.since,
+                "until": wanted.until,
+                "least": wanted.min_duration_s,
+                "most": wanted.max_duration_s,
                 "limit": limit,
                 "after": after,
             },
         ).fetchall()
-
-
-def position(connection: Connection, job: Job) -> int:
-    """How many waiting jobs are as old as a job or older, itself among them."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        cursor.execute(
-            "select count(*) from job where state = 'accepted' and (created_at, id) <= (%s, %s)",
-            [job.created_at, job.id],
-        )
-        found = cursor.fetchone()
-    return max(int(found or 0), 1)
 
 
 def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> Job | None:
@@ -174,6 +191,7 @@ def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> 
         connection,
         f"""update job set state = 'running', attempt = attempt + 1, worker = %s,
                 lease_until = clock_timestamp() + %s, progress = 0, message = 'started',
+                claimed_at = clock_timestamp(),
                 started_at = coalesce(started_at, clock_timestamp()), updated_at = clock_timestamp()
             where id = %s and state = 'accepted' returning {COLUMNS}""",
         (worker, timedelta(seconds=lease_s), job_id),
@@ -340,12 +358,25 @@ def forget_dead_entries(connection: Connection, silent_s: float) -> None:
 
 
 def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int]:
-    """The attempt of each of some jobs that is under way or succeeded, for those that have one."""
+    """The attempt of each of some jobs that is under way or succeeded, if its results are kept."""
     rows = connection.execute(
-        "select id, attempt from job where id = any(%s) and state in ('running', 'successful')",
+        "select id, attempt from job where id = any(%s) and results_removed_at is null"
+        " and state in ('running', 'successful')",
         [job_ids],
     )
     return {row["id"]: row["attempt"] for row in rows}
+
+
+def remove_old_results(connection: Connection, older_than_s: float) -> list[UUID]:
+    """Give up the results of jobs that ended so long ago; their files are swept, the jobs stay."""
+    with connection.cursor(row_factory=scalar_row) as cursor:
+        removed: list[UUID] = cursor.execute(
+            """update job set results_removed_at = clock_timestamp()
+               where state = 'successful' and results_removed_at is null and results ? 'files'
+                 and finished_at < clock_timestamp() - %s returning id""",
+            (timedelta(seconds=older_than_s),),
+        ).fetchall()
+    return removed
 
 
 def may_sweep(connection: Connection) -> bool:

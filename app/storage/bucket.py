@@ -5,14 +5,20 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import obstore
+from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
-from app.errors import InputError, NotFound
+from app.errors import InputError, NotFound, StorageOutage
 from app.storage.folder import COPY_BYTES, RangeReader, Storage, checked_key
+
+RETRIES = 3
+PATIENCE = timedelta(seconds=20)
+"""A request is repeated for so long; then the storage is out, and whoever asked is told."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +40,18 @@ class BucketStorage(Storage):
     def __post_init__(self) -> None:
         try:
             # Plain HTTP only where AWS_ENDPOINT_URL says so itself.
-            store = S3Store.from_url(self.url, client_options={"allow_http": True})
+            store = S3Store.from_url(
+                self.url,
+                client_options={"allow_http": True},
+                retry_config={"max_retries": RETRIES, "retry_timeout": PATIENCE},
+            )
         except Exception as error:
             raise InputError(f"AMERS_STORAGE_URL: {self.url!r} cannot be used: {error}") from error
         object.__setattr__(self, "store", store)
+
+    def local(self, key: str) -> Path | None:
+        """Nothing of a bucket lies on this machine."""
+        return None
 
     def path(self, key: str) -> Path:
         """Nothing of a bucket lies in a folder.
@@ -70,7 +84,7 @@ class BucketStorage(Storage):
 
     def size(self, key: str) -> int:
         """How large a file is, bytes."""
-        with _found(key):
+        with _answering(key):
             return int(obstore.head(self.store, checked_key(key))["size"])
 
     def exists(self, key: str) -> bool:
@@ -83,21 +97,24 @@ class BucketStorage(Storage):
 
     def delete(self, key: str) -> None:
         """Remove a file, if it is there."""
-        obstore.delete(self.store, checked_key(key))
+        with _answering(key):
+            obstore.delete(self.store, checked_key(key))
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a prefix, sorted."""
-        pages = obstore.list(self.store, prefix=checked_key(prefix))
-        return sorted(found["path"] for page in pages for found in page)
+        with _answering(prefix):
+            pages = obstore.list(self.store, prefix=checked_key(prefix))
+            return sorted(found["path"] for page in pages for found in page)
 
     def _download(self, key: str, file: IO[bytes]) -> None:
-        with _found(key):
+        with _answering(key):
             for chunk in obstore.get(self.store, checked_key(key)).stream(min_chunk_size=COPY_BYTES):
                 file.write(chunk)
 
     def _place(self, unfinished: Path, key: str) -> None:
         """Send a file, in several parts at once when it is large."""
-        obstore.put(self.store, checked_key(key), unfinished)
+        with _answering(key):
+            obstore.put(self.store, checked_key(key), unfinished)
         os.unlink(unfinished)
 
 
@@ -109,7 +126,7 @@ class _BucketReader:
     def read(self, start: int, length: int) -> bytes:
         if length == 0:
             return b""
-        with _found(self.key):
+        with _answering(self.key):
             return bytes(obstore.get_range(self.store, self.key, start=start, length=length))
 
     def close(self) -> None:
@@ -135,8 +152,10 @@ class _RangeFile(io.RawIOBase):
 
 
 @contextmanager
-def _found(key: str) -> Iterator[None]:
+def _answering(key: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
         raise NotFound(f"no file {key} in the storage") from None
+    except BaseError as error:
+        raise StorageOutage(f"{key}: the storage does not answer: {error}") from error

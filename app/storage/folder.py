@@ -159,6 +159,15 @@ class Storage:
         """How large a file is, bytes."""
         return self.path(key).stat().st_size
 
+    def local(self, key: str) -> Path | None:
+        """Where a file lies on this machine; None in a storage whose files do not.
+
+        Raises:
+            InputError: the key is not one.
+            NotFound: there is no such file.
+        """
+        return self.path(key)
+
     def path(self, key: str) -> Path:
         """Where a file of the folder is.
 

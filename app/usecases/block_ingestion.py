@@ -165,11 +165,15 @@ INGEST_BLOCK = Process(
     description="Check a block of points, on the server or uploaded, and load it into the store.",
     scope=Scope.ADMIN,
     inputs=IngestBlock,
-    outputs={
-        "id": "Name of the block.",
-        "state": "Staged, or published.",
-        "quality": "Density, views a point, stated precision.",
-    },
+    outputs={},
     check=_check,
     run=_run,
+    values={
+        "number": {"type": "integer", "title": "Number of this version"},
+        "id": {"type": "string", "title": "Name of the block"},
+        "version": {"type": "string", "title": "Version"},
+        "state": {"enum": ["staged", "published"], "title": "What it has become"},
+        "points": {"type": "integer", "title": "Points that were loaded"},
+        "quality": {"type": "object", "title": "Density, views a point, stated precision"},
+    },
 )

@@ -3,7 +3,9 @@
 import logging
 import re
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
@@ -12,11 +14,12 @@ from psycopg import OperationalError
 
 from app.auth import Scope, allows, require
 from app.config import Settings
-from app.db import jobs
+from app.db import job_course, jobs
 from app.db.engine import Connection, Database
-from app.db.jobs import Job, JobFilter, LostJob
+from app.db.job_course import JobMessage
+from app.db.jobs import Job, JobFilter, LostJob, Response
 from app.db.tokens import Token
-from app.errors import AmersError, Conflict, InputError, NotFound
+from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.block_export import EXPORT_BLOCK
@@ -29,6 +32,7 @@ PROCESSES: dict[str, Process] = {
     process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)
 }
 LONGEST_KEY = 200
+MOST_MESSAGES = 1000
 REPORT_EVERY_S = 0.5
 
 log = logging.getLogger(__name__)
@@ -38,11 +42,11 @@ def find_process(process_id: str) -> Process:
     """The process of that name.
 
     Raises:
-        NotFound: there is none.
+        NoSuchProcess: there is none.
     """
     process = PROCESSES.get(process_id)
     if process is None:
-        raise NotFound(f"no process {process_id}: there are {', '.join(PROCESSES)}")
+        raise NoSuchProcess(f"no process {process_id:.100}: there are {', '.join(PROCESSES)}")
     return process
 
 
@@ -53,14 +57,21 @@ def execute(
     process_id: str,
     given: dict[str, Any],
     idempotency_key: str | None = None,
+    outputs: Mapping[str, str] | None = None,
+    response: Response = "document",
 ) -> Job:
     """Ask for work; the same request with the same key asks for it once.
+
+    Args:
+        outputs: name of each output that is wanted, to `value` or `reference`; None: all of them.
+        response: how results are told.
 
     Raises:
         NotFound: no such process, or an input that is not there for this caller.
         NotAllowed: the caller's token lacks the scope.
         TooMany: the caller has as many jobs as he may have at once.
-        InputError: the inputs are not those of the process, or the key came with other ones before.
+        InputError: the inputs or outputs are not those of the process, or the key came with other ones
+            before.
     """
     process = find_process(process_id)
     require(caller, process.scope)
@@ -68,24 +79,27 @@ def execute(
         raise InputError(f"an idempotency key has 1 to {LONGEST_KEY} characters")
     parsed = process.parse_inputs(given)
     inputs = process.format_inputs(parsed)
+    process.check_outputs(outputs or {})
+    wanted = None if outputs is None else dict(outputs)
+    request = (process_id, inputs, wanted, response)
     if idempotency_key is not None:
         known = jobs.find_by_key(connection, caller.id, idempotency_key)
         if known is not None:
-            return _same_request(known, process_id, inputs)
+            return _same_request(known, request)
     process.check(connection, caller, parsed)
     quotas.require_free_job(connection, settings, caller)
-    job = jobs.create(connection, process_id, inputs, caller.id, idempotency_key)
+    job = jobs.create(connection, process_id, inputs, caller.id, idempotency_key, wanted, response)
     if job is not None:
         return job
     assert idempotency_key is not None
     # Somebody else has just used the key: his job is visible now that the insert has waited for him.
     known = jobs.find_by_key(connection, caller.id, idempotency_key)
     assert known is not None
-    return _same_request(known, process_id, inputs)
+    return _same_request(known, request)
 
 
-def _same_request(known: Job, process_id: str, inputs: dict[str, Any]) -> Job:
-    if (known.kind, known.inputs) != (process_id, inputs):
+def _same_request(known: Job, request: tuple[object, ...]) -> Job:
+    if (known.kind, known.inputs, known.outputs, known.response) != request:
         raise InputError(f"the idempotency key was used for job {known.id}, which was asked otherwise")
     return known
 
@@ -94,11 +108,11 @@ def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
     """The job, for its owner or an administrator.
 
     Raises:
-        NotFound: there is none, or it is somebody else's: strangers cannot tell which.
+        NoSuchJob: there is none, or it is somebody else's: strangers cannot tell which.
     """
     job = jobs.find(connection, job_id)
     if job is None or not (job.owner == caller.id or allows(caller, Scope.ADMIN)):
-        raise NotFound(f"no job {job_id}")
+        raise NoSuchJob(f"no job {job_id}")
     return job
 
 
@@ -108,7 +122,7 @@ def list_jobs(
     """The caller's newest jobs, or those that follow one of them; everybody's for an administrator.
 
     Raises:
-        NotFound: the job to follow is none of the caller's.
+        NoSuchJob: the job to follow is none of the caller's.
     """
     if after is not None:
         visible_job(connection, caller, after)
@@ -118,14 +132,29 @@ def list_jobs(
 
 def queue_position(connection: Connection, job: Job) -> int | None:
     """How many jobs are to be begun before this one and with it; None when it does not wait."""
-    return jobs.position(connection, job) if job.state == "accepted" else None
+    return job_course.position(connection, job) if job.state == "accepted" else None
+
+
+def expected_end(connection: Connection, job: Job) -> datetime | None:
+    """When an open job may end, as far as jobs before it tell."""
+    return job_course.expected_end(connection, job)
+
+
+def read_messages(connection: Connection, caller: Token, job_id: UUID) -> list[JobMessage]:
+    """The last messages of a job, the oldest of them first.
+
+    Raises:
+        NoSuchJob: there is none, or not the caller's.
+    """
+    visible_job(connection, caller, job_id)
+    return job_course.read_messages(connection, job_id, MOST_MESSAGES)
 
 
 def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:
     """End a job that nobody wants any more; work on it stops within seconds.
 
     Raises:
-        NotFound: no such job, or not the caller's.
+        NoSuchJob: there is none, or not the caller's.
         Conflict: it has ended; its record and its results are kept.
     """
     job = visible_job(connection, caller, job_id)

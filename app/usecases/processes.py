@@ -1,7 +1,9 @@
 """What a process is: something a user can ask for that a worker does."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -49,7 +51,8 @@ class Process:
         id, title, description: for users.
         scope: what a token needs to ask for it.
         inputs: a frozen dataclass: what a user can say.
-        outputs: name to description.
+        outputs: files that it makes, name to description.
+        values: what else it tells, name to the JSON Schema of its value.
         check: refuses inputs that cannot work, for this caller, when the job is asked for.
         run: does the work, outside of any transaction; the outcome is written by what it returns.
     """
@@ -62,6 +65,21 @@ class Process:
     outputs: dict[str, str]
     check: Callable[[Connection, Token, Any], None]
     run: Callable[[Work], Commit]
+    values: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+    def check_outputs(self, asked: Mapping[str, str]) -> None:
+        """Refuse outputs that it does not make.
+
+        Raises:
+            InputError: naming them.
+        """
+        known = (*self.values, *self.outputs)
+        unknown = [name for name in asked if name not in known]
+        if unknown:
+            raise InputError(
+                f"outputs of {self.id}: {', '.join(unknown)[:200]}: no such output; "
+                f"there are {', '.join(known)}"
+            )
 
     def parse_inputs(self, given: dict[str, Any]) -> Any:
         """Inputs of the process's own type.
@@ -89,10 +107,22 @@ class Process:
         formatted: dict[str, Any] = adapter.dump_python(inputs, mode="json")
         return formatted
 
+    def input_text(self, name: str) -> str:
+        """What an input is, in a few words; "" when nothing is said."""
+        return _texts(self.inputs.__doc__ or "").get(name, "")
+
     def input_schema(self) -> dict[str, Any]:
         """JSON Schema of the inputs."""
         adapter: TypeAdapter[Any] = TypeAdapter(self.inputs)
         return adapter.json_schema()
+
+
+def _texts(docstring: str) -> dict[str, str]:
+    """What the docstring of a dataclass says of its attributes, by their names."""
+    _, _, said = inspect.cleandoc(docstring).partition("Attributes:\n")
+    entries = re.split(r"\n    (?=\S)", "\n" + said)
+    pairs = [entry.split(": ", 1) for entry in entries if ": " in entry]
+    return {name.strip(): " ".join(text.split()) for names, text in pairs for name in names.split(",")}
 
 
 def _unknown_fields(given: dict[str, Any], known: dict[str, Any], path: str = "") -> list[str]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 from app.db.collections import Collection, Property, Viewer
@@ -17,7 +18,8 @@ from app.usecases.page_tokens import parse_token
 
 DEFAULT_LIMIT = 100
 MOST_FEATURES = 10_000
-FILTER_LANGUAGES = ("cql2-text", "cql2-json")
+FILTER_LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
+"""The last one is what GDAL calls CQL2 text: the name of the draft."""
 EARTH_RADIUS_M = 6_378_137.0
 
 
@@ -31,6 +33,7 @@ class Question:
         equal: texts that properties must have.
         filter: CQL2, in `filter_lang`.
         intersects: a GeoJSON geometry that features must meet.
+        ids: of the features, None for any.
     """
 
     limit: int = DEFAULT_LIMIT
@@ -46,6 +49,7 @@ class Question:
     properties: str | None = None
     intersects: Any = None
     equal: tuple[tuple[str, str], ...] = ()
+    ids: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ def condition_of(collection: Collection, question: Question) -> Condition:
         crs = crs_of("bbox-crs", question.bbox_crs, None) if question.bbox_crs else CRS84
         parts.append(in_box(collection, parse_bbox(question.bbox, crs)))
     if question.datetime is not None:
-        parts.append(_in_time(collection, question.datetime))
+        parts.append(in_time(collection, *parse_interval(question.datetime)))
     if question.intersects is not None:
         check_size(question.intersects)
         parts.append(geometry_condition(collection, question.intersects, CRS84))
@@ -115,6 +119,9 @@ def condition_of(collection: Collection, question: Question) -> Condition:
         literal = _literal(collection.queryables[name], value)
         equal = {"op": "=", "args": [{"property": name}, literal]}
         parts.append(translate(equal, collection, CRS84, prefix=f"e{rank}_"))
+    if question.ids is not None:
+        key = f"{collection.key.expression}::text"
+        parts.append(Condition(f"{key} = any(%(ids)s)", {"ids": list(question.ids)}))
     condition = ANYTHING
     for part in parts:
         condition = part if condition is ANYTHING else condition & part
@@ -125,7 +132,7 @@ def _filter(question: Question) -> Any:
     language = question.filter_lang or ("cql2-text" if isinstance(question.filter, str) else "cql2-json")
     if language not in FILTER_LANGUAGES:
         raise InvalidParameter(
-            f"filter-lang: {language!r:.40} found, {' or '.join(FILTER_LANGUAGES)} expected"
+            f"filter-lang: {language!r:.40} found, one of {', '.join(FILTER_LANGUAGES)} expected"
         )
     if language == "cql2-json":
         text = question.filter if isinstance(question.filter, str) else json.dumps(question.filter)
@@ -192,8 +199,12 @@ def _from_mercator(east_m: float, north_m: float) -> list[float]:
     return [lon, math.degrees(math.atan(math.sinh(north_m / EARTH_RADIUS_M)))]
 
 
-def _in_time(collection: Collection, text: str) -> Condition:
-    """The condition that a feature's time meets an instant or an interval `from/to`, `..` for open."""
+def parse_interval(text: str) -> tuple[datetime | None, datetime | None]:
+    """The ends of an interval out of an instant or `from/to`; None for an open end, `..` or nothing.
+
+    Raises:
+        InvalidParameter: the text is neither.
+    """
     ends = text.split("/")
     if len(ends) > 2 or not text or ends == ["", ""]:
         raise InvalidParameter(f"datetime: {text!r:.100} found, a time or FROM/TO expected")
@@ -204,7 +215,7 @@ def _in_time(collection: Collection, text: str) -> Condition:
         raise InvalidParameter(f"datetime: {ends[0]} is after {ends[1]}")
     if high and len(ends[-1]) == 10:
         high = high.replace(hour=23, minute=59, second=59, microsecond=999_999)
-    return in_time(collection, low, high)
+    return low, high
 
 
 def crs_of(parameter: str, uri: str | None, collection: Collection | None) -> Crs:

@@ -14,6 +14,7 @@ import psycopg
 from app.config import Settings
 from app.db import jobs, scenes
 from app.db.engine import Database
+from app.origin import Origin, working_for
 from app.storage import Storage
 from app.usecases.block_ingestion import sweep_archives
 from app.usecases.blocks import sweep_storage
@@ -54,6 +55,7 @@ class Sweeper:
                 sweep_jobs(self.database, self.settings.lease_seconds)
                 if time.monotonic() > files_at:
                     files_at += FILES_EVERY_S
+                    sweep_results(self.database, self.settings.result_days)
                     sweep_files(self.database, self.storage, self.settings.job_seconds)
             except psycopg.OperationalError as outage:
                 log.warning("could not sweep: %s", outage)
@@ -71,6 +73,15 @@ def sweep_jobs(database: Database, lease_s: float) -> None:
         for job_id in jobs.enqueue_forgotten(connection, lease_s):
             log.warning("job %s: was not in the queue any more", job_id)
         jobs.forget_dead_entries(connection, SILENT_WORKER_S)
+
+
+def sweep_results(database: Database, result_days: float | None) -> None:
+    """Give up the results of jobs that ended so many days ago; None keeps all of them."""
+    if result_days is None:
+        return
+    with working_for(Origin(actor_name="retention")), database.transaction() as connection:
+        for job_id in jobs.remove_old_results(connection, 86_400.0 * result_days):
+            log.info("job %s: its results are older than %g days: removed", job_id, result_days)
 
 
 def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> None:

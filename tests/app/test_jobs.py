@@ -96,8 +96,9 @@ def test_processes_are_described_with_the_schema_of_their_inputs(client: TestCli
     described = client.get("/processes/register-scene").json()
     assert described["inputs"]["scene"]["minOccurs"] == 1
     assert described["inputs"]["scene"]["schema"]["format"] == "uuid"
-    options = described["inputs"]["options"]["schema"]["$defs"]["RegistrationOptions"]["properties"]
+    options = described["inputs"]["options"]["schema"]["properties"]
     assert options["max_points"]["type"] == "integer"
+    assert options["adjustment"]["type"] == "object", "no definition lies elsewhere"
     assert "report.json" in described["outputs"]
     assert "dismiss" in described["jobControlOptions"]
     assert client.get("/processes/no-such").status_code == 404
@@ -237,6 +238,7 @@ def test_a_failed_job_tells_why_with_its_numbers(
     error = {
         "type": "about:blank",
         "title": "Not enough points",
+        "error": "NotEnoughPoints",
         "detail": "3 found, 6 needed",
         "found": 3,
     }
