@@ -40,7 +40,7 @@ class AdjustmentOptions:
         folds: of the cross-validation.
         untested_px: what drift and skew are expected to be at the edge of the image before anything is
             measured, one standard deviation; the measures may say more, never less.
-        slope_px: the same where the order is given; infinity leaves them to the measures.
+        slope_px: the same where the order is given; None leaves them to the measures.
     """
 
     order: Order | None = None
@@ -51,7 +51,7 @@ class AdjustmentOptions:
     min_gain: float = 0.03
     folds: int = 5
     untested_px: float = 1.0
-    slope_px: float = float("inf")
+    slope_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,8 @@ def adjust_scene(
     start = problem.robust_solution(usable, _FREE[order])
     scale = max(problem.scale(start, usable), 1e-9)
     agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
-    free, slope_px = _FREE[order], options.slope_px
+    free = _FREE[order]
+    slope_px = float("inf") if options.slope_px is None else options.slope_px
     if options.order is None:
         free = _FREE["affine"]
         slope_px = problem.likeliest_slope_px(agreeing, max(scale, 1.0), options.untested_px)
@@ -195,7 +196,7 @@ class _Problem:
         slope_px: float = np.inf,
         weights: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Parameters (2, 3), drift and skew expected to be within `slope_px`, and their covariance (6, 6)."""
+        """Parameters (2, 3), covariance (6, 6); drift and skew are expected within `slope_px`."""
         design = np.column_stack([np.ones(len(self.t)), self.t])[active]
         parameters = np.zeros((2, 3))
         covariance = np.zeros((6, 6))
