@@ -64,8 +64,8 @@ class Views:
         gsd_m: (m,) ground sampling of each chip, metres.
         image: (m,) int64, rows of `images`.
         incidence_deg, azimuth_deg: (m,) direction from the point to the sensor.
-        health: (m,) share of the registrations that tried the view in which it agreed with the measure
-            of its point, as `health` shrinks it; 1 without a history.
+        health: (m,) how often the view agreed with the measure of its point where it was tried, as
+            `health` has it; 1 without a history.
         images: the images the chips were cut from.
     """
 
@@ -87,8 +87,8 @@ class ControlPoints:
         lon_lat_h: (n, 3).
         covariance_m2: (n, 3, 3) of east, north, up, relative to the frame of the point's block.
         saliency: (n,) 0 to 1, how well the point's chip can be located.
-        health: (n,) share of the registrations that tried the point in which it was active at the end,
-            as `health` shrinks it; 1 without a history.
+        health: (n,) how often the point was active at the end where it was tried, as `health` has it;
+            1 without a history.
         views: the views of the points.
         chip_file: (n,) int64, rows of `chip_files`.
         chip_row: (n,) int64, row of the point's first chip in its file; its views follow.
@@ -139,17 +139,20 @@ HEALTH_PRIOR_TRIES = 5.0
 """Successful tries every point and view begins with: one failure says little, ten say much."""
 
 
-def health(tried: Array | IntArray, succeeded: Array | IntArray) -> Array:
-    """How often points or views served when they were tried, shrunk towards 1.
+def health(expected: Array | IntArray, succeeded: Array | IntArray) -> Array:
+    """How often points or views served, against how often others served where they were tried.
 
-    Five successes are added to what happened: 1 without a history, 0.83 after one failure in one try,
-    0.5 after five in five.
+    Five successes are added to both: 1 without a history, 0.83 after one failure where all others
+    served, 0.5 after five; half as much is lost where only half of the others served. Never above 1.
 
     Args:
-        tried: (n,) registrations that tried it.
-        succeeded: (n,) those in which a point stayed active, or a view agreed with its point's measure.
+        expected: (n,) sum, over the registrations that tried it, of the share of all they tried that
+            served.
+        succeeded: (n,) registrations in which a point stayed active, or a view agreed with its point's
+            measure.
     """
-    return np.asarray((succeeded + HEALTH_PRIOR_TRIES) / (tried + HEALTH_PRIOR_TRIES))
+    ratio = (succeeded + HEALTH_PRIOR_TRIES) / (expected + HEALTH_PRIOR_TRIES)
+    return np.asarray(np.minimum(ratio, 1.0))
 
 
 class ChipSource(Protocol):

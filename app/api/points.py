@@ -12,8 +12,9 @@ from app.api.features import CrsUri, Format
 from app.api.negotiation import GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import features_page
 from app.db.collections import Viewer
+from app.db.history import PointHistory
 from app.db.points import POINTS, PointDetail
-from app.usecases import points
+from app.usecases import history, points
 from app.usecases.features import find_feature
 from services.formats.chip_images import (
     format_chip_png,
@@ -46,10 +47,11 @@ def item(
     crs: CrsUri = None,
     f: Format = None,
 ) -> Response:
-    """One point, its views and the images they were cut from."""
+    """One point, its views and the images they were cut from, and how registrations fared with it."""
     refuse_unknown(request, {"crs", "f"})
     point = points.find_point(connection, point_id)
-    feature = _feature(point, str(request.url.replace(query="")))
+    fared = history.find_history(connection, point_id)
+    feature = _feature(point, fared, str(request.url.replace(query="")))
     given = POINTS.storage_crs
     if crs is not None:
         text, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
@@ -100,8 +102,9 @@ def _download(content: bytes, kind: str, name: str) -> Response:
     return Response(content, media_type=kind, headers={**CHIPS_NEVER_CHANGE, **disposition})
 
 
-def _feature(point: PointDetail, url: str) -> dict[str, Any]:
-    properties = {k: v for k, v in asdict(point).items() if k not in NOT_PROPERTIES}
+def _feature(point: PointDetail, fared: PointHistory, url: str) -> dict[str, Any]:
+    known = {**asdict(point), **asdict(fared)}
+    properties = {k: v for k, v in known.items() if k not in NOT_PROPERTIES}
     feature: dict[str, Any] = jsonable_encoder(
         {
             "type": "Feature",

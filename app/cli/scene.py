@@ -19,6 +19,7 @@ from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorect
 from app.usecases.reference import ReferenceFiles
 from app.usecases.registration import (
     SceneFiles,
+    key_of_file,
     points_of_block,
     points_of_store,
     record,
@@ -189,7 +190,7 @@ def _on_store() -> Iterator[Register]:
             find_points = points_of_store(database, storage)
             made = run_registration(files, find_points, RegistrationOptions(), folder, progress)
             with database.transaction() as connection:
-                record(connection, made)
+                record(connection, made, key_of_file(files.image))
             return report_document(made.report)
 
         yield do

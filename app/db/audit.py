@@ -1,4 +1,4 @@
-"""The table `audit`: every change of a token, a block, a scene or a job, written by the database."""
+"""The table `audit`: changes of tokens, blocks, scenes, jobs and points, written by the database."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -9,7 +9,7 @@ from psycopg.rows import class_row
 
 from app.db.engine import Connection
 
-KINDS = ("token", "block", "scene", "job")
+KINDS = ("token", "block", "scene", "job", "point")
 
 
 @dataclass(frozen=True)

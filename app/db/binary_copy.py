@@ -5,6 +5,7 @@ Source: PostgreSQL documentation, COPY, "Binary Format"; PostGIS, "EWKB".
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from uuid import UUID
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +46,17 @@ def dates(days: npt.NDArray[np.datetime64]) -> Column:
     since = np.where(missing, 0, (days - _EPOCH).astype(np.int64))
     column = numbers(since, "i4")
     return Column(column.data, np.where(missing, -1, column.length))
+
+
+def reals(values: npt.NDArray[np.generic], kind: str) -> Column:
+    """A column of real numbers, NULL for NaN."""
+    column = numbers(values, kind)
+    return Column(column.data, np.where(np.isnan(values), -1, column.length))
+
+
+def uuids(value: UUID, rows: int) -> Column:
+    """A column that holds one UUID in every row."""
+    return Column(np.tile(np.frombuffer(value.bytes, np.uint8), (rows, 1)), np.full(rows, 16))
 
 
 def texts(values: npt.NDArray[np.object_]) -> Column:

@@ -17,6 +17,8 @@ BlockState = Literal["staged", "published", "withdrawn"]
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""
 
+PUBLISHED = "select number from block where state = 'published'"
+
 INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
 

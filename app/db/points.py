@@ -10,23 +10,24 @@ import shapely
 from psycopg import sql
 
 from app.db.binary_copy import parse_copy
-from app.db.blocks import ID_BITS
+from app.db.blocks import ID_BITS, PUBLISHED
 from app.db.collections import Collection, Property
 from app.db.engine import Connection
+from app.db.history import point_health, view_health
 from services.formats.block_tables import covariance_from_spread
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
-PUBLISHED = "select number from block where state = 'published'"
-
-VISIBLE = f"t.superseded_by is null and t.block_number = any(array({PUBLISHED}))"
-"""Points of published blocks, but for those that a better block has at the same place."""
+SERVED = "t.superseded_by is null and t.suspended_at is null"
+VISIBLE = f"{SERVED} and t.block_number = any(array({PUBLISHED}))"
+"""Points of published blocks, but for those that a better block has at the same place, and for those
+that an administrator has suspended."""
 
 # Block by block along the primary key. Asked for more simply, the planner may read all unpublished
 # points on its way to the published ones.
 EVERYTHING = f"""select t.* from ({PUBLISHED} and number >= %(after)s >> {ID_BITS}) b
     cross join lateral (
         select * from point t where id > %(after)s and id >= b.number::bigint << {ID_BITS}
-            and id < (b.number::bigint + 1) << {ID_BITS} and t.superseded_by is null and {{condition}}
+            and id < (b.number::bigint + 1) << {ID_BITS} and {SERVED} and {{condition}}
         order by id limit %(limit)s + 1) t
     order by b.number, t.id limit %(limit)s + 1"""
 
@@ -56,8 +57,9 @@ POINTS = Collection(
     interval=("first_view", "last_view"),
     everything=EVERYTHING,
     total=(
-        "select coalesce(sum(n_points - n_superseded), 0)::bigint as n from block"
-        " where state = 'published'"
+        "select coalesce(sum(n_points - n_superseded), 0)::bigint - (select count(*) from point"
+        f" where suspended_at is not null and superseded_by is null"
+        f" and block_number = any(array({PUBLISHED}))) as n from block where state = 'published'"
     ),
 )
 
@@ -210,6 +212,7 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
     images, first_image = _images(connection, numbers)
     chip_file, chip_files = _chip_files(connection, point["chip_file"].astype(np.int64))
     owner = view["point_id"].astype(np.int64)
+    start = np.searchsorted(owner, np.append(ids, np.iinfo(np.int64).max)).astype(np.int64)
     block_of_view = np.searchsorted(numbers, owner >> ID_BITS)
     points = ControlPoints(
         id=ids,
@@ -219,14 +222,14 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
             _columns(point, "corr_east_north", "corr_east_up", "corr_north_up"),
         ),
         saliency=_columns(point, "saliency")[:, 0],
-        health=np.ones(len(ids)),
+        health=point_health(connection, ids),
         views=Views(
-            start=np.searchsorted(owner, np.append(ids, np.iinfo(np.int64).max)).astype(np.int64),
+            start=start,
             gsd_m=_as_written(view["gsd"]),
             image=first_image[block_of_view] + view["image"].astype(np.int64),
             incidence_deg=_columns(view, "incidence")[:, 0],
             azimuth_deg=_columns(view, "azimuth")[:, 0],
-            health=np.ones(len(view)),
+            health=view_health(connection, ids, start),
             images=images,
         ),
         chip_file=chip_file,
@@ -243,7 +246,7 @@ def _points_query(area: sql.Literal, limit: int | None) -> sql.Composed:
                sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
                saliency, chip_file, chip_row
            from point where geom && {area}::geometry and st_intersects(geom, {area}::geometry)
-               and superseded_by is null
+               and superseded_by is null and suspended_at is null
                and block_number = any(array(select number from block where state = 'published'))"""
     ).format(area=area)
     if limit is None:

@@ -1,16 +1,14 @@
-"""The tables `registration` and `measure`: what became of each point in each registered scene."""
+"""The table `registration`: scenes that were registered, with their reports."""
 
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-import numpy as np
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from app.db.engine import Connection
-from services.types import Measures
 
 COLUMNS = "id, job_id, scene_id, block_versions, options, report, verdict, files, created_at"
 
@@ -69,28 +67,15 @@ def insert_registration(
     return registration_id
 
 
-def insert_measures(connection: Connection, registration_id: UUID, measures: Measures) -> None:
-    """Store what happened to each point."""
-    columns = (
-        "registration_id, point_id, matched, active, reason, score, line, sample, sigma_px,"
-        " residual_line_px, residual_sample_px"
+def claim_scene(connection: Connection, registration_id: UUID, scene_key: str) -> bool:
+    """Let a registration speak for its scene; False when an earlier one does."""
+    connection.execute("select pg_advisory_xact_lock(hashtextextended(%s, 0))", [scene_key])
+    done = connection.execute(
+        """update registration set scene_key = %(key)s, counted = true where id = %(id)s
+           and not exists (select from registration where scene_key = %(key)s and counted)""",
+        {"key": scene_key, "id": registration_id},
     )
-    numbers = np.column_stack(
-        [measures.score, measures.line_sample, measures.sigma_px, measures.residual_px]
-    ).astype(object)
-    numbers[np.isnan(numbers.astype(np.float64))] = None
-    with connection.cursor().copy(f"copy measure ({columns}) from stdin") as copy:
-        for i, point_id in enumerate(measures.point_id):
-            copy.write_row(
-                (
-                    registration_id,
-                    int(point_id),
-                    bool(measures.matched[i]),
-                    bool(measures.active[i]),
-                    str(measures.reason[i]),
-                    *numbers[i],
-                )
-            )
+    return done.rowcount == 1
 
 
 def find_by_job(connection: Connection, job_id: UUID) -> RegistrationRow | None:

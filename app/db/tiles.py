@@ -74,9 +74,11 @@ def block_tile(connection: Connection, z: int, x: int, y: int, viewer: Viewer) -
 
 
 def version(connection: Connection) -> str:
-    """Changes whenever a block is published, withdrawn, or becomes another."""
+    """Changes whenever a block is published, withdrawn, or becomes another, or a point is suspended."""
     row = connection.execute(
-        """select count(*) || '-' || coalesce(extract(epoch from max(state_changed_at)), 0) as it
+        """select count(*) || '-' || coalesce(extract(epoch from max(state_changed_at)), 0)
+               || (select '-' || count(*) || '-' || coalesce(extract(epoch from max(suspended_at)), 0)
+                   from point where suspended_at is not null) as it
            from block"""
     ).fetchone()
     assert row is not None

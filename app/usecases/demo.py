@@ -11,7 +11,13 @@ from app.db import engine
 from app.storage import open_storage
 from app.usecases import blocks
 from app.usecases.production import BlockIdentity, run_production
-from app.usecases.registration import SceneFiles, points_of_store, record, run_registration
+from app.usecases.registration import (
+    SceneFiles,
+    key_of_file,
+    points_of_store,
+    record,
+    run_registration,
+)
 from services.formats.raster import write_raster
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.intersection import intersect
@@ -136,7 +142,7 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
             part_of(progress, 0.75, 0.25),
         )
         with database.transaction() as connection:
-            record(connection, registered)
+            record(connection, registered, key_of_file(image))
             served = len(points_of_store(database, storage)(registered.footprint).points)
     return _compared(
         world, sources, scene, produced, registered.registration, folder, ingested.block.n_points, served

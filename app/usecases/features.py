@@ -12,6 +12,7 @@ from app.db.crs import Crs
 from app.db.density import DENSITY
 from app.db.engine import Connection
 from app.db.features import Count, Key, Reading, Selection
+from app.db.history import HISTORY
 from app.db.outlines import BLOCKS, SCENES
 from app.db.points import POINTS
 from app.errors import InvalidParameter, NotFound
@@ -20,7 +21,7 @@ from app.usecases.questions import Asked, Question, condition_of, crs_of
 from services.formats.feature_files import Column, FeatureTable, read_feature_csv
 
 COLLECTIONS: Mapping[str, Collection] = {
-    collection.id: collection for collection in (POINTS, BLOCKS, DENSITY, SCENES)
+    collection.id: collection for collection in (POINTS, BLOCKS, DENSITY, HISTORY, SCENES)
 }
 LARGEST_TEXT = 2_000
 """Features that are made into one text; more are streamed."""
@@ -91,8 +92,8 @@ def table(connection: Connection, asked: Asked, secret: bytes) -> tuple[FeatureT
 def stream(connection: Connection, asked: Asked, secret: bytes) -> Iterator[bytes | Answer]:
     """The features of a large page as GeoJSON, in pieces; the last thing is the answer about them."""
     reading = Reading()
-    matched = asked.matched or features.count(connection, asked.selection)
     yield from features.stream_geojson(connection, asked.selection, asked.after, asked.limit, reading)
+    matched = _matched(connection, asked, reading.last, reading.returned)
     yield Answer(b"", reading.returned, matched, _next(asked, reading.last, matched, secret))
 
 
@@ -115,7 +116,7 @@ def find_feature(
 def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tuple[float, ...] | None:
     """West, south, east, north of what the viewer may see of a collection, None without any."""
     # Points lie in the outlines of their blocks, which are fewer; so do cells, to a tenth of a degree.
-    whose = BLOCKS if collection.id in ("points", "density") else collection
+    whose = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
     found = features.extent(connection, whose, viewer if whose is collection else Viewer())
     if found is None or found[2] <= 180.0:
         return found

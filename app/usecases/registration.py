@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,6 +20,7 @@ from app.db.points import control_points
 from app.db.tokens import Token
 from app.errors import Conflict, InputError
 from app.storage import Storage, StoredChips
+from app.usecases import history
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.reference import ReferenceFiles, read_reference
 from app.usecases.registration_files import OUTPUTS, write_outputs
@@ -223,12 +225,17 @@ def points_of_store(database: Database, storage: Storage) -> FindPoints:
 def record(
     connection: Connection,
     registered: RegisteredScene,
+    scene_key: str,
     *,
     job_id: UUID | None = None,
     scene_id: UUID | None = None,
     keys: dict[str, str] | None = None,
 ) -> UUID:
-    """Remember a registration and what happened to each point in it."""
+    """Remember a registration and what happened to each point in it.
+
+    Args:
+        scene_key: the same for the same image; see `history.remember`.
+    """
     report = report_document(registered.report)
     registration_id = registrations.insert_registration(
         connection,
@@ -240,8 +247,15 @@ def record(
         verdict=registered.registration.qualification.verdict,
         files=keys or {},
     )
-    registrations.insert_measures(connection, registration_id, registered.registration.measures)
+    history.remember(connection, registration_id, registered.registration, scene_key)
     return registration_id
+
+
+def key_of_file(image: Path) -> str:
+    """What tells an image on the disk from others without reading it all: its place, size and time."""
+    found = image.stat()
+    said = f"{image.resolve()} {found.st_size} {found.st_mtime_ns}"
+    return sha256(said.encode()).hexdigest()
 
 
 def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None:
@@ -272,7 +286,8 @@ def _run(work: Work) -> Commit:
         }
 
     def commit(connection: Connection) -> dict[str, Any]:
-        record(connection, made, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
+        key = scene.sha256 or f"scene {scene.id}"
+        record(connection, made, key, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
         scenes.set_footprint(connection, inputs.scene, made.footprint)
         taken, shape = made.scene.acquisition, made.scene.image.shape
         scenes.describe(connection, inputs.scene, taken, shape, gsd_m)

@@ -270,7 +270,12 @@ def test_points_are_closed_without_a_token(made, client):
 
 def test_the_collections_say_what_they_hold_and_where(made, get):
     listed = get("/collections").json()["collections"]
-    assert [collection["id"] for collection in listed] == ["points", "blocks", "density"]
+    assert [collection["id"] for collection in listed] == [
+        "points",
+        "blocks",
+        "density",
+        "point-history",
+    ]
     for collection in listed:
         assert_allclose(collection["extent"]["spatial"]["bbox"], [[5.2, 43.2, 5.3, 43.3]])
         for link in collection["links"]:

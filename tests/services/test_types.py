@@ -74,6 +74,12 @@ def test_health_is_one_without_a_history_and_falls_with_every_failure() -> None:
     np.testing.assert_allclose(health(tried, np.array([0, 0, 0, 5, 0])), [1, 5 / 6, 0.5, 1, 5 / 105])
 
 
+def test_a_point_that_serves_where_others_fail_is_no_better_than_one_without_a_history() -> None:
+    expected_of_ten_tries_where_half_serve = np.array([5.0, 5.0, 5.0])
+    found = health(expected_of_ten_tries_where_half_serve, np.array([10, 5, 0]))
+    np.testing.assert_allclose(found, [1.0, 1.0, 0.5])
+
+
 @given(st.integers(1, 20), st.data())
 def test_taken_observations_are_the_rows_asked_for(m: int, data: st.DataObject) -> None:
     numbers = np.arange(m)

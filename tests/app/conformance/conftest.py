@@ -11,10 +11,11 @@ from tests.factories import make_block
 
 @pytest.fixture
 def made(connection, storage, tmp_path):
-    """A published block of 60 points; another of 10, staged, lies in the same place."""
+    """A published block of 60 points, 3 of them tried; one of 10, staged, lies in the same place."""
     made = make_block(tmp_path / "block", count=60)
     blocks.ingest_block(connection, storage, made.folder)
     blocks.publish_block(connection, "calanques")
+    connection.execute("insert into point_history (point_id) select id from point limit 3")
     staged = make_block(tmp_path / "staged", count=10, seed=5, name="staged")
     blocks.ingest_block(connection, storage, staged.folder)
     connection.commit()

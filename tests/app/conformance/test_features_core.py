@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-COLLECTIONS = ("points", "blocks", "density")
+COLLECTIONS = ("points", "blocks", "density", "point-history")
 a_tenth_of_a_millimetre_deg = 1e-9
 GEOJSON = "application/geo+json"
 

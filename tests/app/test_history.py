@@ -1,0 +1,375 @@
+"""What registrations leave behind of points and views, and what becomes of it."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from fastapi.testclient import TestClient
+from typer.testing import CliRunner
+
+from app.cli.main import app as amers
+from app.config import Settings
+from app.db import engine, history, jobs, registrations
+from app.db.engine import Connection, Database
+from app.db.jobs import LostJob
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.history import remember
+from app.usecases.registration import (
+    RegisteredScene,
+    SceneFiles,
+    points_of_block,
+    points_of_store,
+    run_registration,
+)
+from services.formats.block_check import check_block
+from services.registration import Registration, RegistrationOptions
+from services.types import health
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+
+VANISHED = 5
+"""Of the 40 points: what they show is gone in the scene."""
+OPTIONS = RegistrationOptions(max_points=0)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    """A block and a scene in which something else is where five of the points should be."""
+    made = make_flat_world(tmp_path_factory.mktemp("world"))
+    points = check_block(made.block).points
+    rng = np.random.default_rng(8)
+    with rasterio.open(made.tagged, "r+") as file:
+        pixels = file.read(1)
+        for line, sample in made.true_model.project(points.lon_lat_h[:VANISHED]).round().astype(int):
+            new = cv2.GaussianBlur(rng.normal(size=(71, 71)), (0, 0), 2.0)
+            pixels[line - 35 : line + 36, sample - 35 : sample + 36] = 1500.0 + 300.0 * new / new.std()
+        file.write(pixels, 1)
+    return made
+
+
+@pytest.fixture(scope="module")
+def registered(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> RegisteredScene:
+    """The scene registered on all points of the block; ids are those of the block."""
+    files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
+    return run_registration(files, points_of_block(world.block), OPTIONS, tmp_path_factory.mktemp("out"))
+
+
+@pytest.fixture
+def database(dsn: str, settings: Settings) -> Iterator[Database]:
+    """The database of the test with its pools."""
+    with engine.pooled(dsn, settings) as database:
+        yield database
+
+
+@pytest.fixture
+def first_id(world: FlatWorld, connection: Connection, storage: Storage) -> int:
+    """Id in the store of the first point of the block, which is published."""
+    block = ingest_block(connection, storage, world.block).block
+    publish_block(connection, str(block.number))
+    connection.commit()
+    return block.number << 26
+
+
+@pytest.fixture
+def stored(registered: RegisteredScene, first_id: int) -> Registration:
+    """The registration as it would have come from the points of the store."""
+    measures = registered.registration.measures
+    measures = replace(measures, point_id=measures.point_id + first_id)
+    return replace(registered.registration, measures=measures)
+
+
+def remembered(connection: Connection, registration: Registration, scene: str) -> None:
+    """Remember a registration of a scene of that name."""
+    registration_id = registrations.insert_registration(
+        connection,
+        job_id=None,
+        scene_id=None,
+        block_versions=[],
+        options={},
+        report={},
+        verdict=registration.qualification.verdict,
+        files={},
+    )
+    remember(connection, registration_id, registration, scene)
+
+
+def failing(registration: Registration, verdict: str = "failed") -> Registration:
+    """The same registration with another verdict."""
+    return replace(registration, qualification=replace(registration.qualification, verdict=verdict))
+
+
+def counters(connection: Connection) -> dict[int, tuple[int, int]]:
+    """Attempts and successes of every point that has a history."""
+    rows = connection.execute("select point_id, attempts, successes from point_history").fetchall()
+    return {row["point_id"]: (row["attempts"], row["successes"]) for row in rows}
+
+
+def test_the_world_is_as_the_tests_need_it(registered: RegisteredScene) -> None:
+    measures = registered.registration.measures
+    assert registered.registration.qualification.verdict in ("good", "usable")
+    assert len(measures.point_id) == 40
+    assert not measures.active[measures.point_id < VANISHED].any()
+    assert measures.active[measures.point_id >= VANISHED].mean() > 0.7
+
+
+def test_every_point_and_view_that_was_tried_leaves_a_row(
+    connection: Connection, stored: Registration
+) -> None:
+    remembered(connection, stored, "a")
+    measures, views = stored.measures, stored.views
+    rows = connection.execute("select * from measure order by point_id").fetchall()
+    assert [row["point_id"] for row in rows] == measures.point_id.tolist()
+    assert [row["active"] for row in rows] == measures.active.tolist()
+    assert [row["reason"] for row in rows] == measures.reason.tolist()
+    lines = np.array([row["line"] for row in rows], dtype=float)
+    np.testing.assert_array_equal(lines, measures.line_sample[:, 0])
+    east = np.array([row["residual_east_m"] for row in rows], dtype=float)
+    np.testing.assert_allclose(east, measures.residual_m[:, 0], rtol=1e-6)
+    rows = connection.execute("select * from view_measure order by point_id, view").fetchall()
+    assert [row["point_id"] for row in rows] == measures.point_id[views.point].tolist()
+    assert [row["view"] for row in rows] == views.view.tolist()
+    assert [row["agreed"] for row in rows] == views.agreed.tolist()
+    assert {row["registration_id"] for row in rows} == {rows[0]["registration_id"]}
+
+
+def test_what_is_kept_of_a_point_is_what_its_rows_add_up_to(
+    connection: Connection, stored: Registration
+) -> None:
+    for scene in ("a", "b", "c"):
+        remembered(connection, stored, scene)
+    kept = connection.execute("select * from point_history order by point_id").fetchall()
+    summed = connection.execute(
+        """select point_id, count(*) as attempts, count(*) filter (where active) as successes,
+               avg(residual_east_m) filter (where matched) as east
+           from measure group by point_id order by point_id"""
+    ).fetchall()
+    for ours, theirs in zip(kept, summed, strict=True):
+        assert (ours["point_id"], ours["attempts"], ours["successes"]) == (
+            theirs["point_id"],
+            theirs["attempts"],
+            theirs["successes"],
+        )
+        if theirs["east"] is not None:
+            assert ours["sum_east_m"] / ours["matched"] == pytest.approx(theirs["east"], rel=1e-5)
+    share = stored.measures.active.mean()
+    np.testing.assert_allclose([row["expected"] for row in kept], 3 * share, rtol=1e-12)
+
+
+def test_a_scene_speaks_once_however_often_it_is_registered(
+    connection: Connection, stored: Registration
+) -> None:
+    remembered(connection, stored, "a")
+    once = counters(connection)
+    remembered(connection, stored, "a")
+    assert counters(connection) == once
+    remembered(connection, stored, "b")
+    assert {tries for tries, _ in counters(connection).values()} == {2}
+
+
+def test_a_failed_registration_is_kept_and_says_nothing_of_its_points(
+    connection: Connection, stored: Registration
+) -> None:
+    remembered(connection, failing(stored), "a")
+    assert counters(connection) == {}
+    kept = connection.execute("select count(*) as n from measure").fetchone()
+    assert kept == {"n": 40}
+    remembered(connection, stored, "a")
+    assert len(counters(connection)) == 40
+
+
+def test_an_attempt_that_has_lost_its_job_counts_nothing(
+    connection: Connection, database: Database, stored: Registration
+) -> None:
+    job = jobs.create(connection, "register-scene", {})
+    assert job is not None
+    for attempt in (1, 2):
+        assert jobs.claim(connection, job.id, "a worker", 30.0)
+        if attempt == 1:
+            jobs.try_again(connection, job.id, 1, 0.0)
+    connection.commit()
+
+    def end(attempt: int) -> None:
+        with database.transaction() as own:
+            remembered(own, stored, "a")
+            jobs.succeed(own, job.id, attempt, {})
+
+    with pytest.raises(LostJob):
+        end(1)
+    assert counters(connection) == {}
+    end(2)
+    with pytest.raises(LostJob):
+        end(2)
+    assert {tries for tries, _ in counters(connection).values()} == {1}
+
+
+def test_what_a_scene_does_not_show_is_no_fault_of_a_point(
+    connection: Connection, stored: Registration
+) -> None:
+    reason = stored.measures.reason.copy()
+    reason[:4] = "nodata", "cloud", "no_chip", "not_tried"
+    hidden = replace(stored, measures=replace(stored.measures, reason=reason))
+    remembered(connection, hidden, "a")
+    assert set(counters(connection)) == set(stored.measures.point_id[4:].tolist())
+
+
+def test_a_view_counts_only_where_it_is_known_what_it_should_have_shown(
+    connection: Connection, stored: Registration
+) -> None:
+    remembered(connection, stored, "a")
+    active = set(stored.measures.point_id[stored.measures.active].tolist())
+    rows = connection.execute("select * from view_history").fetchall()
+    assert {row["point_id"] for row in rows} == active
+    agreed = {
+        (int(stored.measures.point_id[point]), int(view)): bool(agreed)
+        for point, view, agreed in zip(
+            stored.views.point, stored.views.view, stored.views.agreed, strict=True
+        )
+    }
+    for row in rows:
+        assert row["successes"] == agreed[row["point_id"], row["view"]]
+
+
+def test_the_health_of_points_and_views_is_read_with_them(
+    connection: Connection, database: Database, storage: Storage, stored: Registration, first_id: int
+) -> None:
+    outline = np.array([[5.2, 43.2], [5.3, 43.2], [5.3, 43.3], [5.2, 43.3]])
+    fresh = points_of_store(database, storage)(outline).points
+    assert (fresh.health == 1.0).all()
+    assert (fresh.views.health == 1.0).all()
+    for scene in ("a", "b"):
+        remembered(connection, stored, scene)
+    connection.execute(
+        "update view_history set successes = 0 where point_id = %s and view = 1", [first_id + 30]
+    )
+    connection.commit()
+    read = points_of_store(database, storage)(outline).points
+    share = stored.measures.active.mean()
+    expected = np.where(stored.measures.active, 1.0, health(2 * share * np.ones(40), np.zeros(40)))
+    np.testing.assert_allclose(read.health, expected)
+    views, active = stored.views, stored.measures.active
+    disagreed = active[views.point] & ~views.agreed
+    rows = read.views.start[views.point] + views.view
+    lower = set(np.flatnonzero(read.views.health < 1.0).tolist())
+    assert lower == {*rows[disagreed].tolist(), int(read.views.start[30]) + 1}
+
+
+def test_the_next_registration_prefers_points_that_have_served(
+    world: FlatWorld,
+    connection: Connection,
+    database: Database,
+    storage: Storage,
+    stored: Registration,
+    first_id: int,
+    tmp_path: Path,
+) -> None:
+    few = RegistrationOptions(max_points=14)
+    files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
+
+    def vanished_tried(folder: str) -> int:
+        made = run_registration(files, points_of_store(database, storage), few, tmp_path / folder)
+        measures = made.registration.measures
+        return int(((measures.reason != "not_tried") & (measures.point_id < first_id + VANISHED)).sum())
+
+    before = vanished_tried("before")
+    for scene in ("a", "b", "c"):
+        remembered(connection, stored, scene)
+    connection.commit()
+    assert vanished_tried("after") < before
+
+
+def test_a_point_that_fails_where_others_serve_is_proposed_and_served_until_somebody_decides(
+    connection: Connection,
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    stored: Registration,
+    first_id: int,
+) -> None:
+    reader, admin = bearer("read"), bearer("admin")
+
+    def proposed() -> list[int]:
+        asked = {"filter": "state = 'proposed'", "limit": 100}
+        page = client.get("/collections/point-history/items", params=asked, headers=reader).json()
+        return [feature["id"] for feature in page["features"]]
+
+    def served() -> set[int]:
+        page = client.get("/collections/points/items?limit=100", headers=reader).json()
+        assert page["numberMatched"] == page["numberReturned"]
+        return {feature["id"] for feature in page["features"]}
+
+    for scene in range(10):
+        remembered(connection, stored, str(scene))
+    connection.commit()
+    failed = [point for point, (_, successes) in counters(connection).items() if successes == 0]
+    assert proposed() == sorted(failed)
+    assert set(range(first_id, first_id + VANISHED)) <= set(failed)
+    assert len(served()) == 40
+
+    bad = first_id
+    because = {"because": "a roundabout was built there"}
+    assert client.post(f"/points/{bad}/suspend", json=because, headers=reader).status_code == 403
+    assert client.post("/points/1/suspend", json=because, headers=admin).status_code == 404
+    assert client.post(f"/points/{bad}/suspend", json={"because": " "}, headers=admin).status_code == 422
+    done = client.post(f"/points/{bad}/suspend", json=because, headers=admin)
+    assert (done.status_code, done.json()["state"]) == (200, "suspended")
+    assert client.post(f"/points/{bad}/suspend", json=because, headers=admin).status_code == 409
+    assert served() == set(range(first_id, first_id + 40)) - {bad}
+    assert bad not in proposed()
+    one = client.get(f"/collections/points/items/{bad}", headers=reader).json()["properties"]
+    assert (one["attempts"], one["successes"], one["last_success"]) == (10, 0, None)
+    assert one["suspended_because"] == because["because"]
+    assert one["health"] < 0.5
+    good = client.get(f"/collections/points/items/{first_id + 30}", headers=reader).json()["properties"]
+    assert (good["attempts"], good["successes"], good["state"], good["health"]) == (10, 10, "served", 1)
+    assert 0.0 < good["mean_residual_px"] < 1.0
+    assert good["last_success"] is not None
+
+    back = client.post(f"/points/{bad}/reinstate", headers=admin)
+    assert (back.status_code, back.json()["attempts"], back.json()["state"]) == (200, 0, "served")
+    assert client.post(f"/points/{bad}/reinstate", headers=admin).status_code == 409
+    assert bad in served()
+    changes = client.get(f"/audit?kind=point&subject={bad}", headers=admin).json()["changes"]
+    assert [change["after"]["suspended_because"] for change in changes] == [None, because["because"]]
+    assert {change["actor_name"] for change in changes} == {"a token to admin"}
+
+
+def test_a_suspended_point_is_not_given_to_registrations(
+    connection: Connection, database: Database, storage: Storage, first_id: int
+) -> None:
+    outline = np.array([[5.2, 43.2], [5.3, 43.2], [5.3, 43.3], [5.2, 43.3]])
+    assert history.suspend(connection, first_id + 3, "moved")
+    connection.commit()
+    found = points_of_store(database, storage)(outline).points.id
+    assert set(found.tolist()) == set(range(first_id, first_id + 40)) - {first_id + 3}
+
+
+def test_suspensions_are_decided_on_the_command_line(
+    connection: Connection,
+    settings: Settings,
+    stored: Registration,
+    first_id: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert settings.database_url is not None
+    monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
+
+    def points(*words: object) -> list[dict]:
+        done = CliRunner().invoke(amers, ["points", *(str(word) for word in words), "--json"])
+        assert done.exit_code == 0, done.output
+        said: list[dict] = json.loads(done.stdout)
+        return said
+
+    for scene in range(10):
+        remembered(connection, stored, str(scene))
+    connection.commit()
+    proposed = [point["id"] for point in points("suspensions")]
+    assert first_id in proposed
+    points("suspend", first_id, "--because", "gone")
+    assert [point["id"] for point in points("suspensions", "--suspended")] == [first_id]
+    assert [point["id"] for point in points("suspensions")] == [p for p in proposed if p != first_id]
+    points("reinstate", first_id)
+    assert points("suspensions", "--suspended") == []
