@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from itertools import chain, islice
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -16,7 +17,7 @@ from app.db.collections import Collection, Viewer
 from app.db.engine import Database
 from app.usecases import features
 from app.usecases.features import Answer
-from app.usecases.questions import DEFAULT_LIMIT, Asked, Question, understand
+from app.usecases.questions import DEFAULT_LIMIT, FILTER_LANGUAGES, Asked, Question, understand
 from services.formats.feature_files import (
     FeatureTable,
     format_flatgeobuf,
@@ -101,7 +102,12 @@ def _question(
     ] = None,
     filter: Annotated[str | None, Query(description="CQL2.")] = None,
     filter_lang: Annotated[
-        str | None, Query(alias="filter-lang", description="cql2-text, the default, or cql2-json.")
+        str | None,
+        Query(
+            alias="filter-lang",
+            description="cql2-text unless said.",
+            json_schema_extra={"enum": list(FILTER_LANGUAGES)},
+        ),
     ] = None,
     filter_crs: Annotated[
         str | None, Query(alias="filter-crs", description="URI of the reference system in filter.")
@@ -238,10 +244,12 @@ def _answer(
     """A page in a format; links are in the document where it has a place for them, in the header too."""
     if form == "json" and asked.limit > features.LARGEST_TEXT:
         pieces = _streamed(request, database, asked, secret, next_link)
-        first = next(pieces)
-        return StreamingResponse(
-            _chain(first, pieces), media_type=GEOJSON, headers=_headers(asked, FEATURES["json"])
-        )
+        # Read ahead to know that there is no error; with what follows features, it may be all there is.
+        ahead = list(islice(pieces, 3))
+        headers = _headers(asked, FEATURES["json"])
+        if len(ahead) < 3:
+            return Response(b"".join(ahead), media_type=GEOJSON, headers=headers)
+        return StreamingResponse(chain(ahead, pieces), media_type=GEOJSON, headers=headers)
     with database.reading() as connection:
         if form in FILES:
             table, answer = features.table(connection, asked, secret)
@@ -274,12 +282,6 @@ def _streamed(
             else:
                 yield opened + piece
             opened = b""
-
-
-def _chain(first: bytes, others: Iterator[bytes]) -> Iterator[bytes]:
-    """What was read to know that there is no error, then the others."""
-    yield first
-    yield from others
 
 
 def _rest(answer: Answer, links: list[dict[str, Any]]) -> bytes:

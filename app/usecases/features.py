@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 
 import psycopg
 
@@ -121,6 +122,15 @@ def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tu
     if found is None or found[2] <= 180.0:
         return found
     return (-180.0, found[1], 180.0, found[3])
+
+
+def period(
+    connection: Connection, collection: Collection, viewer: Viewer
+) -> tuple[datetime | None, datetime | None]:
+    """The first and the last time of what the viewer may see of scenes; unknown for the others."""
+    if collection is not SCENES:
+        return None, None
+    return features.period(connection, collection, viewer)
 
 
 def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
