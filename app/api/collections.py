@@ -5,7 +5,9 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
+from app.api import stac
 from app.api.deps import PointsReader, ReadConnection, SettingsDep
+from app.api.documents import document_of, geometry_schema, property_schema
 from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
 from app.api.negotiation import (
     DOCUMENTS,
@@ -18,7 +20,7 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Cell, document_page, drawn
-from app.db.collections import Collection, Property, Viewer
+from app.db.collections import Collection, Viewer
 from app.db.engine import Connection
 from app.errors import NotAllowed
 from app.usecases import features
@@ -27,18 +29,9 @@ from app.usecases.tiles import TILED
 router = APIRouter(tags=["collections"])
 
 REL = "http://www.opengis.net/def/rel/ogc/1.0"
-JSON_TYPES: dict[str, dict[str, str]] = {
-    "bigint": {"type": "integer"},
-    "real": {"type": "number"},
-    "double precision": {"type": "number"},
-    "text": {"type": "string"},
-    "boolean": {"type": "boolean"},
-    "date": {"type": "string", "format": "date"},
-    "timestamptz": {"type": "string", "format": "date-time"},
-}
 
 
-@router.get("/collections")
+@router.get("/collections", response_class=Response, responses=document_of("Collections"))
 def collections(
     request: Request,
     connection: ReadConnection,
@@ -72,7 +65,7 @@ def collections(
     )
 
 
-@router.get("/collections/{collection}")
+@router.get("/collections/{collection}", response_class=Response, responses=document_of("Collection"))
 def one_collection(
     request: Request,
     collection: CollectionDep,
@@ -101,38 +94,50 @@ def one_collection(
     )
 
 
-@router.get("/collections/{collection}/queryables")
+@router.get(
+    "/collections/{collection}/queryables",
+    response_class=Response,
+    responses=document_of("JsonSchema", SCHEMA_JSON),
+)
 def queryables(
     request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
     """What a filter may name, as a JSON Schema."""
-    members = {item.name: _schema(item) for item in collection.queryables.values()}
-    members["geometry"] = _geometry_schema(collection)
+    members = {item.name: property_schema(item) for item in collection.queryables.values()}
+    members["geometry"] = geometry_schema(collection)
     return _schema_reply(request, collection, "queryables", members, f)
 
 
-@router.get("/collections/{collection}/sortables")
+@router.get(
+    "/collections/{collection}/sortables",
+    response_class=Response,
+    responses=document_of("JsonSchema", SCHEMA_JSON),
+)
 def sortables(
     request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
     """What features can be sorted by, as a JSON Schema."""
-    members = {item.name: _schema(item) for item in collection.queryables.values()}
+    members = {item.name: property_schema(item) for item in collection.queryables.values()}
     return _schema_reply(request, collection, "sortables", members, f)
 
 
-@router.get("/collections/{collection}/schema")
+@router.get(
+    "/collections/{collection}/schema",
+    response_class=Response,
+    responses=document_of("JsonSchema", SCHEMA_JSON),
+)
 def schema(request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None) -> Response:
     """The properties of a feature, as a JSON Schema with the roles of OGC API - Features - Part 5."""
     members: dict[str, Any] = {}
     for item in collection.queryables.values():
-        members[item.name] = _schema(item)
+        members[item.name] = property_schema(item)
     members[collection.key.name]["x-ogc-role"] = "id"
     if collection.interval and collection.interval[0] != collection.interval[1]:
         for name, end in zip(collection.interval, ("start", "end"), strict=True):
             members[name]["x-ogc-role"] = f"primary-interval-{end}"
     elif collection.interval:
         members[collection.interval[0]]["x-ogc-role"] = "primary-instant"
-    members["geometry"] = {**_geometry_schema(collection), "x-ogc-role": "primary-geometry"}
+    members["geometry"] = {**geometry_schema(collection), "x-ogc-role": "primary-geometry"}
     return _schema_reply(request, collection, "schema", members, f)
 
 
@@ -141,15 +146,26 @@ def describe(
 ) -> dict[str, Any]:
     """A collection as OGC API - Features describes it."""
     box = features.extent(connection, collection, viewer)
-    spatial = {} if box is None else {"extent": {"spatial": {"bbox": [box], "crs": _CRS84}}}
+    # STAC calls for an extent even where nothing is.
+    spatial = {"bbox": [box or WORLD], "crs": _CRS84}
+    period = features.period(connection, collection, viewer)
+    temporal = {"interval": [[None if time is None else time.isoformat() for time in period]]}
     path = f"collections/{collection.id}"
     here = f"{request.base_url}{path}"
     links = [
         *_self_links(request, path),
         *(
-            {"rel": "items", "href": f"{here}/items?f={name}", "type": kind, "title": f"Items, {name}"}
+            # Clients of STAC append ids to the first of them.
+            {
+                "rel": "items",
+                "href": f"{here}/items" if name == "json" else f"{here}/items?f={name}",
+                "type": kind,
+                "title": f"Items, {name}",
+            }
             for name, kind in {"json": GEOJSON, **FEATURES}.items()
         ),
+        {"rel": "root", "href": str(request.base_url), "type": JSON},
+        {"rel": "parent", "href": str(request.base_url), "type": JSON},
         {"rel": "describedby", "href": f"{here}/schema", "type": SCHEMA_JSON},
         {"rel": f"{REL}/schema", "href": f"{here}/schema", "type": SCHEMA_JSON},
         {"rel": f"{REL}/queryables", "href": f"{here}/queryables", "type": SCHEMA_JSON},
@@ -164,11 +180,13 @@ def describe(
         "itemType": "feature",
         "crs": [crs.uri for crs in collection.crs],
         "storageCrs": collection.storage_crs.uri,
-        **spatial,
+        **stac.COLLECTION_MEMBERS,
+        "extent": {"spatial": spatial, "temporal": temporal},
         "links": links,
     }
 
 
+WORLD = (-180.0, -90.0, 180.0, 90.0)
 _CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 
 
@@ -202,19 +220,6 @@ def _schema_reply(
         "additionalProperties": False,
     }
     return JSONResponse(document, media_type=SCHEMA_JSON)
-
-
-def _schema(item: Property) -> dict[str, Any]:
-    said: dict[str, Any] = {"title": item.title, **JSON_TYPES[item.type]}
-    if item.choices:
-        said["enum"] = list(item.choices)
-    if item.unit:
-        said["x-ogc-unit"] = item.unit
-    return said
-
-
-def _geometry_schema(collection: Collection) -> dict[str, str]:
-    return {"title": "Geometry", "format": f"geometry-{collection.geometry_type.lower()}"}
 
 
 def _rectangle(box: list[float]) -> dict[str, Any]:

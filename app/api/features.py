@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
 
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
@@ -43,7 +44,7 @@ PARAMETERS = {
 }
 
 
-def _collection(collection: str) -> Collection:
+async def _collection(collection: str) -> Collection:
     return features.find_collection(collection)
 
 
@@ -59,16 +60,24 @@ def viewer_of(collection: CollectionDep, caller: CallerDep, settings: SettingsDe
     return Viewer() if caller is None else Viewer(caller.id, allows(caller, Scope.ADMIN))
 
 
-ViewerDep = Annotated[Viewer, Depends(viewer_of)]
+async def _viewer(collection: CollectionDep, caller: CallerDep, settings: SettingsDep) -> Viewer:
+    return viewer_of(collection, caller, settings)
 
 
-def _secret(request: Request, database: DatabaseDep) -> bytes:
+ViewerDep = Annotated[Viewer, Depends(_viewer)]
+
+
+async def _secret(request: Request, database: DatabaseDep) -> bytes:
     """The secret of page links, read once by each process."""
     known: bytes | None = getattr(request.app.state, "page_secret", None)
     if known is None:
-        with database.reading() as connection:
-            known = request.app.state.page_secret = features.page_secret(connection)
+        known = request.app.state.page_secret = await run_in_threadpool(_read_secret, database)
     return known
+
+
+def _read_secret(database: Database) -> bytes:
+    with database.reading() as connection:
+        return features.page_secret(connection)
 
 
 SecretDep = Annotated[bytes, Depends(_secret)]
@@ -81,7 +90,7 @@ Format = Annotated[str | None, Query(description=f"Format: {', '.join(FEATURES)}
 CrsUri = Annotated[str | None, Query(description="URI of the reference system of the reply.")]
 
 
-def _question(
+async def _question(
     limit: Annotated[
         int,
         Query(ge=1, description="Most features on the page.", json_schema_extra={"maximum": 10_000}),
@@ -172,7 +181,9 @@ def items(
     refuse_unknown(request, PARAMETERS | set(collection.queryables))
     form = chosen_format(request, FEATURES, f)
     equal = tuple(
-        (name, value) for name, value in request.query_params.items() if name in collection.queryables
+        (name, value)
+        for name, value in request.query_params.items()
+        if name in collection.queryables and name not in PARAMETERS
     )
     asked = understand(collection, viewer, Question(**{**vars(question), "equal": equal}), secret)
     return _answer(request, database, asked, form, secret, _next_of_query(request))

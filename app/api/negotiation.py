@@ -45,8 +45,10 @@ def chosen_format(request: Request, formats: Mapping[str, str], asked: str | Non
             weight = float(weights[0]) if weights else 1.0
         except ValueError:
             weight = 0.0
-        if kind in by_type and weight > 0.0:
-            wanted.append((-weight, rank, by_type[kind]))
+        name = by_type.get(kind)
+        versions = [word for word in parameters if word.startswith("version=")]
+        if name is not None and weight > 0.0 and all(word in formats[name] for word in versions):
+            wanted.append((-weight, rank, name))
     return min(wanted)[2] if wanted else next(iter(formats))
 
 

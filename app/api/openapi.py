@@ -5,23 +5,14 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from app.api.negotiation import PROBLEM_JSON
+from app.api.documents import COMPONENTS, feature_schema, page_schema, property_schema, reference
+from app.api.negotiation import GEOJSON, PROBLEM_JSON
+from app.db.collections import Collection, Property
 from app.usecases.features import COLLECTIONS
 
-PROBLEM = {
-    "type": "object",
-    "description": "Problem details, RFC 9457.",
-    "required": ["type", "title", "status", "detail"],
-    "properties": {
-        "type": {"type": "string"},
-        "title": {"type": "string"},
-        "status": {"type": "integer"},
-        "detail": {"type": "string"},
-    },
-}
 REFUSED = {
     "description": "What was wrong, as problem details.",
-    "content": {PROBLEM_JSON: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+    "content": {PROBLEM_JSON: {"schema": reference("Problem")}},
 }
 
 
@@ -43,31 +34,63 @@ def _finished(document: dict[str, Any]) -> dict[str, Any]:
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
-    schemas["Problem"] = PROBLEM
+    schemas |= COMPONENTS
     document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
     document["security"] = [{"bearer": []}, {}]
     for path, operations in list(document["paths"].items()):
         for operation in operations.values():
             operation["responses"].pop("422", None)
             operation["responses"]["default"] = REFUSED
+            for parameter in operation.get("parameters", []):
+                parameter["schema"] = _without_null(parameter["schema"])
         if "{collection}" in path:
             _spell_out(document["paths"], path)
     return document
 
 
+def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
+    """A parameter that may be left out: nobody can send null."""
+    kinds = [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]
+    if len(kinds) != 1:
+        return schema
+    return {**{name: value for name, value in schema.items() if name != "anyOf"}, **kinds[0]}
+
+
 def _spell_out(paths: dict[str, Any], path: str) -> None:
-    """A path for each collection: clients look for the largest page under the collection's own name."""
+    """A path for each collection: there clients look for the largest page and what filters may name."""
     operations = paths.pop(path)
-    for name in COLLECTIONS:
+    for name, collection in COLLECTIONS.items():
         own = path.replace("{collection}", name)
         if own not in paths:
-            paths[own] = {method: _of_collection(value, name) for method, value in operations.items()}
+            paths[own] = {
+                method: _of_collection(operation, collection, path)
+                for method, operation in operations.items()
+            }
 
 
-def _of_collection(operation: dict[str, Any], name: str) -> dict[str, Any]:
+def _of_collection(operation: dict[str, Any], collection: Collection, path: str) -> dict[str, Any]:
     parameters = [item for item in operation.get("parameters", []) if item["name"] != "collection"]
-    return {
+    own = {
         **operation,
-        "operationId": f"{operation['operationId']}_{name}",
+        "operationId": f"{operation['operationId']}_{collection.id}",
         "parameters": parameters,
     }
+    if path.endswith("/items"):
+        own["parameters"] = parameters + [_equal(item) for item in collection.queryables.values()]
+    if path.endswith(("/items", "/search")):
+        own["responses"] = _giving(page_schema(collection), operation["responses"])
+    elif path.endswith("/{feature_id}"):
+        own["responses"] = _giving(feature_schema(collection), operation["responses"])
+    return own
+
+
+def _equal(item: Property) -> dict[str, Any]:
+    """The parameter that asks for features of which a property has a value."""
+    schema = property_schema(item)
+    return {"name": item.name, "in": "query", "required": False, "schema": schema}
+
+
+def _giving(schema: dict[str, Any], responses: dict[str, Any]) -> dict[str, Any]:
+    good = responses["200"]
+    content = {**good["content"], GEOJSON: {"schema": schema}}
+    return {**responses, "200": {**good, "content": content}}

@@ -5,7 +5,9 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
+from app.api import processes, stac
 from app.api.deps import ReadConnection
+from app.api.documents import document_of
 from app.api.features import Format
 from app.api.negotiation import DOCUMENTS, HTML, JSON, OPENAPI_JSON, chosen_format, refuse_unknown
 from app.api.pages import Cell, document_page
@@ -41,6 +43,8 @@ CONFORMS_TO = (
         )
     ),
     *(f"{TILES}{name}" for name in ("core", "tileset", "tilesets-list", "geodata-tilesets", "mvt")),
+    *processes.CONFORMS_TO,
+    *stac.CONFORMS_TO,
 )
 REL = "http://www.opengis.net/def/rel/ogc/1.0/"
 LINKS = (
@@ -59,7 +63,7 @@ LINKS = (
 )
 
 
-@router.get("/")
+@router.get("/", response_class=Response, responses=document_of("Landing"))
 def landing(request: Request, f: Format = None) -> Response:
     """What this is, and where everything begins."""
     refuse_unknown(request, {"f"})
@@ -69,12 +73,14 @@ def landing(request: Request, f: Format = None) -> Response:
         for rel, path, kind, said in LINKS
     ]
     if chosen_format(request, DOCUMENTS, f) == "json":
-        return JSONResponse({"title": title, "description": description, "links": links})
+        links += stac.landing_links(str(request.base_url))
+        said = {"title": title, "description": description, "conformsTo": CONFORMS_TO}
+        return JSONResponse({**stac.LANDING_MEMBERS, **said, "links": links})
     pages = {link["title"]: link for link in links if not link["rel"].startswith("http")}
     return document_page(request, title, description, list(pages.values()))
 
 
-@router.get("/conformance")
+@router.get("/conformance", response_class=Response, responses=document_of("Conformance"))
 def conformance(request: Request, f: Format = None) -> Response:
     """The conformance classes of OGC API that the service keeps."""
     refuse_unknown(request, {"f"})
@@ -89,8 +95,10 @@ def description(request: Request, f: Format = None) -> Response:
     """The API in OpenAPI 3.1, or as a list of what can be asked."""
     refuse_unknown(request, {"f"})
     document: dict[str, Any] = request.app.openapi()
-    if chosen_format(request, {"json": OPENAPI_JSON, "html": HTML}, f) == "json":
-        return JSONResponse(document, media_type=OPENAPI_JSON)
+    form = chosen_format(request, {"json": OPENAPI_JSON, "plain": JSON, "html": HTML}, f)
+    if form != "html":
+        # GDAL refuses the type of version 3.1, and says with Accept that plain JSON will do.
+        return JSONResponse(document, media_type=OPENAPI_JSON if form == "json" else JSON)
     rows = [
         [Cell(method.upper()), Cell(path), Cell(operation.get("description", ""))]
         for path, operations in document["paths"].items()

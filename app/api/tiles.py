@@ -6,6 +6,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from app.api.deps import ReadConnection
+from app.api.documents import json_of
 from app.api.features import CollectionDep, ViewerDep
 from app.api.negotiation import JSON, MVT
 from app.db.collections import Collection
@@ -23,7 +24,7 @@ REL = "http://www.opengis.net/def/rel/ogc/1.0"
 GEOMETRY_DIMENSION = {"Point": 0, "Polygon": 2}
 
 
-@router.get("/tileMatrixSets")
+@router.get("/tileMatrixSets", responses=json_of("TileMatrixSets"))
 def tile_matrix_sets(request: Request) -> dict[str, Any]:
     """The grids of tiles there are."""
     href = f"{request.base_url}tileMatrixSets/{MATRIX_SET}"
@@ -31,7 +32,7 @@ def tile_matrix_sets(request: Request) -> dict[str, Any]:
     return {"tileMatrixSets": [{"id": MATRIX_SET, "uri": MATRIX_SET_URI, "links": [link]}]}
 
 
-@router.get("/tileMatrixSets/{matrix_set}")
+@router.get("/tileMatrixSets/{matrix_set}", responses=json_of("TileMatrixSet"))
 def tile_matrix_set(matrix_set: str) -> dict[str, Any]:
     """The one grid there is: the square of web maps, halved with each zoom."""
     _refuse_other(matrix_set)
@@ -57,7 +58,7 @@ def tile_matrix_set(matrix_set: str) -> dict[str, Any]:
     }
 
 
-@router.get("/collections/{collection}/tiles")
+@router.get("/collections/{collection}/tiles", responses=json_of("TileSets"))
 def tilesets(request: Request, collection: CollectionDep, viewer: ViewerDep) -> dict[str, Any]:
     """The sets of tiles of a collection."""
     tiles.refuse_untiled(collection.id)
@@ -65,7 +66,7 @@ def tilesets(request: Request, collection: CollectionDep, viewer: ViewerDep) -> 
     return {"links": [_link("self", here, JSON)], "tilesets": [_tileset(request, collection)]}
 
 
-@router.get("/collections/{collection}/tiles/{matrix_set}")
+@router.get("/collections/{collection}/tiles/{matrix_set}", responses=json_of("TileSet"))
 def tileset(
     matrix_set: str, request: Request, collection: CollectionDep, viewer: ViewerDep
 ) -> dict[str, Any]:

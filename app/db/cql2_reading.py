@@ -97,6 +97,8 @@ def parse_instant(text: Any, where: str) -> datetime:
     try:
         if not isinstance(text, str) or len(text) > 40:
             raise ValueError
+        # GDAL asks for a date as `2024-05-06T`.
+        text = text.removesuffix("T")
         if len(text) == 10:
             day = date.fromisoformat(text)
             return datetime(day.year, day.month, day.day, tzinfo=UTC)

@@ -202,5 +202,5 @@ def test_req_html_definition_and_content(get, path):
         assert reply.status_code == 200
         assert reply.headers["content-type"].startswith("text/html")
         assert "<h1>" in reply.text
-        assert "script" not in reply.text
+        assert "<script" not in reply.text
         assert "default-src 'none'" in reply.headers["content-security-policy"]

@@ -1,0 +1,243 @@
+"""Clients that know nothing of Amers, unmodified, on a service that is a process of its own.
+
+They come with a token as they are given one in practice: by a setting of GDAL, by an argument of OWSLib.
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import geopandas
+import httpx
+import numpy as np
+import pyogrio
+import pytest
+from numpy.testing import assert_allclose
+from owslib.ogcapi.features import Features
+from pyproj import CRS
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases import blocks
+from app.usecases.tokens import create_token
+from services.types import ControlPoints
+from tests.app.conftest import TEMPLATE, fresh_database
+from tests.factories import make_block
+from tests.serving import until
+
+BOX = (5.22, 43.21, 5.27, 43.26)
+WHERE = "saliency > 0.5 AND n_views = 3"
+a_tenth_of_a_millimetre_deg = 1e-9
+in_single_precision = 1e-7
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running service with one published block.
+
+    Attributes:
+        authorization: the header of a caller who may read.
+        header_file: the same in a file, for GDAL.
+    """
+
+    url: str
+    points: ControlPoints
+    authorization: dict[str, str]
+    header_file: Path
+
+    @property
+    def in_box(self) -> np.ndarray:
+        lon, lat = self.points.lon_lat_h[:, 0], self.points.lon_lat_h[:, 1]
+        return (lon >= BOX[0]) & (lon <= BOX[2]) & (lat >= BOX[1]) & (lat <= BOX[3])
+
+    @property
+    def meant_by_where(self) -> np.ndarray:
+        return self.points.saliency > 0.5
+
+
+@pytest.fixture(scope="module")
+def served(cluster, tmp_path_factory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    with fresh_database(cluster, TEMPLATE) as dsn:
+        made = make_block(folder / "block", count=60)
+        settings = Settings(database_url=dsn, data_folder=folder / "data")
+        with engine.connect(dsn) as connection:
+            blocks.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
+            blocks.publish_block(connection, "calanques")
+            secret = create_token(connection, "a client", ["read"]).secret
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        environment = {
+            **os.environ,
+            "AMERS_DATABASE_URL": dsn,
+            "AMERS_DATA_FOLDER": str(settings.data_folder),
+        }
+        with (folder / "log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)],
+                env=environment,
+                stdout=log,
+                stderr=log,
+            )
+        url = f"http://127.0.0.1:{port}"
+        try:
+            assert until(lambda: _answers(url)), (folder / "log").read_text()
+            header_file = folder / "header"
+            header_file.write_text(f"Authorization: Bearer {secret}")
+            yield Served(url, made.points, {"Authorization": f"Bearer {secret}"}, header_file)
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _answers(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+@pytest.fixture
+def source(served) -> Iterator[str]:
+    """The service as GDAL names it, with the token as GDAL takes one; what it fetches is printed."""
+    options = {"GDAL_HTTP_HEADER_FILE": str(served.header_file), "CPL_DEBUG": "ON"}
+    pyogrio.set_gdal_config_options(options)
+    yield f"OAPIF:{served.url}"
+    pyogrio.set_gdal_config_options(dict.fromkeys(options))
+
+
+def fetched(capture) -> list[str]:
+    """The addresses of items that GDAL has asked for since this was last called."""
+    said = "".join(capture.readouterr())
+    return [line for line in said.splitlines() if "Fetch(" in line and "/items?" in line]
+
+
+def test_gdal_knows_layers_their_fields_number_and_reference_system_without_reading_them(source):
+    assert {"points", "blocks", "density"} <= set(pyogrio.list_layers(source)[:, 0])
+    info = pyogrio.read_info(source, layer="points")
+    assert info["features"] == 60
+    assert CRS(info["crs"]).equals(CRS("OGC:CRS84h"))
+    assert info["geometry_type"] == "Point Z"
+    kinds = dict(zip(info["fields"].tolist(), info["dtypes"].tolist(), strict=True))
+    assert kinds["saliency"] == "float64"
+    assert kinds["n_views"].startswith("int")
+    assert kinds["first_view"] == "datetime64[D]"
+    assert_allclose(info["total_bounds"], [5.2, 43.2, 5.3, 43.3], atol=1e-9)
+
+
+def test_gdal_reads_all_points_page_by_page_with_heights(served, source, capfd):
+    frame = pyogrio.read_dataframe(source, layer="points", PAGE_SIZE=7)
+    found = np.column_stack([frame.geometry.x, frame.geometry.y, frame.geometry.z])
+    assert_allclose(found, served.points.lon_lat_h, rtol=0, atol=a_tenth_of_a_millimetre_deg)
+    assert_allclose(frame["saliency"], served.points.saliency, rtol=in_single_precision)
+    assert frame["typology"].isna().sum() == 15
+    following = [line for line in fetched(capfd) if "limit=7" in line and "token=" in line]
+    assert len(following) == 60 // 7
+
+
+def test_gdal_leaves_a_box_and_a_filter_to_the_service(served, source, capfd):
+    expected = served.in_box & served.meant_by_where
+    assert 0 < expected.sum() < served.in_box.sum()
+    frame = pyogrio.read_dataframe(source, layer="points", bbox=BOX, where=WHERE)
+    assert_allclose(
+        np.sort(frame.geometry.x),
+        np.sort(served.points.lon_lat_h[expected, 0]),
+        atol=a_tenth_of_a_millimetre_deg,
+    )
+    asked = fetched(capfd)[-1]
+    assert "bbox=5.2" in asked
+    for word in ("saliency", "n_views", "filter-lang=cql-text"):
+        assert word in asked
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "typology IN ('crossroads', 'building corner')",
+        "typology LIKE 'cross%'",
+        "NOT (saliency <= 0.5)",
+        "saliency BETWEEN 0.2 AND 0.4",
+        "typology IS NULL",
+        "saliency > 0.9 OR saliency < 0.1",
+        "first_view >= '2023-03-01'",
+    ],
+)
+def test_gdal_finds_the_same_by_the_service_s_filter_as_by_its_own(served, source, where, tmp_path):
+    everything = tmp_path / "all.fgb"
+    reply = httpx.get(
+        f"{served.url}/collections/points/items?f=fgb&limit=100", headers=served.authorization
+    )
+    everything.write_bytes(reply.content)
+    by_gdal = pyogrio.read_dataframe(everything, where=where)
+    by_service = pyogrio.read_dataframe(source, layer="points", where=where)
+    assert len(by_service) == len(by_gdal) > 0
+
+
+@pytest.mark.skipif(shutil.which("ogr2ogr") is None, reason="Debian's gdal-bin is not installed")
+def test_ogrinfo_and_ogr2ogr_of_the_machine_do_the_same(served, tmp_path):
+    environment = {
+        **os.environ,
+        "GDAL_HTTP_HEADER_FILE": str(served.header_file),
+        "CPL_DEBUG": "ON",
+    }
+    box, copied = [str(value) for value in BOX], tmp_path / "copied.gpkg"
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout + done.stderr
+
+    said = run("ogrinfo", "-so", f"OAPIF:{served.url}", "points")
+    assert "Feature Count: 60" in said
+    assert "Geometry: 3D Point" in said
+    layer = (f"OAPIF:{served.url}", "points")
+    said = run("ogr2ogr", "-spat", *box, "-where", WHERE, str(copied), *layer)
+    assert "filter=" in said
+    frame = geopandas.read_file(copied)
+    expected = served.in_box & served.meant_by_where
+    assert len(frame) == expected.sum() > 0
+    assert_allclose(np.sort(frame.geometry.z), np.sort(served.points.lon_lat_h[expected, 2]), atol=1e-9)
+
+
+def test_owslib_finds_collections_queryables_and_features(served):
+    service = Features(served.url, headers=served.authorization)
+    declared = service.conformance()["conformsTo"]
+    assert "http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/core" in declared
+    assert {"points", "blocks", "density"} <= set(service.feature_collections())
+    assert service.collection("points")["storageCrs"].endswith("CRS84h")
+    assert "saliency" in service.collection_queryables("points")["properties"]
+    assert service.collection_schema("points")["properties"]["id"]["x-ogc-role"] == "id"
+    page = service.collection_items("points", bbox=list(BOX), limit=5)
+    assert (page["numberReturned"], page["numberMatched"]) == (5, served.in_box.sum())
+    strong = service.collection_items("points", filter="saliency > 0.5", limit=100)
+    assert strong["numberReturned"] == (served.points.saliency > 0.5).sum()
+    first = page["features"][0]
+    alone = service.collection_item("points", str(first["id"]))
+    assert_allclose(
+        alone["geometry"]["coordinates"],
+        first["geometry"]["coordinates"],
+        atol=a_tenth_of_a_millimetre_deg,
+    )
+
+
+def test_a_client_that_follows_next_as_qgis_does_sees_every_point_once(served):
+    with httpx.Client(headers=served.authorization) as client:
+        url, seen = f"{served.url}/collections/points/items?limit=9", []
+        while url:
+            page = client.get(url, headers={"Accept": "application/geo+json"}).json()
+            seen += [feature["id"] for feature in page["features"]]
+            url = next((link["href"] for link in page["links"] if link["rel"] == "next"), None)
+    assert seen == (2**26 + np.arange(60)).tolist()
+
+
+def test_clients_without_a_valid_token_are_told_so(served):
+    with pytest.raises(RuntimeError, match="401"):
+        Features(served.url, headers={"Authorization": "Bearer wrong"}).feature_collections()
+    with pytest.raises(pyogrio.errors.DataSourceError, match="401"):
+        pyogrio.read_info(f"OAPIF:{served.url}", layer="points")
