@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
+from services.chip_choice import fine_gsd_m
 from services.coarse import CoarseOptions, search_coarsely
 from services.errors import CoverageError, InputError, NoConsensus, NotEnoughPoints
-from services.matching.consensus import affine_consensus
+from services.matching.consensus import agreeing_points, consensus_tolerance_px
 from services.matching.points import MatchingOptions, PointMatches, match_points
 from services.matching.predict import inside, spread_over_image
 from services.passes import (
@@ -110,9 +111,9 @@ def register_scene(
     """
     visible, chosen = _choose_points(scene, points, options)
     tried = points.take(chosen)
-    fine_m = float(points.views.gsd_m.min())
     model = CorrectedModel(scene.model, no_correction(scene.image.shape))
     uncertainty_m = _start_uncertainty(scene, tried)
+    fine_m = fine_gsd_m(scene, tried, uncertainty_m)
     passes: list[Pass] = []
 
     if 3.0 * uncertainty_m.max() / fine_m > options.coarse.max_fine_radius_px:
@@ -259,8 +260,9 @@ def agreement(
             min_points,
             f"{len(points)} tried within {radius_m:.1f} m, {reasons_in_words(matches.reason)}",
         )
-    tolerance_px = 3.0 * float(np.median(_point_sigma_px(model, points, matches)[found])) + 0.5
-    agreeing = affine_consensus(predicted, matches.line_sample - predicted, found, tolerance_px)
+    sigma_px = float(np.median(_point_sigma_px(model, points, matches)[found]))
+    agreeing, scale = agreeing_points(predicted, matches.line_sample - predicted, found, sigma_px)
+    tolerance_px = consensus_tolerance_px(scale * sigma_px)
     if agreeing.sum() < min_points:
         raise NoConsensus(
             f"{int(found.sum())} points found of {len(points)} tried, but only {int(agreeing.sum())} "

@@ -9,6 +9,14 @@ from scipy.stats import binom
 
 from services.types import Array, BoolArray
 
+MEDIAN_DISTANCE = float(np.sqrt(2.0 * np.log(2.0)))
+"""Median distance of a circular normal law of unit sigma (1.177)."""
+
+LEAST_FOR_SCATTER = 10
+"""From so many measures on their scatter is known well enough to correct what is declared."""
+
+MAX_WIDENINGS = 4
+
 
 @dataclass(frozen=True)
 class Consensus:
@@ -51,6 +59,50 @@ def vote(displacement: Array, tolerance: float, search_radius: float) -> Consens
     by_chance = min(1.0, np.pi * tolerance**2 / (2.0 * search_radius) ** 2)
     false_alarms = count * float(binom.sf(len(members) - 2, count - 1, by_chance))
     return Consensus(agreeing, displacement[agreeing].mean(axis=0), false_alarms)
+
+
+def consensus_tolerance_px(sigma_px: float) -> float:
+    """Distance beyond which a measure does not belong to a consensus; half a pixel is for its model."""
+    return 3.0 * sigma_px + 0.5
+
+
+def agreeing_points(
+    position: Array, displacement: Array, candidates: BoolArray, sigma_px: float
+) -> tuple[BoolArray, float]:
+    """Measures that agree on one affine displacement, as far as they turn out to scatter.
+
+    Points that are worse than declared scatter beyond a tolerance taken from what is declared: cut off
+    there, those left would look as good as declared. So the scale is taken from all that lie around.
+
+    Args:
+        position, displacement: (n, 2) pixels.
+        candidates: (n,) measures to look at.
+        sigma_px: declared standard deviation of a measure against its point.
+
+    Returns:
+        Members (n,), and how many times the declared sigma they scatter, at least 1.
+    """
+    scale, agreeing = 1.0, candidates
+    for _ in range(MAX_WIDENINGS):
+        tolerance_px = consensus_tolerance_px(scale * sigma_px)
+        agreeing = affine_consensus(position, displacement, candidates, tolerance_px)
+        if agreeing.sum() < LEAST_FOR_SCATTER:
+            break
+        seen = _scatter_px(position, displacement, candidates, agreeing, 4.0 * tolerance_px)
+        if seen <= 1.1 * scale * sigma_px:
+            break
+        scale = seen / sigma_px
+    return agreeing, scale
+
+
+def _scatter_px(
+    position: Array, displacement: Array, candidates: BoolArray, agreeing: BoolArray, reach_px: float
+) -> float:
+    """Robust standard deviation a coordinate of the candidates around the affine of those that agree."""
+    design = np.column_stack([np.ones(len(position)), position])
+    affine = np.linalg.lstsq(design[agreeing], displacement[agreeing], rcond=None)[0]
+    distance = np.hypot(*(displacement - design @ affine)[candidates].T)
+    return float(np.median(distance[distance <= reach_px]) / MEDIAN_DISTANCE)
 
 
 def affine_consensus(

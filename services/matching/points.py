@@ -1,7 +1,7 @@
 """Control points found in a scene: their chips, the views combined, every failure with its reason."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, r
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
+from services.matching.radiometry import brightness_and_roughness, clouded, edges
 from services.matching.views import Likeness, choose_views
 from services.sensors.base import SensorModel
 from services.types import (
@@ -39,14 +40,19 @@ class MatchingOptions:
     Attributes:
         max_views: how many views of a point are tried.
         agreement_px: views of a point agree when their measures are this near, in chip pixels.
+        min_edge_score: correlation of edges from which on a point is found by them that is not found by
+            its grey values.
         likeness: which views are tried first.
-        correlation: when a correlation peak is believed.
+        correlation: when a correlation peak is believed. In a window of three standard deviations a
+            peak of 0.6 without a rival is right in 98 of 100 simulated cases; views and the other points
+            have to agree with it all the same.
     """
 
     max_views: int = 4
     agreement_px: float = 0.7
+    min_edge_score: float = 0.5
     likeness: Likeness = field(default_factory=Likeness)
-    correlation: CorrelationOptions = field(default_factory=CorrelationOptions)
+    correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.6))
 
 
 @dataclass(frozen=True)
@@ -57,9 +63,9 @@ class PointMatches:
         line_sample: (n, 2) pixels of the scene; NaN where not found.
         displacement_m: (n, 2) east, north, from where the model expected them; NaN where not found.
         sigma_px: (n,) pixels of the scene.
-        score: (n,) best correlation among the views.
+        score: (n,) best correlation among the views; of edges where `by_gradient`.
         views: (n,) how many views agree.
-        reason: (n,) "" where found.
+        reason: (n,) "" where found; "cloud" where what was not found is bright and smooth.
         by_gradient: (n,) found by the edges of the chips only.
         common_sigma_m: standard deviation a coordinate of what all the measures have in common, metres:
             see `common_sigma`.
@@ -113,6 +119,8 @@ def match_points(
     score = np.full(n, np.nan)
     views = np.zeros(n, dtype=np.int64)
     reason = np.full(n, "", dtype="<U16")
+    by_gradient = np.zeros(n, dtype=bool)
+    looks = np.full((n, 2), np.nan)
     scene_gsd_m = np.full(n, np.nan)
     chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
     offsets: dict[int, list[Array]] = {}
@@ -132,11 +140,10 @@ def match_points(
         scene_gsd_m[row] = image_gsd_m(model, ground)
         stack = point_chips(points, chips, row)
         ratio = scene_gsd_m[row] / gsd_m
-        peaks = [
-            find_chip(patch, _as_seen(stack[number], ratio, reduction), options.correlation)
-            for number in numbers
-        ]
-        row_col, sigma, agreeing, reason[row] = _combined(peaks, options.agreement_px)
+        looks[row] = brightness_and_roughness(patch)
+        like_scene = [_as_seen(stack[number], ratio, reduction) for number in numbers]
+        peaks, combined, by_gradient[row] = _search(patch, like_scene, options)
+        row_col, sigma, agreeing, reason[row] = combined
         for number, peak, agreed in zip(numbers, peaks, agreeing, strict=True):
             seen.append((row, int(number), peak, bool(agreed)))
             if peak.reason == FOUND and reason[row] == FOUND:
@@ -146,6 +153,7 @@ def match_points(
         score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
         displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
         sigma_m[row] = sigma * level_m
+    reason[clouded(looks, reason == FOUND)] = "cloud"
     moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     return PointMatches(
         model.project(moved),
@@ -154,10 +162,30 @@ def match_points(
         score,
         views,
         reason,
-        np.zeros(n, dtype=bool),
+        by_gradient,
         common_sigma(list(offsets.values())) * level_m,
         _view_measures(seen),
     )
+
+
+Combined = tuple[Array, float, BoolArray, str]
+"""Displacement (2,), sigma, which views agree, reason."""
+
+
+def _search(
+    patch: FloatImage, chips: list[FloatImage], options: MatchingOptions
+) -> tuple[list[Peak], Combined, bool]:
+    """The views of a point in a patch: by grey values, else by their edges alone."""
+    peaks = [find_chip(patch, chip, options.correlation) for chip in chips]
+    combined = _combined(peaks, options.agreement_px)
+    if combined[-1] == "low_score":
+        outlines = edges(patch)
+        correlation = replace(options.correlation, min_score=options.min_edge_score)
+        by_edges = [find_chip(outlines, edges(chip), correlation) for chip in chips]
+        again = _combined(by_edges, options.agreement_px)
+        if again[-1] == FOUND:
+            return by_edges, again, True
+    return peaks, combined, False
 
 
 def _view_measures(seen: list[tuple[int, int, Peak, bool]]) -> ViewMeasures:
@@ -212,8 +240,8 @@ def _tile_order(line_sample: Array) -> Sequence[int]:
     return [int(row) for row in np.lexsort((tile[:, 1], tile[:, 0]))]
 
 
-def _combined(peaks: list[Peak], agreement_px: float) -> tuple[Array, float, BoolArray, str]:
-    """One measure from the views of a point: displacement, sigma, which of them agree, reason."""
+def _combined(peaks: list[Peak], agreement_px: float) -> Combined:
+    """One measure from the views of a point."""
     nothing, none = np.full(2, np.nan), np.zeros(len(peaks), dtype=bool)
     found = [p for p in peaks if p.reason == FOUND]
     if not found:

@@ -34,13 +34,13 @@ class QualificationOptions:
         good_coverage_percent: smallest coverage of the image by active points.
         good_active_of_matched: smallest share of matched points that the adjustment keeps.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate, without the part that the points' stated accuracy and chance explain.
+            of the worse coordinate, without what the points' stated accuracy and chance explain.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
-        good_ce90_of_points, usable_ce90_of_points: the same as a share of the points' own CE90, where that
-            allows more: points coarser than the pixels still make a model several times better than
-            they are.
+        good_ce90_of_points, usable_ce90_of_points: the same as a share of the points' own CE90, where
+            that allows more: points coarser than the pixels still make a model several times better
+            than they are.
         good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
         good_rival_share: largest share, of the active points, of deactivated ones that agree among
             themselves on another place: two stories told by as many points are not one truth.

@@ -22,6 +22,7 @@ CRITERION_NAMES = {
     "predicted_ce90_px": ("Predicted CE90, worst place", "px", 2),
     "unit_weight": ("Residuals over what is expected", "", 2),
     "rival_share": ("Points that tell another story", "", 2),
+    "check_points": ("Check points over what is expected", "", 2),
 }
 
 CRITERION_WAYS = {
@@ -38,6 +39,8 @@ CRITERION_WAYS = {
     "one when the stated sigmas are true",
     "rival_share": "largest group of deactivated points that agree on another place, over the "
     "active points",
+    "check_points": "residuals at independent check points, in units of what the covariances of the "
+    "correction, the marks and the points let expect, rms",
 }
 """How the value of each criterion is calculated."""
 
@@ -47,6 +50,7 @@ REASON_WORDS = {
     "nodata": "no data there",
     "flat": "nothing to correlate",
     "low_score": "low score",
+    "cloud": "under a cloud",
     "border_peak": "at the edge of the search",
     "ambiguous": "a second place as likely",
     "views_disagree": "views disagree",
@@ -190,11 +194,13 @@ def check_table(checks: Sequence[Check]) -> Table:
     """Accuracy against points that had no part in the registration."""
     rows = []
     for check in checks:
-        found = check.accuracy
+        found, marks = check.accuracy, check.image_residuals_px
         bias, rmse = (" / ".join(map(number, axes)) for axes in (found.bias_m, found.rmse_m))
         le90 = quantile(found.le90_m) if found.le90_m else ABSENT
-        rows.append([escape(check.against), bias, rmse, quantile(found.ce90_m), le90])
-    return _table("Accuracy", ["Against", "Bias m", "RMSE m", "CE90", "LE90"], rows)
+        rms_px = ABSENT if marks is None else number(marks.xy.rms)
+        rows.append([escape(check.against), bias, rmse, quantile(found.ce90_m), le90, rms_px])
+    columns = ["Against", "Bias m", "RMSE m", "CE90", "LE90", "RMS px"]
+    return _table("Accuracy", columns, rows)
 
 
 def _table(

@@ -10,6 +10,7 @@ from services.errors import ComputationError, CoverageError, NoConsensus, NotEno
 from services.geodesy import metres_per_degree
 from services.imagery import ArrayImage
 from services.intersection import intersect
+from services.matching.points import MatchingOptions
 from services.registration import Registration, register_scene
 from services.scene import Scene
 from services.simulation.view import SimulatedView, simulate_view
@@ -136,7 +137,10 @@ def test_every_view_that_was_tried_is_told(name: str) -> None:
     np.testing.assert_array_equal(agreeing[measures.matched], measures.views[measures.matched])
     assert not views.agreed[~measures.matched[views.point]].any()
     assert (views.reason[views.agreed] == "").all()
-    assert (views.score[views.agreed] >= 0.8).all()
+    options = MatchingOptions()
+    by_gradient = measures.by_gradient[views.point]
+    least = np.where(by_gradient, options.min_edge_score, options.correlation.min_score)
+    assert (views.score >= least)[views.agreed].all()
 
 
 @names

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.matching.consensus import Consensus, affine_consensus, vote
+from services.matching.consensus import Consensus, affine_consensus, agreeing_points, vote
 from services.types import Array
 
 REACH_M = 60.0
@@ -98,6 +98,31 @@ def test_magsac_finds_the_right_two_fifths_of_an_affine_field(seed: int) -> None
     agreeing = affine_consensus(position, measured, np.ones(60, dtype=bool), tolerance=1.0)
     assert (agreeing & right).sum() >= 0.9 * right.sum()
     assert (agreeing & ~right).sum() <= 3
+
+
+def test_points_worse_than_declared_are_kept_and_told() -> None:
+    """Declared three times too good: cut at three declared sigmas they would seem to be as declared."""
+    rng = np.random.default_rng(1)
+    declared_px, shares, scales = 1.0, [], []
+    for _ in range(20):
+        position = rng.uniform(0.0, 700.0, (80, 2))
+        measured = rng.normal(0.0, 3.0 * declared_px, (80, 2)) + position @ [[0.0, 0.004], [-0.003, 0.0]]
+        measured[:16] += rng.uniform(50.0, 200.0, (16, 2))
+        agreeing, scale = agreeing_points(position, measured, np.ones(80, dtype=bool), declared_px)
+        assert not agreeing[:16].any()
+        shares.append(agreeing[16:].mean())
+        scales.append(scale)
+    assert np.mean(shares) > 0.95
+    assert np.mean(scales) == pytest.approx(3.0, rel=0.15)
+
+
+def test_points_as_good_as_declared_leave_the_scale_at_one() -> None:
+    rng = np.random.default_rng(2)
+    position = rng.uniform(0.0, 700.0, (80, 2))
+    for _ in range(20):
+        measured = rng.normal(0.0, 1.0, (80, 2))
+        _, scale = agreeing_points(position, measured, np.ones(80, dtype=bool), 1.0)
+        assert scale == pytest.approx(1.0, abs=0.3)
 
 
 def test_only_candidates_agree() -> None:
