@@ -6,7 +6,8 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from benchmarks._campaign import WRONG, Outcome, Trial
+from benchmarks._campaign import WRONG, Outcome
+from benchmarks._trials import Trial
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

@@ -24,19 +24,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from benchmarks._campaign import (
-    NOMINAL,
-    PLACES,
-    Outcome,
-    Trial,
-    attempt,
-    block_of,
-    draw_trial,
-    in_order_of_places,
-    nominal_trial,
-)
+from benchmarks._campaign import Outcome, attempt
 from benchmarks._measuring import RESULTS, keep
 from benchmarks._stress_figure import draw_figure
+from benchmarks._trials import Trial, draw_trial, in_order_of_places, nominal_trial
+from benchmarks._worlds import NOMINAL, PLACES, block_of
 from services.registration import RegistrationOptions
 
 OPTIONS = RegistrationOptions(max_points=120)

@@ -7,16 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks._campaign import (
-    Block,
-    Outcome,
-    Place,
-    attempt,
-    block_of,
-    draw_trial,
-    nominal_trial,
-    prepare,
-)
+from benchmarks._campaign import Outcome, attempt, prepare
+from benchmarks._trials import draw_trial, nominal_trial
+from benchmarks._worlds import Block, Place, block_of
 from benchmarks.stress import by_factor, read_outcomes, summary
 from services.imagery import Window
 from services.registration import RegistrationOptions

@@ -1,0 +1,116 @@
+"""What is done to each scene of a campaign: everything follows from its number and the seed."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks._worlds import FINE_GSD_M, NOMINAL, PLACES, Place, largest_incidence_deg
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What is done to one scene.
+
+    Attributes:
+        number: of the scene.
+        place: its world.
+        gsd_m: of the scene.
+        incidence_deg, azimuth_deg: of the scene.
+        day: of the year 2024.
+        location_error_m, sigma_m: how far off the model is, and how far it is said to be at one sigma.
+        drift_px: largest drift and skew at the edges of the image.
+        conditions: haze, clouds, inversion, season, noise.
+        vanished, moved: shares of the points.
+        point_ce90_m: as declared.
+        understated: how many times larger the errors of the points are.
+        relief_m, patterned_share: of the world, for the tables.
+        chip_ratio: ground sampling of the scene over that of the finest chips.
+    """
+
+    number: int
+    place: str
+    gsd_m: float
+    incidence_deg: float
+    azimuth_deg: float
+    day: int
+    location_error_m: float
+    sigma_m: float
+    drift_px: float
+    haze: float
+    cloud_cover: float
+    inverted: bool
+    season: float
+    noise: float
+    vanished: float
+    moved: float
+    point_ce90_m: float
+    understated: float
+    relief_m: float
+    patterned_share: float
+    chip_ratio: float
+
+
+def draw_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
+    """The trial of a number: a few factors over their whole range, the others mild."""
+    rng = np.random.default_rng([seed, number])
+    place = places[number % len(places)]
+
+    def either(mild: tuple[float, float], hard: tuple[float, float]) -> float:
+        return float(rng.uniform(*(hard if rng.uniform() < 0.2 else mild)))
+
+    gsd_m = float(np.exp(rng.uniform(*np.log(place.gsd_m))))
+    largest_m = min(2_000.0, 0.15 * gsd_m * place.lines)
+    error_m = float(np.exp(rng.uniform(0.0, np.log(largest_m))))
+    vanished = either((0.0, 0.1), (0.1, 0.5))
+    return Trial(
+        number=number,
+        place=place.name,
+        gsd_m=gsd_m,
+        incidence_deg=float(rng.uniform(0.0, min(35.0, largest_incidence_deg(place)))),
+        azimuth_deg=float(rng.uniform(0.0, 360.0)),
+        day=int(rng.integers(60, 300)),
+        location_error_m=error_m,
+        sigma_m=error_m / float(rng.uniform(1.2, 2.6)),
+        drift_px=either((0.0, 1.0), (1.0, 6.0)),
+        haze=either((0.0, 0.2), (0.2, 0.85)),
+        cloud_cover=either((0.0, 0.1), (0.1, 0.7)),
+        inverted=bool(rng.uniform() < 0.1),
+        season=either((0.0, 0.1), (0.1, 1.0)),
+        noise=either((4.0, 15.0), (15.0, 120.0)),
+        vanished=vanished,
+        moved=either((0.0, 0.1), (0.0, 0.5 - vanished)),
+        point_ce90_m=float(np.exp(rng.uniform(*np.log((0.5, 5.0))))),
+        understated=either((1.0, 1.0), (1.0, 3.0)),
+        relief_m=place.relief_m,
+        patterned_share=place.patterned_share,
+        chip_ratio=gsd_m / FINE_GSD_M,
+    )
+
+
+def nominal_trial(seed: int, number: int, place: Place = NOMINAL) -> Trial:
+    """SRP's conditions: nothing is wrong but the location of the scene and what is declared."""
+    mild = draw_trial(seed, number, (place,))
+    return replace(
+        mild,
+        gsd_m=place.gsd_m[0],
+        incidence_deg=min(mild.incidence_deg, 20.0),
+        location_error_m=10.0,
+        sigma_m=5.0,
+        drift_px=1.0,
+        haze=0.0,
+        cloud_cover=0.0,
+        inverted=False,
+        season=0.0,
+        noise=0.0,
+        vanished=0.0,
+        moved=0.0,
+        point_ce90_m=3.0,
+        understated=1.0,
+        chip_ratio=place.gsd_m[0] / FINE_GSD_M,
+    )
+
+
+def in_order_of_places(numbers: Iterable[int], places: tuple[Place, ...]) -> list[int]:
+    """Numbers of trials so that a world is made once."""
+    return sorted(numbers, key=lambda number: (number % len(places), number))
