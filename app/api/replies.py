@@ -44,6 +44,8 @@ PROBLEM_TYPES: dict[type[Exception], str] = {
     NoSuchJob: f"{OGC_EXCEPTIONS}no-such-job",
     NoSuchProcess: f"{OGC_EXCEPTIONS}no-such-process",
 }
+UNUSABLE = (None, "22003", "22021", "22P05")
+"""What PostgreSQL calls numbers and characters that it cannot hold; None: its driver refused them."""
 RETRY_SECONDS = "5"
 HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
 
@@ -121,7 +123,11 @@ def _not_routed(request: Request, error: Exception) -> JSONResponse:
 
 
 def _unusable(request: Request, error: Exception) -> JSONResponse:
-    """A value that no column holds: a NUL in a text, a number beyond 64 bits."""
+    """A value that no column holds, as a NUL in a text; other such errors are mistakes of ours."""
+    assert isinstance(error, psycopg.DataError)
+    if error.sqlstate not in UNUSABLE:
+        log.error("%s %s broke off", request.method, request.url.path, exc_info=error)
+        return _unexpected(request, error)
     first_line = str(error).partition("\n")[0]
     log.warning("%s %s: %s", request.method, request.url.path, first_line)
     detail = f"a value of this request cannot be used: {first_line}"
