@@ -26,7 +26,15 @@ from tests.factories import make_block
 CANARY = "canary-7f3a91-must-never-be-seen"
 LIMIT_BYTES = 5_000_000
 BODY_LIMIT_BYTES = 200_000
-LEFT_BY_JOBS = ("audit", "job", "upload", "scene", "procrastinate_jobs", "procrastinate_events")
+LEFT_BY_JOBS = (
+    "audit",
+    "job",
+    "job_message",
+    "upload",
+    "scene",
+    "procrastinate_jobs",
+    "procrastinate_events",
+)
 LEFT_BY_JOBS += ("scenes", "blocks", "uploads")
 """Tables and folders in which a file that a job refuses leaves what it was: file, job, reason."""
 
@@ -49,10 +57,10 @@ class Besieged:
     headers: dict[str, dict[str, str]]
     names: dict[str, str]
     outside: Path
-    looked: list[str] = field(default_factory=list)
+    looked: list[dict[str, str]] = field(default_factory=list)
 
-    def digest(self, without: tuple[str, ...] = ("audit",)) -> str:
-        """Checksum of all rows and all files."""
+    def digest(self, without: tuple[str, ...] = ("audit",)) -> dict[str, str]:
+        """Checksums of all tables and all files."""
         with self.database.transaction() as connection:
             tables = connection.execute(
                 "select tablename as name from pg_tables"
@@ -66,16 +74,16 @@ class Besieged:
                     if name not in without
                 )
             ).fetchall()
-        found = hashlib.sha256(repr(sorted(map(str, sums))).encode())
+        found = {row["name"]: str(row["sum"]) for row in sums}
         folder = self.settings.data_folder / "storage"
         for path in sorted(folder.rglob("*")):
-            if path.is_file() and path.relative_to(folder).parts[0] not in without:
-                content = hashlib.sha256(path.read_bytes()).hexdigest()
-                found.update(f"{path.relative_to(folder)} {content}\n".encode())
-        self.looked.append(found.hexdigest())
-        return self.looked[-1]
+            key = path.relative_to(folder)
+            if path.is_file() and key.parts[0] not in without:
+                found[str(key)] = hashlib.sha256(path.read_bytes()).hexdigest()
+        self.looked.append(found)
+        return found
 
-    def known_digest(self) -> str:
+    def known_digest(self) -> dict[str, str]:
         """That of the last look, whatever a test that has failed did since."""
         if not self.looked:
             self.digest()
