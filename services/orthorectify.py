@@ -22,6 +22,8 @@ MAX_READ_PIXELS = 24_000_000
 _SMALLEST_WINDOW = 16
 _MAX_MAP_PIXELS = 40_000_000_000
 _REACH_PX = 3
+_RATIO_STEP = 8
+"""Map pixels between those whose size in the image is looked at."""
 
 
 @dataclass(frozen=True)
@@ -150,19 +152,15 @@ def _rectified(
     if mapping is None:
         return nothing
     line_sample = mapping.line_sample
-    last = np.array(images[0].shape) - 0.5
-    with np.errstate(invalid="ignore"):
-        inside = ((line_sample >= -0.5) & (line_sample <= last)).all(axis=-1)
-    if not inside.any():
+    low, high = _hold_inside(line_sample, *images[0].shape)
+    if not (high >= low).all():
         return nothing
-    found = line_sample[inside]
-    first = np.floor(found.min(axis=0)).astype(np.int64)
-    size = np.ceil(found.max(axis=0)).astype(np.int64) - first + 1
+    first = np.floor(low).astype(np.int64)
+    size = np.ceil(high).astype(np.int64) - first + 1
     if math.prod(size.tolist()) > MAX_READ_PIXELS and min(shape) > _SMALLEST_WINDOW:
         return _divided(images, model, terrain, grid, window, options)
     if options.hide:
-        inside &= ~hidden_ground(model, terrain, grid, window, mapping.height_m)
-    line_sample[~inside] = np.nan
+        line_sample[hidden_ground(model, terrain, grid, window, mapping.height_m)] = np.nan
     ratio = _ratio(line_sample)
     pixels = np.stack(
         [_sampled(image, line_sample, first, size, ratio, options.kernel) for image in images]
@@ -194,8 +192,9 @@ def _divided(
 
 def _ratio(line_sample: Array) -> float:
     """Image pixels a map pixel, in each direction, on the average of a window."""
-    along = np.diff(line_sample, axis=1)[: line_sample.shape[0] - 1]
-    down = np.diff(line_sample, axis=0)[:, : line_sample.shape[1] - 1]
+    every = slice(None, -1, _RATIO_STEP), slice(1, None, _RATIO_STEP)
+    corner = line_sample[every[0], every[0]]
+    along, down = line_sample[every[0], every[1]] - corner, line_sample[every[1], every[0]] - corner
     area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0])
     area = area[np.isfinite(area)]
     return math.sqrt(float(np.median(area))) if len(area) else 1.0
@@ -220,6 +219,21 @@ def _sampled(
     factor = factor if min(pixels.shape) >= factor else 1
     pixels = np.ascontiguousarray(low_pass(mean_pixels(pixels, factor), ratio / factor))
     return _resampled(pixels, line_sample, float(low[0]), float(low[1]), factor, kernel == "cubic")
+
+
+@njit(cache=True)
+def _hold_inside(line_sample: Array, lines: int, samples: int) -> tuple[Array, Array]:
+    """Make positions beyond the image NaN; the lowest and highest (2,) of the others, inf of none."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for r in range(line_sample.shape[0]):
+        for s in range(line_sample.shape[1]):
+            line, sample = line_sample[r, s, 0], line_sample[r, s, 1]
+            if -0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5:
+                low[0], high[0] = min(low[0], line), max(high[0], line)
+                low[1], high[1] = min(low[1], sample), max(high[1], sample)
+            else:
+                line_sample[r, s] = np.nan
+    return low, high
 
 
 @njit(inline="always", error_model="numpy")
