@@ -10,6 +10,7 @@ from starlette.middleware.cors import CORSMiddleware
 
 from app.api import (
     blocks,
+    chips,
     collections,
     features,
     history,
@@ -21,6 +22,7 @@ from app.api import (
     replies,
     results,
     scenes,
+    stac,
     system,
     tiles,
     tokens,
@@ -42,6 +44,8 @@ ROUTERS: tuple[APIRouter, ...] = (
     system.router,
     collections.router,
     points.router,
+    chips.router,
+    stac.router,
     history.router,
     tiles.router,
     features.router,

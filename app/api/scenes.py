@@ -11,10 +11,12 @@ from pydantic import BaseModel, Field
 
 from app.api.body import body_chunks
 from app.api.deps import DatabaseDep, ReadConnection, Registrar, SettingsDep, StorageDep, WriteConnection
+from app.api.files import file_reply
 from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
 from app.usecases.scenes import Upload
+from app.usecases.stac import scene_media_type
 
 router = APIRouter(tags=["scenes"])
 
@@ -77,6 +79,15 @@ def upload_model(
         "size_bytes": stored.size_bytes,
         "sha256": stored.sha256,
     }
+
+
+@router.get("/scenes/{scene_id}/files/{name}", response_class=Response)
+def download_file(
+    scene_id: UUID, name: str, connection: ReadConnection, storage: StorageDep, caller: Registrar
+) -> Response:
+    """The image of a scene, or a file that was laid beside it, as it was sent."""
+    key = scenes.file_key(connection, caller, scene_id, name)
+    return file_reply(storage, key, scene_media_type(name))
 
 
 @router.post("/scenes/reference", status_code=status.HTTP_201_CREATED)

@@ -164,6 +164,14 @@ def copy_csv(connection: Connection, selection: Selection, after: Key | None, li
     return out
 
 
+def keys(connection: Connection, selection: Selection, limit: int) -> list[Any]:
+    """The keys of the features selected, in their order; one beyond the limit where there are more."""
+    chosen, parameters = _chosen(selection, None, limit)
+    statement = f"select {selection.collection.key.expression} as key from ({chosen}) t"
+    rows = connection.execute(statement, parameters, prepare=False).fetchall()
+    return [row["key"] for row in rows]
+
+
 def count(connection: Connection, selection: Selection) -> Count:
     """How many features are selected: exact up to 10,000, beyond as the planner estimates."""
     collection = selection.collection

@@ -33,29 +33,54 @@ BLOCKS = Collection(
 SCENES = Collection(
     id="scenes",
     title="Scenes",
-    description="Images that were uploaded to be registered; an owner sees his own.",
+    description="Images that were uploaded to be registered, as STAC items; an owner sees his own.",
     source="scene t",
     key=Property("id", "text", "Identifier", sql="t.id::text"),
     properties=(
-        Property("name", "text", "Name"),
-        Property("state", "text", "State", choices=("uploading", "uploaded", "removed")),
-        Property("created_at", "timestamptz", "When it was uploaded"),
-        Property("acquired_at", "timestamptz", "When it was taken", nullable=True),
-        Property("sensor", "text", "Platform or instrument", nullable=True),
-        Property("gsd_m", "real", "Ground sampling", unit="m", nullable=True),
-        Property("sigma_m", "real", "Stated standard deviation of its model", unit="m", nullable=True),
-        Property("incidence_deg", "real", "Incidence", unit="deg", nullable=True),
         Property(
-            "azimuth_deg", "real", "Azimuth from the ground to the sensor", unit="deg", nullable=True
+            "datetime",
+            "timestamptz",
+            "When it was taken; when it was uploaded as long as that is not known",
+            sql="coalesce(t.acquired_at, t.created_at)",
         ),
-        Property("sun_elevation_deg", "real", "Elevation of the sun", unit="deg", nullable=True),
-        Property("sun_azimuth_deg", "real", "Azimuth of the sun", unit="deg", nullable=True),
-        Property("lines", "bigint", "Lines", unit="px", nullable=True),
-        Property("samples", "bigint", "Samples", unit="px", nullable=True),
+        Property("title", "text", "Name", sql="t.name"),
+        Property("created", "timestamptz", "When it was uploaded", sql="t.created_at"),
+        Property("platform", "text", "Platform or instrument", sql="t.sensor", nullable=True),
+        Property("gsd", "real", "Ground sampling", sql="t.gsd_m", unit="m", nullable=True),
+        Property("view:incidence_angle", "real", "Incidence", "t.incidence_deg", "deg", True),
+        Property(
+            "view:azimuth",
+            "real",
+            "Azimuth from below the sensor to the scene: 180 degrees from that of a view",
+            # STAC looks from the sensor, the store from the ground.
+            sql="mod((t.azimuth_deg + 180.0)::numeric, 360)::real",
+            unit="deg",
+            nullable=True,
+        ),
+        Property("view:sun_elevation", "real", "Sun's elevation", "t.sun_elevation_deg", "deg", True),
+        Property("view:sun_azimuth", "real", "Sun's azimuth", "t.sun_azimuth_deg", "deg", True),
+        Property(
+            "amers:state", "text", "State", "t.state", choices=("uploading", "uploaded", "removed")
+        ),
+        Property("amers:acquired", "timestamptz", "When it was taken", "t.acquired_at", nullable=True),
+        Property(
+            "amers:sigma_m", "real", "Stated standard deviation of its model", "t.sigma_m", "m", True
+        ),
+        Property("amers:lines", "bigint", "Lines", "t.lines", "px", True),
+        Property("amers:samples", "bigint", "Samples", "t.samples", "px", True),
+        Property(
+            "amers:verdict",
+            "text",
+            "Verdict on its last registration",
+            sql="(select r.verdict from registration r where r.scene_id = t.id"
+            " order by r.created_at desc limit 1)",
+            nullable=True,
+            choices=("good", "usable", "failed"),
+        ),
     ),
     geometry_type="Polygon",
     geometry="t.footprint",
     visible="(%(admin)s::boolean or t.owner = %(viewer)s::uuid)",
-    interval=("acquired_at", "acquired_at"),
+    interval=("datetime", "datetime"),
     is_open=False,
 )

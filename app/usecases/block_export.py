@@ -238,4 +238,5 @@ EXPORT_BLOCK = Process(
     outputs={ARCHIVE: "The block, a zip of its folder."},
     check=_check,
     run=_run,
+    values={"points": {"type": "integer", "title": "Points that were written"}},
 )

@@ -242,4 +242,10 @@ ORTHORECTIFY = Process(
     outputs={ORTHO_NAME: "The scene on the map, a cloud-optimised GeoTIFF."},
     check=_check,
     run=_run,
+    values={
+        "lines": {"type": "integer", "title": "Lines of the map, px"},
+        "samples": {"type": "integer", "title": "Samples of the map, px"},
+        "seen": {"type": "number", "title": "Share of the map that the scene shows"},
+        "error_px": {"type": "number", "title": "Largest error of the mapping, px"},
+    },
 )

@@ -200,6 +200,19 @@ def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> Scen
     return scene
 
 
+def file_key(connection: Connection, caller: Token, scene_id: UUID, name: str) -> str:
+    """Where the storage has a file of a scene.
+
+    Raises:
+        NotFound: no such scene or not the caller's, or no such file of it in the storage.
+    """
+    scene = visible_scene(connection, caller, scene_id)
+    names = {*scene.models, *([scene.file_name] if scene.file_key else [])}
+    if scene.state == "removed" or scene.reference is not None or name not in names:
+        raise NotFound(f"no file {name:.100} of scene {scene_id} in the storage")
+    return f"{folder_of(scene_id)}/{name}"
+
+
 def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
     """The caller's newest scenes; everybody's for an administrator."""
     return scenes.newest_scenes(connection, None if allows(caller, Scope.ADMIN) else caller.id, limit)

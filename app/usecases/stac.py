@@ -1,0 +1,119 @@
+"""Scenes as STAC items: features of the collection `scenes` with their files as assets.
+
+Source: STAC 1.1.0 with the extensions view 1.0.0 and projection 2.0.0.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+from app.db.engine import Connection
+from app.db.scene_files import SceneFiles, read_scene_files
+from app.usecases.registration_files import OUTPUTS, media_type
+
+VERSION = "1.1.0"
+COLLECTION = "scenes"
+EXTENSIONS = (
+    "https://stac-extensions.github.io/view/v1.0.0/schema.json",
+    "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
+)
+IMAGE_TYPES = {
+    ".tif": "image/tiff; application=geotiff",
+    ".tiff": "image/tiff; application=geotiff",
+    ".jp2": "image/jp2",
+    ".j2k": "image/jp2",
+    ".ntf": "application/vnd.nitf",
+    ".nitf": "application/vnd.nitf",
+}
+RESULTS = {
+    "report.json": "report",
+    "report.html": "report-page",
+    "refined_RPC.TXT": "refined-model",
+    "correction.json": "correction",
+    "control_points.geojson": "control-points",
+    "residuals.gpkg": "residuals",
+}
+"""Results that go by a name of their own among the assets; the others go by that of their file."""
+
+Item = dict[str, Any]
+
+
+def stac_items(connection: Connection, features: bytes, base: str) -> list[Item]:
+    """Features of the collection `scenes` as STAC items.
+
+    Args:
+        features: GeoJSON, separated by commas; longitude first, all properties.
+        base: address of the service, with a slash at its end.
+    """
+    found: list[Item] = json.loads(b"[" + features + b"]")
+    files = read_scene_files(connection, [UUID(feature["id"]) for feature in found])
+    return [_item(feature, files[UUID(feature["id"])], base) for feature in found]
+
+
+def scene_media_type(name: str) -> str:
+    """The media type of a file of a scene."""
+    return IMAGE_TYPES.get(Path(name).suffix.lower()) or media_type(name)
+
+
+def _item(feature: Item, files: SceneFiles, base: str) -> Item:
+    here = f"{base}collections/{COLLECTION}"
+    own = f"{here}/items/{feature['id']}"
+    box = _bbox(feature["geometry"])
+    return {
+        "type": "Feature",
+        "stac_version": VERSION,
+        "stac_extensions": EXTENSIONS,
+        "id": feature["id"],
+        "geometry": feature["geometry"],
+        **({} if box is None else {"bbox": box}),
+        "properties": _properties(feature["properties"]),
+        "collection": COLLECTION,
+        "assets": _assets(files, base),
+        "links": [
+            {"rel": "self", "href": own, "type": "application/geo+json"},
+            {"rel": "alternate", "href": f"{own}?f=html", "type": "text/html"},
+            {"rel": "parent", "href": here, "type": "application/json"},
+            {"rel": "collection", "href": here, "type": "application/json"},
+            {"rel": "root", "href": base, "type": "application/json"},
+        ],
+    }
+
+
+def _properties(known: dict[str, Any]) -> dict[str, Any]:
+    """What is known; a scene in its own geometry has no reference system, and says so."""
+    told = {name: value for name, value in known.items() if value is not None}
+    shape = [known["amers:lines"], known["amers:samples"]]
+    return {**told, "proj:code": None, **({} if None in shape else {"proj:shape": shape})}
+
+
+def _bbox(geometry: dict[str, Any] | None) -> list[float] | None:
+    """West, south, east, north of a polygon; west is greater than east across the antimeridian."""
+    if geometry is None:
+        return None
+    lon, lat = zip(*geometry["coordinates"][0], strict=True)
+    west, east = min(lon), max(lon)
+    return [west, min(lat), east - 360.0 if east > 180.0 else east, max(lat)]
+
+
+def _assets(files: SceneFiles, base: str) -> dict[str, dict[str, Any]]:
+    scene = f"{base}scenes/{files.scene_id}/files"
+    assets: dict[str, dict[str, Any]] = {}
+    if files.image is not None:
+        kind, title = scene_media_type(files.image), "The image as delivered."
+        assets["image"] = _asset(f"{scene}/{files.image}", kind, title, "data")
+    for name in files.models:
+        title = "A file delivered beside the image."
+        assets[name] = _asset(f"{scene}/{name}", scene_media_type(name), title, "metadata")
+    for name in files.results:
+        title = OUTPUTS.get(name, "The refined model as the scene has it.")
+        href = f"{base}jobs/{files.job_id}/results/{name}"
+        key = RESULTS.get(name, name)
+        assets[key if key not in assets else f"refined-{key}"] = _asset(
+            href, media_type(name), title, "metadata"
+        )
+    return assets
+
+
+def _asset(href: str, kind: str, title: str, role: str) -> dict[str, Any]:
+    return {"href": href, "type": kind, "title": title, "roles": [role]}
