@@ -1,5 +1,6 @@
 """Control points of published blocks: by box, by outline, one by one."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any
@@ -78,6 +79,12 @@ POINT_KINDS = (
     ("chip_file", "i4"),
     ("chip_row", "i8"),
 )
+POINT_COLUMNS = sql.SQL(
+    """id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h,
+    sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
+    saliency, chip_file, chip_row"""
+)
+IN_PUBLISHED = sql.SQL("block_number = any(array(select number from block where state = 'published'))")
 VIEW_KINDS = (
     ("point_id", "i8"),
     ("image", "i4"),
@@ -201,7 +208,23 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
         Points in the order of their ids.
     """
     area = sql.Literal(shapely.to_wkb(_on_the_map(outline), include_srid=True, hex=True))
-    point = _read(connection, _points_query(area, limit), POINT_KINDS)
+    return _with_views(connection, _points_query(area, limit))
+
+
+def points_of_ids(connection: Connection, ids: Sequence[int]) -> StoredPoints:
+    """The published points of some ids, with their views, as arrays.
+
+    Returns:
+        Points in the order of their ids; those that there are not are left out.
+    """
+    query = sql.SQL("select {} from point where id = any({}) and {} order by id").format(
+        POINT_COLUMNS, sql.Literal(list(ids)), IN_PUBLISHED
+    )
+    return _with_views(connection, query)
+
+
+def _with_views(connection: Connection, points_query: sql.Composed) -> StoredPoints:
+    point = _read(connection, points_query, POINT_KINDS)
     ids = point["id"].astype(np.int64)
     views_query = sql.SQL(
         "select point_id, image, gsd_m, incidence_deg, azimuth_deg from view"
@@ -242,13 +265,10 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
 def _points_query(area: sql.Literal, limit: int | None) -> sql.Composed:
     """Points inside an area; with a limit, the rows where `rank * limit / count` steps up."""
     inside = sql.SQL(
-        """select id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h,
-               sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
-               saliency, chip_file, chip_row
+        """select {columns}
            from point where geom && {area}::geometry and st_intersects(geom, {area}::geometry)
-               and superseded_by is null and suspended_at is null
-               and block_number = any(array(select number from block where state = 'published'))"""
-    ).format(area=area)
+               and superseded_by is null and suspended_at is null and {published}"""
+    ).format(columns=POINT_COLUMNS, area=area, published=IN_PUBLISHED)
     if limit is None:
         return inside + sql.SQL(" order by id")
     return sql.SQL(

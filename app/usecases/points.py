@@ -1,21 +1,25 @@
 """Asking for control points: pages of a box, one point, its chips."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from app.db import features, points
+from app.db.collections import Viewer
 from app.db.engine import Connection
-from app.db.features import Count, Reading
+from app.db.features import Count, Reading, Selection
 from app.db.points import POINTS, PointDetail, PointView
-from app.errors import NotFound
+from app.errors import InvalidParameter, NotFound
 from app.usecases.features import everything_in
-from app.usecases.questions import MOST_FEATURES
+from app.usecases.questions import MOST_FEATURES, Question, condition_of
 from services.formats.chip_images import LabelledChips
-from services.types import Acquisition, ChipSource
+from services.formats.chip_stacks import stream_chips_npz
+from services.types import Acquisition, ChipSource, ControlPoints
 
 ALL = 2**40
+MOST_POINTS_WITH_CHIPS = 1_000
+"""Points whose chips are sent at once: 8 views of 16 bits each are 163 MB."""
 
 
 def count_points(connection: Connection, bbox: str) -> Count:
@@ -41,6 +45,44 @@ def csv(connection: Connection, bbox: str) -> Iterator[bytes]:
         if page.last is None:
             return
         after = page.last
+
+
+def points_of_ids(connection: Connection, ids: Sequence[int]) -> ControlPoints:
+    """Some published points, with their views.
+
+    Raises:
+        InvalidParameter: there are too many.
+        NotFound: there is not every one of them; the first that are missing are named.
+    """
+    asked = sorted(set(ids))
+    if len(asked) > MOST_POINTS_WITH_CHIPS:
+        raise InvalidParameter(f"ids: {len(asked)} points, {MOST_POINTS_WITH_CHIPS} at most")
+    found = points.points_of_ids(connection, [one for one in asked if abs(one) < 2**63]).points
+    missing = sorted(set(asked) - set(found.id.tolist()))
+    if missing:
+        raise NotFound(f"no point {', '.join(map(str, missing[:10]))}{' …' * (len(missing) > 10)}")
+    return found
+
+
+def points_of_question(connection: Connection, question: Question) -> ControlPoints:
+    """The published points that a question leaves, with their views.
+
+    Raises:
+        InvalidParameter: the question cannot be understood, or leaves too many.
+    """
+    condition = condition_of(POINTS, question)
+    selection = Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition)
+    ids = features.keys(connection, selection, MOST_POINTS_WITH_CHIPS)
+    if len(ids) > MOST_POINTS_WITH_CHIPS:
+        raise InvalidParameter(
+            f"bbox, filter: more than {MOST_POINTS_WITH_CHIPS} points are meant; ask for a smaller place"
+        )
+    return points.points_of_ids(connection, ids).points
+
+
+def stream_chips(points: ControlPoints, chips: ChipSource) -> Iterator[bytes]:
+    """All chips of points with what they show, as a NumPy archive in pieces."""
+    return stream_chips_npz(points, chips)
 
 
 def find_point(connection: Connection, point_id: int) -> PointDetail:

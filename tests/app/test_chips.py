@@ -1,0 +1,147 @@
+"""The chips of many points at once."""
+
+import io
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from app.usecases import blocks, points
+from services.formats import chip_stacks
+from tests.factories import make_block
+
+CHIPS = "/collections/points/chips"
+FIRST = 2**26
+in_single_precision = 1e-7
+
+
+@pytest.fixture
+def made(connection, storage, tmp_path):
+    """A published block of 40 points with 6 chips each, of 16 bits."""
+    made = make_block(tmp_path / "block", count=40)
+    blocks.ingest_block(connection, storage, made.folder)
+    blocks.publish_block(connection, "calanques")
+    connection.commit()
+    return made
+
+
+@pytest.fixture
+def get(made, client, bearer):
+    headers = bearer("read")
+    return lambda path, **parameters: client.get(path, params=parameters or None, headers=headers)
+
+
+def arrays(reply):
+    assert reply.status_code == 200, reply.text
+    assert reply.headers["content-type"] == "application/x-npz"
+    with np.load(io.BytesIO(reply.content), allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def test_chips_of_many_points_are_those_of_each_with_all_that_is_known_of_them(made, get):
+    ids = [FIRST + 31, FIRST + 2, FIRST + 3]
+    found = arrays(get(CHIPS, ids=",".join(map(str, ids))))
+    assert_array_equal(found["point_id"], np.repeat(sorted(ids), 6))
+    assert_array_equal(found["view"], np.tile(np.arange(6), 3))
+    assert found["chips"].dtype == np.uint16
+    for point in sorted(ids):
+        alone = arrays(get(f"/collections/points/items/{point}/chips"))
+        rows = found["point_id"] == point
+        for name, expected in alone.items():
+            if name == "lon_lat_h":
+                expected = np.tile(expected, (6, 1))
+            if expected.dtype.kind == "f":
+                assert_allclose(found[name][rows], expected, rtol=in_single_precision, err_msg=name)
+            else:
+                assert_array_equal(found[name][rows], expected, err_msg=name)
+
+
+def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, bearer):
+    lon, lat = made.points.lon_lat_h[:, 0], made.points.lon_lat_h[:, 1]
+    in_box = (lon >= 5.22) & (lon <= 5.27) & (lat >= 43.21) & (lat <= 43.26)
+    found = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26"))
+    assert_array_equal(np.unique(found["point_id"]), FIRST + np.flatnonzero(in_box))
+    strong = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26", filter="saliency > 0.5"))
+    expected = in_box & (made.points.saliency > 0.5)
+    assert_array_equal(np.unique(strong["point_id"]), FIRST + np.flatnonzero(expected))
+    triangle = [[[5.2, 43.2], [5.3, 43.2], [5.2, 43.3], [5.2, 43.2]]]
+    body = {"intersects": {"type": "Polygon", "coordinates": triangle}}
+    below = arrays(client.post(CHIPS, json=body, headers=bearer("read")))
+    expected = (lon - 5.2) + (lat - 43.2) < 0.1
+    assert_array_equal(np.unique(below["point_id"]), FIRST + np.flatnonzero(expected))
+
+
+def test_a_place_without_points_is_an_archive_without_chips(get):
+    found = arrays(get(CHIPS, bbox="0,0,1,1"))
+    assert found["chips"].shape == (0, 101, 101)
+    assert {len(column) for column in found.values()} == {0}
+
+
+def test_chips_of_8_and_16_bits_come_together_with_their_values(
+    made, get, connection, storage, tmp_path
+):
+    small = make_block(
+        tmp_path / "small", count=5, seed=3, name="small", box=(6.2, 43.2, 6.3, 43.3), dtype=np.uint8
+    )
+    blocks.ingest_block(connection, storage, small.folder)
+    blocks.publish_block(connection, "small")
+    connection.commit()
+    found = arrays(get(CHIPS, ids=f"{FIRST},{2 * FIRST}"))
+    assert found["chips"].dtype == np.uint16
+    for point in (FIRST, 2 * FIRST):
+        alone = arrays(get(f"/collections/points/items/{point}/chips"))
+        assert_array_equal(found["chips"][found["point_id"] == point], alone["chips"])
+
+
+def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monkeypatch):
+    whole = get(CHIPS, bbox="5,43,6,44").content
+    monkeypatch.setattr(chip_stacks, "CHIPS_AT_ONCE", 12)
+    in_pieces = arrays(get(CHIPS, bbox="5,43,6,44"))
+    with np.load(io.BytesIO(whole)) as expected:
+        for name, column in expected.items():
+            assert_array_equal(in_pieces[name], column)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "status", "named"),
+    [
+        ({}, 400, "ids"),
+        ({"ids": "1,x"}, 400, "1,x"),
+        ({"ids": ""}, 400, "ids"),
+        ({"ids": f"{FIRST}", "bbox": "5,43,6,44"}, 400, "ids"),
+        ({"ids": f"{FIRST},7,8"}, 404, "7, 8"),
+        ({"ids": "9" * 19}, 404, "9" * 19),
+        ({"ids": "9" * 30}, 400, "ids"),
+        ({"bbox": "1,2,3"}, 400, "bbox"),
+        ({"filter": "colour = 1"}, 400, "colour"),
+        ({"bbox": "5,43,6,44", "f": "npz"}, 400, "f"),
+    ],
+)
+def test_a_wrong_question_for_chips_is_refused(get, parameters, status, named):
+    reply = get(CHIPS, **parameters)
+    assert reply.status_code == status
+    assert named in reply.json()["detail"]
+
+
+def test_more_points_than_are_sent_at_once_are_refused(get, monkeypatch):
+    monkeypatch.setattr(points, "MOST_POINTS_WITH_CHIPS", 39)
+    for asked in (
+        {"bbox": "5,43,6,44"},
+        {"ids": ",".join(str(FIRST + i) for i in range(40))},
+    ):
+        reply = get(CHIPS, **asked)
+        assert reply.status_code == 400
+        assert "39" in reply.json()["detail"]
+
+
+def test_chips_are_for_those_who_may_read_points(made, client):
+    assert client.get(CHIPS, params={"ids": str(FIRST)}).status_code == 401
+    assert client.post(CHIPS, json={"ids": [FIRST]}).status_code == 401
+
+
+def test_chips_that_are_not_where_the_store_says_are_an_error_before_the_reply_begins(
+    made, get, storage
+):
+    for file in storage.folder.rglob("*.npy"):
+        file.unlink()
+    assert get(CHIPS, ids=str(FIRST)).status_code == 404
