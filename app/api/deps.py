@@ -1,9 +1,13 @@
-"""What endpoints ask for: settings, store, storage, and a caller who may."""
+"""What endpoints ask for: settings, store, storage, and a caller who may.
+
+What does not wait is `async`: it costs a call, where anything else costs a change of threads.
+"""
 
 from collections.abc import Iterator
 from typing import Annotated
 
 from fastapi import Depends, Header, Request
+from starlette.concurrency import run_in_threadpool
 
 from app import origin
 from app.auth import Scope, authenticate, authenticate_identity, require
@@ -15,22 +19,22 @@ from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
 
 
-def _settings(request: Request) -> Settings:
+async def _settings(request: Request) -> Settings:
     settings: Settings = request.app.state.settings
     return settings
 
 
-def _database(request: Request) -> Database:
+async def _database(request: Request) -> Database:
     database: Database = request.app.state.database
     return database
 
 
-def _storage(request: Request) -> Storage:
+async def _storage(request: Request) -> Storage:
     storage: Storage = request.app.state.storage
     return storage
 
 
-def _chips(request: Request) -> StoredChips:
+async def _chips(request: Request) -> StoredChips:
     chips: StoredChips = request.app.state.chips
     return chips
 
@@ -50,7 +54,7 @@ def _reading(database: DatabaseDep) -> Iterator[Connection]:
 ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
 
 
-def _caller(
+async def _caller(
     request: Request, database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
 ) -> Token | None:
     """The caller's token, None when none was sent; one that is sent but wrong is refused."""
@@ -59,15 +63,17 @@ def _caller(
     kind, _, secret = authorization.partition(" ")
     if kind.lower() != "bearer" or not secret.strip():
         raise NotAllowed("the Authorization header must read `Bearer TOKEN`", known=False)
-    issuer: Issuer | None = request.app.state.issuer
-    if issuer is not None and looks_like_jwt(secret.strip()):
-        caller = authenticate_identity(database, issuer.identify(secret.strip()))
-    else:
-        with database.reading() as connection:
-            caller = authenticate(connection, secret.strip())
+    caller = await run_in_threadpool(_known, request.app.state.issuer, database, secret.strip())
     here = origin.current()
     here.actor, here.actor_name = caller.id, caller.name
     return caller
+
+
+def _known(issuer: Issuer | None, database: Database, secret: str) -> Token:
+    if issuer is not None and looks_like_jwt(secret):
+        return authenticate_identity(database, issuer.identify(secret))
+    with database.reading() as connection:
+        return authenticate(connection, secret)
 
 
 CallerDep = Annotated[Token | None, Depends(_caller)]
@@ -82,26 +88,26 @@ def _transaction(database: DatabaseDep, caller: CallerDep) -> Iterator[Connectio
 WriteConnection = Annotated[Connection, Depends(_transaction, scope="function")]
 
 
-def _reader(caller: CallerDep) -> Token:
+async def _reader(caller: CallerDep) -> Token:
     return require(caller, Scope.READ)
 
 
-def _registrar(caller: CallerDep) -> Token:
+async def _registrar(caller: CallerDep) -> Token:
     return require(caller, Scope.REGISTER)
 
 
-def _admin(caller: CallerDep) -> Token:
+async def _admin(caller: CallerDep) -> Token:
     return require(caller, Scope.ADMIN)
 
 
-def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
+async def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
     """Anybody where points are public, else a caller with scope `read`."""
     if caller is None and settings.public_points:
         return None
     return require(caller, Scope.READ)
 
 
-def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
+async def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
     """Anybody where metrics are public, else a caller with scope `monitor`."""
     if caller is None and settings.public_metrics:
         return None
