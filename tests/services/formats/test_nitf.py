@@ -1,89 +1,66 @@
-"""RPC00B and RPC00A in NITF files, as raw bytes of the standard."""
+"""RPC00B and RPC00A in NITF files, as bytes of the standard; GDAL reads the same pixels and places."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from rasterio.transform import RPCTransformer
 
+from services.errors import FormatError
+from services.formats.raster import open_raster
 from services.formats.rpc_files import read_rpc
+from services.imagery import Window
 from services.sensors.rpc import RpcModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
-a_thousandth_of_a_pixel = 1e-3
-GROUND = (5.2, 44.2, 600.0), (0.05, 0.04, 500.0)
-# STDI-0002, RPC00B: term by term, powers of longitude, latitude and height.
-TERMS_B = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0)]
-TERMS_B += [(0, 2, 0), (0, 0, 2), (1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0)]
-TERMS_B += [(0, 1, 2), (2, 0, 1), (0, 2, 1), (0, 0, 3)]
-# RPC00A: the product of all three before the squares, the third degree by falling powers.
-TERMS_A = [*TERMS_B[:7], (1, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2), (3, 0, 0), (2, 1, 0), (2, 0, 1)]
-TERMS_A += [(1, 2, 0), (0, 3, 0), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3)]
+GOLDEN = Path(__file__).parents[2] / "golden"
+PLACES = json.loads((GOLDEN / "invented_nitf_places.json").read_text())
+GROUND, LINE_SAMPLE = np.array(PLACES["lon_lat_h"]), np.array(PLACES["line_sample"])
+
+a_millionth_of_a_pixel = 1e-6
+CORNER_OF_FIRST_PIXEL = 0.5
+both_records = pytest.mark.parametrize("name", ["invented_rpc00b.ntf", "invented_rpc00a.ntf"])
 
 
-def coefficients() -> list[dict[tuple[int, int, int], float]]:
-    """Four polynomials whose terms all differ."""
-    rng = np.random.default_rng(3)
-    out = []
-    for k in range(4):
-        values = {term: float(np.round(rng.uniform(1.0, 9.0) * 1e-4, 6)) for term in TERMS_B}
-        values[0, 0, 0] = 0.001 if k % 2 == 0 else 1.0
-        if k % 2 == 0:
-            values[(0, 1, 0) if k == 0 else (1, 0, 0)] = -0.9 if k == 0 else 0.9
-        out.append(values)
-    return out
-
-
-def record(terms: list[tuple[int, int, int]]) -> str:
-    """The 1,041 bytes of the record."""
-    numbers = "".join(
-        f"{polynomial[term]:+.6E}".replace("E+0", "E+").replace("E-0", "E-")
-        for polynomial in coefficients()
-        for term in terms
-    )
-    head = "1" + "0003.00" + "0000.50" + "001000" + "01200"
-    head += f"{GROUND[0][1]:+08.4f}{GROUND[0][0]:+09.4f}{600:+05d}"
-    head += "001000" + "01200" + f"{GROUND[1][1]:+08.4f}{GROUND[1][0]:+09.4f}{500:+05d}"
-    assert len(head + numbers) == 1041
-    return head + numbers
-
-
-def write_nitf(path: Path, name: str, terms: list[tuple[int, int, int]]) -> Path:
-    pixels = np.ones((1, 2000, 2400), np.uint8)
-    with rasterio.open(
-        path,
-        "w",
-        driver="NITF",
-        height=2000,
-        width=2400,
-        count=1,
-        dtype="uint8",
-        TRE=f"{name}={record(terms)}",
-    ) as file:
-        file.write(pixels)
-    return path
-
-
-def expected(lon_lat_h: np.ndarray) -> np.ndarray:
-    """The ratios, term by term, from nothing but powers."""
-    normalised = (lon_lat_h - np.array(GROUND[0])) / np.array(GROUND[1])
-    sums = [
-        sum(value * np.prod(normalised ** np.array(term), axis=1) for term, value in polynomial.items())
-        for polynomial in coefficients()
-    ]
-    return np.column_stack([1000.0 + 1000.0 * sums[0] / sums[1], 1200.0 + 1200.0 * sums[2] / sums[3]])
-
-
-@pytest.mark.parametrize(("name", "terms"), [("RPC00B", TERMS_B), ("RPC00A", TERMS_A)])
-def test_a_record_is_read_as_the_standard_has_it(
-    tmp_path: Path, name: str, terms: list[tuple[int, int, int]]
-) -> None:
-    delivered = read_rpc(write_nitf(tmp_path / "a.ntf", name, terms))
+@both_records
+def test_a_record_is_read_as_the_standard_has_it(name: str) -> None:
+    delivered = read_rpc(GOLDEN / name)
     model = delivered.model
     assert isinstance(model, RpcModel)
-    ground = np.array(GROUND[0]) + np.random.default_rng(1).uniform(-0.9, 0.9, (200, 3)) * np.array(
-        GROUND[1]
-    )
-    np.testing.assert_allclose(model.project(ground), expected(ground), atol=a_thousandth_of_a_pixel)
+    np.testing.assert_allclose(model.project(GROUND), LINE_SAMPLE, atol=a_millionth_of_a_pixel, rtol=0)
     assert (model.error_bias_m, model.error_random_m) == (3.0, 0.5)
+    assert (delivered.convention, delivered.crop_origin) == ("tags", (0.0, 0.0))
+
+
+def test_gdal_counts_the_pixels_of_a_record_from_half_a_pixel_before() -> None:
+    with rasterio.open(GOLDEN / "invented_rpc00b.ntf") as file, RPCTransformer(file.rpcs) as gdal:
+        line, sample = gdal.rowcol(*GROUND.T, op=np.asarray)
+    found = np.column_stack([line, sample]) - CORNER_OF_FIRST_PIXEL
+    np.testing.assert_allclose(found, LINE_SAMPLE, atol=a_millionth_of_a_pixel, rtol=0)
+
+
+@both_records
+def test_the_pixels_are_those_that_were_written(name: str) -> None:
+    image = open_raster(GOLDEN / name)
+    line, sample = np.indices((32, 48))
+    assert image.shape == line.shape
+    pixels = image.read(Window(0, 0, *line.shape))
+    np.testing.assert_array_equal(pixels, (5 * line + 2 * sample) % 251 + 1)
+
+
+@pytest.mark.parametrize("kept", [3, 50, 404, 900, 1900, 2500])
+def test_a_truncated_file_is_a_format_error(tmp_path: Path, kept: int) -> None:
+    (tmp_path / "a.ntf").write_bytes((GOLDEN / "invented_rpc00b.ntf").read_bytes()[:kept])
+    with pytest.raises(FormatError):
+        read_rpc(tmp_path / "a.ntf")
+
+
+def test_a_record_with_letters_for_numbers_is_a_format_error(tmp_path: Path) -> None:
+    whole = (GOLDEN / "invented_rpc00a.ntf").read_bytes()
+    start = whole.index(b"RPC00A01041") + 11 + 81
+    (tmp_path / "a.ntf").write_bytes(whole[:start] + b"+x.yzuvwE+1" + whole[start + 11 :])
+    with pytest.raises(FormatError):
+        read_rpc(tmp_path / "a.ntf")
