@@ -124,7 +124,7 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
         f"{np.median(registered_px[~among]):.3f} px, expected {np.median(std_px[~among]):.3f} px; "
         f"pixels of {scene_gsd_m(colour):.2f} m, {found.qualification.verdict}"
     )
-    assert among.sum() > 100
+    assert among.sum() > 50
     assert np.median(registered_px[among]) < three_tenths_of_a_pixel
     assert np.quantile(registered_px[among], 0.9) < three_tenths_of_a_pixel
     assert np.median(registered_px[~among]) < 3.0 * np.median(std_px[~among])
