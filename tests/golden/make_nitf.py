@@ -1,4 +1,4 @@
-"""Writes two NITF 2.1 files to the byte, with an RPC00B and an RPC00A record, and where they show points.
+"""Writes two NITF 2.1 files to the byte, with RPC00B and RPC00A, and where they show points.
 
 Source: MIL-STD-2500C for the headers, NGA STDI-0002 for the records.
 """
