@@ -42,9 +42,10 @@ operator; QuickBird, Smiley (2009), the worst quarter of two years.
 ORTHO_CE90_M = (("S2", 17.5), ("LC0", 12.0), ("LO0", 12.0))
 """Horizontal accuracy of ortho-images without control of ours, by the start of the sensor's name.
 
-Sources: Sentinel-2, 20 m at 95.5 % before the reference images of the mission were used (ESA, user
-handbook), hence 17.5 m CE90 of a circular normal law; Landsat 8 and 9 terrain-corrected products,
-12 m CE90 (USGS, data users handbook).
+Sentinel-2: 20 m at two standard deviations without control points (ESA, GMES-GSEG-EOPG-TN-09-0008, table
+4-6), taken as 95 % of a circular normal law, hence 17.5 m CE90. Products refined on the mission's
+reference images, since 2021, reach 8 m at 95 %, but their pixels do not say that they are. Landsat 8 and
+9, terrain-corrected: 12 m CE90 assumed, the requirement that Storey, Choate and Lee (2014) verify.
 """
 
 _SENSOR_IN_NAME = (
