@@ -9,7 +9,7 @@ import numpy as np
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.imagery import image_gsd_m
 from services.matching.points import PointMatches
-from services.scene import Scene, scene_gsd_m
+from services.scene import Scene, scene_centre
 from services.sensors.correction import CorrectedModel
 from services.types import Array, BoolArray, ControlPoints
 
@@ -48,6 +48,7 @@ def adjust_on(
     options: AdjustmentOptions,
 ) -> SceneAdjustment:
     """The correction of a scene from what was found of its points; see `adjust_scene`."""
+    ground_to_px = scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, :2]
     return adjust_scene(
         scene.model,
         scene.image.shape,
@@ -57,7 +58,7 @@ def adjust_on(
         points.covariance_m2,
         options,
         candidates,
-        matches.common_sigma_m / scene_gsd_m(scene),
+        ground_to_px @ matches.common_covariance_m2 @ ground_to_px.T,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
-from services.chip_choice import fine_gsd_m
+from services.chip_choice import chance_of_being_shown, fine_gsd_m
 from services.coarse import CoarseOptions, search_coarsely
 from services.errors import CoverageError, InputError, NoConsensus, NotEnoughPoints
 from services.matching.consensus import agreeing_points, consensus_tolerance_px
@@ -36,6 +36,10 @@ from services.types import (
     no_progress,
     part_of,
 )
+
+WORTH_TRYING = 0.2
+"""Where there are more points than are tried, those are left out whose chip the scene shows whole with a
+chance less than this share of the best one's."""
 
 
 @dataclass(frozen=True)
@@ -229,14 +233,26 @@ def _choose_points(
     spread_m2 = np.trace(points.covariance_m2[visible], axis1=1, axis2=2)
     preference = points.saliency[visible] * points.health[visible]
     preference /= 1.0 + spread_m2 / max(float(np.median(spread_m2)), 1e-12)
+    count = options.max_points or len(visible)
+    likely = _likely_shown(scene, points.take(visible), predicted[visible], count)
     best = spread_over_image(
-        predicted[visible],
-        points.lon_lat_h[visible, 2],
-        preference,
+        predicted[visible[likely]],
+        points.lon_lat_h[visible[likely], 2],
+        preference[likely],
         scene.image.shape,
-        options.max_points or len(visible),
+        count,
     )
-    return visible, np.sort(visible[best])
+    return visible, np.sort(visible[likely[best]])
+
+
+def _likely_shown(scene: Scene, points: ControlPoints, line_sample: Array, count: int) -> IntArray:
+    """Rows of the points to choose from: all, or when they are many those likely to be shown whole."""
+    if len(points) <= count:
+        return np.arange(len(points))
+    uncertainty_m = _start_uncertainty(scene, points)
+    finest_m = float(points.views.gsd_m.min())
+    chance = chance_of_being_shown(scene, points, line_sample, finest_m, uncertainty_m)
+    return np.flatnonzero(chance >= WORTH_TRYING * chance.max())
 
 
 def _start_uncertainty(scene: Scene, points: ControlPoints) -> Array:

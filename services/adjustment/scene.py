@@ -99,7 +99,7 @@ def adjust_scene(
     covariance_m2: Array,
     options: AdjustmentOptions = AdjustmentOptions(),
     candidates: BoolArray | None = None,
-    common_sigma_px: float = 0.0,
+    common_covariance_px2: Array | None = None,
 ) -> SceneAdjustment:
     """Find the correction of a model that best explains where control points were seen.
 
@@ -120,8 +120,8 @@ def adjust_scene(
         covariance_m2: (n, 3, 3) of the points, east, north, up.
         options: thresholds.
         candidates: (n,) measures that may be used; all that are finite when None.
-        common_sigma_px: standard deviation a coordinate of an error that all measures share; it adds to
-            the covariance of the shift.
+        common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to that
+            of the shift.
 
     Raises:
         NotEnoughPoints: when fewer than `min_points` measures are usable, before or after deactivation.
@@ -161,7 +161,8 @@ def adjust_scene(
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
     honest = replace(problem, variance=variance * max(sigma0, 1.0) ** 2)
     parameters, covariance = honest.solution(active, free, slope_px)
-    covariance[[0, 3], [0, 3]] += common_sigma_px**2
+    if common_covariance_px2 is not None:
+        covariance[np.ix_([0, 3], [0, 3])] += common_covariance_px2
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,

@@ -169,7 +169,7 @@ def match_places(
         views=found.astype(np.int64),
         reason=reason,
         by_gradient=np.zeros(n, dtype=bool),
-        common_sigma_m=reference.common_sigma_m,
+        common_covariance_m2=reference.common_sigma_m**2 * np.eye(2),
         tried=ViewMeasures(np.arange(n), np.zeros(n, dtype=np.int64), score, found, reason),
     )
 

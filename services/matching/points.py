@@ -11,6 +11,7 @@ from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
 from services.matching.radiometry import brightness_and_roughness, clouded, edges
+from services.matching.shared_error import common_covariance_px2
 from services.matching.views import Likeness, choose_views
 from services.sensors.base import SensorModel
 from services.types import (
@@ -28,9 +29,6 @@ from services.types import (
 )
 
 TILE_PX = 512
-COMMON_SIGMA_PX = 0.05
-"""Least systematic part of a registration, chip pixels. Simulated scenes of 1 m on chips of 2 m, of
-the day of one of the chips or another, lie 0.08 to 0.12 chip pixels off the truth, scatter 0.01."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +65,8 @@ class PointMatches:
         views: (n,) how many views agree.
         reason: (n,) "" where found; "cloud" where what was not found is bright and smooth.
         by_gradient: (n,) found by the edges of the chips only.
-        common_sigma_m: standard deviation a coordinate of what all the measures have in common, metres:
-            see `common_sigma`.
+        common_covariance_m2: (2, 2) east, north, of what all the measures have in common: see
+            `shared_error`.
         tried: what became of every view that was tried; its rows are those of the points.
     """
 
@@ -79,7 +77,7 @@ class PointMatches:
     views: IntArray
     reason: np.ndarray
     by_gradient: BoolArray
-    common_sigma_m: float
+    common_covariance_m2: Array
     tried: ViewMeasures
 
 
@@ -123,7 +121,7 @@ def match_points(
     looks = np.full((n, 2), np.nan)
     scene_gsd_m = np.full(n, np.nan)
     chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
-    offsets: dict[int, list[Array]] = {}
+    offsets: list[Array] = []
     seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
         if done % 64 == 0:
@@ -146,15 +144,22 @@ def match_points(
         row_col, sigma, agreeing, reason[row] = combined
         for number, peak, agreed in zip(numbers, peaks, agreeing, strict=True):
             seen.append((row, int(number), peak, bool(agreed)))
-            if peak.reason == FOUND and reason[row] == FOUND:
-                image_number = int(points.views.image[points.views.start[row] + number])
-                offsets.setdefault(image_number, []).append(peak.row_col - row_col)
+            offsets.append((peak.row_col - row_col)[::-1] * [1.0, -1.0])
         views[row] = agreeing.sum()
         score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
         displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
         sigma_m[row] = sigma * level_m
     reason[clouded(looks, reason == FOUND)] = "cloud"
     moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
+    found_views = np.array([np.isfinite(offset).all() for offset in offsets], dtype=bool)
+    view_row = np.array([points.views.start[row] + number for row, number, *_ in seen], dtype=np.int64)
+    shared_px2 = common_covariance_px2(
+        scene,
+        points.views,
+        view_row[found_views],
+        np.array(offsets).reshape(-1, 2)[found_views],
+        np.array([agreed for *_, agreed in seen], dtype=bool)[found_views],
+    )
     return PointMatches(
         model.project(moved),
         displacement_m,
@@ -163,7 +168,7 @@ def match_points(
         views,
         reason,
         by_gradient,
-        common_sigma(list(offsets.values())) * level_m,
+        shared_px2 * level_m**2,
         _view_measures(seen),
     )
 
@@ -198,23 +203,6 @@ def _view_measures(seen: list[tuple[int, int, Peak, bool]]) -> ViewMeasures:
         agreed=np.array([agreed for *_, agreed in seen], dtype=bool),
         reason=np.array([peak.reason for *_, peak, _ in seen], dtype="<U16"),
     )
-
-
-def common_sigma(offsets: list[list[Array]]) -> float:
-    """What the chips of one image have in common and no number of points averages out, chip pixels.
-
-    Roofs and relief lean with the direction of a view: over all points, the chips cut from one lie a
-    little beside those cut from another. How far the images' mean offsets scatter tells how well their
-    mean is known; what they share among themselves is covered by `COMMON_SIGMA_PX`.
-
-    Args:
-        offsets: for every image, the offsets (2,) of its measures from the points' combined ones.
-    """
-    means = np.array([np.median(of_image, axis=0) for of_image in offsets if len(of_image) >= 5])
-    if len(means) < 2:
-        return 2.0 * COMMON_SIGMA_PX
-    scatter = float((means**2).mean(axis=1).sum() / (len(means) * (len(means) - 1)))
-    return float(np.hypot(COMMON_SIGMA_PX, np.sqrt(scatter)))
 
 
 def chip_pixels(chip: np.ndarray) -> FloatImage:
