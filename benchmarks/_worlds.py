@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks._simulated import lay_points
 from services.imagery import render_chip
-from services.production import stored_chip
+from services.matching.chips import stored_chip
 from services.scene import Scene
 from services.simulation.render import STEEPEST
 from services.simulation.tiles import TiledView
@@ -28,8 +28,9 @@ REFERENCES = (
     (12.0, 100.0, datetime(2024, 5, 28, 10, 25, tzinfo=UTC)),
     (10.0, 290.0, datetime(2024, 7, 14, 10, 50, tzinfo=UTC)),
     (20.0, 200.0, datetime(2024, 8, 20, 10, 40, tzinfo=UTC)),
+    (15.0, 15.0, datetime(2024, 6, 20, 10, 35, tzinfo=UTC)),
 )
-"""Incidence, azimuth and time of the views a block is made from."""
+"""Incidence, azimuth and time of the views a block is made from: from all sides, on different days."""
 
 
 @dataclass(frozen=True)
