@@ -10,8 +10,7 @@ from rasterio.windows import Window as RasterWindow
 from services.formats.raster import gdal_rpc
 from services.imagery import ImageSource, ReducedImage, reduce_image, render_chip
 from services.intersection import intersect
-from services.matching.chips import chip_inside, chip_saliency, refine_on_chips
-from services.production import stored_chip
+from services.matching.chips import chip_inside, chip_saliency, refine_on_chips, stored_chip
 from services.scene import Scene, scene_gsd_m, view_direction
 from services.sensors.rpc import RpcModel
 from services.simulation.view import ViewGeometry, render_view

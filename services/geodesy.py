@@ -15,6 +15,7 @@ WGS84_A = 6378137.0
 WGS84_F = 1.0 / 298.257223563
 WGS84_E2 = WGS84_F * (2.0 - WGS84_F)
 WGS84_B = WGS84_A * (1.0 - WGS84_F)
+_MARGIN_DEG = 1e-6
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)
 
 
@@ -89,6 +90,24 @@ def _to_geodetic(ecef: Array) -> Array:
     for i in range(len(ecef)):
         out[i] = ecef_to_geodetic(ecef[i, 0], ecef[i, 1], ecef[i, 2])
     return out
+
+
+def continuous(lon_lat: Array) -> Array:
+    """Positions (n, 2 or 3) whose longitudes do not jump at 180 degrees, half a turn round the first."""
+    out = np.array(lon_lat, dtype=np.float64)
+    out[:, 0] = lon_lat[0, 0] + (lon_lat[:, 0] - lon_lat[0, 0] + 180.0) % 360.0 - 180.0
+    return out
+
+
+def box_around(lon_lat: Array) -> Array:
+    """Outline (4, 2) of a box that holds positions (n, 2 or 3), a tenth of a metre larger than needed.
+
+    Counter-clockwise, not closed, longitudes continuous.
+    """
+    held = continuous(lon_lat)[:, :2]
+    west, south = held.min(axis=0) - _MARGIN_DEG
+    east, north = held.max(axis=0) + _MARGIN_DEG
+    return np.array([[west, south], [east, south], [east, north], [west, north]])
 
 
 def ecef_from_lon_lat_h(lon_lat_h: Array) -> Array:

@@ -8,10 +8,16 @@ import numpy as np
 from services.adjustment.block import BlockAdjustment, BlockOptions, adjust_block
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
-from services.geodesy import east_north_up
+from services.geodesy import box_around, continuous, east_north_up
 from services.imagery import render_chip
 from services.intersection import Intersection, intersect
-from services.matching.chips import RefinementOptions, chip_inside, chip_saliency, refine_on_chips
+from services.matching.chips import (
+    RefinementOptions,
+    chip_inside,
+    chip_saliency,
+    refine_on_chips,
+    stored_chip,
+)
 from services.matching.features import FeatureOptions, tie_points
 from services.matching.predict import rank_in_group
 from services.scene import Scene, scene_gsd_m, view_direction
@@ -20,7 +26,6 @@ from services.types import (
     Array,
     ChipArray,
     ControlPoints,
-    FloatImage,
     IntArray,
     Observations,
     Progress,
@@ -224,7 +229,7 @@ def _candidates(
 
 def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
     """Number of the square of ground every point (n, 3) lies in."""
-    enu = east_north_up(lon_lat_h, np.median(lon_lat_h, axis=0))[:, :2]
+    enu = east_north_up(lon_lat_h, np.median(continuous(lon_lat_h), axis=0))[:, :2]
     if options.spacing_m is not None:
         side = options.spacing_m
     else:
@@ -304,11 +309,7 @@ def _finished(
             ]
         )
 
-    margin_deg = 1e-6
-    low = lon_lat_h[:, :2].min(axis=0) - margin_deg
-    high = lon_lat_h[:, :2].max(axis=0) + margin_deg
-    outline = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    return Production(points, cut, block, relative, outline)
+    return Production(points, cut, block, relative, box_around(lon_lat_h))
 
 
 def _views(
@@ -348,9 +349,3 @@ def _directions(
             model, model.project(ground[views]), ground[views]
         )
     return incidence, azimuth
-
-
-def stored_chip(pixels: FloatImage) -> ChipArray:
-    """A chip as it is stored: uint16, 0 where there is nodata."""
-    stored = np.clip(np.rint(np.nan_to_num(pixels, nan=0.0)), 1, np.iinfo(np.uint16).max)
-    return np.where(np.isfinite(pixels), stored, 0).astype(np.uint16)

@@ -11,7 +11,15 @@ from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
 from services.scene import Scene
 from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, FloatImage, Observations, Progress, no_progress
+from services.types import (
+    Array,
+    BoolArray,
+    ChipArray,
+    FloatImage,
+    Observations,
+    Progress,
+    no_progress,
+)
 
 _KERNEL = 51
 
@@ -149,3 +157,9 @@ def chip_saliency(chip: FloatImage) -> float:
         return 0.0
     scores[margin - 4 : margin + 5, margin - 4 : margin + 5] = -1.0
     return float(np.clip(1.0 - scores.max(), 0.0, 1.0))
+
+
+def stored_chip(pixels: FloatImage) -> ChipArray:
+    """A chip as it is stored: uint16, 0 where there is nodata."""
+    stored = np.clip(np.rint(np.nan_to_num(pixels, nan=0.0)), 1, np.iinfo(np.uint16).max)
+    return np.where(np.isfinite(pixels), stored, 0).astype(np.uint16)

@@ -9,7 +9,8 @@ from services.conventions import CHIP_CENTRE, CHIP_SIZE
 from services.errors import ComputationError, InputError, NotEnoughPoints
 from services.imagery import ArrayImage, render_chip
 from services.intersection import Intersection, intersect
-from services.production import Production, ProductionOptions, produce_points, stored_chip
+from services.matching.chips import stored_chip
+from services.production import Production, ProductionOptions, produce_points
 from services.scene import Scene
 from services.simulation.view import plan_geometry
 from services.types import Array, Observations

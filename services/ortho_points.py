@@ -1,0 +1,235 @@
+"""ORTHO-IMAGE AND HEIGHTS IN -> NEW POINTS OUT: the salient places of one image that lies on a map."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from services.errors import InputError, NotEnoughPoints
+from services.geodesy import box_around
+from services.imagery import Window, mean_pixels, render_chip
+from services.matching.chips import chip_inside, chip_saliency, stored_chip
+from services.scene import Scene, scene_centre, scene_gsd_m
+from services.terrain import Terrain
+from services.types import (
+    Array,
+    ChipArray,
+    ControlPoints,
+    FloatImage,
+    Progress,
+    Views,
+    no_progress,
+)
+
+_FEWEST = 6
+"""Points that make a block."""
+_APART_PX = 10
+"""Distance of the corners that are tried in a square, pixels of the fine chips."""
+
+
+@dataclass(frozen=True)
+class OrthoPointOptions:
+    """How points are taken out of an ortho-image.
+
+    Attributes:
+        fine_gsd_m, coarse_gsd_m: ground samplings of the chips; by default the image's own in two
+            digits, and four times that.
+        spacing_m: side of the squares that get a point each; None cuts the image into about `points`.
+        points: how many points are aimed at when there is no spacing.
+        candidates: how many corners of every square are tried.
+        min_saliency: of a point's chip.
+        local_sigma_px: how far a detail of the image lies off the rest of it, its own pixels, one
+            standard deviation a coordinate.
+    """
+
+    fine_gsd_m: float | None = None
+    coarse_gsd_m: float | None = None
+    spacing_m: float | None = None
+    points: int = 300
+    candidates: int = 3
+    min_saliency: float = 0.05
+    local_sigma_px: float = 0.3
+
+
+@dataclass(frozen=True)
+class Heights:
+    """How high the ground lies.
+
+    Attributes:
+        terrain: where it is known.
+        flat_m: metres above the ellipsoid, the same everywhere, where there is no terrain.
+        sigma_m: of these heights, one standard deviation.
+    """
+
+    terrain: Terrain | None
+    flat_m: float
+    sigma_m: float
+
+    def at(self, lon_lat: Array) -> Array:
+        """Heights (n,) at longitudes and latitudes (n, 2); NaN where they are not known."""
+        if self.terrain is not None:
+            return self.terrain.height_m(lon_lat)
+        return np.full(len(lon_lat), self.flat_m)
+
+
+@dataclass(frozen=True)
+class OrthoPoints:
+    """The points of an ortho-image.
+
+    Attributes:
+        points: as of `Production`; each has one view.
+        chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
+        gsds_m: ground samplings of the chips, fine and coarse.
+        outline: (m, 2) lon, lat of a rectangle that holds the points, counter-clockwise, not closed.
+    """
+
+    points: ControlPoints
+    chips: Callable[[int], ChipArray]
+    gsds_m: tuple[float, float]
+    outline: Array
+
+
+def ortho_points(
+    scene: Scene,
+    heights: Heights,
+    options: OrthoPointOptions = OrthoPointOptions(),
+    progress: Progress = no_progress,
+) -> OrthoPoints:
+    """Make control points with chips out of one ortho-image and the heights of its ground.
+
+    The image is cut into squares; the corners of each (Shi and Tomasi, 1994) whose chips can be located
+    by their own content are points. Their place is the image's, their height that of the ground there:
+    what the image's producer got wrong is in them, and their frame is the image's.
+
+    Args:
+        scene: an ortho-image, with its map grid as model.
+        heights: of the ground.
+        options: thresholds.
+        progress: told where the work stands.
+
+    Raises:
+        InputError: heights move what the scene shows, so that it is no ortho-image.
+        NotEnoughPoints: too little of the image is salient and known in height.
+    """
+    gsd_m = scene_gsd_m(scene)
+    middle = scene_centre(scene)[None, :]
+    if scene.model.project_derivative(middle)[0, :, 2].any():
+        raise InputError("an ortho-image is needed: heights move what this scene shows")
+    fine_m = options.fine_gsd_m or float(f"{gsd_m:.2g}")
+    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
+    if not 0.0 < fine_m < coarse_m:
+        raise InputError(f"ground samplings {fine_m:g} and {coarse_m:g} m: the finer is expected first")
+    squares = _squares(scene, gsd_m, options)
+    found: list[tuple[Array, float]] = []
+    for number, square in enumerate(squares):
+        if number % 16 == 0:
+            progress(0.9 * number / len(squares), f"looking at {len(squares)} squares")
+        best = _best_of(scene, heights, square, fine_m, options)
+        if best is not None:
+            found.append(best)
+    if len(found) < _FEWEST:
+        raise NotEnoughPoints(
+            len(found), _FEWEST, f"salient places of known height in {len(squares)} squares of the image"
+        )
+    progress(1.0, f"{len(found)} points")
+    return _finished(scene, heights, found, (fine_m, coarse_m), gsd_m * options.local_sigma_px)
+
+
+def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Window]:
+    """The image cut into squares, or nearly so."""
+    lines, samples = scene.image.shape
+    if options.spacing_m is not None:
+        side = options.spacing_m / gsd_m
+    else:
+        side = float(np.sqrt(lines * samples / options.points))
+    rows, cols = max(1, int(lines / side)), max(1, int(samples / side))
+    line = [lines * k // rows for k in range(rows + 1)]
+    sample = [samples * k // cols for k in range(cols + 1)]
+    return [
+        Window(top, left, bottom - top, right - left)
+        for top, bottom in pairwise(line)
+        for left, right in pairwise(sample)
+    ]
+
+
+def _best_of(
+    scene: Scene, heights: Heights, square: Window, fine_m: float, options: OrthoPointOptions
+) -> tuple[Array, float] | None:
+    """The most salient corner (lon, lat, height) of a square with its saliency."""
+    factor = max(1, int(fine_m / scene_gsd_m(scene)))
+    corners = _corners(mean_pixels(scene.image.read(square), factor), options.candidates)
+    line_sample = corners * factor + (factor - 1) / 2.0 + [square.line, square.sample]
+    lon_lat = scene.model.locate(line_sample, np.zeros(len(corners)))[:, :2]
+    lon_lat_h = np.column_stack([lon_lat, heights.at(lon_lat)])
+    lon_lat_h = lon_lat_h[np.isfinite(lon_lat_h).all(axis=1)]
+    whole = chip_inside(scene.model, scene.image.shape, lon_lat_h, fine_m)
+    best: tuple[Array, float] | None = None
+    for ground in lon_lat_h[whole]:
+        stored = stored_chip(render_chip(scene.image, scene.model, ground, fine_m))
+        saliency = chip_saliency(stored.astype(np.float32)) if stored.all() else 0.0
+        if saliency >= options.min_saliency and (best is None or saliency > best[1]):
+            best = ground, saliency
+    return best
+
+
+def _corners(pixels: FloatImage, count: int) -> Array:
+    """The strongest corners (n, 2) of some pixels, away from what is missing."""
+    missing = ~np.isfinite(pixels)
+    if missing.all() or min(pixels.shape) < 8:
+        return np.empty((0, 2))
+    filled = np.where(missing, np.float32(pixels[~missing].mean()), pixels)
+    mask = cv2.erode((~missing).astype(np.uint8), np.ones((9, 9), np.uint8))
+    found = cv2.goodFeaturesToTrack(filled, count, 0.01, _APART_PX, mask=mask, blockSize=7)
+    return np.empty((0, 2)) if found is None else found.reshape(-1, 2)[:, ::-1].astype(np.float64)
+
+
+def _finished(
+    scene: Scene,
+    heights: Heights,
+    found: list[tuple[Array, float]],
+    gsds_m: tuple[float, float],
+    sigma_m: float,
+) -> OrthoPoints:
+    """Points, views and the way to their chips."""
+    lon_lat_h = np.array([ground for ground, _ in found])
+    n = len(lon_lat_h)
+    shown = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsds_m[1])
+    for row in np.flatnonzero(shown):
+        chip = render_chip(scene.image, scene.model, lon_lat_h[row], gsds_m[1])
+        shown[row] = np.isfinite(chip).all()
+    start = np.concatenate([[0], np.cumsum(1 + shown)]).astype(np.int64)
+    gsd_m = np.full(start[-1], gsds_m[0])
+    gsd_m[start[1:][shown] - 1] = gsds_m[1]
+    straight_down = np.zeros(start[-1])
+    variance_m2 = np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2
+    points = ControlPoints(
+        id=np.arange(n, dtype=np.int64),
+        lon_lat_h=lon_lat_h,
+        covariance_m2=np.tile(np.diag(variance_m2), (n, 1, 1)),
+        saliency=np.array([saliency for _, saliency in found]),
+        health=np.ones(n),
+        views=Views(
+            start=start,
+            gsd_m=gsd_m,
+            image=np.zeros(start[-1], dtype=np.int64),
+            incidence_deg=straight_down,
+            azimuth_deg=straight_down,
+            health=np.ones(start[-1]),
+            images=(scene.acquisition,),
+        ),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=start[:-1].copy(),
+        chip_files=("chips",),
+    )
+
+    def cut(row: int) -> ChipArray:
+        return np.stack(
+            [
+                stored_chip(render_chip(scene.image, scene.model, lon_lat_h[row], float(g)))
+                for g in gsd_m[start[row] : start[row + 1]]
+            ]
+        )
+
+    return OrthoPoints(points, cut, gsds_m, box_around(lon_lat_h))
