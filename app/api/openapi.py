@@ -6,13 +6,29 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from app.api.documents import COMPONENTS, feature_schema, page_schema, property_schema, reference
-from app.api.negotiation import GEOJSON, PROBLEM_JSON
+from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, PROBLEM_JSON
 from app.db.collections import Collection, Property
 from app.usecases.features import COLLECTIONS
+from app.usecases.tiles import MATRIX_SET, MOST_ZOOM
 
 REFUSED = {
     "description": "What was wrong, as problem details.",
     "content": {PROBLEM_JSON: {"schema": reference("Problem")}},
+}
+
+_BY_COMMAS = {"style": "form", "explode": False}
+LISTS = {
+    "bbox": {
+        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 6},
+        **_BY_COMMAS,
+    },
+    "ids": {"schema": {"type": "array", "items": {"type": "integer"}, "minItems": 1}, **_BY_COMMAS},
+}
+PLACES: dict[str, dict[str, Any]] = {
+    "matrix_set": {"enum": [MATRIX_SET]},
+    "z": {"minimum": 0, "maximum": MOST_ZOOM},
+    "y": {"minimum": 0},
+    "x": {"minimum": 0},
 }
 
 
@@ -42,10 +58,23 @@ def _finished(document: dict[str, Any]) -> dict[str, Any]:
             operation["responses"].pop("422", None)
             operation["responses"]["default"] = REFUSED
             for parameter in operation.get("parameters", []):
-                parameter["schema"] = _without_null(parameter["schema"])
+                _define(parameter, operation)
         if "{collection}" in path:
             _spell_out(document["paths"], path)
     return document
+
+
+def _define(parameter: dict[str, Any], operation: dict[str, Any]) -> None:
+    """What the code takes as text and reads by itself, as the standards define it."""
+    parameter["schema"] = _without_null(parameter["schema"])
+    content = operation["responses"].get("200", {}).get("content", {})
+    if parameter["name"] in ("bbox", "ids") and parameter["in"] == "query":
+        parameter |= LISTS[parameter["name"]]
+    elif parameter["name"] == "f" and HTML in content:
+        formats = FEATURES if FEATURES["csv"] in content else DOCUMENTS
+        parameter["schema"]["enum"] = list(formats)
+    elif parameter["name"] in PLACES:
+        parameter["schema"] |= PLACES[parameter["name"]]
 
 
 def _without_null(schema: dict[str, Any]) -> dict[str, Any]:

@@ -60,7 +60,11 @@ def download_result(
     return file_reply(storage, results.result_key(job, name), media_type(name))
 
 
-@router.get("/schemas/report.json", response_class=JSONResponse)
+@router.get(
+    "/schemas/report.json",
+    response_class=Response,
+    responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
+)
 def report_schema() -> JSONResponse:
     """The JSON Schema of `report.json`, the report of a registration."""
     return JSONResponse(document.report_schema(), media_type=SCHEMA_JSON)

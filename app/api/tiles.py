@@ -12,10 +12,10 @@ from app.api.negotiation import JSON, MVT
 from app.db.collections import Collection
 from app.errors import NotFound
 from app.usecases import tiles
+from app.usecases.tiles import MATRIX_SET
 
 router = APIRouter(tags=["tiles"])
 
-MATRIX_SET = "WebMercatorQuad"
 MATRIX_SET_URI = "http://www.opengis.net/def/tilematrixset/OGC/1.0/WebMercatorQuad"
 MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 WORLD_M = 20_037_508.342789244

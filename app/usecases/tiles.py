@@ -6,6 +6,7 @@ from app.db.engine import Connection
 from app.errors import NotFound
 
 TILED = ("points", "density", "blocks")
+MATRIX_SET = "WebMercatorQuad"
 MOST_ZOOM = 24
 
 

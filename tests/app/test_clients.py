@@ -5,12 +5,8 @@ They come with a token as they are given one in practice: by a setting of GDAL, 
 
 import os
 import shutil
-import socket
 import subprocess
-import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 
 import geopandas
 import httpx
@@ -21,15 +17,7 @@ from numpy.testing import assert_allclose
 from owslib.ogcapi.features import Features
 from pyproj import CRS
 
-from app.config import Settings
-from app.db import engine
-from app.storage import Storage
-from app.usecases import blocks
-from app.usecases.tokens import create_token
-from services.types import ControlPoints
-from tests.app.conftest import TEMPLATE, fresh_database
-from tests.factories import make_block
-from tests.serving import until
+from tests.app.served import Served, service_with_a_block
 
 BOX = (5.22, 43.21, 5.27, 43.26)
 WHERE = "saliency > 0.5 AND n_views = 3"
@@ -37,77 +25,35 @@ a_tenth_of_a_millimetre_deg = 1e-9
 in_single_precision = 1e-7
 
 
-@dataclass(frozen=True)
-class Served:
-    """A running service with one published block.
-
-    Attributes:
-        authorization: the header of a caller who may read.
-        header_file: the same in a file, for GDAL.
-    """
-
-    url: str
-    points: ControlPoints
-    authorization: dict[str, str]
-    header_file: Path
-
-    @property
-    def in_box(self) -> np.ndarray:
-        lon, lat = self.points.lon_lat_h[:, 0], self.points.lon_lat_h[:, 1]
-        return (lon >= BOX[0]) & (lon <= BOX[2]) & (lat >= BOX[1]) & (lat <= BOX[3])
-
-    @property
-    def meant_by_where(self) -> np.ndarray:
-        return self.points.saliency > 0.5
-
-
 @pytest.fixture(scope="module")
 def served(cluster, tmp_path_factory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("served")
-    with fresh_database(cluster, TEMPLATE) as dsn:
-        made = make_block(folder / "block", count=60)
-        settings = Settings(database_url=dsn, data_folder=folder / "data")
-        with engine.connect(dsn) as connection:
-            blocks.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
-            blocks.publish_block(connection, "calanques")
-            secret = create_token(connection, "a client", ["read"]).secret
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        environment = {
-            **os.environ,
-            "AMERS_DATABASE_URL": dsn,
-            "AMERS_DATA_FOLDER": str(settings.data_folder),
-        }
-        with (folder / "log").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)],
-                env=environment,
-                stdout=log,
-                stderr=log,
-            )
-        url = f"http://127.0.0.1:{port}"
-        try:
-            assert until(lambda: _answers(url)), (folder / "log").read_text()
-            header_file = folder / "header"
-            header_file.write_text(f"Authorization: Bearer {secret}")
-            yield Served(url, made.points, {"Authorization": f"Bearer {secret}"}, header_file)
-        finally:
-            process.terminate()
-            process.wait()
-
-
-def _answers(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/readyz").status_code == 200
-    except httpx.TransportError:
-        return False
+    with service_with_a_block(cluster, tmp_path_factory.mktemp("served"), "read") as served:
+        yield served
 
 
 @pytest.fixture
-def source(served) -> Iterator[str]:
+def in_box(served) -> np.ndarray:
+    lon, lat = served.points.lon_lat_h[:, 0], served.points.lon_lat_h[:, 1]
+    return (lon >= BOX[0]) & (lon <= BOX[2]) & (lat >= BOX[1]) & (lat <= BOX[3])
+
+
+@pytest.fixture
+def in_box_and_strong(served, in_box) -> np.ndarray:
+    return in_box & (served.points.saliency > 0.5)
+
+
+@pytest.fixture
+def header_file(served) -> str:
+    """The caller's header in a file, for GDAL."""
+    path = served.folder / "header"
+    path.write_text(f"Authorization: {served.authorization['Authorization']}")
+    return str(path)
+
+
+@pytest.fixture
+def source(served, header_file) -> Iterator[str]:
     """The service as GDAL names it, with the token as GDAL takes one; what it fetches is printed."""
-    options = {"GDAL_HTTP_HEADER_FILE": str(served.header_file), "CPL_DEBUG": "ON"}
+    options = {"GDAL_HTTP_HEADER_FILE": header_file, "CPL_DEBUG": "ON"}
     pyogrio.set_gdal_config_options(options)
     yield f"OAPIF:{served.url}"
     pyogrio.set_gdal_config_options(dict.fromkeys(options))
@@ -142,13 +88,12 @@ def test_gdal_reads_all_points_page_by_page_with_heights(served, source, capfd):
     assert len(following) == 60 // 7
 
 
-def test_gdal_leaves_a_box_and_a_filter_to_the_service(served, source, capfd):
-    expected = served.in_box & served.meant_by_where
-    assert 0 < expected.sum() < served.in_box.sum()
+def test_gdal_leaves_a_box_and_a_filter_to_the_service(served, source, in_box, in_box_and_strong, capfd):
+    assert 0 < in_box_and_strong.sum() < in_box.sum()
     frame = pyogrio.read_dataframe(source, layer="points", bbox=BOX, where=WHERE)
     assert_allclose(
         np.sort(frame.geometry.x),
-        np.sort(served.points.lon_lat_h[expected, 0]),
+        np.sort(served.points.lon_lat_h[in_box_and_strong, 0]),
         atol=a_tenth_of_a_millimetre_deg,
     )
     asked = fetched(capfd)[-1]
@@ -181,10 +126,12 @@ def test_gdal_finds_the_same_by_the_service_s_filter_as_by_its_own(served, sourc
 
 
 @pytest.mark.skipif(shutil.which("ogr2ogr") is None, reason="Debian's gdal-bin is not installed")
-def test_ogrinfo_and_ogr2ogr_of_the_machine_do_the_same(served, tmp_path):
+def test_ogrinfo_and_ogr2ogr_of_the_machine_do_the_same(
+    served, header_file, in_box_and_strong, tmp_path
+):
     environment = {
         **os.environ,
-        "GDAL_HTTP_HEADER_FILE": str(served.header_file),
+        "GDAL_HTTP_HEADER_FILE": header_file,
         "CPL_DEBUG": "ON",
     }
     box, copied = [str(value) for value in BOX], tmp_path / "copied.gpkg"
@@ -200,12 +147,13 @@ def test_ogrinfo_and_ogr2ogr_of_the_machine_do_the_same(served, tmp_path):
     said = run("ogr2ogr", "-spat", *box, "-where", WHERE, str(copied), *layer)
     assert "filter=" in said
     frame = geopandas.read_file(copied)
-    expected = served.in_box & served.meant_by_where
-    assert len(frame) == expected.sum() > 0
-    assert_allclose(np.sort(frame.geometry.z), np.sort(served.points.lon_lat_h[expected, 2]), atol=1e-9)
+    assert len(frame) == in_box_and_strong.sum() > 0
+    assert_allclose(
+        np.sort(frame.geometry.z), np.sort(served.points.lon_lat_h[in_box_and_strong, 2]), atol=1e-9
+    )
 
 
-def test_owslib_finds_collections_queryables_and_features(served):
+def test_owslib_finds_collections_queryables_and_features(served, in_box):
     service = Features(served.url, headers=served.authorization)
     declared = service.conformance()["conformsTo"]
     assert "http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/core" in declared
@@ -214,7 +162,7 @@ def test_owslib_finds_collections_queryables_and_features(served):
     assert "saliency" in service.collection_queryables("points")["properties"]
     assert service.collection_schema("points")["properties"]["id"]["x-ogc-role"] == "id"
     page = service.collection_items("points", bbox=list(BOX), limit=5)
-    assert (page["numberReturned"], page["numberMatched"]) == (5, served.in_box.sum())
+    assert (page["numberReturned"], page["numberMatched"]) == (5, in_box.sum())
     strong = service.collection_items("points", filter="saliency > 0.5", limit=100)
     assert strong["numberReturned"] == (served.points.saliency > 0.5).sum()
     first = page["features"][0]

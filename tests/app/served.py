@@ -1,0 +1,81 @@
+"""A service as a process of its own, on a database of the tests with one published block."""
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+from app.config import Settings
+from app.db import engine
+from app.db.embedded import Cluster
+from app.storage import Storage
+from app.usecases import blocks
+from app.usecases.tokens import create_token
+from services.types import ControlPoints
+from tests.app.conftest import TEMPLATE, fresh_database
+from tests.factories import make_block
+from tests.serving import until
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running service with one published block of 60 points.
+
+    Attributes:
+        points: of the block; their ids in the service begin at 2^26.
+        authorization: the header of a caller.
+        folder: where its log and the caller's files may lie.
+    """
+
+    url: str
+    points: ControlPoints
+    authorization: dict[str, str]
+    folder: Path
+
+
+@contextmanager
+def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator[Served]:
+    """A service without a worker, for a caller with a scope; stopped at the end."""
+    with fresh_database(cluster, TEMPLATE) as dsn:
+        made = make_block(folder / "block", count=60)
+        settings = Settings(database_url=dsn, data_folder=folder / "data")
+        with engine.connect(dsn) as connection:
+            blocks.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
+            blocks.publish_block(connection, "calanques")
+            secret = create_token(connection, "a client", [scope]).secret
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        environment = {
+            **os.environ,
+            "AMERS_DATABASE_URL": dsn,
+            "AMERS_DATA_FOLDER": str(settings.data_folder),
+        }
+        log = folder / "log"
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)],
+                env=environment,
+                stdout=output,
+                stderr=output,
+            )
+        url = f"http://127.0.0.1:{port}"
+        try:
+            assert until(lambda: _answers(url)), log.read_text()
+            yield Served(url, made.points, {"Authorization": f"Bearer {secret}"}, folder)
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _answers(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
