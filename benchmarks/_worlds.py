@@ -71,8 +71,8 @@ PLACES = tuple(
     )
     for k, (size_m, posting_m, gsds_m, lines, low_m, high_m, points) in enumerate(
         (
-            (2_100.0, 0.5, (0.2, 0.45), 3600, 20.0, 120.0, 32),
-            (3_100.0, 0.7, (0.45, 0.95), 2800, 60.0, 250.0, 30),
+            (1_700.0, 0.5, (0.2, 0.45), 2600, 20.0, 120.0, 36),
+            (2_600.0, 0.7, (0.45, 0.95), 2200, 60.0, 250.0, 32),
             (5_000.0, 1.0, (0.95, 2.1), 2000, 100.0, 350.0, 28),
             (9_500.0, 2.0, (2.1, 4.5), 1800, 200.0, 900.0, 28),
             (17_500.0, 4.0, (4.5, 9.5), 1600, 300.0, 1_800.0, 28),
@@ -84,8 +84,8 @@ PLACES = tuple(
         ("hills", high_m, 0.6 * (1 - k % 2)),
     )
 )
-NOMINAL = Place("nominal", 77, 1_700.0, 0.5, 60.0, 0.0, (0.5, 0.5), 2900, points=32)
-"""SRP's conditions: some 300 points of 3 m CE90 with chips of 2 m, in a scene of 0.5 m."""
+NOMINAL = Place("nominal", 77, 1_700.0, 0.5, 60.0, 0.0, (0.5, 0.5), 2900, points=40)
+"""SRP's conditions: some 450 points of 3 m CE90 with chips of 2 m, in a scene of 0.5 m."""
 
 
 @lru_cache(maxsize=1)

@@ -38,9 +38,10 @@ class QualificationOptions:
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
-        good_ce90_of_points, usable_ce90_of_points: the same as a share of the points' own CE90, where
-            that allows more: points coarser than the pixels still make a model several times better
-            than they are.
+        good_displacement_of_points, usable_displacement_of_points, good_ce90_of_points,
+            usable_ce90_of_points: the same two as shares of the points' own CE90, where that allows
+            more: points coarser than the pixels still make a model several times better than they are
+            (SRP: corners within 0.3 m with points of 3 m).
         good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
         good_rival_share: largest share, of the active points, of deactivated ones that agree among
             themselves on another place: two stories told by as many points are not one truth.
@@ -56,6 +57,7 @@ class QualificationOptions:
     good_active_of_matched: float = 0.5
     good_residual_std_px: float = 1.0
     good_displacement_px: float = 0.5
+    good_displacement_of_points: float = 0.1
     good_ce90_px: float = 1.0
     good_ce90_of_points: float = 0.25
     good_unit_weight: float = 3.0
@@ -63,6 +65,7 @@ class QualificationOptions:
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
+    usable_displacement_of_points: float = 0.3
     usable_ce90_px: float = 3.0
     usable_ce90_of_points: float = 0.5
     coverage_cells: int = 5
@@ -281,8 +284,11 @@ def compare(
     options: QualificationOptions,
 ) -> tuple[Criterion, ...]:
     """Hold the figures against the thresholds."""
-    good_px = max(options.good_ce90_px, options.good_ce90_of_points * points_ce90_px)
-    usable_px = max(options.usable_ce90_px, options.usable_ce90_of_points * points_ce90_px)
+    o = options
+    good_px = max(o.good_ce90_px, o.good_ce90_of_points * points_ce90_px)
+    usable_px = max(o.usable_ce90_px, o.usable_ce90_of_points * points_ce90_px)
+    good_moved_px = max(o.good_displacement_px, o.good_displacement_of_points * points_ce90_px)
+    usable_moved_px = max(o.usable_displacement_px, o.usable_displacement_of_points * points_ce90_px)
     moved_px = max((place.median_px for place in stability.displacements), default=float("nan"))
     good = (
         _at_least("active_points", equipment.active, options.good_active_points, "good"),
@@ -291,13 +297,13 @@ def compare(
             "active_of_matched", equipment.active_of_matched, options.good_active_of_matched, "good"
         ),
         _at_most("residual_std_px", std_px, options.good_residual_std_px, "good"),
-        _at_most("displacement_px", moved_px, options.good_displacement_px, "good"),
+        _at_most("displacement_px", moved_px, good_moved_px, "good"),
         _at_most("predicted_ce90_px", predicted.worst_px, good_px, "good"),
     )
     usable = (
         _at_least("active_points", equipment.active, options.usable_active_points, "usable"),
         _at_most("residual_std_px", std_px, options.usable_residual_std_px, "usable"),
-        _at_most("displacement_px", moved_px, options.usable_displacement_px, "usable"),
+        _at_most("displacement_px", moved_px, usable_moved_px, "usable"),
         _at_most("predicted_ce90_px", predicted.worst_px, usable_px, "usable"),
     )
     return good + usable

@@ -32,7 +32,7 @@ CRITERION_WAYS = {
     "residual_std_px": "standard deviation of the active residuals, n - 1, the worse of x and y, "
     "without what the accuracy stated for the points and chance explain",
     "displacement_px": "adjustment redone on a part of the points: median over the draws, worst of four "
-    "corners and centre",
+    "corners and centre; points coarser than the pixels allow a share of their own",
     "predicted_ce90_px": "covariance of the correction carried over the image: radius that holds 90 % "
     "of its normal law, largest of the grid; points coarser than the pixels allow a share of their own",
     "unit_weight": "root of the weighted squares of the active residuals over the degrees of freedom: "
