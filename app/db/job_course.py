@@ -87,7 +87,7 @@ def expected_end(connection: Connection, job: Job) -> datetime | None:
                    else greatest(clock_timestamp(),
                                  %(claimed)s::timestamptz + make_interval(secs => own.seconds))
                    end
-               from own, before, workers""",
+               from own, before, workers where own.seconds is not null""",
             {
                 "past": PAST_JOBS,
                 "kind": job.kind,

@@ -1,0 +1,159 @@
+"""The course of a job as it is told: messages, the expected end, results that go after a while."""
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from uuid import UUID, uuid4
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine, job_course, jobs
+from app.db.audit import list_changes
+from app.db.engine import Connection, Database
+from app.db.jobs import Job
+from app.storage import Storage
+from app.worker.sweep import sweep_files, sweep_results
+
+LEASE_S = 30.0
+LONGEST_JOB_S = 3600.0
+a_second = timedelta(seconds=1)
+
+
+@pytest.fixture
+def database(settings: Settings) -> Iterator[Database]:
+    assert settings.database_url is not None
+    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
+        yield database
+
+
+def asked(connection: Connection, kind: str = "register-scene") -> Job:
+    job = jobs.create(connection, kind, {"scene": str(uuid4())})
+    assert job is not None
+    return job
+
+
+def begun(connection: Connection, kind: str = "register-scene") -> Job:
+    job = jobs.claim(connection, asked(connection, kind).id, "w", LEASE_S)
+    assert job is not None
+    return job
+
+
+def done_in(connection: Connection, seconds: float, kind: str = "register-scene") -> UUID:
+    """A job that succeeded so long after a worker had taken it."""
+    job = begun(connection, kind)
+    jobs.succeed(connection, job.id, job.attempt, {})
+    connection.execute(
+        "update job set claimed_at = finished_at - make_interval(secs => %s) where id = %s",
+        [seconds, job.id],
+    )
+    return job.id
+
+
+def wait_of(connection: Connection, job: Job) -> timedelta:
+    """From now to the expected end of a job."""
+    end = job_course.expected_end(connection, job)
+    now = connection.execute("select clock_timestamp() as now").fetchone()
+    assert end is not None
+    assert now is not None
+    moment: datetime = now["now"]
+    return end - moment
+
+
+def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
+    job = asked(connection)
+    first = jobs.claim(connection, job.id, "w", LEASE_S)
+    assert first is not None
+    jobs.report(connection, job.id, 1, 10, "looking for points")
+    jobs.report(connection, job.id, 1, 20, "looking for points")
+    jobs.try_again(connection, job.id, 1, 0.0)
+    jobs.claim(connection, job.id, "w", LEASE_S)
+    jobs.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
+    said = job_course.read_messages(connection, job.id, 100)
+    assert [(entry.attempt, entry.progress, entry.message) for entry in said] == [
+        (0, 0, "waiting for a worker"),
+        (1, 0, "started"),
+        (1, 10, "looking for points"),
+        (1, 20, "broke off, waiting for the next attempt"),
+        (2, 0, "started"),
+        (2, 0, "3 found"),
+    ]
+    assert [entry.at for entry in said] == sorted(entry.at for entry in said)
+    assert job_course.read_messages(connection, job.id, 2) == said[-2:]
+
+
+def test_the_expected_end_is_the_median_of_past_jobs_of_its_process(connection: Connection):
+    running = begun(connection)
+    assert job_course.expected_end(connection, running) is None, "nothing like it was ever done"
+    for seconds in (10, 100, 1000):
+        done_in(connection, seconds)
+    done_in(connection, 5, kind="ingest-block")
+    assert abs(wait_of(connection, running) - timedelta(seconds=100)) < a_second
+    connection.execute(
+        "update job set claimed_at = claimed_at - interval '70 s' where id = %s", [running.id]
+    )
+    later = jobs.find(connection, running.id)
+    assert later is not None
+    assert abs(wait_of(connection, later) - timedelta(seconds=30)) < a_second
+
+
+def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(connection: Connection):
+    done_in(connection, 100)
+    done_in(connection, 20, kind="ingest-block")
+    begun(connection)
+    asked(connection, kind="ingest-block")
+    waiting = asked(connection)
+    asked(connection)
+    assert abs(wait_of(connection, waiting) - timedelta(seconds=100 + 20 + 100)) < a_second
+    connection.execute(
+        "insert into procrastinate_workers (last_heartbeat) values (now()), (now()),"
+        " (now() - interval '1 hour')"
+    )
+    assert abs(wait_of(connection, waiting) - timedelta(seconds=(100 + 20) / 2 + 100)) < a_second
+    ended = jobs.find(connection, done_in(connection, 1))
+    assert ended is not None
+    assert job_course.expected_end(connection, ended) is None
+
+
+def test_results_go_after_a_while_and_the_job_says_so(
+    client: TestClient, bearer, database: Database, storage: Storage
+):
+    me, admin = bearer("register"), bearer("admin")
+    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    body = {"inputs": {"scene": scene}}
+    urls = []
+    with database.transaction() as connection:
+        for age_days in (3.0, 1.0):
+            reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+            url = reply.headers["location"]
+            job = jobs.claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
+            assert job is not None
+            key = storage.put(f"results/{job.id}/1/report.json", [b"{}"]).key
+            jobs.succeed(connection, job.id, 1, {"verdict": "good", "files": {"report.json": key}})
+            connection.execute(
+                "update job set finished_at = finished_at - make_interval(secs => %s) where id = %s",
+                [86_400.0 * age_days, job.id],
+            )
+            urls.append(url)
+    sweep_results(database, None)
+    sweep_files(database, storage, LONGEST_JOB_S)
+    assert len(storage.keys("results")) == 2, "without a setting all are kept"
+    for _ in range(2):
+        sweep_results(database, 2.0)
+        sweep_files(database, storage, LONGEST_JOB_S)
+    old, young = urls
+    assert storage.keys("results") == [f"results/{young.rsplit('/', 1)[1]}/1/report.json"]
+    told = client.get(old, headers=me).json()
+    assert told["status"] == "successful"
+    assert not any(link["rel"].endswith("/results") for link in told["links"])
+    gone = client.get(f"{old}/results", headers=me)
+    assert gone.status_code == 410
+    assert "removed on" in gone.json()["detail"]
+    assert client.get(f"{old}/results/report.json", headers=me).status_code == 404
+    assert client.get(f"{young}/results/report.json", headers=me).content == b"{}"
+    with database.transaction() as connection:
+        changes = list_changes(connection, 1000, None, "job", old.rsplit("/", 1)[1])
+    assert (changes[0].actor_name, changes[0].action) == ("retention", "changed")
+    assert client.get("/audit?kind=job", headers=admin).json()["changes"][0]["after"][
+        "results_removed_at"
+    ]
