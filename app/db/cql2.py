@@ -24,6 +24,7 @@ ARITHMETIC = {
     "*": "({0} * {1})",
     "/": "({0} / nullif({1}, 0))",
     "div": "trunc({0} / nullif({1}, 0))",
+    "^": "power({0}, {1})",
     "%": "mod(({0})::numeric, nullif(({1})::numeric, 0))::float8",
 }
 SPATIAL = {
@@ -254,6 +255,8 @@ class _Translator:
 
     def _spatial(self, op: str, args: list[Any]) -> str:
         _count(op, args, 2)
+        if op != "s_intersects" and any(_is_collection(arg) for arg in args):
+            raise InvalidParameter(f"filter: {op}: a GeometryCollection has no such relation")
         sides = [self._geometry(arg) for arg in args]
         # A box of the index first: PostGIS does so itself but for the relations it has no index for.
         return f"{SPATIAL[op]}({sides[0]}, {sides[1]})"
@@ -318,6 +321,10 @@ def _expression(found: Property) -> tuple[str, str]:
         return f"({found.expression}::timestamp at time zone 'UTC')", "time"
     kind = "number" if found.is_number else {"timestamptz": "time"}.get(found.type, found.type)
     return found.expression, kind
+
+
+def _is_collection(node: Any) -> bool:
+    return isinstance(node, dict) and node.get("type") == "GeometryCollection"
 
 
 def _is_spatial(node: Any) -> bool:
