@@ -112,14 +112,17 @@ class Storage:
         with path.open("rb") as file:
             return self.put(key, iter(lambda: file.read(COPY_BYTES), b""))
 
-    def put_chips(self, path: Path) -> StoredFile:
-        """Store a copy of a block's chip file under its checksum, unless it is there already."""
+    def put_chips(self, path: Path, expected_sha256: str | None = None) -> StoredFile:
+        """Store a copy of a block's chip file under its checksum, unless it is there already.
+
+        What has another checksum than expected is not stored; the reply tells the one it has.
+        """
         with self._unfinished(None) as writing:
             with path.open("rb") as file:
                 while chunk := file.read(COPY_BYTES):
                     writing.write(chunk)
             key = chips_key(writing.sha256)
-            if not self.exists(key):
+            if expected_sha256 in (None, writing.sha256) and not self.exists(key):
                 self._place(writing.finish(), key)
         return StoredFile(key, writing.size_bytes, writing.sha256)
 

@@ -12,12 +12,12 @@ from app.db.blocks import Block, BlockState
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
 from app.errors import Conflict, InputError, NotFound
-from app.storage import Storage, chips_key
+from app.storage import Storage, StoredFile
 from services.errors import FormatError
 from services.formats.block import BlockContents, block_member
-from services.formats.block_check import check_block
+from services.formats.block_check import check_block, check_checksums
 from services.formats.block_json import BLOCK_JSON, AccuracyFigure, parse_block_json
-from services.formats.chip_files import read_chip_file
+from services.formats.chip_files import ChipFile, read_chip_file
 from services.quality.block import BlockQuality, block_quality
 from services.types import Progress, no_progress, part_of
 
@@ -91,18 +91,19 @@ def ingest_block(
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     _check_priority(priority)
-    contents = check_block(folder, part_of(progress, 0.0, 0.3))
+    contents = check_block(folder, part_of(progress, 0.0, 0.1), chip_checksums=False)
     document = (folder / BLOCK_JSON).read_bytes()
     metadata = contents.document.metadata
     quality = block_quality(contents.points, contents.n_views, metadata.extent)
-    blocks.lock_ingestion(connection)
-    block = blocks.insert_block(
-        connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
-    )
-    if block is None:
-        raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
-    files = _store_chips(storage, folder, contents, part_of(progress, 0.3, 0.3))
-    load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
+    with connection.transaction():
+        blocks.lock_ingestion(connection)
+        block = blocks.insert_block(
+            connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
+        )
+        if block is None:
+            raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
+        files = _store_chips(storage, folder, contents, part_of(progress, 0.1, 0.5))
+        load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
     return Ingested(block, quality)
 
 
@@ -293,21 +294,26 @@ def _change(connection: Connection, block: Block, state: BlockState) -> Block:
 def _store_chips(
     storage: Storage, folder: Path, contents: BlockContents, progress: Progress
 ) -> list[StoredChipFile]:
-    """Copy the files of chips, some at once; what arrives must be what was checked."""
-    names = contents.points.chip_files
+    """Copy the files of chips, some at once; what arrives must be what the block promises.
 
-    def store(name: str) -> StoredChipFile:
+    Raises:
+        BlockProblems: files have other checksums; they are not stored.
+    """
+    names, promised = contents.points.chip_files, contents.document.checksums
+
+    def store(name: str) -> tuple[StoredFile, ChipFile]:
         path = block_member(folder, name)
         layout = read_chip_file(path, name)
-        key = storage.put_chips(path).key
-        if key != chips_key(contents.document.checksums[name].lower()):
-            raise FormatError(f"{name}: changed while it was ingested")
-        return StoredChipFile(name, key, np.dtype(layout.dtype).name, layout.count)
+        return storage.put_chips(path, promised[name].lower()), layout
 
     progress(0.0, "storing chips")
-    stored = []
+    stored: dict[str, tuple[StoredFile, ChipFile]] = {}
     with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
-        for file in pool.map(store, names):
-            stored.append(file)
+        for name, file in zip(names, pool.map(store, names), strict=True):
+            stored[name] = file
             progress(len(stored) / len(names), "storing chips")
-    return stored
+    check_checksums({name: file.sha256 for name, (file, _) in stored.items()}, contents.document)
+    return [
+        StoredChipFile(name, file.key, np.dtype(layout.dtype).name, layout.count)
+        for name, (file, layout) in stored.items()
+    ]

@@ -1,5 +1,6 @@
 """Everything an Amers block promises, checked before anything of it is used."""
 
+from collections.abc import Mapping, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,7 @@ SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 1e6
 OUTLINE_MARGIN_DEG = 1e-9
 LISTED = 20
 FILES_AT_ONCE = 4
+CHIPS = "chips/"
 ROWS_OF_ONE_KIND = 3
 
 
@@ -71,7 +73,9 @@ class BlockProblems(FormatError):
         self.count = count
 
 
-def check_block(folder: Path, progress: Progress = no_progress) -> BlockContents:
+def check_block(
+    folder: Path, progress: Progress = no_progress, chip_checksums: bool = True
+) -> BlockContents:
     """Validate a block folder entirely, and read it.
 
     Checked: checksums, missing and unlisted files, paths and links, columns and types, ranges,
@@ -81,13 +85,19 @@ def check_block(folder: Path, progress: Progress = no_progress) -> BlockContents
     Args:
         folder: of the block.
         progress: told while checksums are taken.
+        chip_checksums: False for who copies the files of chips and takes their checksums on the way:
+            passing over their bytes is most of the work. Everything else is checked.
 
     Raises:
         BlockProblems: with up to 20 problems, each with file, field, row, value and what was expected.
         FormatError: when block.json or a table cannot be read at all.
     """
     document = read_document(folder)
-    _check_files(folder, document, progress).raise_if_any()
+    later = set() if chip_checksums else {name for name in document.checksums if name.startswith(CHIPS)}
+    report = _check_files(folder, document, later, progress)
+    if report.count:
+        _check_later(report, folder, document, later)
+    report.raise_if_any()
     progress(1.0, "checking points and views")
     points, views = read_points(folder / POINTS_PARQUET), read_views(folder / VIEWS_PARQUET)
     report = _Report()
@@ -96,6 +106,7 @@ def check_block(folder: Path, progress: Progress = no_progress) -> BlockContents
     report.raise_if_any()
     _check_views(report, points, views, document)
     _check_chips(report, folder, points, document)
+    _check_later(report, folder, document, later - set(points.chip_files))
     report.raise_if_any()
     progress(1.0, "block checked")
     return assemble(document, points, views)
@@ -125,7 +136,23 @@ class _Report:
             raise BlockProblems(tuple(self.problems), self.count)
 
 
-def _check_files(folder: Path, document: BlockDocument, progress: Progress) -> _Report:
+def check_checksums(found: Mapping[str, str], document: BlockDocument) -> None:
+    """Compare checksums of files that were taken elsewhere with those that block.json promises.
+
+    Args:
+        found: checksum by path in the block.
+
+    Raises:
+        BlockProblems: naming the files whose bytes are others.
+    """
+    report = _Report()
+    for name, checksum in found.items():
+        _check_checksum(report, name, checksum, document.checksums[name])
+    report.raise_if_any()
+
+
+def _check_files(folder: Path, document: BlockDocument, later: Set[str], progress: Progress) -> _Report:
+    """Which files there are, and the checksums of all but those that are left for later."""
     report = _Report()
     present = _files(folder, report)
     listed = set(document.checksums)
@@ -134,13 +161,22 @@ def _check_files(folder: Path, document: BlockDocument, progress: Progress) -> _
         report.add(BLOCK_JSON, "amers:checksums", f"no checksum of {name!r:.200}", "one of every file")
     for name in sorted(present - listed - {BLOCK_JSON}):
         report.add(name, "", "a file without a checksum", "only files listed in amers:checksums")
-    names = sorted(listed)
+    for name in sorted(later - present):
+        report.add(name, "", "no file", "the file listed in amers:checksums")
+    names = sorted(listed - later)
     progress(0.0, "checking checksums")
     with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
         for i, found in enumerate(pool.map(lambda name: _checksum(folder, name), names)):
             progress((i + 1) / len(names), "checking checksums")
             _check_checksum(report, names[i], found, document.checksums[names[i]])
     return report
+
+
+def _check_later(report: _Report, folder: Path, document: BlockDocument, names: Set[str]) -> None:
+    """The checksums that were left for later: who is refused hears of all that is wrong."""
+    for name in sorted(names):
+        if (folder / name).is_file():
+            _check_checksum(report, name, _checksum(folder, name), document.checksums[name])
 
 
 def _checksum(folder: Path, name: str) -> str | FormatError | None:

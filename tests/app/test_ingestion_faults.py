@@ -131,12 +131,11 @@ def test_a_block_that_changes_while_it_is_ingested_is_refused(connection, storag
         if message == "storing chips":
             changed_chip(made.folder)
 
-    with pytest.raises(FormatError, match="changed while it was ingested"):
+    with pytest.raises(FormatError, match=r"chips/0000\.npy: sha256"):
         blocks.ingest_block(connection, storage, made.folder, change)
     connection.rollback()
     assert rows(connection) == dict.fromkeys(TABLES, 0)
-    assert len(blocks.sweep_storage(connection, storage)) == 1
-    assert storage.keys("chips") == []
+    assert not (storage.folder / "chips").exists()
 
 
 @pytest.fixture
