@@ -8,7 +8,14 @@ import typer
 from app.cli.output import AsJson, show_one
 from app.cli.progress import shown_progress
 from app.errors import InputError
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.orthorectification import TerrainFile
+from app.usecases.production import (
+    BlockIdentity,
+    OrthoFiles,
+    run_ortho_production,
+    run_production,
+)
+from services.ortho_points import OrthoPointOptions
 from services.production import ProductionOptions
 
 app = typer.Typer(help="New blocks of points out of images.", no_args_is_help=True)
@@ -69,6 +76,69 @@ def run(
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
             "frame_sigma_m": round(relative.frame_sigma_m, 2),
+        },
+        as_json=as_json,
+    )
+
+
+@app.command()
+def ortho(
+    image: Annotated[Path, typer.Argument(help="GeoTIFF (or COG) or JPEG 2000 on a map.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the block; must not exist.")],
+    dem: Annotated[Path | None, typer.Option(help="GeoTIFF with the heights of the ground.")] = None,
+    vertical: Annotated[
+        str | None,
+        typer.Option(help="What the heights are counted from: ellipsoid, EGM96, EGM2008, EPSG:…"),
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    height_m: Annotated[
+        float | None, typer.Option(help="One height above the ellipsoid, instead of --dem.")
+    ] = None,
+    height_sigma_m: Annotated[
+        float | None,
+        typer.Option(help="Of the heights; by default a tenth of the terrain's step.", min=0.01),
+    ] = None,
+    block_id: Annotated[
+        str | None, typer.Option("--id", help="Of the block; else the folder's.")
+    ] = None,
+    version: Annotated[str, typer.Option(help="Of the block.")] = "1",
+    title: Annotated[str, typer.Option(help="For people.")] = "",
+    license_name: Annotated[str, typer.Option("--license", help="SPDX identifier.")] = "proprietary",
+    gsd_m: Annotated[
+        str | None,
+        typer.Option(help="Ground samplings of the chips: FINE,COARSE in metres; else the image's."),
+    ] = None,
+    points: Annotated[int, typer.Option(help="How many to aim at, without --spacing-m.", min=6)] = (
+        _DEFAULT.points
+    ),
+    spacing_m: Annotated[
+        float | None, typer.Option(help="One point a square of this side.", min=1.0)
+    ] = None,
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the image on the map, metres.", min=0.01)
+    ] = None,
+    bands: Annotated[str | None, typer.Option(help="Looked at: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Image that is not zero where no point shall be.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make control points with chips out of one ortho-image and the heights of its ground."""
+    fine_m, coarse_m = (None, None) if gsd_m is None else _pair(gsd_m)
+    options = OrthoPointOptions(
+        fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points
+    )
+    terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
+    files = OrthoFiles(image, terrain, height_m, height_sigma_m, sigma_m, bands, mask)
+    identity = BlockIdentity(block_id or output.name, version, title, license_name)
+    with shown_progress() as progress:
+        made = run_ortho_production(files, output, identity, options, progress)
+    show_one(
+        {
+            "block": output,
+            "points": len(made.points),
+            "views": int(made.points.views.start[-1]),
+            "chip_gsds_m": list(made.gsds_m),
         },
         as_json=as_json,
     )

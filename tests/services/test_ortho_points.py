@@ -1,0 +1,136 @@
+"""Points of an ortho-image lie where its map says, and find the same ground in another image."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from services.conventions import CHIP_SIZE
+from services.errors import InputError, NotEnoughPoints
+from services.imagery import ArrayImage, render_chip
+from services.map_grid import MapGrid
+from services.matching.chips import chip_inside
+from services.ortho_points import Heights, OrthoPointOptions, OrthoPoints, ortho_points
+from services.registration import register_scene
+from services.scene import Scene
+from services.sensors.ortho import OrthoModel
+from services.terrain import Terrain
+from services.types import Acquisition, Array
+from tests.services.simulated import MemoryChips, block_views
+from tests.services.textures import as_pixels, moved, texture
+
+GSD_M = 10.0
+SIDE = 768
+FLAT = Heights(None, 120.0, 15.0)
+OPTIONS = OrthoPointOptions(points=60)
+LOWER_LEFT_XY = (400_000.0, 5_800_000.0)
+AT_180_DEGREES_XY = (162_300.0, 100_000.0)
+"""Of UTM zone 1; longitude 180 is near its easting 166,000 there."""
+MOVED_PX = (1.3, -2.6)
+a_hundredth_of_a_pixel = 0.01
+
+
+@cache
+def land() -> Array:
+    return texture(np.random.default_rng(4), SIDE, 1.5)
+
+
+def ortho(pixels: Array, zone: int = 33, corner_xy: tuple[float, float] = LOWER_LEFT_XY) -> Scene:
+    step_xy = np.array([[0.0, GSD_M], [-GSD_M, 0.0]])
+    origin_xy = np.array(corner_xy) + [0.0, GSD_M * SIDE]
+    grid = MapGrid(f"EPSG:326{zone:02d}", origin_xy, step_xy, (SIDE, SIDE))
+    taken = Acquisition("land", incidence_deg=0.0, azimuth_deg=0.0)
+    return Scene(ArrayImage(as_pixels(pixels)), OrthoModel(grid), taken, 5.0)
+
+
+@cache
+def made() -> OrthoPoints:
+    return ortho_points(ortho(land()), FLAT, OPTIONS)
+
+
+def chips_of(found: OrthoPoints) -> MemoryChips:
+    return MemoryChips(np.concatenate([found.chips(row) for row in range(len(found.points))]))
+
+
+def test_every_square_of_the_image_gets_a_point() -> None:
+    seen = ortho(land()).model.project(made().points.lon_lat_h)
+    assert len(made().points) >= 0.6 * OPTIONS.points  # those at the edges have no whole chip
+    cell = np.floor(seen / SIDE * 4.0).astype(int)
+    assert len(set(map(tuple, cell))) == 16
+    assert (made().points.saliency >= OPTIONS.min_saliency).all()
+
+
+def test_points_have_the_height_of_the_ground_and_the_sigmas_that_were_said() -> None:
+    points = made().points
+    assert (points.lon_lat_h[:, 2] == FLAT.flat_m).all()
+    sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
+    np.testing.assert_allclose(sigma_m[:, :2], 0.3 * GSD_M, rtol=1e-3)
+    np.testing.assert_allclose(sigma_m[:, 2], FLAT.sigma_m)
+
+
+def test_chips_are_what_the_image_shows_and_whole() -> None:
+    scene, points = ortho(land()), made().points
+    assert made().gsds_m == (10.0, 40.0)
+    for row in range(len(points)):
+        chips = made().chips(row)
+        gsds_m = points.views.gsd_m[slice(*points.views.start[row : row + 2])]
+        assert chips.shape == (len(gsds_m), CHIP_SIZE, CHIP_SIZE)
+        assert chips.min() > 0
+        for chip, gsd_m in zip(chips, gsds_m, strict=True):
+            shown = render_chip(scene.image, scene.model, points.lon_lat_h[row], gsd_m)
+            np.testing.assert_array_equal(chip, np.maximum(np.rint(shown), 1))
+    assert (points.views.incidence_deg == 0.0).all()
+
+
+def test_the_same_land_moved_is_found_where_it_was_moved_to() -> None:
+    scene = replace(ortho(moved(land(), *MOVED_PX)), sigma_m=30.0)
+    found = register_scene(scene, made().points, chips_of(made()))
+    middle = np.full((1, 2), (SIDE - 1) / 2.0)
+    shift_px = (found.model.correction.apply(middle) - middle)[0]
+    np.testing.assert_allclose(shift_px, MOVED_PX, atol=a_hundredth_of_a_pixel)
+    assert found.qualification.equipment.active >= 20
+
+
+def test_missing_pixels_and_unknown_heights_get_no_point() -> None:
+    pixels = land().copy()
+    pixels[:, : SIDE // 2] = np.nan
+    scene = ortho(pixels)
+    heights = np.full((SIDE, SIDE), 40.0, dtype=np.float32)
+    heights[: SIDE // 2] = np.nan
+    grid = scene.model.grid  # type: ignore[attr-defined]
+    known = Heights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
+    points = ortho_points(scene, known, replace(OPTIONS, points=100)).points
+    seen = scene.model.project(points.lon_lat_h)
+    assert seen[:, 1].min() > SIDE / 2 + CHIP_SIZE / 2 - 1
+    assert seen[:, 0].min() > SIDE / 2 - 1
+    np.testing.assert_allclose(points.lon_lat_h[:, 2], 40.0)
+
+
+def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
+    scene = ortho(land(), 1, AT_180_DEGREES_XY)
+    found = ortho_points(scene, FLAT, OPTIONS)
+    lon = found.points.lon_lat_h[:, 0]
+    assert (lon < -179.9).any()
+    assert (lon > 179.9).any()
+    assert np.ptp(found.outline[:, 0]) < 0.1
+    assert chip_inside(scene.model, scene.image.shape, found.points.lon_lat_h, GSD_M).all()
+    turned = lon[:, None] + [-360.0, 0.0, 360.0]
+    west, east = found.outline[:, 0].min(), found.outline[:, 0].max()
+    assert ((turned > west) & (turned < east)).any(axis=1).all()
+
+
+def test_an_image_without_detail_makes_no_points() -> None:
+    with pytest.raises(NotEnoughPoints, match="salient places of known height in"):
+        ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
+
+
+def test_an_image_that_is_not_rectified_is_refused() -> None:
+    with pytest.raises(InputError, match="an ortho-image is needed: heights move"):
+        ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
+
+
+def test_ground_samplings_the_wrong_way_round_are_refused() -> None:
+    options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
+    with pytest.raises(InputError, match="20 and 10 m: the finer is expected first"):
+        ortho_points(ortho(land()), FLAT, options)
