@@ -20,7 +20,7 @@ from app.api.jobs import job_url, status_info
 from app.auth import Scope, allows
 from app.db.blocks import Block
 from app.db.tokens import Token
-from app.usecases import block_ingestion, blocks, jobs
+from app.usecases import block_uploads, blocks, jobs
 from app.usecases.block_ingestion import INGEST_BLOCK
 from app.usecases.blocks import Published
 from services.quality.block import quality_document
@@ -71,7 +71,7 @@ def upload_block(
     """Upload a zip or tar of a block; the reply says how `POST /blocks` names it."""
     length = request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else None
-    upload_id = block_ingestion.receive_archive(
+    upload_id = block_uploads.receive_block(
         database, storage, settings, caller, name, body_chunks(request), announced
     )
     return {"upload": str(upload_id)}

@@ -90,7 +90,7 @@ Format = Annotated[str | None, Query(description=f"Format: {', '.join(FEATURES)}
 CrsUri = Annotated[str | None, Query(description="URI of the reference system of the reply.")]
 
 
-async def _question(
+async def question_of_query(
     limit: Annotated[
         int,
         Query(ge=1, description="Most features on the page.", json_schema_extra={"maximum": 10_000}),
@@ -174,7 +174,7 @@ def items(
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[Question, Depends(_question)],
+    question: Annotated[Question, Depends(question_of_query)],
     f: Format = None,
 ) -> Response:
     """A page of the features of a collection."""

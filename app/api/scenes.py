@@ -64,16 +64,18 @@ def upload_scene(
 
 
 @router.put("/scenes/{scene_id}/files/{name}", openapi_extra={"requestBody": BINARY_BODY})
-def upload_model(
+def upload_beside(
     scene_id: UUID,
     name: str,
     request: Request,
     database: DatabaseDep,
     storage: StorageDep,
+    settings: SettingsDep,
     caller: Registrar,
 ) -> dict[str, Any]:
-    """Upload a file with the sensor model of a scene, to lie beside its image under that name."""
-    stored = scenes.upload_model(database, storage, caller, scene_id, _upload(request, name))
+    """Upload a file to lie beside the image of a scene: model, terrain, mask or check points."""
+    upload = _upload(request, name)
+    stored = scenes.upload_beside(database, storage, settings, caller, scene_id, upload)
     return {
         "name": stored.key.rsplit("/", 1)[1],
         "size_bytes": stored.size_bytes,

@@ -87,11 +87,24 @@ def prolong(connection: Connection, upload_id: UUID) -> UploadRow | None:
         ).fetchone()
 
 
-def finish(connection: Connection, upload_id: UUID, file_key: str | None) -> bool:
-    """Note that the file is complete and in its place; False when it was given up meanwhile."""
+def finish(
+    connection: Connection,
+    upload_id: UUID,
+    file_key: str | None = None,
+    size_bytes: int | None = None,
+    sha256: str | None = None,
+) -> bool:
+    """Note that the file is complete and in its place; False when it was given up meanwhile.
+
+    Args:
+        file_key: where it lies when it is nobody else's.
+        size_bytes, sha256: as found, where they had not been announced.
+    """
     done = connection.execute(
-        "update upload set finished_at = now(), file_key = %s where id = %s and finished_at is null",
-        [file_key, upload_id],
+        """update upload set finished_at = now(), file_key = %s, size_bytes = coalesce(%s, size_bytes),
+               sha256 = coalesce(%s, sha256)
+           where id = %s and finished_at is null""",
+        [file_key, size_bytes, sha256, upload_id],
     )
     return done.rowcount == 1
 
@@ -108,6 +121,34 @@ def delete_expired(connection: Connection) -> list[UUID]:
             "delete from upload where finished_at is null and expires_at < now() returning id"
         ).fetchall()
     return expired
+
+
+def find_block(connection: Connection, upload_id: UUID) -> str | None:
+    """Where the storage has the archive of a block that has arrived."""
+    with connection.cursor(row_factory=scalar_row) as cursor:
+        found: str | None = cursor.execute(
+            "select file_key from upload where id = %s and purpose = 'block'", [upload_id]
+        ).fetchone()
+    return found
+
+
+def delete_unwanted_blocks(connection: Connection) -> list[str]:
+    """Forget archives that nobody asked for in time and no open job names; returns their keys."""
+    with connection.cursor(row_factory=scalar_row) as cursor:
+        keys: list[str] = cursor.execute(
+            """delete from upload u where purpose = 'block' and finished_at is not null
+                   and expires_at < now()
+                   and not exists (select from job where state in ('accepted', 'running')
+                                   and inputs ->> 'upload' = u.id::text)
+               returning file_key"""
+        ).fetchall()
+    return keys
+
+
+def present(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:
+    """Those of some uploads that are not forgotten."""
+    with connection.cursor(row_factory=scalar_row) as cursor:
+        return set(cursor.execute("select id from upload where id = any(%s)", [upload_ids]))
 
 
 def arriving(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:

@@ -1,28 +1,24 @@
-"""Taking in blocks: archives that arrive, and the job that checks and loads a block."""
+"""Taking in blocks: the job that checks and loads one."""
 
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
-from uuid import UUID, uuid4
+from uuid import UUID
 
 from app.auth import Scope
-from app.config import Settings
-from app.db import block_uploads
-from app.db.engine import Connection, Database
+from app.db import uploads
+from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError, NotFound
-from app.storage import Storage
-from app.usecases import blocks, quotas
+from app.usecases import blocks
+from app.usecases.block_uploads import finished_block
 from app.usecases.processes import Commit, Process, Work
-from app.usecases.scenes import clean_name
 from services.errors import FormatError
 from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
 from services.formats.block_json import BLOCK_JSON
 from services.quality.block import quality_document
 
-UPLOADS = "uploads"
 UNPACKED_TIMES = 4
 """A block unpacks to at most so many times the largest upload."""
 
@@ -44,53 +40,12 @@ class IngestBlock:
     priority: int = 0
 
 
-def receive_archive(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    caller: Token,
-    name: str,
-    chunks: Iterable[bytes],
-    announced_bytes: int | None = None,
-) -> UUID:
-    """Take in a zip or tar of a block; it is looked into by the job that ingests it, not here.
-
-    Returns:
-        The id by which an ingestion names it.
-
-    Raises:
-        TooLarge: more bytes than are accepted, or than the caller's quota leaves.
-        InputError: the name is none.
-    """
-    file_name = clean_name(name)
-    with database.transaction() as connection:
-        left = quotas.upload_allowance(connection, settings, caller, announced_bytes)
-    key = f"{UPLOADS}/{uuid4()}/{file_name}"
-    stored = storage.put(key, chunks, min(left, settings.upload_limit_bytes))
-    try:
-        with database.transaction() as connection:
-            return block_uploads.keep_upload(
-                connection, caller.id, file_name, key, stored.size_bytes, stored.sha256
-            )
-    except BaseException:
-        storage.delete(key)
-        raise
-
-
-def sweep_archives(connection: Connection, storage: Storage) -> list[str]:
-    """Remove the archives that nobody had ingested in time; returns their keys."""
-    unwanted = block_uploads.delete_unwanted(connection)
-    for key in unwanted:
-        storage.delete(key)
-    return unwanted
-
-
 def _check(connection: Connection, caller: Token, inputs: IngestBlock) -> None:
     """Whether there is such a folder is for the worker to see: it may have other disks than the API."""
     if (inputs.path is None) == (inputs.upload is None):
         raise InputError("inputs of ingest-block: either path or upload is expected")
-    if inputs.upload is not None and block_uploads.find_archive(connection, inputs.upload) is None:
-        raise NotFound(f"no uploaded block {inputs.upload}")
+    if inputs.upload is not None:
+        finished_block(connection, caller, inputs.upload)
 
 
 def _run(work: Work) -> Commit:
@@ -129,7 +84,7 @@ def _unpacked(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
     """The folder of a block that came as an archive."""
     assert upload_id is not None
     with work.database.reading() as connection:
-        key = block_uploads.find_archive(connection, upload_id)
+        key = uploads.find_block(connection, upload_id)
     if key is None:
         raise NotFound(f"no uploaded block {upload_id}")
     work.progress(0.0, "unpacking the block")

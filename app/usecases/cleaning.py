@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from uuid import UUID
 
-from app.db import jobs, scenes
+from app.db import jobs, scenes, uploads
 from app.db.engine import Connection, Database
 from app.storage import Storage
 
 
 def remove_unnamed_files(database: Database, storage: Storage) -> list[str]:
-    """Remove scenes that are not there any more, and results of attempts that do not count.
+    """Remove scenes and uploads that are not there any more, and results of attempts that do not count.
 
     Rows come before files (an upload, a running attempt) and go after them, so a file without a row is
     never one on its way.
@@ -21,6 +21,7 @@ def remove_unnamed_files(database: Database, storage: Storage) -> list[str]:
     wanted: tuple[tuple[str, Callable[[Connection, list[str]], set[str]]], ...] = (
         ("scenes", _scene_folders),
         ("results", _attempt_folders),
+        ("uploads", _upload_folders),
     )
     for top, still_wanted in wanted:
         keys = storage.keys(top)
@@ -48,3 +49,10 @@ def _attempt_folders(connection: Connection, folders: list[str]) -> set[str]:
     return {
         folder for folder, job_id in ids.items() if counting.get(job_id) == int(folder.split("/")[2])
     }
+
+
+def _upload_folders(connection: Connection, folders: list[str]) -> set[str]:
+    """Those of `uploads/ID` whose upload is there or arriving."""
+    ids = {folder: UUID(folder.split("/")[1]) for folder in folders}
+    present = uploads.present(connection, list(ids.values()))
+    return {folder for folder, upload_id in ids.items() if upload_id in present}

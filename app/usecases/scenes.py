@@ -3,6 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
@@ -13,7 +14,7 @@ from app.db import scenes
 from app.db.engine import Connection, Database
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
-from app.errors import Conflict, InputError, NotFound, TooLarge
+from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge
 from app.storage import Storage, StoredFile
 from app.usecases import quotas
 from services.errors import FormatError
@@ -22,7 +23,12 @@ from services.formats.raster import DRIVER_OF_SIGNATURE
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
 MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc")
+MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
+RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
+"""Terrains, masks and geoids, which are as large as images."""
+BESIDE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES
 MODEL_LIMIT_BYTES = 16 << 20
+"""Also of marks."""
 
 
 @dataclass(frozen=True)
@@ -78,45 +84,63 @@ def upload_scene(
             raise Conflict("the upload took so long that it was given up")
         return row
     except BaseException:
-        storage.delete(key)
         with database.transaction() as connection:
             scenes.give_up_upload(connection, scene_id)
+        # What an outage leaves is swept.
+        with suppress(StorageOutage):
+            storage.delete(key)
         raise
 
 
-def upload_model(
-    database: Database, storage: Storage, caller: Token, scene_id: UUID, upload: Upload
+def upload_beside(
+    database: Database,
+    storage: Storage,
+    settings: Settings,
+    caller: Token,
+    scene_id: UUID,
+    upload: Upload,
 ) -> StoredFile:
-    """Lay a file with the geometry of a scene beside its image, in place of one of the same name.
+    """Lay a file beside the image of a scene, in place of one of the same name.
 
     Raises:
         NotFound: no such scene, or not the caller's.
         Conflict: the scene has no files any more, or not yet.
-        InputError: not a kind of file that holds a model.
+        InputError: not a kind of file that belongs there.
+        TooLarge: more bytes than such files, or the caller, may have.
     """
-    with database.reading() as connection:
-        file_name = model_name(visible_scene(connection, caller, scene_id), upload.name)
-    _refuse_too_large(upload, MODEL_LIMIT_BYTES)
+    with database.transaction() as connection:
+        file_name = name_beside(visible_scene(connection, caller, scene_id), upload.name)
+        limit_bytes = limit_beside(settings, file_name)
+        _refuse_too_large(upload, limit_bytes)
+        left = quotas.upload_allowance(connection, settings, caller, upload.size_bytes)
     key = f"{folder_of(scene_id)}/{file_name}"
-    stored = _receive(storage, key, upload, upload.chunks, MODEL_LIMIT_BYTES)
+    stored = _receive(storage, key, upload, upload.chunks, min(limit_bytes, left))
     with database.transaction() as connection:
         note_model(connection, scene_id, file_name, stored.size_bytes, stored.sha256)
     return stored
 
 
-def model_name(scene: SceneRow, name: str) -> str:
-    """The name under which a file with the geometry of a scene lies beside its image.
+def limit_beside(settings: Settings, file_name: str) -> int:
+    """How large a file beside an image may be, bytes."""
+    is_raster = file_name.lower().endswith(RASTER_SUFFIXES)
+    return settings.upload_limit_bytes if is_raster else MODEL_LIMIT_BYTES
+
+
+def name_beside(scene: SceneRow, name: str) -> str:
+    """The name under which a file lies beside the image of a scene: model, terrain, mask, check points.
 
     Raises:
         Conflict: the scene has no files of its own any more, or the name is that of its image.
-        InputError: not a kind of file that holds a model.
+        InputError: not a kind of file that belongs there.
     """
     file_name = clean_name(name)
     if scene.state == "removed" or scene.reference is not None:
         state = "removed" if scene.reference is None else "where they were before"
         raise Conflict(f"the files of scene {scene.id} are {state}")
-    if not file_name.lower().endswith(MODEL_SUFFIXES):
-        raise InputError(f"a model file ends in {', '.join(MODEL_SUFFIXES)}; {file_name} does not")
+    if not file_name.lower().endswith(BESIDE_SUFFIXES):
+        raise InputError(
+            f"a file beside an image ends in {', '.join(BESIDE_SUFFIXES)}; {file_name} does not"
+        )
     if file_name == scene.file_name:
         raise Conflict(f"{file_name} is the image of the scene")
     return file_name

@@ -20,12 +20,14 @@ from app.db.uploads import Purpose, UploadRow
 from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage
 from app.usecases import quotas
+from app.usecases.block_uploads import block_key
 from app.usecases.scenes import (
     MODEL_LIMIT_BYTES,
     MODEL_SUFFIXES,
     clean_name,
     folder_of,
-    model_name,
+    limit_beside,
+    name_beside,
     note_model,
     refuse_strange,
     visible_scene,
@@ -99,7 +101,8 @@ def begin(
     """
     purpose: Purpose = new.purpose or ("image" if new.scene is None else "model")
     require(caller, Scope.ADMIN if purpose == "block" else Scope.REGISTER)
-    limit = MODEL_LIMIT_BYTES if purpose == "model" else settings.upload_limit_bytes
+    is_beside = purpose == "model"
+    limit = limit_beside(settings, new.name) if is_beside else settings.upload_limit_bytes
     if new.size_bytes > limit:
         raise TooLarge(f"{new.size_bytes} bytes announced, at most {limit} are accepted")
     quotas.upload_allowance(connection, settings, caller, new.size_bytes)
@@ -107,7 +110,7 @@ def begin(
     if purpose == "model":
         if scene_id is None:
             raise InputError("scene: a model needs the id of the scene beside whose image it lies")
-        file_name = model_name(visible_scene(connection, caller, scene_id), new.name)
+        file_name = name_beside(visible_scene(connection, caller, scene_id), new.name)
     elif purpose == "image":
         if scene_id is not None:
             raise InputError("scene: an image begins a scene of its own")
@@ -205,22 +208,6 @@ def drop(connection: Connection, storage: Storage, upload: UploadRow) -> None:
     _path(storage, upload.id).unlink(missing_ok=True)
 
 
-def finished_block(connection: Connection, caller: Token, upload_id: UUID) -> str:
-    """The key of an archive with a block that has arrived.
-
-    Raises:
-        NotFound: there is no such upload of this caller.
-        Conflict: it has not arrived yet.
-        InputError: it is no block.
-    """
-    upload = find(connection, caller, upload_id)
-    if upload.purpose != "block":
-        raise InputError(f"upload {upload_id} is not one of a block")
-    if upload.file_key is None:
-        raise Conflict(f"upload {upload_id} has not arrived yet")
-    return upload.file_key
-
-
 def sweep_uploads(database: Database, storage: Storage) -> list[str]:
     """Give up the uploads nobody went on with; returns the names of the files removed.
 
@@ -297,9 +284,9 @@ def _settle(
             storage.adopt(path, f"{folder_of(upload.scene_id)}/{upload.file_name}")
             with database.transaction() as connection:
                 note_model(connection, upload.scene_id, upload.file_name, upload.size_bytes, sha256)
-                uploads.finish(connection, upload.id, None)
+                uploads.finish(connection, upload.id)
         else:
-            key = f"blocks/{upload.id}/{upload.file_name}"
+            key = block_key(upload)
             storage.adopt(path, key)
             with database.transaction() as connection:
                 uploads.finish(connection, upload.id, key)
@@ -351,7 +338,7 @@ def _place_image(
             raise Conflict("the upload took so long that it was given up")
         for model in noted:
             note_model(connection, upload.scene_id, *model)
-        uploads.finish(connection, upload.id, None)
+        uploads.finish(connection, upload.id)
     path.unlink(missing_ok=True)
 
 

@@ -16,7 +16,7 @@ from app.db import jobs, scenes
 from app.db.engine import Database
 from app.origin import Origin, working_for
 from app.storage import Storage
-from app.usecases.block_ingestion import sweep_archives
+from app.usecases.block_uploads import sweep_blocks
 from app.usecases.blocks import sweep_storage
 from app.usecases.cleaning import remove_unnamed_files
 from app.usecases.uploads import sweep_uploads
@@ -97,6 +97,6 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s)
     with database.transaction() as connection:
         connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
-        removed += sweep_storage(connection, storage) + sweep_archives(connection, storage)
+        removed += sweep_storage(connection, storage) + sweep_blocks(connection, storage)
     for name in removed:
         log.info("removed %s, which nothing names", name)

@@ -10,7 +10,7 @@ from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import httpx
 import numpy as np
@@ -23,7 +23,9 @@ from app.config import Settings
 from app.db import engine
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.uploads import finished_block, sweep_uploads
+from app.usecases.block_uploads import finished_block
+from app.usecases.uploads import sweep_uploads
+from app.worker.sweep import sweep_files
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
 LIMIT_BYTES = 400_000
@@ -360,3 +362,31 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
         caller = list_tokens(connection)[0]
         key = finished_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
     assert storage.size(key) == 100
+
+
+def test_archives_lie_alike_and_are_swept_alike_whichever_way_they_came(
+    client: TestClient, bearer: Bearer, storage: Storage, settings: Settings, dsn: str
+):
+    admin = bearer("admin")
+    put = client.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10, headers=admin).json()["upload"]
+    reply = begun(client, admin | TUS, 40, filename="a.zip", purpose="block")
+    tus = reply.headers["location"].rsplit("/", 1)[1]
+    assert piece(client, reply.headers["location"], admin | TUS, 0, bytes(40)).status_code == 204
+    keys = sorted(f"uploads/{upload}/a.zip" for upload in (put, tus))
+    assert storage.keys("uploads") == keys
+    for upload in (put, tus):
+        told = client.get(f"/uploads/{upload}", headers=admin).json()
+        assert (told["state"], told["purpose"], told["size_bytes"]) == ("finished", "block", 40)
+    assert settings.database_url is not None
+    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
+        storage.put(f"uploads/{uuid4()}/left.zip", [b"by a killed service"])
+        sweep_files(database, storage, 3600.0)
+        assert storage.keys("uploads") == keys
+        with database.transaction() as connection:
+            connection.execute("update upload set expires_at = now() - interval '1 h'")
+        sweep_files(database, storage, 3600.0)
+    assert storage.keys("uploads") == []
+    gone = client.post(
+        "/processes/ingest-block/execution", json={"inputs": {"upload": put}}, headers=admin
+    )
+    assert gone.status_code == 404
