@@ -94,6 +94,56 @@ class ReducedImage:
     factor: int
 
 
+class KeptWindows:
+    """An image whose windows are read once, as far as memory is allowed for them.
+
+    A registration looks at the same places pass after pass; what `sample_image` has made of a window
+    serves the smaller ones inside it.
+
+    Attributes:
+        source: the image.
+        most_bytes: what may be kept; windows read after that are not.
+        kept_bytes: what is kept.
+    """
+
+    def __init__(self, source: ImageSource, most_bytes: int = 96_000_000) -> None:
+        """Keep nothing yet."""
+        self.source = source
+        self.most_bytes = most_bytes
+        self.kept_bytes = 0
+        self._kept: list[tuple[int, Window, FloatImage]] = []
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        return self.source.shape
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window; NaN beyond the image and where nodata."""
+        return self.source.read(window)
+
+    def means(self, window: Window, factor: int) -> FloatImage:
+        """Means over squares of pixels of a window that begins and ends with a square."""
+        for kept_factor, kept, means in self._kept:
+            line, sample = window.line - kept.line, window.sample - kept.sample
+            inside = line >= 0 and sample >= 0 and kept_factor == factor
+            if inside and line + window.lines <= kept.lines and sample + window.samples <= kept.samples:
+                top, left = line // factor, sample // factor
+                bottom, right = top + window.lines // factor, left + window.samples // factor
+                return means[top:bottom, left:right]
+        means = mean_pixels(self.source.read(window), factor)
+        if self.kept_bytes + means.nbytes <= self.most_bytes:
+            self.kept_bytes += means.nbytes
+            self._kept.append((factor, window, means))
+        return means
+
+
+def _means(image: ImageSource, window: Window, factor: int) -> FloatImage:
+    if isinstance(image, KeptWindows):
+        return image.means(window, factor)
+    return mean_pixels(image.read(window), factor)
+
+
 def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_000) -> ReducedImage:
     """The whole image at a fraction of its resolution, read once, strip by strip.
 
@@ -241,7 +291,10 @@ def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: 
     first, last = np.maximum(first, -margin), np.minimum(last, np.array(image.shape) + margin)
     if (last <= 0).any() or (first >= image.shape).any() or (last - first < 4 * factor).any():
         return nothing
+    # Squares of pixels that lie the same in every window, so that means of one serve another.
+    first -= first % factor
+    last += -last % factor
     window = Window(int(first[0]), int(first[1]), *(int(v) for v in last - first))
-    pixels = mean_pixels(image.read(window), factor)
+    pixels = _means(image, window, factor)
     position = (line_sample - first - (factor - 1) / 2.0) / factor
     return resample(spline_coefficients(pixels, blur_px(ratio / factor)), position)

@@ -9,6 +9,7 @@ from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
 from services.chip_choice import chance_of_being_shown, fine_gsd_m
 from services.coarse import CoarseOptions, search_coarsely
 from services.errors import CoverageError, InputError, NoConsensus, NotEnoughPoints
+from services.imagery import KeptWindows
 from services.matching.consensus import agreeing_points, consensus_tolerance_px
 from services.matching.points import MatchingOptions, PointMatches, match_points
 from services.matching.predict import inside, spread_over_image
@@ -133,11 +134,12 @@ def register_scene(
             part_of(progress, 0.0, 0.3),
         )
         passes.append(done)
+    image = KeptWindows(scene.image)
     for number in range(options.fine_passes):
         radius_px = search_radius_px(uncertainty_m, fine_m, options.coarse.max_search_px)
         part = part_of(progress, 0.3 + 0.6 * number / options.fine_passes, 0.6 / options.fine_passes)
         matches = match_points(
-            scene.image,
+            image,
             model,
             tried,
             chips,

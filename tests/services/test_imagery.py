@@ -8,6 +8,7 @@ import pytest
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.imagery import (
     ArrayImage,
+    KeptWindows,
     Window,
     chip_ground,
     image_gsd_m,
@@ -270,3 +271,33 @@ def test_a_chip_from_a_reduction_lies_where_that_of_the_whole_image_does(
 def test_the_sampling_of_an_image_is_the_side_of_its_pixels_on_the_ground(gsd_m: float) -> None:
     model = replace(PlaneModel(gsd_m), turn_deg=25.0)
     assert image_gsd_m(model, point_at(10.0, 20.0)) == pytest.approx(gsd_m, rel=1e-9)
+
+
+def test_a_window_inside_one_that_was_read_is_not_read_again() -> None:
+    image, model, read = noise_image(), PlaneModel(1.0), []
+
+    class Counted(ArrayImage):
+        def read(self, window: Window) -> FloatImage:
+            read.append(window)
+            return super().read(window)
+
+    for gsd_m in (1.0, 4.5):
+        read.clear()
+        kept = KeptWindows(Counted(image.pixels))
+        render_chip(kept, model, point_at(0.0, 0.0), gsd_m, 141)
+        again = render_chip(kept, model, point_at(7.3, -4.1), gsd_m, 113)
+        assert len(read) == 1
+        np.testing.assert_array_equal(again, render_chip(image, model, point_at(7.3, -4.1), gsd_m, 113))
+        render_chip(kept, model, point_at(40.0, 0.0), gsd_m, 141)
+        assert len(read) == 2
+
+
+def test_windows_beyond_the_memory_they_may_take_are_read_again() -> None:
+    image, model = noise_image(), PlaneModel(1.0)
+    kept = KeptWindows(image, most_bytes=200_000)
+    wanted = render_chip(image, model, point_at(90.0, 0.0), 1.0)
+    for _ in range(2):
+        for east_m in (0.0, 30.0, 60.0, 90.0):
+            chip = render_chip(kept, model, point_at(east_m, 0.0), 1.0)
+    np.testing.assert_array_equal(chip, wanted)
+    assert 0 < kept.kept_bytes <= 200_000
