@@ -1,46 +1,17 @@
-"""Simulated images in files, and control points whose truth is known."""
+"""Control points of simulated ground, measured as they would be, whose truth is known."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
-import rasterio
-from rasterio.windows import Window as RasterWindow
 
-from services.formats.raster import gdal_rpc
 from services.imagery import ImageSource, ReducedImage, reduce_image, render_chip
 from services.intersection import intersect
 from services.matching.chips import chip_inside, chip_saliency, refine_on_chips, stored_chip
 from services.scene import Scene, scene_gsd_m, view_direction
-from services.sensors.rpc import RpcModel
-from services.simulation.view import ViewGeometry, render_view
 from services.simulation.world import World
 from services.types import Array, ChipArray, ControlPoints, Views
 
 LEAST_SALIENCY = 0.3
-
-
-def write_view(
-    path: Path, world: World, geometry: ViewGeometry, model: RpcModel, rng: np.random.Generator
-) -> None:
-    """Take an image strip by strip into a tiled, compressed GeoTIFF with RPC tags."""
-    lines, samples = geometry.plan.shape
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        height=lines,
-        width=samples,
-        count=1,
-        dtype="uint16",
-        tiled=True,
-        compress="deflate",
-        predictor=2,
-        BIGTIFF="IF_SAFER",
-    ) as file:
-        file.rpcs = gdal_rpc(model)
-        for line, strip in render_view(world, geometry, rng):
-            file.write(strip, 1, window=RasterWindow(0, line, samples, len(strip)))
 
 
 def lay_points(

@@ -1,26 +1,31 @@
-"""Time and memory of registering scenes of growing size.
+"""Time, memory and profile of registering large scenes, and AROSICS beside it.
 
-Scenes of 0.5 m are simulated, delivered 50 m wrong and with a drift of 2 px, and written as tiled,
-compressed GeoTIFF with RPC tags. The block is made once, from two views of 1.5 m of other days and
-directions whose models are true: points anywhere on the ground are measured on chips in both and
-intersected, and keep the covariance of the intersection; each has chips of 2 m and 20 m from both views.
-Points lie densest in the middle, so that every scene has as many as are tried.
+A scene of 0.5 m is delivered 15 m wrong and with a drift of 2 px, as a tiled, compressed GeoTIFF with
+RPC tags. It is rendered around the points only; between them a piece of it is repeated, so that reading
+costs what it costs in a whole image. The block has chips of 2 m cut from six views of other days and
+directions whose models are true: points are measured on chips in all of them, intersected, and keep the
+covariance of the intersection. 200 points are tried, each with its six views, in two passes.
 
-All of that is made in a process of its own. Each registration runs in another one, from the files, and
-tells its CPU time (imports left out, all threads) and the peak of its resident memory, with what it had
-before it began beside it. The smallest scene is registered once more before, uncounted: it compiles.
-CE90 is that of a grid of 25 x 25 places of the image, between where the registered model locates them
-and what they truly show. Run: python -m benchmarks.registration [--largest 5000]
+All of that is made in a process of its own, and each registration runs in another one, from the files.
+Told are the CPU time (all threads; imports left out) of the first registration of the process, which
+loads compiled code, and the median of those after it; the peak of resident memory, with what the process
+had before beside it; and where the time goes, as CPU time under a profiler. CE90 is that of a grid of
+25 x 25 places of the image, between where the registered model locates them and what they truly show.
+
+AROSICS (local co-registration) finds as many tie points in an ortho pair of the same ground, when an
+interpreter that has it is given.
+Run: python -m benchmarks.registration [--sizes 5000,40000] [--arosics PYTHON]
 """
 
 import argparse
+import cProfile
 import multiprocessing
+import pstats
 import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import TypeVar
@@ -29,94 +34,93 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair
+from benchmarks._large_scene import SIGMA_M, make_case
 from benchmarks._measuring import keep
-from benchmarks._simulated import lay_points, write_view
-from services.errors import ComputationError
-from services.formats.block import FolderChips, read_block, write_block
-from services.formats.block_json import BlockMetadata, BlockSpecification, Provenance
-from services.formats.raster import open_raster
+from services.formats.block import FolderChips, read_block
 from services.formats.scenes import read_scene
 from services.geodesy import metres_per_degree
+from services.matching.points import MatchingOptions
 from services.quality.accuracy import accuracy
-from services.registration import register_scene
-from services.scene import Scene
+from services.registration import Registration, RegistrationOptions, register_scene
 from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.simulation.render import surface_seen
-from services.simulation.view import ViewPlan, plan_geometry
-from services.simulation.world import World, make_world
 from services.types import Array
 
-SIZES = (2_500, 5_000, 10_000, 20_000)
-GSD_M = 0.5
-CHIP_GSDS_M = (2.0, 20.0)
-REFERENCE_GSD_M = 1.5
-REFERENCE_MARGIN_M = 1_300.0
-REFERENCES = (
-    (12.0, 100.0, datetime(2024, 5, 28, 10, 25, tzinfo=UTC)),
-    (10.0, 290.0, datetime(2024, 7, 14, 10, 50, tzinfo=UTC)),
+SIZES = (5_000, 40_000)
+POINTS, VIEWS = 200, 6
+PAIR_SIZE = 5_000
+
+STAGES = (
+    ("reading the scene", "raster.py", "read", ""),
+    ("rendering it as chips", "imagery.py", "render_chip", "reading the scene"),
+    ("correlating", "correlate.py", "find_chip", ""),
+    ("reading chips", "types.py", "point_chips", ""),
+    ("combining views", "points.py", "_combined", ""),
+    ("adjusting, also for the stability test", "scene.py", "adjust_scene", ""),
 )
-"""Incidence, azimuth and time of the views the block is made from."""
-BORDER_M = 250.0
-CANDIDATES_PER_SCENE = 1_000
-ERROR_M = (30.0, -40.0)
-DRIFT_PX = np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
-SIGMA_M = 25.0
-SEED = 4
+"""What is told, the function whose time it is, and the stage within it that is told by itself."""
 
 Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
 class Registered:
-    """What one process tells of its registration."""
+    """What one process tells of its registrations."""
 
     correction: ImageCorrection
     tried: int
+    views: int
     active: int
-    cpu_s: float
-    wall_s: float
+    verdict: str
+    first_s: float
+    again_s: float
     start_mib: float
     peak_mib: float
+    stages_s: dict[str, float]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The scene of one size: medians of the times, the largest of the peaks."""
+    """The scene of one size."""
 
     size_px: int
     file_mb: float
-    cpu_s: float
-    wall_s: float
+    made_s: float
+    first_s: float
+    again_s: float
     start_mib: float
     peak_mib: float
     tried: int
+    views: int
     active: int
+    verdict: str
     ce90_before_m: float
     ce90_m: float
-
-
-@dataclass(frozen=True)
-class Refused:
-    """The scene of one size that was not registered, and why."""
-
-    size_px: int
-    reason: str
+    stages_s: dict[str, float]
 
 
 def main() -> None:
     """Make, measure, print, keep."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--largest", type=int, default=max(SIZES), help="lines of the largest scene")
+    parser.add_argument("--sizes", default=",".join(map(str, SIZES)), help="lines of the scenes")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--arosics", metavar="PYTHON", help="an interpreter that has AROSICS")
     arguments = parser.parse_args()
-    sizes = [size for size in SIZES if size <= arguments.largest] or [arguments.largest]
-    with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
-        folder = Path(name)
-        apart(make_all, folder, sizes)
-        attempt(folder, sizes[0], 1)
-        outcomes = [attempt(folder, size, arguments.repeats) for size in sizes]
+    outcomes = []
+    for size in map(int, arguments.sizes.split(",")):
+        with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
+            outcomes.append(measure(Path(name), size, arguments.repeats))
     show(outcomes)
-    keep("registration", [asdict(outcome) for outcome in outcomes])
+    kept: dict[str, object] = {"scenes": [asdict(outcome) for outcome in outcomes]}
+    if arguments.arosics is None:
+        print("AROSICS was not run: --arosics names an interpreter that has it")
+    else:
+        with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
+            apart(make_pair, Path(name), PAIR_SIZE)
+            found = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE, POINTS)
+        show_beside(outcomes[-1], found)
+        kept["arosics"] = asdict(found)
+    keep("registration", kept)
 
 
 def apart(work: Callable[..., Made], *arguments: object) -> Made:
@@ -125,109 +129,78 @@ def apart(work: Callable[..., Made], *arguments: object) -> Made:
         return pool.submit(work, *arguments).result()
 
 
-def make_all(folder: Path, sizes: list[int]) -> None:
-    """The block and the scenes of one place, each scene with what some of its pixels truly show."""
-    world = make_world(np.random.default_rng(SEED), size_m=2_000.0)
-    make_block(folder, world, sizes)
-    for size in sizes:
-        plan = ViewPlan(
-            f"scene_{size}",
-            place(world),
-            (size, size),
-            GSD_M,
-            incidence_deg=14.0,
-            azimuth_deg=200.0,
-            acquired_at=datetime(2024, 6, 20, 10, 40, tzinfo=UTC),
-        )
-        rng = np.random.default_rng([SEED, size])
-        geometry = plan_geometry(world, plan, rng, ERROR_M, DRIFT_PX)
-        write_view(scene_path(folder, size), world, geometry, geometry.delivered, rng)
-        axis = np.linspace(0.0, size - 1.0, 25)
-        line_sample = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-        shown = surface_seen(world, geometry.true_model, line_sample)
-        np.savez(truth_path(folder, size), line_sample=line_sample, lon_lat_h=shown)
-
-
-def make_block(folder: Path, world: World, sizes: list[int]) -> None:
-    """A block whose points lie in the ground of every scene."""
-    rng = np.random.default_rng(SEED)
-    side_px = int((max(sizes) * GSD_M + 2.0 * REFERENCE_MARGIN_M) / REFERENCE_GSD_M)
-    references = []
-    for number, (incidence_deg, azimuth_deg, acquired_at) in enumerate(REFERENCES):
-        plan = ViewPlan(
-            f"reference_{number}",
-            place(world),
-            (side_px, side_px),
-            REFERENCE_GSD_M,
-            incidence_deg=incidence_deg,
-            azimuth_deg=azimuth_deg,
-            acquired_at=acquired_at,
-        )
-        geometry = plan_geometry(world, plan, rng)
-        path = folder / f"{plan.image_id}.tif"
-        write_view(path, world, geometry, geometry.rpc, rng)
-        references.append(Scene(open_raster(path), geometry.rpc, geometry.acquisition, 0.0))
-    east_m, north_m = metres_per_degree(float(world.centre_lon_lat[1]), 0.0)
-    lon_lat = np.concatenate(
-        [
-            np.array(place(world))
-            + rng.uniform(-0.5, 0.5, (CANDIDATES_PER_SCENE, 2))
-            * (size * GSD_M - BORDER_M)
-            / [east_m, north_m]
-            for size in sizes
-        ]
+def measure(folder: Path, size: int, repeats: int) -> Outcome:
+    """Make a scene, register it some times, and hold the result against the truth."""
+    made_s = apart(timed_make, folder, size)
+    done = apart(register_often, folder, repeats)
+    scene = read_scene(folder / "scene.tif", sigma_m=SIGMA_M)
+    with np.load(folder / "truth.npz") as truth:
+        line_sample, shown = truth["line_sample"], truth["lon_lat_h"]
+    refined = CorrectedModel(scene.model, done.correction)
+    told = {name: value for name, value in vars(done).items() if name != "correction"}
+    return Outcome(
+        size_px=size,
+        file_mb=(folder / "scene.tif").stat().st_size / 1e6,
+        made_s=made_s,
+        ce90_before_m=ce90_m(scene.model.locate(line_sample, shown[:, 2]), shown),
+        ce90_m=ce90_m(refined.locate(line_sample, shown[:, 2]), shown),
+        **told,
     )
-    points, cut = lay_points(world, references, lon_lat, CHIP_GSDS_M)
-    low, high = points.lon_lat_h[:, :2].min(axis=0), points.lon_lat_h[:, :2].max(axis=0)
-    metadata = BlockMetadata(
-        id="bench",
-        version="1",
-        title="Points of simulated ground",
-        description="",
-        license="",
-        extent=np.array([low, [high[0], low[1]], high, [low[0], high[1]]]),
-        created=datetime(2024, 7, 1, tzinfo=UTC),
-        specification=BlockSpecification(CHIP_GSDS_M, len(REFERENCES)),
-        provenance=Provenance(
-            "benchmarks", "1", tuple(scene.acquisition.image_id for scene in references), {}
-        ),
-    )
-    write_block(folder / "block", metadata, points, cut, {})
 
 
-def place(world: World) -> tuple[float, float]:
-    """Longitude and latitude of the middle of everything."""
-    lon, lat = world.centre_lon_lat.tolist()
-    return lon, lat
+def timed_make(folder: Path, size: int) -> float:
+    """CPU time of making a case."""
+    make_case(folder, size)
+    return time.process_time()
 
 
-def scene_path(folder: Path, size: int) -> Path:
-    """The scene of a size."""
-    return folder / f"scene_{size}.tif"
-
-
-def truth_path(folder: Path, size: int) -> Path:
-    """What is true about the scene of a size."""
-    return folder / f"truth_{size}.npz"
-
-
-def register(folder: Path, size: int) -> Registered:
+def register_often(folder: Path, repeats: int) -> Registered:
     """Register one scene from its file on the block in its folder, as a process of its own."""
     start_mib = memory_mib("VmRSS")
-    wall_s, cpu_s = time.perf_counter(), time.process_time()
-    scene = read_scene(scene_path(folder, size), sigma_m=SIGMA_M)
-    with FolderChips(folder / "block") as chips:
-        registration = register_scene(scene, read_block(folder / "block").points, chips)
+    taken_s = []
+    for _ in range(1 + repeats):
+        start = time.process_time()
+        registration = register(folder)
+        taken_s.append(time.process_time() - start)
+    peak_mib = memory_mib("VmHWM")
+    profile = cProfile.Profile(time.process_time)
+    profile.runcall(register, folder)
     measures = registration.measures
     return Registered(
         correction=registration.adjustment.correction,
         tried=int((measures.reason != "not_tried").sum()),
+        views=len(registration.views.view),
         active=int(measures.active.sum()),
-        cpu_s=time.process_time() - cpu_s,
-        wall_s=time.perf_counter() - wall_s,
+        verdict=registration.qualification.verdict,
+        first_s=taken_s[0],
+        again_s=median(taken_s[1:]),
         start_mib=start_mib,
-        peak_mib=memory_mib("VmHWM"),
+        peak_mib=peak_mib,
+        stages_s=stages_s(profile),
     )
+
+
+def register(folder: Path) -> Registration:
+    """Register the scene of a folder."""
+    scene = read_scene(folder / "scene.tif", sigma_m=SIGMA_M)
+    options = RegistrationOptions(max_points=POINTS, matching=MatchingOptions(max_views=VIEWS))
+    with FolderChips(folder / "block") as chips:
+        return register_scene(scene, read_block(folder / "block").points, chips, options)
+
+
+def stages_s(profile: cProfile.Profile) -> dict[str, float]:
+    """CPU time of the stages, and of all the rest."""
+    stats = pstats.Stats(profile)
+    taken = {}
+    for stage, file, function, within in STAGES:
+        spent = sum(
+            values[3]
+            for (path, _, name), values in stats.stats.items()  # type: ignore[attr-defined]
+            if name == function and path.endswith(f"/{file}")
+        )
+        taken[stage] = spent - taken.get(within, 0.0)
+    taken["everything else"] = stats.total_tt - sum(taken.values())  # type: ignore[attr-defined]
+    return taken
 
 
 def memory_mib(name: str) -> float:
@@ -239,35 +212,6 @@ def memory_mib(name: str) -> float:
     return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith(f"{name}:"))
 
 
-def attempt(folder: Path, size: int, repeats: int) -> Outcome | Refused:
-    """Figures of one scene, or why there are none: a refusal is a result, too."""
-    try:
-        return measure(folder, size, repeats)
-    except ComputationError as error:
-        return Refused(size, str(error))
-
-
-def measure(folder: Path, size: int, repeats: int) -> Outcome:
-    """Register one scene some times, and hold the result against the truth."""
-    runs = [apart(register, folder, size) for _ in range(repeats)]
-    scene = read_scene(scene_path(folder, size), sigma_m=SIGMA_M)
-    with np.load(truth_path(folder, size)) as truth:
-        line_sample, shown = truth["line_sample"], truth["lon_lat_h"]
-    refined = CorrectedModel(scene.model, runs[0].correction)
-    return Outcome(
-        size_px=size,
-        file_mb=scene_path(folder, size).stat().st_size / 1e6,
-        cpu_s=median(run.cpu_s for run in runs),
-        wall_s=median(run.wall_s for run in runs),
-        start_mib=max(run.start_mib for run in runs),
-        peak_mib=max(run.peak_mib for run in runs),
-        tried=runs[0].tried,
-        active=runs[0].active,
-        ce90_before_m=ce90_m(scene.model.locate(line_sample, shown[:, 2]), shown),
-        ce90_m=ce90_m(refined.locate(line_sample, shown[:, 2]), shown),
-    )
-
-
 def ce90_m(found: Array, true: Array) -> float:
     """CE90 of ground positions against true ones."""
     east_north = [
@@ -277,41 +221,55 @@ def ce90_m(found: Array, true: Array) -> float:
     return accuracy(np.array(east_north)).ce90_m.value
 
 
-def show(outcomes: list[Outcome | Refused]) -> None:
-    """Print the table."""
-    table = Table(
-        "lines x samples",
-        "file",
-        "CPU",
-        "wall",
-        "memory before",
-        "peak",
-        "tried",
-        "active",
-        "CE90 before",
-        "after",
-        title="registration of one scene",
-    )
-    for o in outcomes:
-        if isinstance(o, Refused):
-            continue
-        table.add_row(
-            f"{o.size_px:,}²",
-            f"{o.file_mb:.0f} MB",
-            f"{o.cpu_s:.1f} s",
-            f"{o.wall_s:.1f} s",
-            f"{o.start_mib:.0f} MiB",
-            f"{o.peak_mib:.0f} MiB",
-            str(o.tried),
-            str(o.active),
-            f"{o.ce90_before_m:.1f} m",
-            f"{o.ce90_m:.2f} m",
-        )
+def show(outcomes: list[Outcome]) -> None:
+    """Print the tables."""
+    table = Table("", *(f"{o.size_px:,}²" for o in outcomes), title="registration of one scene")
+    for name, tell in ROWS:
+        table.add_row(name, *(tell(o) for o in outcomes))
+    profile = Table("profile", *(f"{o.size_px:,}²" for o in outcomes))
+    for stage in outcomes[0].stages_s:
+        shares = (o.stages_s[stage] / sum(o.stages_s.values()) for o in outcomes)
+        profile.add_row(stage, *(f"{share:.0%}" for share in shares))
     console = Console(width=105)
     console.print(table)
-    for o in outcomes:
-        if isinstance(o, Refused):
-            console.print(f"{o.size_px:,}² was not registered: {o.reason}")
+    console.print(profile)
+
+
+ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
+    ("file", lambda o: f"{o.file_mb:,.0f} MB"),
+    ("made in", lambda o: f"{o.made_s:.0f} s"),
+    ("CPU, first in its process", lambda o: f"{o.first_s:.2f} s"),
+    ("CPU, again", lambda o: f"{o.again_s:.2f} s"),
+    ("memory before", lambda o: f"{o.start_mib:.0f} MiB"),
+    ("peak", lambda o: f"{o.peak_mib:.0f} MiB"),
+    ("points tried", lambda o: str(o.tried)),
+    ("views tried, last pass", lambda o: str(o.views)),
+    ("active", lambda o: str(o.active)),
+    ("CE90 before", lambda o: f"{o.ce90_before_m:.1f} m"),
+    ("CE90 after", lambda o: f"{o.ce90_m:.2f} m"),
+    ("verdict", lambda o: o.verdict),
+)
+
+
+def show_beside(ours: Outcome, found: TiePoints) -> None:
+    """Print AROSICS beside a registration."""
+    table = Table("", "points tried", "accepted", "CPU", "CPU a point", "Amers is faster")
+    each_s = ours.again_s / ours.active
+    other_s = found.cpu_s / found.accepted if found.accepted else float("inf")
+    for name, tried, accepted, cpu_s, spent_s in (
+        (f"Amers, {ours.size_px:,}²", ours.tried, ours.active, ours.again_s, each_s),
+        (f"AROSICS, {PAIR_SIZE:,}²", found.tried, found.accepted, found.cpu_s, other_s),
+    ):
+        table.add_row(
+            name,
+            str(tried),
+            str(accepted),
+            f"{cpu_s:.1f} s",
+            f"{1e3 * spent_s:.1f} ms",
+            f"{spent_s / each_s:.0f} x",
+        )
+    Console(width=105).print(table)
+    print(f"AROSICS' median shift: {found.east_m:+.2f} m east, {found.north_m:+.2f} m north")
 
 
 if __name__ == "__main__":
