@@ -7,7 +7,6 @@ the same features. Run: python -m benchmarks.footprint
 
 import argparse
 import json
-import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,22 +18,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from app.db import binary_copy as binary
 from app.db import engine
+from app.db.box import Box
 from app.db.collections import Viewer
-from app.db.conditions import Box
 from app.db.embedded import Cluster
 from app.db.engine import Connection
-from app.db.ingestion import POINT_COLUMNS
 from app.usecases.features import find_collection, page
 from app.usecases.questions import Question, understand
-from services.formats.hilbert import hilbert_order
-from services.geodesy import metres_per_degree
+from benchmarks._filled import Ground, fill
+from benchmarks._measuring import keep
 
-RESULTS = Path(__file__).parent / "results"
-CENTRE_LAT_DEG = 44.0
-POINTS_PER_KM2 = 0.5
-BLOCK = 1
 SECRET = b"of pages"
 
 ROWS = """
@@ -69,74 +62,22 @@ def main() -> None:
         Path(name).chmod(0o755)
         with Cluster(Path(name) / "postgres", durable=False).lease() as dsn:
             engine.upgrade(dsn)
+            ground = fill(dsn, arguments.points)
             with engine.connect(dsn) as connection:
-                side_deg = fill(connection, arguments.points)
-                connection.commit()
-                outcomes = [
-                    measure(connection, side_deg, arguments.points, size, arguments.repeats)
-                    for size in (1_000, 2_000)
-                ]
+                sizes = (1_000, 2_000)
+                outcomes = [measure(connection, ground, size, arguments.repeats) for size in sizes]
     show(outcomes, arguments.points)
-    RESULTS.mkdir(exist_ok=True)
-    kept = {"points": arguments.points, "outcomes": [asdict(outcome) for outcome in outcomes]}
-    (RESULTS / "footprint.json").write_text(json.dumps(kept, indent=1) + "\n")
+    found = [asdict(outcome) for outcome in outcomes]
+    keep("footprint", {"points": arguments.points, "outcomes": found})
 
 
-def fill(connection: Connection, count: int) -> tuple[float, float]:
-    """A published block of points; returns the size of its box in degrees of longitude and latitude."""
-    rng = np.random.default_rng(1)
-    side_m = math.sqrt(count / POINTS_PER_KM2) * 1000.0
-    east_m, north_m = metres_per_degree(CENTRE_LAT_DEG, 0.0)
-    side_deg = side_m / east_m, side_m / north_m
-    low = np.array([0.0, CENTRE_LAT_DEG - side_deg[1] / 2.0])
-    lon_lat = low + rng.uniform(0.0, 1.0, (count, 2)) * side_deg
-    lon_lat_h = np.column_stack([lon_lat[hilbert_order(lon_lat)], rng.uniform(0.0, 2000.0, count)])
-    connection.execute(
-        """insert into block (id, version, state, extent, n_points, n_views, metadata, checksum)
-           values ('bench', '1', 'published', st_makeenvelope(0, 0, 1, 1, 4326), %s, 0, '{}', '')""",
-        [count],
-    )
-    connection.execute(
-        """insert into chip_file (block_number, name, storage_key, dtype, n_chips)
-           values (1, 'chips/0000.npy', 'chips/0', 'uint8', 0)"""
-    )
-    columns = [
-        binary.numbers((BLOCK << 26) + np.arange(count), "i8"),
-        binary.numbers(np.full(count, BLOCK), "i4"),
-        binary.points_z(lon_lat_h),
-        *(binary.numbers(rng.uniform(0.5, 3.0, count), "f4") for _ in range(3)),
-        *(binary.numbers(rng.uniform(-0.3, 0.3, count), "f4") for _ in range(3)),
-        binary.numbers(np.full(count, 8), "i2"),
-        binary.numbers(rng.uniform(0.0, 1.0, count), "f4"),
-        binary.texts(rng.choice(np.array(["crossroads", "building corner", None], dtype=object), count)),
-        binary.dates(np.full(count, np.datetime64("2023-03-01"))),
-        binary.dates(np.full(count, np.datetime64("2024-06-09"))),
-        binary.numbers(np.ones(count), "i4"),
-        binary.numbers(np.arange(count) * 8, "i8"),
-        binary.numbers(np.full(count, 8), "i2"),
-    ]
-    with connection.cursor() as cursor:
-        with cursor.copy(f"copy point ({POINT_COLUMNS}) from stdin (format binary)") as copy:
-            for piece, _ in binary.copy_pieces(columns):
-                copy.write(piece)
-        cursor.execute("analyze point")
-        cursor.execute("analyze block")
-    return side_deg
-
-
-def measure(
-    connection: Connection, side_deg: tuple[float, float], count: int, size: int, repeats: int
-) -> Outcome:
+def measure(connection: Connection, ground: Ground, size: int, repeats: int) -> Outcome:
     """Time both ways in turn on the same boxes, the first of each not counted."""
     rng = np.random.default_rng(size)
-    part = math.sqrt(size / count)
     times: dict[str, list[float]] = {"sql": [], "python": []}
     found = []
     for turn in range(repeats + 5):
-        west, south = rng.uniform(0.0, 1.0 - part, 2) * side_deg
-        south += CENTRE_LAT_DEG - side_deg[1] / 2.0
-        corners = west, south, west + part * side_deg[0], south + part * side_deg[1]
-        box = Box(*map(float, corners))
+        box = Box(*ground.box(rng, size))
         in_sql, sql_s = timed(lambda box=box: in_database(connection, box))
         in_python, python_s = timed(lambda box=box: in_rows(connection, box))
         if turn == 0:
