@@ -10,7 +10,7 @@ from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, r
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
-from services.matching.radiometry import brightness_and_roughness, clouded, edges
+from services.matching.radiometry import clouded, edges, looks_of
 from services.matching.shared_error import common_covariance_px2
 from services.matching.views import Likeness, choose_views
 from services.sensors.base import SensorModel
@@ -118,7 +118,7 @@ def match_points(
     views = np.zeros(n, dtype=np.int64)
     reason = np.full(n, "", dtype="<U16")
     by_gradient = np.zeros(n, dtype=bool)
-    looks = np.full((n, 2), np.nan)
+    looks = [np.empty((0, 2))] * n
     scene_gsd_m = np.full(n, np.nan)
     chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
     offsets: list[Array] = []
@@ -138,7 +138,7 @@ def match_points(
         scene_gsd_m[row] = image_gsd_m(model, ground)
         stack = point_chips(points, chips, row)
         ratio = scene_gsd_m[row] / gsd_m
-        looks[row] = brightness_and_roughness(patch)
+        looks[row] = looks_of(patch)
         like_scene = [_as_seen(stack[number], ratio, reduction) for number in numbers]
         peaks, combined, by_gradient[row] = _search(patch, like_scene, options)
         row_col, sigma, agreeing, reason[row] = combined

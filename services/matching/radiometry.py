@@ -1,5 +1,7 @@
 """Ground that does not look as it did: edges where contrast has changed, clouds over the rest."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -9,7 +11,17 @@ ENOUGH_FOUND = 5
 """From so many points found on, others can be compared with them."""
 
 CLOUD_ROUGHNESS = 0.4
-"""A cloud is at most so rough as the ground of points that were found."""
+"""A cloud is at most so rough as half of the ground around points that were found."""
+
+CLOUD_BRIGHTNESS = 0.9
+"""It is brighter than this share of that ground."""
+
+CLOUD_SHARE = 0.1
+"""So much of what is around a point under clouds hides it: nothing else is as bright, and correlation
+follows what is brightest."""
+
+CELL_PX = 10
+"""Side of the squares that are bright and smooth or not."""
 
 
 def edges(pixels: FloatImage) -> FloatImage:
@@ -29,23 +41,38 @@ def edges(pixels: FloatImage) -> FloatImage:
     return np.asarray(cv2.sqrt(cv2.magnitude(right, down)))
 
 
-def brightness_and_roughness(pixels: FloatImage) -> tuple[float, float]:
-    """Mean of the pixels, and mean difference of neighbours; NaN where there are none."""
-    step = np.abs(pixels[:, 1:] - pixels[:, :-1])
-    seen = np.isfinite(step)
-    if not seen.any():
-        return float("nan"), float("nan")
-    return float(np.nanmean(pixels)), float(step[seen].mean())
-
-
-def clouded(looks: Array, found: BoolArray) -> BoolArray:
-    """Which points lie under a cloud: not found, brighter than most that were, and much smoother.
+def looks_of(pixels: FloatImage) -> Array:
+    """Brightness and roughness of the squares of a patch: mean, and mean difference of neighbours.
 
     Args:
-        looks: (n, 2) brightness and roughness around each point; NaN where nothing was seen.
+        pixels: (r, c), NaN where there is nothing.
+
+    Returns:
+        (squares, 2); NaN where a square is not seen whole.
+    """
+    rows, columns = (size // CELL_PX for size in pixels.shape)
+    inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
+    cells = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
+    cells = cells.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
+    rough = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
+    return np.column_stack([cells.mean(axis=(1, 2)), rough])
+
+
+def clouded(looks: Sequence[Array], found: BoolArray) -> BoolArray:
+    """Which points are hidden by clouds: not found, and much around them is bright and smooth.
+
+    Args:
+        looks: (squares, 2) around each of n points, as `looks_of` gives them.
         found: (n,) points that were found. With fewer than `ENOUGH_FOUND` nothing is called a cloud.
     """
+    hidden = np.zeros(len(found), dtype=bool)
     if found.sum() < ENOUGH_FOUND:
-        return np.zeros(len(found), dtype=bool)
-    bright, rough = np.nanmedian(looks[found], axis=0)
-    return np.asarray(~found & (looks[:, 0] > bright) & (looks[:, 1] < CLOUD_ROUGHNESS * rough))
+        return hidden
+    ground = np.concatenate([look for look, seen in zip(looks, found, strict=True) if seen])
+    bright = np.nanquantile(ground[:, 0], CLOUD_BRIGHTNESS)
+    rough = np.nanmedian(ground[:, 1])
+    for row in np.flatnonzero(~found):
+        look = looks[row][np.isfinite(looks[row]).all(axis=1)]
+        cloud = (look[:, 0] > bright) & (look[:, 1] < CLOUD_ROUGHNESS * rough)
+        hidden[row] = len(look) > 0 and cloud.mean() >= CLOUD_SHARE
+    return hidden

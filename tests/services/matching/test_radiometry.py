@@ -1,11 +1,10 @@
 """Ground whose contrast has changed is found by its edges; what clouds hide is said to be hidden."""
 
 import numpy as np
-import pytest
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import brightness_and_roughness, clouded, edges
-from services.types import FloatImage
+from services.matching.radiometry import clouded, edges, looks_of
+from services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
 a_tenth_of_a_pixel = 0.1
@@ -46,23 +45,37 @@ def test_edges_beside_nodata_are_unknown() -> None:
     assert set(zip(*np.nonzero(unknown), strict=True)) == {(8, 9), (10, 9), (9, 8), (9, 10)}
 
 
-def test_a_cloud_is_bright_and_smooth_and_was_not_found() -> None:
-    rng = np.random.default_rng(0)
-    found = np.arange(40) < 20
-    looks = np.column_stack([rng.normal(600.0, 50.0, 40), rng.normal(30.0, 3.0, 40)])
-    cloud, water, field = [25, 26, 27], [30, 31], [35]
-    looks[cloud] = [2500.0, 6.0]
-    looks[water] = [150.0, 6.0]
-    looks[field] = [2500.0, 30.0]
-    looks[39] = np.nan
-    looks[3] = [2500.0, 6.0]
-    assert list(np.flatnonzero(clouded(looks, found))) == cloud
-    few = np.arange(40) < 4
-    assert not clouded(looks, few).any()
+def ground_and_clouds(rng: np.random.Generator) -> tuple[list[Array], dict[str, int]]:
+    """Squares around 40 points; of those that are not found, some are not ground."""
+    looks = [
+        np.column_stack([rng.normal(600.0, 50.0, 100), rng.normal(30.0, 5.0, 100)]) for _ in range(40)
+    ]
+    kinds = {"cloud": 25, "part of a cloud": 26, "rim of a cloud": 27, "water": 30, "bright field": 31}
+    looks[25][:] = [2500.0, 6.0]
+    looks[26][:30] = [2500.0, 6.0]
+    looks[27][:5] = [2500.0, 6.0]
+    looks[30][:] = [150.0, 6.0]
+    looks[31][:] = [2500.0, 30.0]
+    looks[39][:] = np.nan
+    looks[3][:] = [2500.0, 6.0]
+    return looks, kinds
 
 
-def test_brightness_and_roughness_leave_out_what_is_not_seen() -> None:
-    pixels = np.full((5, 5), np.nan, dtype=np.float32)
-    assert np.isnan(brightness_and_roughness(pixels)).all()
-    pixels[:, :3] = [[1.0, 3.0, 5.0]]
-    assert brightness_and_roughness(pixels) == pytest.approx((3.0, 2.0))
+def test_a_cloud_is_bright_and_smooth_and_hides_a_point() -> None:
+    looks, kinds = ground_and_clouds(np.random.default_rng(0))
+    hidden = clouded(looks, np.arange(40) < 20)
+    assert list(np.flatnonzero(hidden)) == [kinds["cloud"], kinds["part of a cloud"]]
+
+
+def test_nothing_is_called_a_cloud_where_no_ground_was_found() -> None:
+    looks, _ = ground_and_clouds(np.random.default_rng(0))
+    assert not clouded(looks, np.arange(40) < 4).any()
+
+
+def test_squares_not_seen_whole_have_no_looks() -> None:
+    pixels = np.tile(np.array([[1.0, 3.0]], dtype=np.float32), (20, 13))
+    pixels[15, 15] = np.nan
+    looks = looks_of(pixels)
+    assert looks.shape == (4, 2)
+    np.testing.assert_allclose(looks[:3], [[2.0, 2.0]] * 3)
+    assert np.isnan(looks[3]).all()
