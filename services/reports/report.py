@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from services.adjustment.scene import SceneAdjustment
 from services.passes import Pass
-from services.quality.accuracy import Accuracy
+from services.quality.accuracy import Accuracy, NormalisedError
 from services.quality.qualification import (
     Coverage,
     Criterion,
@@ -21,6 +21,9 @@ from services.quality.stability import ImageResiduals, PredictedAccuracy, Stabil
 from services.types import Acquisition, Array, ChipArray, FloatImage, Measures
 
 REPORT_FORMAT = "amers-registration-report/1"
+
+Method = Literal["control points", "reference image"]
+"""What a scene is registered on."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,15 @@ class Check:
 
     Attributes:
         against: what the points are, in words.
-        accuracy: of the registered model there.
+        accuracy: of the registered model there; a single scene gives no heights, hence no LE90.
+        image_residuals_px: of the marks; x along samples, y along lines; None when not marked.
+        normalised: the residuals in units of what model, marks and points state; None when unknown.
     """
 
     against: str
     accuracy: Accuracy
+    image_residuals_px: ImageResiduals | None = None
+    normalised: NormalisedError | None = None
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,7 @@ class RegistrationSummary:
         refit_error_px: largest difference between the corrected model and the one written; 0 when that
             carries the correction exactly, NaN when nothing was written.
         refined_note: which files carry the correction, and how well, in words.
+        method: what the scene was registered on.
         software_version: of Amers.
         started_at, finished_at: UTC, given by the caller; None when unknown.
         checks: against independent points, if there are any.
@@ -148,6 +156,7 @@ class RegistrationSummary:
     finished_at: datetime | None = None
     checks: tuple[Check, ...] = ()
     refined_note: str = ""
+    method: Method = "control points"
 
 
 @dataclass(frozen=True)
@@ -235,7 +244,8 @@ class RegistrationReport:
         verdict: "good", "usable" or "failed"; follows from the criteria alone.
         criteria: every threshold with the value held against it.
         scene: what was registered.
-        blocks: whose points were used.
+        method: whether on control points or on a reference image.
+        blocks: whose points were used; the reference image, where that was.
         correction: what was found.
         passes: rounds of matching, in order.
         equipment: points visible, matched and active.
@@ -256,6 +266,7 @@ class RegistrationReport:
     verdict: Verdict
     criteria: tuple[Criterion, ...]
     scene: SceneRecord
+    method: Method
     blocks: tuple[BlockUsed, ...]
     correction: CorrectionRecord
     passes: tuple[Pass, ...]
@@ -290,6 +301,7 @@ def build_report(summary: RegistrationSummary) -> RegistrationReport:
             sigma_m=summary.sigma_m,
             footprint_lon_lat=summary.footprint,
         ),
+        method=summary.method,
         blocks=summary.blocks,
         correction=_correction_record(summary),
         passes=summary.passes,

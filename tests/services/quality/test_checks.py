@@ -1,0 +1,95 @@
+"""A registered model against ground that had no part in it."""
+
+import numpy as np
+import pytest
+
+from services.errors import CoverageError
+from services.quality.checks import MARKING_SIGMA_PX, CheckPoints, check_model, qualified_by
+from services.quality.qualification import QualificationOptions, qualify
+from services.sensors.correction import CorrectedModel
+from tests.services.conftest import GSD_M, SHAPE, FlatModel, Registered
+
+LIMIT = 3.0
+
+
+def check_points(
+    scene: Registered, n: int, noise_px: float, moved_px: tuple[float, float] = (0.0, 0.0), seed: int = 7
+) -> CheckPoints:
+    """Points of known ground where the true model shows them, marked with noise, and moved."""
+    rng = np.random.default_rng(seed)
+    delivered = rng.uniform(0.0, 1.0, (n, 2)) * (np.array(SHAPE) - 1.0)
+    marks = scene.truth.apply(delivered) + rng.normal(0.0, noise_px, (n, 2)) + moved_px
+    ground = FlatModel().locate(delivered, np.zeros(n))
+    return CheckPoints(ground, marks, np.full((n, 3), np.nan), np.full(n, noise_px))
+
+
+def checked(scene: Registered, points: CheckPoints, frame_sigma_m: float = float("nan")):
+    model = CorrectedModel(FlatModel(), scene.adjustment.correction)
+    return check_model(model, scene.adjustment, points, frame_sigma_m)
+
+
+def test_honest_statements_give_residuals_of_the_size_they_let_expect(registered):
+    scene = registered()
+    found = checked(scene, check_points(scene, n=200, noise_px=0.3))
+    assert found.accuracy.n == found.residual_px.xy.n == 200
+    assert found.normalised.lower < found.normalised.mean_square < found.normalised.upper
+    assert found.accuracy.le90_m is None
+
+
+def test_the_accuracy_on_the_ground_is_that_of_the_marks_seen_through_the_model(registered):
+    scene = registered(noise_px=0.01)
+    moved_line_px, moved_sample_px = 2.0, -3.0
+    found = checked(scene, check_points(scene, 50, 1e-6, (moved_line_px, moved_sample_px)))
+    east_m, north_m = found.accuracy.bias_m
+    model_px = 0.01
+    assert east_m == pytest.approx(moved_sample_px * GSD_M, abs=model_px)
+    assert north_m == pytest.approx(-moved_line_px * GSD_M, abs=model_px)
+    assert found.residual_px.y.mean == pytest.approx(moved_line_px, abs=model_px)
+    assert found.residual_px.x.mean == pytest.approx(moved_sample_px, abs=model_px)
+
+
+def test_points_that_contradict_a_registration_take_its_verdict_of_good_away(registered):
+    scene = registered()
+    good = qualify(
+        scene.measures,
+        scene.adjustment,
+        scene.shape,
+        scene.refit,
+        scene.gsd_m,
+        QualificationOptions(),
+        np.random.default_rng(3),
+    )
+    assert good.verdict == "good"
+    agreeing = qualified_by(good, checked(scene, check_points(scene, 40, 0.3)), LIMIT)
+    assert agreeing.verdict == "good"
+    moved = checked(scene, check_points(scene, 40, 0.3, (2.0, 0.0)))
+    contradicted = qualified_by(good, moved, LIMIT)
+    assert contradicted.verdict == "usable"
+    (criterion,) = [c for c in contradicted.criteria if not c.passed]
+    assert criterion.name == "check_points"
+    assert criterion.value > LIMIT
+
+
+def test_what_points_and_their_frame_state_is_expected_of_them(registered):
+    scene = registered()
+    points = check_points(scene, 40, 0.3, (2.0, 0.0))
+    strict = checked(scene, points).normalised.mean_square
+    in_a_frame_of_a_metre = checked(scene, points, frame_sigma_m=1.0).normalised.mean_square
+    stated = CheckPoints(points.lon_lat_h, points.line_sample, np.ones((40, 3)), points.sigma_px)
+    assert in_a_frame_of_a_metre < strict / 4.0
+    assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)
+
+
+def test_marks_that_say_nothing_of_themselves_are_taken_for_those_of_a_person(registered):
+    scene = registered()
+    points = check_points(scene, 200, MARKING_SIGMA_PX)
+    unsaid = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, np.full(200, np.nan))
+    assert checked(scene, unsaid) == checked(scene, points)
+
+
+def test_points_beside_the_scene_are_refused_by_number(registered):
+    scene = registered()
+    points = check_points(scene, 3, 0.3)
+    nowhere = CheckPoints(np.full((3, 3), np.nan), points.line_sample, points.sigma_m, points.sigma_px)
+    with pytest.raises(CoverageError, match="none of the 3 check points"):
+        checked(scene, nowhere)
