@@ -40,6 +40,8 @@ class Settings(BaseSettings):
         storage_url: a bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; none: the
             data folder.
         scene_folder: holds scenes that may be registered where they lie; none: not at all.
+        reference_folder: holds the reference images and terrains that scenes may be registered on; none:
+            there are none.
         ingest_folder: holds the block folders that may be ingested through the API; none: not at all.
         quota_upload_bytes: what the scenes of one token may take in the storage at once.
         quota_jobs: how many jobs of one token may wait or run at once.
@@ -71,6 +73,7 @@ class Settings(BaseSettings):
     lease_seconds: float = Field(default=30.0, gt=0)
     storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")
     scene_folder: Path | None = None
+    reference_folder: Path | None = None
     ingest_folder: Path | None = None
     quota_upload_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
     quota_jobs: int = Field(default=100, ge=0)

@@ -9,7 +9,7 @@ from types import FrameType
 
 import typer
 
-from app.cli import audit, block, db, demo, points, production, scene, serve, token, worker
+from app.cli import audit, block, db, demo, points, production, reference, scene, serve, token, worker
 from app.errors import AmersError, ComputationError
 
 EXIT_REFUSED = 2
@@ -25,6 +25,7 @@ app = typer.Typer(
 app.add_typer(block.app, name="block")
 app.add_typer(points.app, name="points")
 app.add_typer(scene.app, name="scene")
+app.add_typer(reference.app, name="reference")
 app.add_typer(production.app, name="production")
 app.add_typer(db.app, name="db")
 app.add_typer(token.app, name="token")

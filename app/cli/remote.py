@@ -42,8 +42,16 @@ class Service:
     ) -> None:
         self._http.close()
 
-    def register(self, files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
+    def register(
+        self, files: SceneFiles, folder: Path, progress: Progress, copy_image: bool = False
+    ) -> dict[str, Any]:
         """Have a scene registered and download what came out of it.
+
+        Args:
+            files: of the scene.
+            folder: for what comes out of it.
+            progress: told where the work stands.
+            copy_image: also have a GeoTIFF copied, with the refined model in its tags.
 
         Returns:
             The report as a document.
@@ -53,10 +61,15 @@ class Service:
             ComputationError: the scene could not be registered.
             ServiceFailure: the service does not answer, or not as it should.
         """
-        beside = _files_beside(files)
+        given = [path for path in (files.mask, files.check_points) if path is not None]
+        beside = [*_files_beside(files), *given]
         scene = self._upload_scene(files, progress)
         names = {path: self._upload_model(scene, path) for path in beside}
-        inputs = {"scene": scene, **({"model": names[files.model]} if files.model else {})}
+        named = {"model": files.model, "mask": files.mask, "check_points": files.check_points}
+        asked = {name: names[path] for name, path in named.items() if path is not None}
+        said = {"bands": files.bands, "check_heights": files.check_heights}
+        asked |= {name: value for name, value in said.items() if value is not None}
+        inputs = {"scene": scene, "copy_image": copy_image, **asked}
         execution = "processes/register-scene/execution"
         job = self._ask("POST", execution, json={"inputs": inputs}).json()
         job = self._watch(job, progress)

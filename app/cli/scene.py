@@ -15,13 +15,13 @@ from app.config import read_settings
 from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
+from app.usecases.ground_control import points_of_block, points_of_store
 from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorectification
-from app.usecases.reference import ReferenceFiles
+from app.usecases.reference import ReferenceFiles, this_reference
+from app.usecases.references import references_of_store
 from app.usecases.registration import (
     SceneFiles,
     key_of_file,
-    points_of_block,
-    points_of_store,
     record,
     run_registration,
 )
@@ -32,8 +32,9 @@ from services.types import Progress
 
 app = typer.Typer(help="Scenes and their registration.", no_args_is_help=True)
 
-Register = Callable[[SceneFiles, Path, Progress], dict[str, Any]]
-"""Registers one scene, writes what came out of it into a folder, returns the report as a document."""
+Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
+"""Registers one scene, writes what came out of it into a folder, returns the report as a document; the
+last says whether its image is copied."""
 
 
 @app.callback()
@@ -64,6 +65,21 @@ def register(
     model: Annotated[
         Path | None, typer.Option(help="File of the model, if it is not found by itself.")
     ] = None,
+    bands: Annotated[
+        str | None, typer.Option(help="Looked at: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Image of the same ground, not zero where not to look.")
+    ] = None,
+    check_points: Annotated[
+        Path | None, typer.Option(help="Points held out: .gcp, .points, .pts, GeoJSON or OPF.")
+    ] = None,
+    check_heights: Annotated[
+        str | None, typer.Option(help="What heights of .gcp and .pts are above: ellipsoid, EPSG:…")
+    ] = None,
+    copy_image: Annotated[
+        bool, typer.Option("--copy-image", help="Copy a GeoTIFF, the refined model in its tags.")
+    ] = False,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder; one inside it for each of several scenes.")
     ] = Path("registered"),
@@ -78,23 +94,20 @@ def register(
 
     Points come from the store unless --block, --reference or --server says otherwise.
     """
-    if reference is not None and server is not None:
-        raise InputError("--reference and --server exclude each other")
-    if dem is not None and reference is None:
-        raise InputError("--dem is the ground of a --reference")
-    if block is not None and server is not None:
-        raise InputError("--block and --server exclude each other")
-    if model is not None and len(scenes) > 1:
-        raise InputError("--model is the model of one scene")
-    names = [scene.stem for scene in scenes]
-    if len(set(names)) < len(names):
-        raise InputError("several scenes of the same name would write into the same folder")
+    of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
+    _refuse_contradictions(block, reference, dem, server)
+    _refuse_mixed_up(scenes, [name for name, file in of_one.items() if file is not None])
     try:
         terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
         held = None if reference is None else ReferenceFiles(reference, terrain)
         with _registrar(block, held, server, token) as do:
             outcomes = [
-                _one(do, SceneFiles(scene, model, sigma_m), folder)
+                _one(
+                    do,
+                    SceneFiles(scene, model, sigma_m, bands, mask, check_points, check_heights),
+                    folder,
+                    copy_image,
+                )
                 for scene, folder in _folders(scenes, output)
             ]
     except ServiceFailure as failure:
@@ -148,6 +161,24 @@ def ortho(
     show_one(asdict(made), as_json=as_json)
 
 
+def _refuse_contradictions(
+    block: Path | None, reference: Path | None, dem: Path | None, server: str | None
+) -> None:
+    if server is not None and (reference is not None or block is not None):
+        raise InputError("--server excludes --reference and --block: the service has its own")
+    if dem is not None and reference is None:
+        raise InputError("--dem is the ground of a --reference")
+
+
+def _refuse_mixed_up(scenes: list[Path], of_one: list[str]) -> None:
+    """Refuse files of one scene for several, and scenes that would write into the same folder."""
+    if of_one and len(scenes) > 1:
+        raise InputError(f"{', '.join(of_one)}: of one scene, {len(scenes)} given")
+    names = [scene.stem for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError("several scenes of the same name would write into the same folder")
+
+
 def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
     for scene in scenes:
         yield scene, output if len(scenes) == 1 else output / scene.stem
@@ -170,10 +201,18 @@ def _registrar(
 
 def _on_files(block: Path | None, reference: ReferenceFiles | None) -> Register:
     find_points = None if block is None else points_of_block(block)
+    find_reference = None if reference is None else this_reference(reference)
 
-    def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
-        options = RegistrationOptions()
-        made = run_registration(files, find_points, options, folder, progress, reference)
+    def do(files: SceneFiles, folder: Path, progress: Progress, copy_image: bool) -> dict[str, Any]:
+        made = run_registration(
+            files,
+            find_points,
+            RegistrationOptions(),
+            folder,
+            progress,
+            find_reference,
+            copy_image=copy_image,
+        )
         return report_document(made.report)
 
     return do
@@ -186,9 +225,16 @@ def _on_store() -> Iterator[Register]:
     storage = open_storage(settings)
     with engine.opened(settings) as database:
 
-        def do(files: SceneFiles, folder: Path, progress: Progress) -> dict[str, Any]:
-            find_points = points_of_store(database, storage)
-            made = run_registration(files, find_points, RegistrationOptions(), folder, progress)
+        def do(files: SceneFiles, folder: Path, progress: Progress, copy_image: bool) -> dict[str, Any]:
+            made = run_registration(
+                files,
+                points_of_store(database, storage),
+                RegistrationOptions(),
+                folder,
+                progress,
+                references_of_store(database, settings),
+                copy_image=copy_image,
+            )
             with database.transaction() as connection:
                 record(connection, made, key_of_file(files.image))
             return report_document(made.report)
@@ -196,11 +242,11 @@ def _on_store() -> Iterator[Register]:
         yield do
 
 
-def _one(do: Register, files: SceneFiles, folder: Path) -> dict[str, Any] | AmersError:
+def _one(do: Register, files: SceneFiles, folder: Path, copy_image: bool) -> dict[str, Any] | AmersError:
     """What is shown of one registered scene, or why it was not registered."""
     try:
         with shown_progress() as progress:
-            report = do(files, folder, progress)
+            report = do(files, folder, progress, copy_image)
     except AmersError as error:
         return error
     if report["verdict"] == "failed":
@@ -219,8 +265,17 @@ def _one(do: Register, files: SceneFiles, folder: Path) -> dict[str, Any] | Amer
         "shift_m": correction["shift_m"],
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         "ce90_predicted_px": report["predicted"]["worst_px"],
+        **_check_figures(report["checks"]),
         "output": folder,
     }
+
+
+def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is shown of independent check points, if there are any."""
+    if not checks:
+        return {}
+    accuracy = checks[0]["accuracy"]
+    return {"check_points": accuracy["n"], "check_ce90_m": accuracy["ce90_m"]["value"]}
 
 
 def _show(records: list[dict[str, Any]], as_json: bool, asked: int) -> None:

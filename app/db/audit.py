@@ -9,7 +9,7 @@ from psycopg.rows import class_row
 
 from app.db.engine import Connection
 
-KINDS = ("token", "block", "scene", "job", "point")
+KINDS = ("token", "block", "scene", "job", "point", "reference_image")
 
 
 @dataclass(frozen=True)

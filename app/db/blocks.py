@@ -36,7 +36,8 @@ class Block:
         number: of this version in this database.
         id, version: as its producer names it.
         priority: of blocks over one place, the points of the greater one are served.
-        n_superseded: how many of its points are not served because a better block has them.
+        n_superseded: how many of its points are not served: a better block has them, or they are
+            suspended.
         outline: (m, 2) lon, lat, not closed.
         checksum: sha256 of its block.json.
     """

@@ -117,6 +117,9 @@ def uploaded_bytes(connection: Connection, token_id: UUID) -> int:
                    where owner = %(owner)s and state <> 'removed'
                        and not exists (select from upload u where u.scene_id = s.id
                                        and u.purpose = 'image' and u.finished_at is null))
+                + (select coalesce(sum((beside.value->>'size_bytes')::bigint), 0)
+                   from scene s, jsonb_each(s.models) beside
+                   where owner = %(owner)s and state <> 'removed')
                 + (select coalesce(sum(size_bytes), 0) from upload
                    where owner = %(owner)s and finished_at is null) as used""",
         {"owner": token_id},

@@ -10,11 +10,11 @@ from app.config import Settings
 from app.db import engine
 from app.storage import open_storage
 from app.usecases import blocks
+from app.usecases.ground_control import points_of_store
 from app.usecases.production import BlockIdentity, run_production
 from app.usecases.registration import (
     SceneFiles,
     key_of_file,
-    points_of_store,
     record,
     run_registration,
 )

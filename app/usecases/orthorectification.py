@@ -10,7 +10,7 @@ from uuid import UUID
 import numpy as np
 
 from app.auth import Scope
-from app.db import scenes
+from app.db import registrations, scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import Conflict, InputError
@@ -25,6 +25,8 @@ from services.orthorectify import OrthoOptions, OrthoWindow, choose_grid, orthor
 from services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
+REFINED_NAME = "refined_RPC.TXT"
+"""As a registration calls its refined model."""
 _KEPT_TYPES = ("uint8", "uint16", "int16", "float32")
 
 
@@ -90,7 +92,8 @@ class OrthorectifyScene:
     Attributes:
         scene: id of an uploaded scene.
         dem: name of the file with the terrain that was uploaded beside its image.
-        model: name of the uploaded file with its model, refined perhaps; by default it is found.
+        model: name of the uploaded file with its model; by default it is found.
+        registration: job that registered the scene, whose refined model is then followed.
         vertical: what the heights are counted from, when the file does not say.
         geoid: name of an uploaded grid file of the geoid.
         fill_px: voids are filled from heights at most so many nodes away.
@@ -101,6 +104,7 @@ class OrthorectifyScene:
     scene: UUID
     dem: str
     model: str | None = None
+    registration: UUID | None = None
     vertical: str | None = None
     geoid: str | None = None
     fill_px: int = 0
@@ -199,6 +203,25 @@ def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> 
         given = getattr(inputs, name)
         if given is not None and given != clean_name(given):
             raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
+    if inputs.registration is not None:
+        if inputs.model is not None:
+            raise InputError("model and registration exclude each other")
+        _refined_key(connection, inputs.scene, inputs.registration)
+
+
+def _refined_key(connection: Connection, scene_id: UUID, job_id: UUID) -> str:
+    """Where the storage has the refined model that a job left of a scene.
+
+    Raises:
+        InputError: the job did not register the scene, or left no RPC.
+    """
+    found = registrations.find_by_job(connection, job_id)
+    if found is None or found.scene_id != scene_id:
+        raise InputError(f"registration: job {job_id} did not register scene {scene_id}")
+    key = found.files.get(REFINED_NAME)
+    if key is None:
+        raise InputError(f"registration: job {job_id} left no {REFINED_NAME}: no RPC fits its model")
+    return key
 
 
 def _run(work: Work) -> Commit:
@@ -206,13 +229,18 @@ def _run(work: Work) -> Commit:
     inputs: OrthorectifyScene = work.inputs
     with work.database.transaction() as connection:
         scene = scenes.find_scene(connection, inputs.scene)
+        asked = inputs.registration
+        refined = None if asked is None else _refined_key(connection, inputs.scene, asked)
     if scene is None or scene.state == "removed":
         raise Conflict(f"scene {inputs.scene} has been removed")
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
+        model = image.with_name(inputs.model) if inputs.model else None
+        if refined is not None:
+            model = work.storage.fetch(refined, Path(folder))
         made = run_orthorectification(
             image,
-            image.with_name(inputs.model) if inputs.model else None,
+            model,
             TerrainFile(
                 image.with_name(inputs.dem),
                 inputs.vertical,

@@ -1,14 +1,26 @@
 """A reference ortho-image and a terrain, to register scenes on where there are no control points."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from app.errors import InputError
+from app.usecases.ground_control import FoundPoints
 from app.usecases.orthorectification import TerrainFile
 from services.formats.dem import read_dem
 from services.formats.raster import map_grid_of, open_raster
 from services.matching.dense import Reference
+from services.reference import (
+    ReferenceChips,
+    ReferenceOptions,
+    homologous_points,
+    register_on_reference,
+)
+from services.registration import Registration, RegistrationOptions
+from services.reports.report import BlockUsed
+from services.scene import Scene
 from services.sensors.ortho import OrthoModel
+from services.types import Array, Progress
 
 LOCAL_SIGMA_PX = 0.3
 """How far details of an ortho-image lie off the rest of it, one standard deviation, its own pixels."""
@@ -35,6 +47,53 @@ class ReferenceFiles:
     image: Path
     terrain: TerrainFile | None = None
     sigma_m: float | None = None
+
+
+@dataclass(frozen=True)
+class FoundReference:
+    """A reference that shows the ground of a scene.
+
+    Attributes:
+        name: for people.
+        files: on this machine.
+        id: in the store; None for one that a command names.
+        gsd_m: its ground sampling; NaN for one that a command names.
+        known: (k, 3) ground positions that earlier scenes were found by, the best first.
+    """
+
+    name: str
+    files: ReferenceFiles
+    id: int | None = None
+    gsd_m: float = float("nan")
+    known: Array | None = None
+
+
+FindReference = Callable[[Array], FoundReference | None]
+"""A reference that shows what is inside an outline (n, 2) of lon, lat; None when there is none."""
+
+
+def this_reference(files: ReferenceFiles) -> FindReference:
+    """The reference a command names, whatever the scene."""
+    return lambda outline: FoundReference(files.image.name, files)
+
+
+def register_on(
+    found: FoundReference, scene: Scene, options: RegistrationOptions, progress: Progress
+) -> tuple[Registration, FoundPoints]:
+    """Register a scene on a reference.
+
+    Returns:
+        The registration, and its homologous points as control points.
+    """
+    held = read_reference(found.files)
+    of_reference = ReferenceOptions(
+        seed=options.seed, adjustment=options.adjustment, qualification=options.qualification
+    )
+    registration = register_on_reference(scene, held, of_reference, progress, found.known)
+    lon_lat_h = registration.measures.lon_lat_h
+    points, chips = homologous_points(lon_lat_h, held), ReferenceChips(held, lon_lat_h)
+    used = BlockUsed(found.name, "reference image")
+    return registration, FoundPoints(points, chips, (used,), held.frame_sigma_m)
 
 
 def read_reference(files: ReferenceFiles) -> Reference:

@@ -1,13 +1,11 @@
 """Registering a scene: read its files, find points, call the science, write the outcome."""
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal, get_args
 from uuid import UUID
 
 import numpy as np
@@ -15,31 +13,30 @@ import shapely
 
 from app.auth import Scope
 from app.db import registrations, scenes
-from app.db.engine import Connection, Database
-from app.db.points import control_points
+from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import Conflict, InputError
-from app.storage import Storage, StoredChips
 from app.usecases import history
+from app.usecases.check_points import read_check_points
+from app.usecases.ground_control import FindPoints, FoundPoints, points_of_store
 from app.usecases.processes import Commit, Process, Work
-from app.usecases.reference import ReferenceFiles, read_reference
+from app.usecases.reference import FindReference, FoundReference, register_on
+from app.usecases.references import keep_places, references_of_store
 from app.usecases.registration_files import OUTPUTS, write_outputs
 from app.usecases.scenes import clean_name, local_image, visible_scene
 from services.errors import CoverageError
-from services.formats.block import FolderChips
-from services.formats.block_check import check_block
+from services.formats.bands import parse_bands
 from services.formats.scenes import read_scene
-from services.reference import (
-    ReferenceChips,
-    ReferenceOptions,
-    homologous_points,
-    register_on_reference,
-)
+from services.quality.checks import CheckPoints, check_model, qualified_by
 from services.registration import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
-from services.reports.report import BlockUsed, RegistrationReport
+from services.reports.report import Check, RegistrationReport
+from services.reports.report import Method as ReportedMethod
 from services.scene import Scene, scene_footprint, scene_gsd_m
-from services.types import Array, ChipSource, ControlPoints, Progress, no_progress
+from services.types import Array, Progress, no_progress
+
+Method = Literal["auto", "points", "reference"]
+"""What a scene is registered on: control points, a reference image, or that where there is no point."""
 
 METRES_PER_DEGREE = 111_320.0
 REACH_SIGMAS = 3.0
@@ -50,14 +47,29 @@ REACH_SIGMAS = 3.0
 class RegisterScene:
     """What a user says to have a scene registered.
 
+    Files are named that were uploaded beside the image.
+
     Attributes:
         scene: id of an uploaded scene.
-        model: name of the uploaded file that holds its model; by default it is found.
+        model: name of the file that holds its model; by default it is found.
+        method: "points", "reference", or "auto": on points, on a reference where there is none.
+        bands: what is looked at, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic
+            band or the mean of the visible ones.
+        mask: name of an image of the same ground that is not zero where pixels shall not be used.
+        check_points: name of a file with points that are held out of the registration.
+        check_heights: what the heights in it are above, where its format cannot say.
+        copy_image: whether a GeoTIFF is delivered again with the refined model in its tags.
         options: of the registration.
     """
 
     scene: UUID
     model: str | None = None
+    method: Method = "auto"
+    bands: str | None = None
+    mask: str | None = None
+    check_points: str | None = None
+    check_heights: str | None = None
+    copy_image: bool = False
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
 
@@ -69,32 +81,19 @@ class SceneFiles:
         image: the image; what lies beside it is looked at for a model.
         model: file of the model, if it is not found by itself.
         sigma_m: accuracy of the model, metres; by default what the producer or the sensor says.
+        bands: what is looked at; see `services.formats.bands.parse_bands`.
+        mask: image of the same ground, not zero where pixels shall not be used.
+        check_points: points held out of the registration.
+        check_heights: what their heights are above, where their format cannot say.
     """
 
     image: Path
     model: Path | None = None
     sigma_m: float | None = None
-
-
-@dataclass(frozen=True)
-class FoundPoints:
-    """Control points of a piece of ground.
-
-    Attributes:
-        chips: where the chips of the points are.
-        blocks: whose points they are.
-        frame_sigma_m: how well the frame of the worst of them is known, one standard deviation a
-            coordinate; NaN when a block does not say.
-    """
-
-    points: ControlPoints
-    chips: ChipSource
-    blocks: tuple[BlockUsed, ...]
-    frame_sigma_m: float
-
-
-FindPoints = Callable[[Array], FoundPoints]
-"""Points inside an outline (n, 2) of lon, lat."""
+    bands: str | None = None
+    mask: Path | None = None
+    check_points: Path | None = None
+    check_heights: str | None = None
 
 
 @dataclass(frozen=True)
@@ -103,12 +102,14 @@ class RegisteredScene:
 
     Attributes:
         scene: as read; its pixels are gone once its files are.
+        reference: what it was registered on; None: control points.
         footprint: (n, 2) lon, lat outline of the scene.
         files: the outputs, by name.
     """
 
     scene: Scene
     registration: Registration
+    reference: FoundReference | None
     report: RegistrationReport
     footprint: Array
     files: dict[str, Path]
@@ -120,33 +121,46 @@ def run_registration(
     options: RegistrationOptions,
     folder: Path,
     progress: Progress = no_progress,
-    reference: ReferenceFiles | None = None,
+    find_reference: FindReference | None = None,
+    method: Method = "auto",
+    copy_image: bool = False,
 ) -> RegisteredScene:
     """Register one scene and write what came out of it into a folder.
 
     Args:
         files: the scene.
-        find_points: the control points; None registers on the reference only.
+        find_points: the control points; None: there are none.
         options: thresholds.
         folder: made when missing.
         progress: told where the work stands.
-        reference: what the scene is registered on where there is no control point.
+        find_reference: what the scene is registered on where there is no control point.
+        method: "auto" or one of both.
+        copy_image: also copy a GeoTIFF, with the refined model in its tags.
 
     Raises:
-        InputError: the scene cannot be used.
+        InputError: the scene, its mask or its check points cannot be used.
         ComputationError: it cannot be registered.
     """
     started_at = datetime.now(UTC)
-    scene = read_scene(files.image, files.model, files.sigma_m)
+    bands = None if files.bands is None else parse_bands(files.bands)
+    scene = read_scene(files.image, files.model, files.sigma_m, bands, mask=files.mask)
+    held_out = None
+    if files.check_points is not None:
+        held_out = read_check_points(files.check_points, files.check_heights, files.image, scene)
     footprint = scene_footprint(scene)
-    registration, found = _registered(
+    outline = _grown(footprint, REACH_SIGMAS * scene.sigma_m)
+    registration, found, reference = _registered(
         scene,
-        footprint,
-        find_points,
-        reference,
+        outline,
+        None if method == "reference" else find_points,
+        None if method == "points" else find_reference,
         options,
         lambda fraction, message: progress(0.9 * fraction, message),
     )
+    checks: tuple[Check, ...] = ()
+    if held_out is not None and files.check_points is not None:
+        registration, check = _checked(registration, held_out, found, options, files.check_points.name)
+        checks = (check,)
     progress(0.9, "writing the report")
     report, paths = write_outputs(
         folder,
@@ -159,67 +173,57 @@ def run_registration(
         registration,
         options,
         started_at,
+        copy_image,
+        "control points" if reference is None else "reference image",
+        checks,
     )
-    return RegisteredScene(scene, registration, report, footprint, paths)
+    return RegisteredScene(scene, registration, reference, report, footprint, paths)
 
 
 def _registered(
     scene: Scene,
-    footprint: Array,
+    outline: Array,
     find_points: FindPoints | None,
-    reference: ReferenceFiles | None,
+    find_reference: FindReference | None,
     options: RegistrationOptions,
     progress: Progress,
-) -> tuple[Registration, FoundPoints]:
-    """A registration and the points it was made on: control points, or else places of a reference."""
+) -> tuple[Registration, FoundPoints, FoundReference | None]:
+    """A registration and what it was made on: control points, or else places of a reference."""
+    missing = CoverageError("no reference image shows the ground of the scene")
     if find_points is not None:
         progress(0.0, "looking for points")
-        found = find_points(_grown(footprint, REACH_SIGMAS * scene.sigma_m))
+        found = find_points(outline)
         try:
             registration = register_scene(
                 scene, found.points, found.chips, options, progress, found.frame_sigma_m
             )
-            return registration, found
-        except CoverageError:
-            if reference is None:
-                raise
+            return registration, found, None
+        except CoverageError as error:
+            missing = error
+    reference = None if find_reference is None else find_reference(outline)
     if reference is None:
-        raise InputError("neither control points nor a reference to register the scene on")
-    held = read_reference(reference)
-    of_reference = ReferenceOptions(
-        seed=options.seed, adjustment=options.adjustment, qualification=options.qualification
+        raise missing
+    return (*register_on(reference, scene, options, progress), reference)
+
+
+def _checked(
+    registration: Registration,
+    points: CheckPoints,
+    found: FoundPoints,
+    options: RegistrationOptions,
+    name: str,
+) -> tuple[Registration, Check]:
+    """A registration whose qualification knows what independent points say of it."""
+    checked = check_model(registration.model, registration.adjustment, points, found.frame_sigma_m)
+    limit = options.qualification.good_unit_weight
+    qualification = qualified_by(registration.qualification, checked, limit)
+    check = Check(
+        f"independent check points of {name}",
+        checked.accuracy,
+        checked.residual_px,
+        checked.normalised,
     )
-    registration = register_on_reference(scene, held, of_reference, progress)
-    lon_lat_h = registration.measures.lon_lat_h
-    points, chips = homologous_points(lon_lat_h, held), ReferenceChips(held, lon_lat_h)
-    block = BlockUsed(reference.image.name, "reference image")
-    return registration, FoundPoints(points, chips, (block,), held.frame_sigma_m)
-
-
-def points_of_block(folder: Path) -> FindPoints:
-    """Points straight out of a block folder, once it has been checked entirely."""
-    contents = check_block(folder)
-    metadata = contents.document.metadata
-    said = next((figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m"), None)
-
-    def find(outline: Array) -> FoundPoints:
-        block = BlockUsed(metadata.id, metadata.version)
-        return FoundPoints(contents.points, FolderChips(folder), (block,), _frame_sigma_m([said]))
-
-    return find
-
-
-def points_of_store(database: Database, storage: Storage) -> FindPoints:
-    """Points of the published blocks of the store."""
-
-    def find(outline: Array) -> FoundPoints:
-        with database.transaction() as connection:
-            found = control_points(connection, outline)
-        blocks = tuple(BlockUsed(block.id, block.version) for block in found.blocks)
-        frame_sigma_m = _frame_sigma_m([block.frame_sigma_m for block in found.blocks])
-        return FoundPoints(found.points, StoredChips(storage), blocks, frame_sigma_m)
-
-    return find
+    return replace(registration, qualification=qualification), check
 
 
 def record(
@@ -247,7 +251,11 @@ def record(
         verdict=registered.registration.qualification.verdict,
         files=keys or {},
     )
-    history.remember(connection, registration_id, registered.registration, scene_key)
+    made, reference = registered.registration, registered.reference
+    if reference is None:
+        history.remember(connection, registration_id, made, scene_key)
+    else:
+        keep_places(connection, reference, made, registered.footprint)
     return registration_id
 
 
@@ -262,8 +270,12 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
     scene = visible_scene(connection, caller, inputs.scene)
     if scene.state != "uploaded":
         raise Conflict(f"scene {inputs.scene} cannot be registered: its image is {scene.state}")
-    if inputs.model is not None and inputs.model != clean_name(inputs.model):
-        raise InputError(f"model: {inputs.model!r} is not the name of an uploaded file")
+    for name in ("model", "mask", "check_points"):
+        given = getattr(inputs, name)
+        if given is not None and given != clean_name(given):
+            raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
+    if inputs.bands is not None:
+        parse_bands(inputs.bands)
 
 
 def _run(work: Work) -> Commit:
@@ -276,9 +288,16 @@ def _run(work: Work) -> Commit:
     find_points = points_of_store(work.database, work.storage)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
-        model = inputs.model and image.with_name(inputs.model)
-        files = SceneFiles(image, model or None, scene.sigma_m)
-        made = run_registration(files, find_points, inputs.options, Path(folder), work.progress)
+        made = run_registration(
+            _files_of(inputs, image, scene.sigma_m),
+            find_points,
+            inputs.options,
+            Path(folder),
+            work.progress,
+            references_of_store(work.database, work.settings),
+            inputs.method,
+            inputs.copy_image,
+        )
         gsd_m = scene_gsd_m(made.scene)
         keys = {
             name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
@@ -291,14 +310,26 @@ def _run(work: Work) -> Commit:
         scenes.set_footprint(connection, inputs.scene, made.footprint)
         taken, shape = made.scene.acquisition, made.scene.image.shape
         scenes.describe(connection, inputs.scene, taken, shape, gsd_m)
-        return {"verdict": made.report.verdict, "files": keys}
+        return {"verdict": made.report.verdict, "method": made.report.method, "files": keys}
 
     return commit
 
 
-def _frame_sigma_m(said: Sequence[float | None]) -> float:
-    """The worst of what blocks say of their frames; NaN when one says nothing."""
-    return math.nan if None in said or not said else max(value for value in said if value is not None)
+def _files_of(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
+    """The files of a scene that lie beside its image, by the names they were uploaded under."""
+
+    def beside(name: str | None) -> Path | None:
+        return None if name is None else image.with_name(name)
+
+    return SceneFiles(
+        image,
+        beside(inputs.model),
+        sigma_m,
+        inputs.bands,
+        beside(inputs.mask),
+        beside(inputs.check_points),
+        inputs.check_heights,
+    )
 
 
 def _grown(outline: Array, metres: float) -> Array:
@@ -318,4 +349,8 @@ REGISTER_SCENE = Process(
     outputs=OUTPUTS,
     check=_check,
     run=_run,
+    values={
+        "verdict": {"enum": ["good", "usable", "failed"], "title": "How good it is"},
+        "method": {"enum": list(get_args(ReportedMethod)), "title": "What it was registered on"},
+    },
 )

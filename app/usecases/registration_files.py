@@ -18,7 +18,9 @@ from services.reports.document import format_report
 from services.reports.html import format_html
 from services.reports.report import (
     BlockUsed,
+    Check,
     ChipPair,
+    Method,
     Quicklook,
     RegistrationReport,
     RegistrationSummary,
@@ -74,6 +76,8 @@ def write_outputs(
     options: RegistrationOptions,
     started_at: datetime,
     copy_image: bool = False,
+    method: Method = "control points",
+    checks: tuple[Check, ...] = (),
 ) -> tuple[RegistrationReport, dict[str, Path]]:
     """Write everything a user takes home from a registration.
 
@@ -81,6 +85,8 @@ def write_outputs(
         folder: made when missing; files of the same names are replaced.
         image, model: the files of the scene, to write the refined model as they have it.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
+        method: what the scene was registered on.
+        checks: of the model against independent points.
 
     Returns:
         The report, and the files by name.
@@ -110,6 +116,8 @@ def write_outputs(
         software_version=version("amers"),
         started_at=started_at,
         finished_at=datetime.now(UTC),
+        method=method,
+        checks=checks,
     )
     report = build_report(summary)
     sigma_m = _point_sigmas_m(points, registration.measures)

@@ -1,7 +1,9 @@
-"""Rectifying scenes from the command line."""
+"""Rectifying scenes from the command line and by a service."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from uuid import UUID
 
 import cv2
 import numpy as np
@@ -9,11 +11,15 @@ import pytest
 import rasterio
 import rasterio.vrt
 import rasterio.warp
+from fastapi.testclient import TestClient
 from rasterio.transform import from_origin
 from typer.testing import CliRunner
 
 from app.cli.main import app
+from app.config import Settings
+from app.db import engine, jobs
 from app.errors import AmersError
+from app.usecases.jobs import do_attempt
 from services.formats.raster import write_raster
 from services.formats.rpc_text import parse_rpc_text
 
@@ -82,6 +88,52 @@ def test_heights_without_a_datum_and_files_written_over_are_refused(tmp_path: Pa
         ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", scene)
     with pytest.raises(AmersError, match="cubic or bilinear"):
         ortho(scene, "--dem", dem, "--kernel", "lanczos", "-o", tmp_path / "ortho.tif")
+
+
+def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    settings: Settings,
+    dsn: str,
+    tmp_path: Path,
+) -> None:
+    image, dem = write_inputs(tmp_path)
+    me = bearer("register")
+    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
+    laid = client.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes(), headers=me)
+    assert laid.status_code == 200, laid.text
+
+    def outcome(**said: object) -> dict:
+        body = {"inputs": {"scene": scene, "dem": "dem.tif", **said}}
+        asked = client.post("/processes/orthorectify/execution", json=body, headers=me)
+        assert asked.status_code == 201, asked.text
+        job_id = asked.json()["jobID"]
+        with engine.pooled(dsn, settings) as database:
+            with database.transaction() as connection:
+                assert jobs.claim(connection, UUID(job_id), "a worker", 30.0)
+            do_attempt(database, settings, UUID(job_id), 1)
+        job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
+        if job["status"] == "failed":
+            return job
+        found: dict = client.get(f"/jobs/{job_id}/results", headers=me).json()
+        return found
+
+    unsaid = outcome()
+    assert unsaid["error"]["error"] == "VerticalDatumError"
+    assert "dem.tif" in unsaid["error"]["detail"]
+    results = outcome(vertical="ellipsoid")
+    assert results["error_px"] < 0.1
+    served = client.get(results["ortho.tif"]["href"], headers=me)
+    assert served.headers["content-type"].startswith("image/tiff")
+    (tmp_path / "served.tif").write_bytes(served.content)
+    ortho(image, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "own.tif")
+    with rasterio.open(tmp_path / "served.tif") as ours, rasterio.open(tmp_path / "own.tif") as own:
+        assert (ours.crs, ours.transform) == (own.crs, own.transform)
+        np.testing.assert_array_equal(ours.read(), own.read())
+    unknown = {"scene": scene, "dem": "dem.tif", "registration": str(UUID(int=1))}
+    refused = client.post("/processes/orthorectify/execution", json={"inputs": unknown}, headers=me)
+    assert refused.status_code == 422
+    assert "did not register scene" in refused.json()["detail"]
 
 
 @pytest.mark.real_data

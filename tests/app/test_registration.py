@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from fastapi.testclient import TestClient
 from jsonschema import validate
 
@@ -19,7 +20,8 @@ from app.config import Settings
 from app.db import engine
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
-from app.usecases.registration import SceneFiles, points_of_block, points_of_store, run_registration
+from app.usecases.ground_control import points_of_block, points_of_store
+from app.usecases.registration import SceneFiles, run_registration
 from app.usecases.registration_files import OUTPUTS
 from services.formats.control_point_files import read_control_points
 from services.formats.rpc_files import read_rpc
@@ -34,6 +36,7 @@ from tests.app.workers import ended, running_worker, wait_until
 
 A_TENTH_OF_A_PIXEL = 0.1
 A_MILLIONTH_OF_A_PIXEL = 1e-6
+MASKED_LINES = 400
 COMMON_FILES = set(OUTPUTS)
 
 Bearer = Callable[[str], dict[str, str]]
@@ -148,15 +151,32 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
         f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.image.read_bytes(), headers=me
     )
     scene = upload.json()["id"]
-    client.put(f"/scenes/{scene}/files/scene_RPC.TXT", content=world.rpc_text.read_bytes(), headers=me)
-    body = {"inputs": {"scene": scene, "options": {"max_points": 30}}}
+    write_check_points(tmp_path / "checks.geojson", world)
+    write_mask(tmp_path / "mask.tif")
+    for path in (world.rpc_text, tmp_path / "checks.geojson", tmp_path / "mask.tif"):
+        laid = client.put(f"/scenes/{scene}/files/{path.name}", content=path.read_bytes(), headers=me)
+        assert laid.status_code == 200, laid.text
+    assert client.put(f"/scenes/{scene}/files/a.exe", content=b"MZ", headers=me).status_code == 422
+    inputs = {
+        "scene": scene,
+        "bands": "1",
+        "mask": "mask.tif",
+        "check_points": "checks.geojson",
+        "copy_image": True,
+        "options": {"max_points": 30},
+    }
+    wrong = {"inputs": {**inputs, "bands": "zero"}}
+    execution = "/processes/register-scene/execution"
+    assert client.post(execution, json=wrong, headers=me).status_code == 422
+    body = {"inputs": inputs}
     asked = client.post("/processes/register-scene/execution", json=body, headers=me)
     with running_worker(settings, tmp_path / "log"):
         done = ended(client, asked.headers["location"], me)
     assert (done["status"], done["progress"]) == ("successful", 100), done
     results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
     assert results.pop("verdict") in ("good", "usable")
-    assert set(results) == COMMON_FILES | {"scene_RPC.TXT"}
+    assert results.pop("method") == "control points"
+    assert set(results) == COMMON_FILES | {"scene_RPC.TXT", "scene.tif"}
     folder = tmp_path / "downloaded"
     folder.mkdir()
     for name, link in results.items():
@@ -170,7 +190,17 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     for name in ("..%2Freport.json", "nothing.json", "%2e%2e"):
         assert client.get(f"/jobs/{done['jobID']}/results/{name}", headers=me).status_code == 404
     assert client.get(f"/scenes/{scene}", headers=me).json()["footprint"]["type"] == "Polygon"
+    assert largest_error_px(read_rpc(folder / "scene.tif").model, world.true_model) < A_TENTH_OF_A_PIXEL
     report = json.loads((folder / "report.json").read_text())
+    assert report["checks"][0]["accuracy"]["n"] == 36
+    points = json.loads((folder / "control_points.geojson").read_text())["features"]
+    under_the_mask = [
+        one["properties"]["reason"]
+        for one in points
+        if one["properties"]["predicted_line"] < MASKED_LINES
+    ]
+    assert set(under_the_mask) <= {"nodata", "not_tried"}
+    assert "nodata" in under_the_mask
     with engine.connect(dsn) as connection:
         counts = connection.execute(
             "select count(*) as tried, count(*) filter (where active) as active from measure"
@@ -247,6 +277,81 @@ def test_the_command_registers_straight_from_a_block_folder(
     assert_registered(folder, world)
     beside = read_rpc(world.tagged, folder / "tagged_RPC.TXT").model
     assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
+
+
+def write_mask(path: Path) -> None:
+    """A mask four times coarser than the scene that hides its first lines."""
+    hidden = np.zeros((300, 300), np.uint8)
+    hidden[: MASKED_LINES // 4 + 30] = 1
+    with rasterio.open(path, "w", driver="GTiff", width=300, height=300, count=1, dtype="uint8") as file:
+        file.write(hidden, 1)
+
+
+def write_check_points(path: Path, world: FlatWorld, moved_px: float = 0.0) -> None:
+    """Ground that the truth places in the scene, as GeoJSON; marks are moved along the lines."""
+    step = np.linspace(-0.002, 0.002, 6)
+    lon, lat = (axis.ravel() for axis in np.meshgrid(step + CENTRE[0], step + CENTRE[1]))
+    ground = np.column_stack([lon, lat, np.full(36, GROUND_H)])
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": place.tolist()},
+            "properties": {"line": line + moved_px, "sample": sample, "sigma_px": 0.2, "check": True},
+        }
+        for place, (line, sample) in zip(ground, world.true_model.project(ground), strict=True)
+    ]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def test_points_held_out_are_told_in_the_report_and_can_take_a_good_verdict_away(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    def register(moved_px: float) -> dict:
+        write_check_points(tmp_path / "checks.geojson", world, moved_px)
+        command = ("scene", "register", world.tagged, "--block", world.block, "--sigma-m", SIGMA_M)
+        done = amers(
+            *command, "--check-points", tmp_path / "checks.geojson", "-o", tmp_path / "out", "--json"
+        )
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["check_points"] == 36
+        report: dict = json.loads((tmp_path / "out" / "report.json").read_text())
+        validate(report, report_schema())
+        return report
+
+    report = register(moved_px=0.0)
+    (check,) = report["checks"]
+    half_a_pixel_m = 0.25
+    assert check["accuracy"]["n"] == 36
+    assert 0.0 < check["accuracy"]["ce90_m"]["value"] < half_a_pixel_m
+    assert check["image_residuals_px"]["xy"]["rms"] < A_TENTH_OF_A_PIXEL
+    (criterion,) = [one for one in report["criteria"] if one["name"] == "check_points"]
+    assert criterion["passed"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "independent check points of checks.geojson" in page
+    (criterion,) = [one for one in register(5.0)["criteria"] if one["name"] == "check_points"]
+    assert not criterion["passed"]
+    assert criterion["value"] > criterion["limit"]
+
+
+def test_check_points_of_another_image_are_refused_by_name(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    write_check_points(tmp_path / "checks.geojson", world)
+    document = json.loads((tmp_path / "checks.geojson").read_text())
+    (tmp_path / "checks.geojson").write_text(json.dumps({**document, "image": "other.tif"}))
+    done = amers(
+        "scene",
+        "register",
+        world.tagged,
+        "--block",
+        world.block,
+        "-o",
+        tmp_path / "out",
+        "--check-points",
+        tmp_path / "checks.geojson",
+    )
+    assert done.returncode == 2
+    assert "checks.geojson: expected marks in tagged.tif, found marks in other.tif" in done.stderr
 
 
 def test_the_command_registers_with_the_store_and_remembers_the_measures(

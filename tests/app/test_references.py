@@ -1,0 +1,248 @@
+"""Reference images of a service: registered, used where there are no points, their places kept."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from uuid import UUID
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from fastapi.testclient import TestClient
+from rasterio.transform import Affine
+
+from app.config import Settings
+from app.db import engine, jobs, references
+from app.db.engine import Connection, Database
+from app.errors import Conflict, InputError, NotFound
+from app.main import create_app
+from app.usecases.jobs import do_attempt
+from app.usecases.references import (
+    NewReference,
+    add_reference,
+    keep_places,
+    references_of_store,
+    remove_reference,
+)
+from app.usecases.registration import RegisteredScene, SceneFiles, run_registration
+from services.errors import CoverageError
+from services.imagery import ArrayImage, sample_image
+from services.registration import RegistrationOptions
+from services.types import FloatImage
+
+SHIFT_PX = np.array([5.3, -3.6])
+A_TENTH_OF_A_PIXEL = 0.1
+SIZE = 420
+GSD_M = 10.0
+SIGMA_M = 40.0
+OPTIONS = RegistrationOptions()
+
+
+def write(path: Path, pixels: FloatImage) -> Path:
+    """An image on a map, in Germany."""
+    grid = Affine(GSD_M, 0, 5e5, 0, -GSD_M, 5e6)
+    profile = {"driver": "GTiff", "width": SIZE, "height": SIZE, "count": 1, "dtype": "uint16"}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with rasterio.open(path, "w", crs="EPSG:32632", transform=grid, **profile) as file:
+        file.write(np.clip(pixels, 1, 65535).astype(np.uint16), 1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a reference, and two scenes of its ground whose maps are a few pixels off."""
+    folder = tmp_path_factory.mktemp("images")
+    rng = np.random.default_rng(4)
+    ground = cv2.GaussianBlur(rng.normal(size=(512, 512)), (0, 0), 1.5)
+    ground = (500.0 + 80.0 * ground / ground.std()).astype(np.float32)
+    pixel = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij"), -1) + 40.0
+    write(folder / "allowed" / "reference.tif", sample_image(ArrayImage(ground), pixel, 1.0))
+    for name, moved in (("first", SHIFT_PX), ("second", -SHIFT_PX)):
+        seen = sample_image(ArrayImage(ground), pixel - moved, 1.0)
+        write(folder / f"{name}.tif", seen + rng.normal(0.0, 5.0, seen.shape).astype(np.float32))
+    return folder
+
+
+@pytest.fixture
+def settings(settings: Settings, folder: Path) -> Settings:
+    """Settings that let references be used."""
+    return settings.model_copy(update={"reference_folder": folder / "allowed"})
+
+
+@pytest.fixture
+def database(dsn: str, settings: Settings) -> Iterator[Database]:
+    """The database of the test with its pools."""
+    with engine.pooled(dsn, settings) as database:
+        yield database
+
+
+@pytest.fixture
+def added(connection: Connection, settings: Settings) -> None:
+    """The reference, in the store."""
+    add_reference(connection, settings, NewReference("land", "reference.tif", sigma_m=3.0))
+    connection.commit()
+
+
+def registered(database: Database, settings: Settings, image: Path, output: Path) -> RegisteredScene:
+    """A scene registered as the service would, its places kept."""
+    find = references_of_store(database, settings)
+    files = SceneFiles(image, sigma_m=SIGMA_M)
+    made = run_registration(files, None, OPTIONS, output, find_reference=find)
+    assert made.reference is not None
+    with database.transaction() as connection:
+        keep_places(connection, made.reference, made.registration, made.footprint)
+    return made
+
+
+def places(connection: Connection) -> list[tuple[int, int]]:
+    """How often each place was looked for and found."""
+    rows = connection.execute("select tried, found from homologous_place order by id").fetchall()
+    return [(row["tried"], row["found"]) for row in rows]
+
+
+def test_only_files_of_the_folder_that_lie_on_a_map_become_references(
+    connection: Connection, settings: Settings, folder: Path
+) -> None:
+    def refused(reason: str, **said: object) -> None:
+        new = replace(NewReference("land", "reference.tif"), **said)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=reason):
+            add_reference(connection, settings, new)
+
+    refused("image: '../first.tif' is no file below", image="../first.tif")
+    refused("image: .* is no file below", image=str(folder / "first.tif"))
+    refused("image: 'none.tif' is no file below", image="none.tif")
+    refused("dem: 'none.tif' is no file below", dem="none.tif")
+    refused("name: 1 to 120 characters", name=" ")
+    refused("sigma_m: 0 found", sigma_m=0.0)
+    refused("of the heights of a dem", vertical="EGM96")
+    closed = settings.model_copy(update={"reference_folder": None})
+    with pytest.raises(InputError, match="AMERS_REFERENCE_FOLDER is not set"):
+        add_reference(connection, closed, NewReference("land", "reference.tif"))
+    assert references.list_references(connection) == []
+
+
+def test_a_reference_is_known_by_one_name_until_it_is_removed(
+    connection: Connection, settings: Settings, added: None
+) -> None:
+    with pytest.raises(Conflict):
+        add_reference(connection, settings, NewReference("land", "reference.tif"))
+    connection.rollback()
+    (row,) = references.list_references(connection)
+    the_scale_of_the_map = 1e-3
+    assert (row.name, row.sigma_m) == ("land", 3.0)
+    assert row.gsd_m == pytest.approx(GSD_M, rel=the_scale_of_the_map)
+    remove_reference(connection, "land")
+    with pytest.raises(NotFound):
+        remove_reference(connection, "land")
+
+
+def test_places_found_are_kept_and_searched_first_in_the_next_scene(
+    database: Database,
+    settings: Settings,
+    connection: Connection,
+    added: None,
+    folder: Path,
+    tmp_path: Path,
+) -> None:
+    first = registered(database, settings, folder / "first.tif", tmp_path / "first")
+    assert first.report.verdict == "good"
+    assert first.report.method == "reference image"
+    assert [block.id for block in first.report.blocks] == ["land"]
+    found = first.registration.adjustment.correction.parameters[:, 0]
+    assert np.abs(found - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+    once = places(connection)
+    connection.rollback()
+    assert 20 < len(once) <= int(first.registration.measures.active.sum())
+    assert set(once) == {(1, 1)}
+
+    find = references_of_store(database, settings)
+    known = find(first.footprint)
+    assert known is not None
+    assert known.known is not None
+    assert len(known.known) == len(once)
+
+    second = registered(database, settings, folder / "second.tif", tmp_path / "second")
+    found = second.registration.adjustment.correction.parameters[:, 0]
+    assert np.abs(found + SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+    twice = places(connection)
+    again = [counts for counts in twice if counts[0] == 2]
+    assert len(again) > 0.8 * len(once)
+    assert sum(found for _, found in again) > 1.9 * len(again)
+    assert len(twice) < 1.5 * len(once)
+
+
+def test_a_failed_registration_leaves_no_places(
+    database: Database,
+    settings: Settings,
+    connection: Connection,
+    added: None,
+    folder: Path,
+    tmp_path: Path,
+) -> None:
+    find = references_of_store(database, settings)
+    files = SceneFiles(folder / "first.tif", sigma_m=SIGMA_M)
+    made = run_registration(files, None, OPTIONS, tmp_path, find_reference=find)
+    assert made.reference is not None
+    failed = replace(
+        made.registration, qualification=replace(made.registration.qualification, verdict="failed")
+    )
+    keep_places(connection, made.reference, failed, made.footprint)
+    assert places(connection) == []
+
+
+def test_a_scene_beside_every_reference_says_so(
+    database: Database, settings: Settings, folder: Path, tmp_path: Path
+) -> None:
+    files = SceneFiles(folder / "first.tif", sigma_m=SIGMA_M)
+    find = references_of_store(database, settings)
+    with pytest.raises(CoverageError, match="no reference image shows the ground"):
+        run_registration(files, None, OPTIONS, tmp_path, find_reference=find)
+
+
+def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked(
+    settings: Settings,
+    database: Database,
+    bearer: Callable[[str], dict[str, str]],
+    folder: Path,
+) -> None:
+    admin, me = bearer("admin"), bearer("register")
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        body = {"name": "land", "image": "reference.tif"}
+        assert client.post("/references", json=body, headers=me).status_code == 403
+        assert (
+            client.post("/references", json={**body, "image": "../first.tif"}, headers=admin).status_code
+            == 422
+        )
+        assert client.post("/references", json=body, headers=admin).status_code == 201
+        listed = client.get("/references", headers=me).json()["references"]
+        assert [one["name"] for one in listed] == ["land"]
+        upload = client.post(
+            f"/scenes?name=first.tif&sigma_m={SIGMA_M}",
+            content=(folder / "first.tif").read_bytes(),
+            headers=me,
+        )
+        scene = upload.json()["id"]
+
+        def outcome(method: str) -> dict:
+            body = {"inputs": {"scene": scene, "method": method}}
+            asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+            assert asked.status_code == 201, asked.text
+            job_id = asked.json()["jobID"]
+            with database.transaction() as connection:
+                assert jobs.claim(connection, UUID(job_id), "a worker", 30.0)
+            do_attempt(database, settings, UUID(job_id), 1)
+            job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
+            if job["status"] == "successful":
+                return client.get(f"/jobs/{job_id}/results", headers=me).json()
+            return job
+
+        points_only = outcome("points")
+        assert (points_only["status"], points_only["error"]["error"]) == ("failed", "CoverageError")
+        for method in ("auto", "reference"):
+            assert outcome(method)["method"] == "reference image"
+        assert client.delete("/references/land", headers=admin).status_code == 204
+        gone = outcome("auto")
+        assert "no control point" in gone["error"]["detail"]
+        changes = client.get("/audit?kind=reference_image", headers=admin).json()["changes"]
+        assert [change["action"] for change in changes] == ["deleted", "created"]
