@@ -1,0 +1,36 @@
+"""Points out of one Sentinel-2 image, and the same land of another day registered on them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.real_data
+
+SHIFT_M = np.array([6.4, 18.3])
+"""East and north, of the May scene against the June one: SIFT features over all of both."""
+SHIFT_ALLOWED_M = 1.0
+GSD_M = 10.0
+
+
+def test_the_may_scene_of_berlin_is_registered_on_points_of_the_june_one(
+    real_data: Path, amers, tmp_path
+) -> None:
+    (june,) = (real_data / "s2a_berlin_pair").glob("ref_*.tif")
+    (may,) = (real_data / "s2a_berlin_pair").glob("tgt_*.tif")
+    block = tmp_path / "berlin-june"
+    heights = ("--height-m", "80", "--height-sigma-m", "30")
+    made = amers("production", "ortho", june, *heights, "-o", block)
+    assert made["points"] > 150
+    assert made["chip_gsds_m"] == [10.0, 40.0]
+    ingested = amers("block", "ingest", block, "--publish")["block"]
+    assert (ingested["state"], ingested["points"]) == ("published", made["points"])
+
+    out = tmp_path / "may"
+    done = amers("scene", "register", may, "-o", out)
+    line_px, sample_px = done["shift_px"]
+    found_m = np.array([sample_px, -line_px]) * GSD_M
+    print(f"{found_m} m east and north, {done['active']} of {done['visible']} points, {done['verdict']}")
+    assert np.abs(found_m - SHIFT_M).max() < SHIFT_ALLOWED_M
+    assert done["verdict"] == "good"
+    assert done["matched"] < 0.8 * done["visible"]  # the others are under the clouds of May
