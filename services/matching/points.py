@@ -41,9 +41,8 @@ class MatchingOptions:
         min_edge_score: correlation of edges from which on a point is found by them that is not found by
             its grey values.
         likeness: which views are tried first.
-        correlation: when a correlation peak is believed. In a window of three standard deviations a
-            peak of 0.6 without a rival is right in 98 of 100 simulated cases; views and the other points
-            have to agree with it all the same.
+        correlation: when a correlation peak is believed. From 0.6 on 215 of 216 peaks of four simulated
+            scenes were right; views and the other points have to agree with it all the same.
     """
 
     max_views: int = 4
