@@ -79,7 +79,7 @@ def describe_process(process_id: str, request: Request) -> dict[str, Any]:
             "title": name,
             **({"description": process.input_text(name)} if process.input_text(name) else {}),
             "minOccurs": 1 if name in required else 0,
-            "schema": _inlined(member, schema.get("$defs", {})),
+            "schema": inlined(member, schema.get("$defs", {})),
         }
         for name, member in schema["properties"].items()
     }
@@ -138,16 +138,16 @@ def _plain(request: Request, name: str, value: Any) -> Any:
     return known
 
 
-def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
+def inlined(schema: Any, definitions: dict[str, Any]) -> Any:
     """A JSON Schema that needs no definitions from elsewhere; ours never name themselves."""
     if isinstance(schema, list):
-        return [_inlined(item, definitions) for item in schema]
+        return [inlined(item, definitions) for item in schema]
     if not isinstance(schema, dict):
         return schema
-    rest = {key: _inlined(value, definitions) for key, value in schema.items() if key != "$ref"}
+    rest = {key: inlined(value, definitions) for key, value in schema.items() if key != "$ref"}
     if "$ref" in schema:
         named = definitions[schema["$ref"].rsplit("/", 1)[1]]
-        return {**_inlined(named, definitions), **rest}
+        return {**inlined(named, definitions), **rest}
     return rest
 
 

@@ -15,7 +15,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.api import features
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.features import PARAMETERS, CrsUri, Format, SecretDep, viewer_of
-from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
+from app.api.negotiation import (
+    FEATURES,
+    GEOJSON,
+    HTML,
+    JSON,
+    SCHEMA_JSON,
+    chosen_format,
+    refuse_unknown,
+)
+from app.api.processes import inlined
 from app.db.collections import Viewer
 from app.db.engine import Database
 from app.db.outlines import SCENES
@@ -35,6 +44,12 @@ CONFORMS_TO = (
 SEARCH_LINKS = (
     {"rel": "root", "path": "", "type": JSON, "title": "this document"},
     {"rel": "child", "path": f"collections/{stac.COLLECTION}", "type": JSON, "title": "Scenes"},
+    {
+        "rel": "http://www.opengis.net/def/rel/ogc/1.0/queryables",
+        "path": f"collections/{stac.COLLECTION}/queryables",
+        "type": SCHEMA_JSON,
+        "title": "what a search may name",
+    },
     {"rel": "search", "path": "search", "type": GEOJSON, "title": "search of scenes", "method": "GET"},
     {"rel": "search", "path": "search", "type": GEOJSON, "title": "search of scenes", "method": "POST"},
 )
@@ -100,6 +115,13 @@ def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
     return viewer_of(SCENES, caller, settings)
 
 
+def _search_schema() -> dict[str, Any]:
+    """The JSON Schema of a search, for the description of the API."""
+    schema = ItemSearch.model_json_schema()
+    described: dict[str, Any] = inlined(schema, schema.pop("$defs", {}))
+    return described
+
+
 ViewerDep = Annotated[Viewer, Depends(_scenes_viewer)]
 Listed = Annotated[str | None, Query(description="Separated by commas.")]
 
@@ -133,7 +155,7 @@ def search(
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {JSON: {"schema": ItemSearch.model_json_schema(ref_template="#/$defs/{model}")}},
+            "content": {JSON: {"schema": _search_schema()}},
         }
     },
 )
