@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,9 +12,18 @@ import httpx
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    ConsoleMessage,
+    Page,
+    Request,
+    Route,
+    expect,
+    sync_playwright,
+)
 
 from tests.app.flat_world import FlatWorld, make_flat_world
+from tests.factories import make_block
 from tests.serving import Service, until
 
 ROOT = Path(__file__).parents[2]
@@ -23,10 +34,13 @@ DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
 patience_ms = 90_000
 chip_px = 101
+piece_bytes = 8 * 1024 * 1024
+"""Of an upload, as web/source/upload.ts sends them."""
 points_of_the_block = 40
 vector_colour = np.array([0xB3, 0x26, 0x1E])
 enough_px = 50
 most_stops = 80
+poll_ms = 100
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +179,88 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     opened.value.wait_for_load_state()
     expect(opened.value.locator("body")).to_contain_text(report["verdict"])
     opened.value.screenshot(path=ARTEFACTS / "report-page.png")
+
+
+def test_an_upload_goes_on_where_it_stopped_when_the_page_is_opened_again(
+    visit, world, secret, tmp_path
+):
+    """The connection hangs after the first piece, the reader loads the page anew and asks once more."""
+    image = tmp_path / "large.tif"
+    image.write_bytes(world.tagged.read_bytes().ljust(piece_bytes + piece_bytes // 2, b"\0"))
+    page = visit("#/scenes", secret)
+    pieces: list[Request] = []
+    begun: list[Request] = []
+
+    def note(request: Request) -> None:
+        (pieces if request.method == "PATCH" else begun if request.method == "POST" else []).append(
+            request
+        )
+
+    def hang(route: Route) -> None:
+        if route.request.headers.get("upload-offset", "0") == "0":
+            route.continue_()
+
+    page.on("request", note)
+    page.route("**/uploads/*", hang)
+    upload(page, "Image", image)
+    assert until(lambda: page.wait_for_timeout(poll_ms) or len(pieces) == 2)
+    assert pieces[1].headers["upload-offset"] == str(piece_bytes)
+    page.screenshot(path=ARTEFACTS / "upload-hangs.png")
+
+    page.reload()
+    page.unroute("**/uploads/*")
+    pieces.clear()
+    begun.clear()
+    upload(page, "Image", image)
+    expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+    assert [piece.headers["upload-offset"] for piece in pieces] == [str(piece_bytes)]
+    assert [request.url for request in begun if request.url.endswith("/uploads")] == []
+
+
+def upload(page: Page, label: str, file: Path) -> None:
+    """Choose a file in the form and send it off."""
+    page.get_by_label(label).first.set_input_files(file)
+    page.locator("form button[type=submit]").click()
+
+
+def test_a_job_that_waits_tells_its_place_in_the_queue(visit, world, secret, service):
+    """The worker is held still, as one is that is busy with something else."""
+    headers = {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
+        sent = client.post("/scenes?name=waits.tif", content=world.tagged.read_bytes())
+        inputs = {"inputs": {"scene": sent.raise_for_status().json()["id"]}}
+        workers = service.workers()
+        for worker in workers:
+            os.kill(worker, signal.SIGSTOP)
+        try:
+            asked = client.post("/processes/register-scene/execution", json=inputs)
+            page = visit(f"#/job/{asked.raise_for_status().json()['jobID']}", secret)
+            expect(page.get_by_text("number 1 in the queue")).to_be_visible()
+            page.screenshot(path=ARTEFACTS / "queue.png")
+        finally:
+            for worker in workers:
+                os.kill(worker, signal.SIGCONT)
+        expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+
+
+def test_an_administrator_uploads_a_block_which_is_checked_and_staged(
+    visit, administrator, secret, tmp_path
+):
+    made = make_block(tmp_path / "block", name="uploaded")
+    archive = Path(shutil.make_archive(str(tmp_path / "uploaded"), "zip", made.folder))
+    assert visit("#/blocks", secret).get_by_text("Add a block").count() == 0
+
+    page = visit("#/blocks", administrator)
+    page.get_by_text("Add a block").click()
+    page.screenshot(path=ARTEFACTS / "block-upload.png")
+    upload(page, "Block", archive)
+    expect(page.locator(".badge")).to_have_text("successful")
+    page.screenshot(path=ARTEFACTS / "block-uploaded.png")
+    page.get_by_role("link", name="See the block").click()
+    expect(page.get_by_role("button", name="Publish")).to_be_visible()
+    page.get_by_role("link", name="Blocks").first.click()
+    row = page.get_by_role("listitem").filter(has_text="uploaded@1")
+    expect(row.locator(".badge")).to_have_text("staged")
 
 
 def report_of(page: Page, service: Service, secret: str) -> dict:

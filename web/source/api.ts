@@ -65,6 +65,8 @@ export interface Job {
   finished: string | null;
   error?: { title: string; detail: string };
   inputs?: { scene?: string };
+  "amers:queuePosition"?: number;
+  "amers:estimatedEnd"?: string;
 }
 
 export interface Result {

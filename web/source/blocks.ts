@@ -1,8 +1,11 @@
 // Blocks: what there is, how good each is, and its publication by an administrator.
 
-import { type BlockFeature, get, type Page, post } from "./api";
+import { type BlockFeature, get, type Job, type Page, post } from "./api";
 import { badge, facts, figure, fill, h, plural, problem, when } from "./elements";
-import { announce, type ShowView } from "./place";
+import { announce, go, type Place, type ShowView } from "./place";
+import { send } from "./upload";
+
+const ARCHIVES = ".zip,.tar,.tar.gz,.tgz";
 
 interface Distribution {
   median: number;
@@ -23,14 +26,16 @@ export function blocks(signal?: AbortSignal): Promise<Page<BlockFeature>> {
   return get<Page<BlockFeature>>("collections/blocks/items?limit=1000", signal);
 }
 
-/** All blocks that the caller may see. */
-export const showBlocks: ShowView = async ({ panel, atlas, signal }) => {
+/** All blocks that the caller may see; an administrator brings others. */
+export const showBlocks: ShowView = async (place) => {
+  const { panel, atlas, signal, scopes } = place;
   const { features } = await blocks(signal);
   await atlas.show("blocks", features);
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Blocks"),
     h("p", {}, "A block is one production of points, published and withdrawn as a whole."),
+    scopes.includes("admin") ? ingestionForm(place) : null,
     features.length === 0 ? h("p", { class: "quiet" }, "There is none yet.") : null,
     h("ul", { class: "list" }, ...features.map(row)),
   );
@@ -86,6 +91,38 @@ export const showBlock: ShowView = async (place, number) => {
     }
   }
 };
+
+function ingestionForm({ signal }: Place): HTMLElement {
+  const archive = h("input", { type: "file", id: "archive", accept: ARCHIVES, required: true });
+  const publish = h("input", { type: "checkbox", id: "publish" });
+  const button = h("button", { type: "submit", class: "strong" }, "Upload and check");
+  const state = h("div", { class: "upload" });
+  const form = h(
+    "form",
+    { onsubmit: (event) => void submit(event) },
+    h("label", { for: "archive" }, "Block", h("span", { class: "quiet" }, " an archive of its folder: zip or tar")),
+    archive,
+    h("label", { class: "choice" }, publish, " Publish it at once"),
+    button,
+    state,
+  );
+  return h("details", { class: "card" }, h("summary", {}, "Add a block"), form);
+
+  async function submit(event: Event): Promise<void> {
+    event.preventDefault();
+    const [file] = archive.files ?? [];
+    if (!file) return;
+    button.disabled = true;
+    try {
+      const { upload } = await send(file, { purpose: "block" }, state, signal);
+      const inputs = { upload, publish: publish.checked };
+      go(`#/job/${(await post<Job>("processes/ingest-block/execution", { inputs })).jobID}`);
+    } catch (error) {
+      state.replaceChildren(problem(error));
+      button.disabled = false;
+    }
+  }
+}
 
 function row({ id, properties: block }: BlockFeature): HTMLElement {
   return h(

@@ -30,8 +30,13 @@ export const showJob: ShowView = async (place, id) => {
   const { panel, signal } = place;
   const heading = h("h1", { tabindex: -1 }, "Job");
   const body = h("div");
-  fill(panel, h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")), heading, body);
+  const back = h("a", { href: "#/scenes" }, "← Scenes");
+  fill(panel, h("p", {}, back), heading, body);
   let job = await find(id, signal);
+  if (job.processID === "ingest-block") {
+    back.href = "#/blocks";
+    back.textContent = "← Blocks";
+  }
   heading.textContent = job.processID.replace("-", " ").replace(/^./, (first) => first.toUpperCase());
   const running = progressOf(job);
   if (!ended(job)) fill(body, running.element);
@@ -61,7 +66,7 @@ function progressOf(first: Job): { element: HTMLElement; update(job: Job): void 
     element: h("div", { class: "upload" }, words, bar, stop),
     update(job) {
       bar.value = job.progress;
-      words.textContent = job.status === "accepted" ? "Waiting for a worker" : `${job.progress} % · ${job.message ?? "at work"}`;
+      words.textContent = standing(job);
     },
   };
 
@@ -73,6 +78,14 @@ function progressOf(first: Job): { element: HTMLElement; update(job: Job): void 
       stop.replaceWith(problem(error));
     }
   }
+}
+
+/** Where a job stands that has not ended. */
+function standing(job: Job): string {
+  const { "amers:queuePosition": position, "amers:estimatedEnd": end } = job;
+  const waiting = position == null ? "Waiting for a worker" : `Waiting for a worker: number ${position} in the queue`;
+  const now = job.status === "accepted" ? waiting : `${job.progress} % · ${job.message ?? "at work"}`;
+  return end ? `${now} · may end on ${when(end)}` : now;
 }
 
 function outcome(job: Job): HTMLElement {
@@ -89,7 +102,7 @@ async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElem
   const told = results["report.json"];
   const measured = results["control_points.geojson"];
   if (!told || !measured) {
-    fill(body, outcome(job), await downloads(results, signal));
+    fill(body, outcome(job), toBlock(results), await downloads(results, signal));
     return;
   }
   const [report, points] = await Promise.all([
@@ -105,6 +118,12 @@ async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElem
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
   atlas.fit(footprint, 17);
+}
+
+/** The way to the block that a job has brought into the store. */
+function toBlock({ number }: Record<string, unknown>): HTMLElement | null {
+  if (typeof number !== "number") return null;
+  return h("p", {}, h("a", { class: "button strong", href: `#/block/${number}` }, "See the block"));
 }
 
 function summary(report: Report, exaggeration: number): HTMLElement[] {
@@ -148,7 +167,7 @@ async function downloads(results: Results, signal: AbortSignal): Promise<HTMLEle
     const link = h("a", { href: "#", role: "button", onclick: (event) => void save(event, file, link) }, file.title);
     return h("li", {}, link, h("span", { class: "quiet" }, file.type));
   });
-  return h("div", {}, open, h("h2", {}, "Files"), h("ul", { class: "list" }, ...rows));
+  return h("div", {}, open, files.length ? h("h2", {}, "Files") : null, h("ul", { class: "list" }, ...rows));
 
   async function save(event: Event, file: Result, link: HTMLElement): Promise<void> {
     event.preventDefault();

@@ -4,7 +4,7 @@ import type { Feature } from "geojson";
 import { get, type Job, post, type Scene } from "./api";
 import { badge, bytes, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { go, type Place, type ShowView } from "./place";
-import { type SceneUpload, uploadModel, uploadScene } from "./upload";
+import { send, uploadModel } from "./upload";
 
 const IMAGES = ".tif,.tiff,.jp2,.j2k,.ntf,.nitf,.zip,.tar";
 const MODELS = ".txt,.xml,.rpb,.rpc";
@@ -80,7 +80,7 @@ function uploadForm({ signal }: Place): HTMLElement {
   const image = h("input", { type: "file", id: "image", accept: IMAGES, required: true });
   const models = h("input", { type: "file", id: "models", accept: MODELS, multiple: true });
   const sigma = h("input", { type: "number", id: "sigma", min: 0.01, step: "any", inputmode: "decimal", placeholder: "unknown" });
-  const send = h("button", { type: "submit", class: "strong" }, "Upload and register");
+  const button = h("button", { type: "submit", class: "strong" }, "Upload and register");
   const state = h("div", { class: "upload" });
   const form = h(
     "form",
@@ -91,7 +91,7 @@ function uploadForm({ signal }: Place): HTMLElement {
     models,
     h("label", { for: "sigma" }, "Accuracy of the model, metres"),
     sigma,
-    send,
+    button,
     state,
   );
   return h("details", { open: true, class: "card" }, h("summary", {}, "Register a scene"), form);
@@ -100,37 +100,15 @@ function uploadForm({ signal }: Place): HTMLElement {
     event.preventDefault();
     const [file] = image.files ?? [];
     if (!file) return;
-    send.disabled = true;
-    const bar = h("progress", { max: file.size, value: 0, "aria-label": "Upload" });
-    const figures = h("span", { class: "quiet" }, bytes(0));
-    const upload = uploadScene(file, sigma.value, (sent, all) => {
-      bar.value = sent;
-      figures.textContent = `${bytes(sent)} of ${bytes(all)}`;
-    });
-    state.replaceChildren(bar, figures, pauseButton(upload));
-    const leaving = (): void => upload.pause();
-    signal.addEventListener("abort", leaving);
+    button.disabled = true;
     try {
-      const scene = await upload.done;
-      signal.removeEventListener("abort", leaving);
+      const { scene } = await send(file, sigma.value ? { sigma_m: sigma.value } : {}, state, signal);
       for (const model of models.files ?? []) await uploadModel(scene, model);
       go(`#/job/${await register(scene)}`);
     } catch (error) {
       state.replaceChildren(problem(error));
-      send.disabled = false;
+      button.disabled = false;
     }
-  }
-}
-
-function pauseButton(upload: SceneUpload): HTMLElement {
-  const button: HTMLButtonElement = h("button", { type: "button", onclick: () => turn() }, "Pause");
-  return button;
-
-  function turn(): void {
-    const paused = button.textContent === "Pause";
-    if (paused) upload.pause();
-    else upload.resume();
-    button.textContent = paused ? "Go on" : "Pause";
   }
 }
 

@@ -1,54 +1,96 @@
-// Uploads that survive a lost connection: tus 1.0, piece by piece.
+// Uploads that survive a lost connection and a closed tab: tus 1.0, piece by piece.
 
-import { type HttpResponse, Upload } from "tus-js-client";
+import { type HttpResponse, type PreviousUpload, Upload } from "tus-js-client";
 import { address, authorization, call, Refused } from "./api";
+import { bytes, h } from "./elements";
 
 const PIECE_BYTES = 8 * 1024 * 1024;
 const RETRY_MS = [0, 1000, 3000, 5000, 10000, 20000, 30000];
 
-/** An upload under way; asking for the same file again goes on where it stopped. */
-export interface SceneUpload {
-  /** The scene's id, once all bytes have arrived and were found good. */
-  done: Promise<string>;
+/** What has arrived: the upload, and the scene it has become if it is one. */
+export interface Arrived {
+  upload: string;
+  scene: string;
+}
+interface Sending {
+  done: Promise<Arrived>;
   pause(): void;
   resume(): void;
 }
 
 /**
- * Upload the image of a scene.
+ * Upload a file under the reader's eyes; the same file said the same of goes on where it once stopped.
  *
- * @param progress told the bytes that have arrived and those there are.
+ * @param metadata what the service is told of the file, beside its name.
+ * @param state where the progress is shown.
+ * @param signal ends when the reader goes elsewhere: the upload waits for him to come back.
  */
-export function uploadScene(image: File, sigmaM: string, progress: (sent: number, all: number) => void): SceneUpload {
-  let scene = "";
-  const noted = (_request: unknown, reply: HttpResponse): void => {
-    scene = reply.getHeader("Amers-Scene") ?? scene;
-  };
-  let upload!: Upload;
-  const done = new Promise<string>((resolve, reject) => {
-    upload = new Upload(image, {
-      endpoint: address("uploads"),
-      headers: { Accept: "application/json", ...authorization() },
-      metadata: { filename: image.name, ...(sigmaM ? { sigma_m: sigmaM } : {}) },
-      chunkSize: PIECE_BYTES,
-      retryDelays: RETRY_MS,
-      removeFingerprintOnSuccess: true,
-      onAfterResponse: noted,
-      onProgress: (sent, all) => progress(sent, all ?? image.size),
-      onError: (error) => reject(refusal(error)),
-      onSuccess: () => resolve(scene),
-    });
+export async function send(file: File, metadata: Record<string, string>, state: HTMLElement, signal: AbortSignal): Promise<Arrived> {
+  const bar = h("progress", { max: file.size, value: 0, "aria-label": "Upload" });
+  const figures = h("span", { class: "quiet" }, bytes(0));
+  const sending = begin(file, { filename: file.name, ...metadata }, (sent) => {
+    bar.value = sent;
+    figures.textContent = `${bytes(sent)} of ${bytes(file.size)}`;
   });
-  void upload.findPreviousUploads().then(([previous]) => {
-    if (previous) upload.resumeFromPreviousUpload(previous);
-    upload.start();
-  });
-  return { done, pause: () => void upload.abort(), resume: () => upload.start() };
+  state.replaceChildren(bar, figures, pauseButton(sending));
+  const leaving = (): void => sending.pause();
+  signal.addEventListener("abort", leaving);
+  try {
+    return await sending.done;
+  } finally {
+    signal.removeEventListener("abort", leaving);
+  }
 }
 
 /** Upload a file with the model of a scene beside its image. */
 export async function uploadModel(scene: string, model: File): Promise<void> {
   await call(`scenes/${scene}/files/${encodeURIComponent(model.name)}`, { method: "PUT", body: model });
+}
+
+function begin(file: File, metadata: Record<string, string>, progress: (sent: number) => void): Sending {
+  const endpoint = address("uploads");
+  const name = ["amers", endpoint, file.size, file.lastModified, JSON.stringify(metadata)].join(" ");
+  let scene = "";
+  let upload!: Upload;
+  const done = new Promise<Arrived>((resolve, reject) => {
+    upload = new Upload(file, {
+      endpoint,
+      headers: { Accept: "application/json", ...authorization() },
+      metadata,
+      fingerprint: () => Promise.resolve(name),
+      chunkSize: PIECE_BYTES,
+      retryDelays: RETRY_MS,
+      removeFingerprintOnSuccess: true,
+      onAfterResponse: (_request, reply) => {
+        scene = reply.getHeader("Amers-Scene") ?? scene;
+      },
+      onProgress: progress,
+      onError: (error) => reject(refusal(error)),
+      onSuccess: () => resolve({ upload: upload.url!.split("/").at(-1)!, scene }),
+    });
+  });
+  void upload.findPreviousUploads().then((previous) => {
+    const [latest] = previous.sort((one, other) => begunAt(other) - begunAt(one));
+    if (latest) upload.resumeFromPreviousUpload(latest);
+    upload.start();
+  });
+  return { done, pause: () => void upload.abort(), resume: () => upload.start() };
+}
+
+function begunAt({ creationTime }: PreviousUpload): number {
+  return new Date(creationTime).getTime();
+}
+
+function pauseButton(sending: Sending): HTMLElement {
+  const button: HTMLButtonElement = h("button", { type: "button", onclick: () => turn() }, "Pause");
+  return button;
+
+  function turn(): void {
+    const paused = button.textContent === "Pause";
+    if (paused) sending.pause();
+    else sending.resume();
+    button.textContent = paused ? "Go on" : "Pause";
+  }
 }
 
 /** What went wrong with an upload, in the service's own words if it said any. */
