@@ -13,7 +13,7 @@ had before beside it; and where the time goes, as CPU time under a profiler. CE9
 25 x 25 places of the image, between where the registered model locates them and what they truly show.
 
 AROSICS (local co-registration) finds as many tie points in an ortho pair of the same ground, when an
-interpreter that has it is given.
+interpreter that has it is given; the dense method registers the same pair at as many places.
 Run: python -m benchmarks.registration [--sizes 5000,40000] [--arosics PYTHON]
 """
 
@@ -34,7 +34,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair
+from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair, register_pair
 from benchmarks._large_scene import SIGMA_M, make_case
 from benchmarks._measuring import keep
 from services.formats.block import FolderChips, read_block
@@ -117,9 +117,10 @@ def main() -> None:
     else:
         with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
             apart(make_pair, Path(name), PAIR_SIZE)
-            found = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE, POINTS)
-        show_beside(outcomes[-1], found)
-        kept["arosics"] = asdict(found)
+            ours = apart(register_pair, Path(name), POINTS, arguments.repeats)
+            theirs = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE, POINTS)
+        show_beside(outcomes[-1], ours, theirs)
+        kept |= {"pair": asdict(ours), "pair_arosics": asdict(theirs)}
     keep("registration", kept)
 
 
@@ -251,25 +252,38 @@ ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
 )
 
 
-def show_beside(ours: Outcome, found: TiePoints) -> None:
-    """Print AROSICS beside a registration."""
-    table = Table("", "points tried", "accepted", "CPU", "CPU a point", "Amers is faster")
-    each_s = ours.again_s / ours.active
-    other_s = found.cpu_s / found.accepted if found.accepted else float("inf")
-    for name, tried, accepted, cpu_s, spent_s in (
-        (f"Amers, {ours.size_px:,}²", ours.tried, ours.active, ours.again_s, each_s),
-        (f"AROSICS, {PAIR_SIZE:,}²", found.tried, found.accepted, found.cpu_s, other_s),
+def show_beside(scene: Outcome, ours: TiePoints, theirs: TiePoints) -> None:
+    """Print the ortho pair by both, and what a point of the scene costs beside its tie points."""
+    table = Table("", "tried", "accepted", "CPU", "CPU each", "AROSICS takes", "shift found")
+    their_s = theirs.cpu_s / max(theirs.accepted, 1)
+    pair = f"pair of {PAIR_SIZE:,}²"
+    for name, tried, accepted, cpu_s, shift in (
+        (f"AROSICS, {pair}", theirs.tried, theirs.accepted, theirs.cpu_s, shift_of(theirs)),
+        (f"Amers, the same {pair}", ours.tried, ours.accepted, ours.cpu_s, shift_of(ours)),
+        (
+            f"Amers, points of {VIEWS} views, {scene.size_px:,}²",
+            scene.tried,
+            scene.active,
+            scene.again_s,
+            "",
+        ),
     ):
+        each_s = cpu_s / max(accepted, 1)
         table.add_row(
             name,
             str(tried),
             str(accepted),
             f"{cpu_s:.1f} s",
-            f"{1e3 * spent_s:.1f} ms",
-            f"{spent_s / each_s:.0f} x",
+            f"{1e3 * each_s:.1f} ms",
+            f"{their_s / each_s:.1f} x",
+            shift,
         )
     Console(width=105).print(table)
-    print(f"AROSICS' median shift: {found.east_m:+.2f} m east, {found.north_m:+.2f} m north")
+
+
+def shift_of(found: TiePoints) -> str:
+    """East and north, in words."""
+    return f"{found.east_m:+.2f}, {found.north_m:+.2f} m"
 
 
 if __name__ == "__main__":
