@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import ConnectionPool
 
@@ -22,6 +23,14 @@ Pool = ConnectionPool[Connection]
 
 READER = "amers_reader"
 """Role of the connections that answer reading requests: it can do nothing but select."""
+SILENT_LINE_S = 15
+"""What was sent over a line and not confirmed for so long shows that the line is cut."""
+NOTICING_CUTS: dict[str, Any] = {
+    "tcp_user_timeout": 1000 * SILENT_LINE_S,
+    "keepalives_idle": SILENT_LINE_S,
+    "keepalives_interval": SILENT_LINE_S // 3,
+    "keepalives_count": 3,
+}
 FIRST_SPATIAL_PLAN = """select st_asgeojson(st_transform(st_setsrid(st_makepoint(n, 0, 0), 4326), 3857))
     from generate_series(0, 0) n where n = 0"""
 """Loads PostGIS and PROJ: up to 60 ms that no caller should wait for."""
@@ -88,7 +97,8 @@ def opened(settings: Settings) -> Iterator[Database]:
 
 @contextmanager
 def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
-    """Pools on a database, whatever its schema."""
+    """Pools on a database, whatever its schema; a line that is cut is noticed within seconds."""
+    dsn = make_conninfo(**(NOTICING_CUTS | conninfo_to_dict(dsn)))
     limit_ms = round(1000 * settings.read_timeout_seconds)
     # A parallel worker is a process that loads PostGIS for one query, longer than most queries take.
     reading = (

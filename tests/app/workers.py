@@ -14,13 +14,20 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 
-PATIENCE_S = 90.0
+PATIENCE_S = 240.0
 ENDED = ("successful", "failed", "dismissed")
 
 
 @contextmanager
-def running_worker(settings: Settings, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
-    """`amers worker` as a process of its own; killed at the end with all it started."""
+def running_worker(
+    settings: Settings, log: Path, *prefix: str, **more: str
+) -> Iterator["subprocess.Popen[bytes]"]:
+    """`amers worker` as a process of its own; killed at the end with all it started.
+
+    Args:
+        prefix: the command that runs it, as `ip netns exec NAME`.
+        more: of its environment.
+    """
     assert settings.database_url is not None
     environment = os.environ | {
         "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
@@ -28,10 +35,12 @@ def running_worker(settings: Settings, log: Path) -> Iterator["subprocess.Popen[
         "AMERS_LEASE_SECONDS": str(settings.lease_seconds),
         "AMERS_JOB_SECONDS": str(settings.job_seconds),
         "AMERS_JOB_MEMORY_BYTES": str(settings.job_memory_bytes),
+        **({"AMERS_INGEST_FOLDER": str(settings.ingest_folder)} if settings.ingest_folder else {}),
+        **more,
     }
     with log.open("ab") as output:
         worker = subprocess.Popen(
-            [sys.executable, "-m", "app.cli.main", "worker"],
+            [*prefix, sys.executable, "-m", "app.cli.main", "worker"],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=output,
