@@ -13,6 +13,7 @@ import argparse
 import http.client
 import json
 import math
+import signal
 import tempfile
 import threading
 import time
@@ -77,6 +78,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measure of throughput")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # stopped by `timeout`, it cleans up too
     console = Console()
     with ExitStack() as stack:
         store = stack.enter_context(filled(arguments.points, console))
