@@ -4,11 +4,14 @@ SQL in a declaration calls the row `t`, and may use `%(admin)s` and `%(viewer)s`
 an administrator, and the id of the caller's token.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 from uuid import UUID
 
+from app.db.box import Box
 from app.db.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
+from app.db.engine import Connection
 
 SqlType = Literal["bigint", "real", "double precision", "text", "date", "timestamptz", "boolean"]
 
@@ -77,6 +80,7 @@ class Collection:
         everything: SELECT of all visible rows that meet `{condition}` in the order of keys beyond
             `%(after)s`, at most `%(limit)s` + 1, where that is quicker than asking plainly.
         total: SELECT of `n`, how many visible rows there are, where that is quicker than counting.
+        in_box: about how many features a box holds for anybody, where counts are kept.
         members: SQL of text that follows the properties of a feature in GeoJSON, beginning with a comma.
         is_open: whether it is open to everybody where points are.
     """
@@ -95,6 +99,7 @@ class Collection:
     found_by: str = ""
     everything: str = ""
     total: str = ""
+    in_box: Callable[[Connection, Box], int] | None = None
     members: str = ""
     is_open: bool = True
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
+from app.db.box import Box
 from app.db.collections import Collection
 
 
@@ -17,34 +18,27 @@ class Condition:
         sql: over a row `t`.
         parameters: by the names that it uses.
         spatial: whether it keeps to a place, so that the index of geometries serves it.
+        box: that it keeps to, if it says so.
+        beside: what it says beside the box, in SQL.
     """
 
     sql: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
     spatial: bool = False
+    box: Box | None = None
+    beside: str = ""
 
     def __and__(self, other: "Condition") -> "Condition":
-        parameters = {**self.parameters, **other.parameters}
-        return Condition(f"{self.sql} and {other.sql}", parameters, self.spatial or other.spatial)
+        return Condition(
+            f"{self.sql} and {other.sql}",
+            {**self.parameters, **other.parameters},
+            self.spatial or other.spatial,
+            self.box or other.box,
+            " and ".join(said for said in (self.beside, other.beside) if said),
+        )
 
 
 ANYTHING = Condition("true")
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of longitude and latitude; `east` below `west` crosses the antimeridian.
-
-    Attributes:
-        low_m, high_m: heights; unbounded unless given.
-    """
-
-    west: float
-    south: float
-    east: float
-    north: float
-    low_m: float = -math.inf
-    high_m: float = math.inf
 
 
 def in_box(collection: Collection, box: Box) -> Condition:
@@ -73,7 +67,8 @@ def in_box(collection: Collection, box: Box) -> Condition:
     if collection.has_height and box.low_m > -math.inf:
         parameters |= {"low": box.low_m, "high": box.high_m}
         sql += f" and st_z({geometry}) between %(low)s and %(high)s"
-    return Condition(f"{sql}, false)", parameters, spatial=True)
+    beside = "" if box.low_m == -math.inf else f"st_z({geometry}) between %(low)s and %(high)s"
+    return Condition(f"{sql}, false)", parameters, spatial=True, box=box, beside=beside)
 
 
 def in_time(collection: Collection, since: datetime | None, until: datetime | None) -> Condition:
@@ -85,4 +80,4 @@ def in_time(collection: Collection, since: datetime | None, until: datetime | No
         f"({start}::timestamp at time zone 'UTC' <= coalesce(%(until)s::timestamptz, 'infinity')"
         f" and {end}::timestamp at time zone 'UTC' >= coalesce(%(since)s::timestamptz, '-infinity'))"
     )
-    return Condition(sql, {"since": since, "until": until})
+    return Condition(sql, {"since": since, "until": until}, beside=sql)

@@ -71,7 +71,7 @@ def translate(expression: Any, collection: Collection, crs: Crs, prefix: str = "
     """
     translator = _Translator(collection, crs, prefix)
     sql = translator.boolean(expression)
-    return Condition(f"({sql})", translator.parameters, _is_spatial(expression))
+    return Condition(f"({sql})", translator.parameters, _is_spatial(expression), beside=f"({sql})")
 
 
 def geometry_condition(collection: Collection, geometry: Any, crs: Crs) -> Condition:

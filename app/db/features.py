@@ -15,6 +15,7 @@ from typing import Any, Literal
 import psycopg
 from psycopg.rows import tuple_row
 
+from app.db.box import WORLD
 from app.db.collections import Collection, Property, Viewer
 from app.db.conditions import ANYTHING, Condition
 from app.db.crs import Crs, from_storage, in_own_order
@@ -173,7 +174,7 @@ def keys(connection: Connection, selection: Selection, limit: int) -> list[Any]:
 
 
 def count(connection: Connection, selection: Selection) -> Count:
-    """How many features are selected: exact up to 10,000, beyond as the planner estimates."""
+    """How many features are selected: exact up to 10,000, an estimate beyond."""
     collection = selection.collection
     if selection.condition is ANYTHING and collection.total:
         row = connection.execute(collection.total, _of(selection.viewer)).fetchone()
@@ -193,11 +194,31 @@ def count(connection: Connection, selection: Selection) -> Count:
         least = EXACT_COUNT + 1
     except psycopg.errors.QueryCanceled:
         least = 1
+    return Count(max(least, _estimate(connection, selection, parameters)), exact=False)
+
+
+def _estimate(connection: Connection, selection: Selection, parameters: dict[str, Any]) -> int:
+    """About how many features are selected.
+
+    Where counts are kept, by them for the box, and by what the planner knows of all rows for the rest.
+    """
+    collection, condition = selection.collection, selection.condition
+    if collection.in_box is None:
+        return _planned(connection, _from_where(selection), parameters)
+    number = collection.in_box(connection, condition.box or WORLD)
+    if not condition.beside:
+        return number
+    meeting = _planned(connection, f"{collection.source} where {condition.beside}", parameters)
+    return round(number * meeting / max(1, _planned(connection, collection.source, parameters)))
+
+
+def _planned(connection: Connection, source: str, parameters: dict[str, Any]) -> int:
+    """How many rows the planner expects."""
     plan = connection.execute(
-        f"explain (format json) select 1 from {_from_where(selection)}", parameters, prepare=False
+        f"explain (format json) select 1 from {source}", parameters, prepare=False
     ).fetchone()
     assert plan is not None
-    return Count(max(least, int(plan["QUERY PLAN"][0]["Plan"]["Plan Rows"])), exact=False)
+    return int(plan["QUERY PLAN"][0]["Plan"]["Plan Rows"])
 
 
 def find(connection: Connection, selection: Selection, reference: str) -> str | None:

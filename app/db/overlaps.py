@@ -11,6 +11,7 @@ import shapely
 import shapely.affinity
 
 from app.db.blocks import ID_BITS
+from app.db.density import count_unserved_cells
 from app.db.engine import Connection
 
 SAME_PLACE_M = 10.0
@@ -59,7 +60,7 @@ def settle(connection: Connection, number: int) -> None:
             if block.number != number and not area.is_empty:
                 _decide(connection, block, _before(ranked, block), area)
         _decide(connection, own, _before(ranked, own), own.area)
-    _count(connection)
+    count_unserved(connection)
 
 
 def _published(connection: Connection) -> list[Ranked]:
@@ -127,14 +128,16 @@ def _release(connection: Connection, ranked: list[Ranked], number: int) -> None:
         )
 
 
-def _count(connection: Connection) -> None:
-    """Keep how many points of each block are superseded."""
+def count_unserved(connection: Connection) -> None:
+    """Keep how many points of each block and cell are not served: superseded, or suspended."""
     connection.execute(
         f"""update block set n_superseded = coalesce(found.n, 0)
             from block b left join (select (id >> {ID_BITS})::int as number, count(*) as n from point
-                                    where superseded_by is not null group by 1) found using (number)
+                                    where superseded_by is not null or suspended_at is not null
+                                    group by 1) found using (number)
             where block.number = b.number and block.n_superseded <> coalesce(found.n, 0)"""
     )
+    count_unserved_cells(connection)
 
 
 def _range(number: int) -> dict[str, int]:

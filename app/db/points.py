@@ -13,6 +13,7 @@ from psycopg import sql
 from app.db.binary_copy import parse_copy
 from app.db.blocks import ID_BITS, PUBLISHED
 from app.db.collections import Collection, Property
+from app.db.density import points_in_box
 from app.db.engine import Connection
 from app.db.history import point_health, view_health
 from services.formats.block_tables import covariance_from_spread
@@ -58,10 +59,10 @@ POINTS = Collection(
     interval=("first_view", "last_view"),
     everything=EVERYTHING,
     total=(
-        "select coalesce(sum(n_points - n_superseded), 0)::bigint - (select count(*) from point"
-        f" where suspended_at is not null and superseded_by is null"
-        f" and block_number = any(array({PUBLISHED}))) as n from block where state = 'published'"
+        "select coalesce(sum(n_points - n_superseded), 0)::bigint as n from block"
+        " where state = 'published'"
     ),
+    in_box=points_in_box,
 )
 
 POINT_KINDS = (

@@ -1,7 +1,7 @@
 """Vector tiles, made by the database: points, density cells, outlines of blocks."""
 
 from app.db.collections import Viewer
-from app.db.density import COARSEST
+from app.db.density import COARSEST, SERVED
 from app.db.engine import Connection
 from app.db.outlines import BLOCKS
 from app.db.points import POINTS
@@ -14,8 +14,9 @@ FIRST_POINT_ZOOM = 8
 TILE = "st_tileenvelope(%(z)s, %(x)s, %(y)s)"
 TILE_LON_LAT = f"st_transform(st_expand({TILE}, %(margin_m)s), 4326)"
 CELL_FIELDS = (
-    "t.n_points, t.n_blocks, round(least(t.outline_km2, t.cell_km2)::numeric, 3)::float8 as area_km2,"
-    " (t.n_points / least(t.outline_km2, t.cell_km2))::real as points_per_km2"
+    f"{SERVED} as n_points, t.n_blocks,"
+    " round(least(t.outline_km2, t.cell_km2)::numeric, 3)::float8 as area_km2,"
+    f" ({SERVED} / least(t.outline_km2, t.cell_km2))::real as points_per_km2"
 )
 NOBODY = Viewer()
 POINT_FIELDS = (
@@ -27,7 +28,7 @@ POINT_FIELDS = (
 def point_tile(connection: Connection, z: int, x: int, y: int) -> bytes:
     """Published points, each with its id; below zoom 8 the centres of density cells that hold some."""
     if z < FIRST_POINT_ZOOM:
-        where = f"t.level = {_level(z)} and t.n_points > 0"
+        where = f"t.level = {_level(z)} and {SERVED} > 0"
         fields = f"true as aggregated, {CELL_FIELDS}"
         return _tile(
             connection,
@@ -77,8 +78,7 @@ def version(connection: Connection) -> str:
     """Changes whenever a block is published, withdrawn, or becomes another, or a point is suspended."""
     row = connection.execute(
         """select count(*) || '-' || coalesce(extract(epoch from max(state_changed_at)), 0)
-               || (select '-' || count(*) || '-' || coalesce(extract(epoch from max(suspended_at)), 0)
-                   from point where suspended_at is not null) as it
+               || '-' || coalesce((select max(id) from audit where kind = 'point'), 0) as it
            from block"""
     ).fetchone()
     assert row is not None

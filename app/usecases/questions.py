@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
+from app.db.box import Box
 from app.db.collections import Collection, Property, Viewer
-from app.db.conditions import ANYTHING, Box, Condition, in_box, in_time
+from app.db.conditions import ANYTHING, Condition, in_box, in_time
 from app.db.cql2 import geometry_condition, translate
 from app.db.cql2_reading import check_size, parse_instant, parse_json, parse_text
 from app.db.crs import CRS84, EVERY, Crs

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pyogrio.raw import read as read_features
 
+from app.db import overlaps
 from app.usecases import blocks, features
 from tests.factories import make_block
 
@@ -124,6 +125,29 @@ def test_density_is_what_is_published_and_goes_when_it_is_withdrawn(get, connect
     assert get("/collections/density/items").json()["features"] == []
     levels = connection.execute("select count(*) as n from density_cell").fetchone()
     assert levels == {"n": 0}
+
+
+def test_density_counts_points_that_are_served(get, connection):
+    def counted():
+        cells = get("/collections/density/items").json()["features"]
+        row, column = tile_of(5.25, 43.25, 3)
+        return sum(cell["properties"]["n_points"] for cell in cells), get(
+            TILES.format("density", 3, row, column)
+        ).content
+
+    whole = counted()
+    connection.execute(
+        "update point set suspended_at = now(), suspended_because = 'gone' where id < %s", [2**26 + 7]
+    )
+    overlaps.count_unserved(connection)
+    connection.commit()
+    fewer = counted()
+    assert (whole[0], fewer[0]) == (60, 53)
+    assert fewer[1] != whole[1]
+    connection.execute("update point set suspended_at = null, suspended_because = null")
+    overlaps.count_unserved(connection)
+    connection.commit()
+    assert counted()[0] == 60
 
 
 def tile_of(lon, lat, z):

@@ -19,12 +19,11 @@ from app.db.engine import Connection, Database
 from app.db.jobs import LostJob
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.ground_control import points_of_block, points_of_store
 from app.usecases.history import remember
 from app.usecases.registration import (
     RegisteredScene,
     SceneFiles,
-    points_of_block,
-    points_of_store,
     run_registration,
 )
 from services.formats.block_check import check_block
@@ -252,7 +251,8 @@ def test_the_health_of_points_and_views_is_read_with_them(
     expected = np.where(stored.measures.active, 1.0, health(2 * share * np.ones(40), np.zeros(40)))
     np.testing.assert_allclose(read.health, expected)
     views, active = stored.views, stored.measures.active
-    disagreed = active[views.point] & ~views.agreed
+    shown = ~np.isin(views.reason, history.SAYS_NOTHING)
+    disagreed = active[views.point] & ~views.agreed & shown
     rows = read.views.start[views.point] + views.view
     lower = set(np.flatnonzero(read.views.health < 1.0).tolist())
     assert lower == {*rows[disagreed].tolist(), int(read.views.start[30]) + 1}

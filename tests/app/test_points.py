@@ -14,17 +14,20 @@ from typer.testing import CliRunner
 
 from app.cli.main import app as commands
 from app.db import features
-from app.db.features import Count
+from app.db.collections import Viewer
+from app.db.features import Count, Selection
 from app.db.points import POINTS
 from app.errors import InputError
 from app.usecases import blocks, points
 from app.usecases.features import everything_in
+from app.usecases.questions import Question, condition_of
 from services.geodesy import east_north_up
 from tests.factories import make_block
 
 ITEMS = "/collections/points/items"
 a_tenth_of_a_millimetre_deg = 1e-9
 a_millimetre = 1e-3
+a_step_of_the_planner = 0.02
 
 
 @pytest.fixture
@@ -160,27 +163,46 @@ def test_a_token_of_another_query_is_refused(made, get):
 def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     connection, storage, tmp_path
 ):
-    many = make_block(tmp_path / "many", count=10_050, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
+    # Over 16 cells of the density; another block is not published.
+    many = make_block(
+        tmp_path / "many",
+        count=12_500,
+        box=(5.0, 43.0, 5.4, 43.4),
+        n_images=2,
+        gsds_m=(2.0,),
+        dtype=np.uint8,
+    )
     blocks.ingest_block(connection, storage, many.folder)
     blocks.publish_block(connection, "calanques")
-    hidden = make_block(
-        tmp_path / "hidden", count=3_000, n_images=2, gsds_m=(2.0,), dtype=np.uint8, name="hidden"
-    )
+    hidden = make_block(tmp_path / "hidden", count=3_000, n_images=2, gsds_m=(2.0,), name="hidden")
     blocks.ingest_block(connection, storage, hidden.folder)
     connection.execute("analyze point")
-    lon = np.sort(many.points.lon_lat_h[:, 0])
-    middle = (lon[9_999] + lon[10_000]) / 2
-    few, all_of_them = f"5,43,{middle},44", "5,43,6,44"
+    lon = many.points.lon_lat_h[:, 0]
+    ordered = np.sort(lon)
+    middle = (ordered[9_999] + ordered[10_000]) / 2
 
     def count(bbox):
         return features.count(connection, everything_in(POINTS, bbox))
 
-    assert count(few) == Count(10_000, exact=True)
-    estimate = count(all_of_them)
+    assert count(f"4,42,{middle},44") == Count(10_000, exact=True)
+    assert count(None) == Count(12_500, exact=True)
+    # Cells that the box does not cut are counted, so these are wrong by nothing.
+    assert count("4,42,6,44") == Count(12_500, exact=False)
+    assert count("170,42,5.4,44") == Count(12_500, exact=False)
+    # Of cells that it cuts at 5.36, the part inside is taken for the part of their points.
+    estimate, true = count("4,42,5.36,44"), (lon <= 5.36).sum()
     assert not estimate.exact
-    assert estimate.number == pytest.approx(10_050, rel=0.2)
-    assert estimate.number >= 10_001
-    assert count(None) == Count(10_050, exact=True)
+    assert 10_000 < true != estimate.number
+    assert abs(estimate.number - true) <= (lon > 5.3).sum()
+
+    question = Question(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
+    condition = condition_of(POINTS, question)
+    estimate = features.count(connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition))
+    true = (many.points.saliency > 0.1).sum()
+    assert not estimate.exact
+    assert true > 10_000
+    # The planner keeps what all points hold, served or not, in a hundred steps.
+    assert estimate.number == pytest.approx(true, rel=a_step_of_the_planner)
 
 
 def test_one_point_comes_with_its_views_and_their_images(made, get):
