@@ -8,25 +8,27 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
-from app.api.negotiation import NPZ, refuse_unknown
+from app.api.negotiation import NPZ, TIFF, refuse_unknown
 from app.errors import InvalidParameter
 from app.storage import StoredChips
 from app.usecases import points
-from app.usecases.points import MOST_POINTS_WITH_CHIPS
+from app.usecases.points import MOST_POINTS_WITH_CHIPS, StackFormat
 from app.usecases.questions import Question
 from services.types import ControlPoints
 
 router = APIRouter(tags=["points"])
 
-PARAMETERS = {"ids", "bbox", "filter", "datetime"}
+PARAMETERS = {"ids", "bbox", "filter", "datetime", "f"}
+TYPES: dict[StackFormat, str] = {"npz": NPZ, "tif": TIFF}
 MEANS = f"Chips of at most {MOST_POINTS_WITH_CHIPS:,} points are given at once."
 ARCHIVE: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "A NumPy archive. `chips` is (n, 101, 101) of raw values, 0 is nodata; all other"
-        " arrays have a row for each chip: `point_id`, `view`, `lon_lat_h` of the point, `gsd_m`,"
+        "description": "npz: a NumPy archive. `chips` is (n, 101, 101) of raw values, 0 is nodata; all"
+        " other arrays have a row for each chip: `point_id`, `view`, `lon_lat_h` of the point, `gsd_m`,"
         " `incidence_deg`, `azimuth_deg`, `image_id`, `sensor`, `acquired_at`, `sun_elevation_deg`,"
-        " `sun_azimuth_deg`. Chips of a point follow each other, points are in the order of their ids.",
-        "content": {NPZ: {}},
+        " `sun_azimuth_deg`. tif: a GeoTIFF with a page for each chip, described by the same in JSON."
+        " Chips of a point follow each other, points are in the order of their ids.",
+        "content": {NPZ: {}, TIFF: {}},
     }
 }
 
@@ -43,6 +45,7 @@ class ChipsAsked(BaseModel):
     bbox: str | None = None
     filter: str | dict[str, Any] | None = None
     datetime: str | None = None
+    f: StackFormat = "npz"
 
 
 @router.get(
@@ -60,9 +63,12 @@ def chips_of_points(
     bbox: Annotated[str | None, Query(description="W,S,E,N, as for items.")] = None,
     filter: Annotated[str | None, Query(description="CQL2 text.")] = None,
     datetime: Annotated[str | None, Query(description="A time, or FROM/TO.")] = None,
+    f: Annotated[StackFormat, Query(description="tif: a page for each chip.")] = "npz",
 ) -> StreamingResponse:
     refuse_unknown(request, PARAMETERS)
-    asked = ChipsAsked(ids=_parse_ids(ids), bbox=bbox, filter=filter, datetime=datetime, intersects=None)
+    asked = ChipsAsked(
+        ids=_parse_ids(ids), bbox=bbox, filter=filter, datetime=datetime, intersects=None, f=f
+    )
     return _archive(database, stored, asked)
 
 
@@ -81,14 +87,14 @@ def search_chips(
 
 def _archive(database: DatabaseDep, stored: StoredChips, asked: ChipsAsked) -> StreamingResponse:
     """The first piece is read before the reply begins, so that chips that are not there are an error."""
-    pieces = points.stream_chips(_meant(database, asked), stored)
+    pieces = points.stream_chips(_meant(database, asked), stored, asked.f)
     first = next(pieces)
-    disposition = {"Content-Disposition": 'attachment; filename="chips.npz"'}
-    return StreamingResponse(chain((first,), pieces), media_type=NPZ, headers=disposition)
+    disposition = {"Content-Disposition": f'attachment; filename="chips.{asked.f}"'}
+    return StreamingResponse(chain((first,), pieces), media_type=TYPES[asked.f], headers=disposition)
 
 
 def _meant(database: DatabaseDep, asked: ChipsAsked) -> ControlPoints:
-    by_question = asked.model_dump(exclude={"ids"}, exclude_none=True)
+    by_question = asked.model_dump(exclude={"ids", "f"}, exclude_none=True)
     if (asked.ids is None) == (not by_question):
         raise InvalidParameter("ids: either ids or one of bbox, filter, intersects, datetime expected")
     with database.reading() as connection:

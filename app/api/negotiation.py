@@ -12,6 +12,7 @@ HTML = "text/html"
 SCHEMA_JSON = "application/schema+json"
 OPENAPI_JSON = "application/vnd.oai.openapi+json;version=3.1"
 PROBLEM_JSON = "application/problem+json"
+TIFF = "image/tiff; application=geotiff"
 NPZ = "application/x-npz"
 MVT = "application/vnd.mapbox-vector-tile"
 

@@ -9,7 +9,7 @@ from fastapi.encoders import jsonable_encoder
 
 from app.api.deps import ChipsDep, PointsReader, ReadConnection
 from app.api.features import CrsUri, Format
-from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, chosen_format, refuse_unknown
+from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, refuse_unknown
 from app.api.pages import features_page
 from app.db.collections import Viewer
 from app.db.history import PointHistory
@@ -26,7 +26,6 @@ from services.formats.chip_images import (
 router = APIRouter(prefix="/collections/points/items", tags=["points"])
 
 PNG = "image/png"
-TIFF = "image/tiff; application=geotiff"
 CHIPS_NEVER_CHANGE = {"Cache-Control": "private, max-age=86400"}
 NOT_PROPERTIES = {"id", "lon_deg", "lat_deg", "height_m", "chip_key", "chip_row", "chip_count"}
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -14,9 +15,11 @@ from app.errors import InvalidParameter, NotFound
 from app.usecases.features import everything_in
 from app.usecases.questions import MOST_FEATURES, Question, condition_of
 from services.formats.chip_images import LabelledChips
+from services.formats.chip_pages import stream_chips_tiff
 from services.formats.chip_stacks import stream_chips_npz
 from services.types import Acquisition, ChipSource, ControlPoints
 
+StackFormat = Literal["npz", "tif"]
 ALL = 2**40
 MOST_POINTS_WITH_CHIPS = 1_000
 """Points whose chips are sent at once: 8 views of 16 bits each are 163 MB."""
@@ -80,9 +83,17 @@ def points_of_question(connection: Connection, question: Question) -> ControlPoi
     return points.points_of_ids(connection, ids).points
 
 
-def stream_chips(points: ControlPoints, chips: ChipSource) -> Iterator[bytes]:
-    """All chips of points with what they show, as a NumPy archive in pieces."""
-    return stream_chips_npz(points, chips)
+def stream_chips(points: ControlPoints, chips: ChipSource, form: StackFormat) -> Iterator[bytes]:
+    """All chips of points with what they show, in pieces: a NumPy archive, or a GeoTIFF of many pages.
+
+    Raises:
+        NotFound: a GeoTIFF without any page is none.
+    """
+    if form == "npz":
+        return stream_chips_npz(points, chips)
+    if not len(points.id):
+        raise NotFound("no chips here, and no GeoTIFF without a page; ask for npz")
+    return stream_chips_tiff(points, chips)
 
 
 def find_point(connection: Connection, point_id: int) -> PointDetail:

@@ -4,6 +4,7 @@ import io
 
 import numpy as np
 import pytest
+import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
 from app.usecases import blocks, points
@@ -71,6 +72,17 @@ def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, b
     assert_array_equal(np.unique(below["point_id"]), FIRST + np.flatnonzero(expected))
 
 
+def test_chips_come_as_pages_of_a_geotiff_too(get, tmp_path):
+    asked = {"ids": f"{FIRST + 2},{FIRST + 3}"}
+    expected, path = arrays(get(CHIPS, **asked)), tmp_path / "chips.tif"
+    reply = get(CHIPS, f="tif", **asked)
+    assert reply.headers["content-type"] == "image/tiff; application=geotiff"
+    path.write_bytes(reply.content)
+    for page, chip in enumerate(expected["chips"], start=1):
+        with rasterio.open(f"GTIFF_DIR:{page}:{path}") as found:
+            assert_array_equal(found.read(1), chip)
+
+
 def test_a_place_without_points_is_an_archive_without_chips(get):
     found = arrays(get(CHIPS, bbox="0,0,1,1"))
     assert found["chips"].shape == (0, 101, 101)
@@ -114,7 +126,9 @@ def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monke
         ({"ids": "9" * 30}, 400, "ids"),
         ({"bbox": "1,2,3"}, 400, "bbox"),
         ({"filter": "colour = 1"}, 400, "colour"),
-        ({"bbox": "5,43,6,44", "f": "npz"}, 400, "f"),
+        ({"bbox": "5,43,6,44", "f": "png"}, 400, "f"),
+        ({"bbox": "0,0,1,1", "f": "tif"}, 404, "npz"),
+        ({"bbox": "5,43,6,44", "limit": "3"}, 400, "limit"),
     ],
 )
 def test_a_wrong_question_for_chips_is_refused(get, parameters, status, named):

@@ -44,6 +44,24 @@ def test_req_core_api_definition_success(get):
     assert get(link(get("/").json(), "service-doc")).headers["content-type"].startswith("text/html")
 
 
+def test_req_core_fc_bbox_definition_and_fc_time_definition(get):
+    paths = get(link(get("/").json(), "service-desc")).json()["paths"]
+    for name in COLLECTIONS:
+        asked = paths[f"/collections/{name}/items"]["get"]["parameters"]
+        defined = {item["name"]: item for item in asked}
+        bbox = defined["bbox"]
+        assert (bbox["in"], bbox["required"], bbox["style"], bbox["explode"]) == (
+            "query",
+            False,
+            "form",
+            False,
+        )
+        assert (bbox["schema"]["type"], bbox["schema"]["items"]["type"]) == ("array", "number")
+        assert (bbox["schema"]["minItems"], bbox["schema"]["maxItems"]) == (4, 6)
+        assert defined["datetime"]["schema"]["type"] == "string"
+        assert {"saliency", "typology", "first_view"} <= set(defined) or name != "points"
+
+
 def test_req_core_conformance_success(get):
     classes = get("/conformance").json()["conformsTo"]
     for name in ("core", "geojson", "html"):
