@@ -49,6 +49,13 @@ def changed_chip(folder: Path) -> None:
         file.write(b"\x01\x02")
 
 
+def changed_file_that_no_point_names(folder: Path) -> None:
+    (folder / "chips/9999.npy").write_bytes(b"of no point")
+    document = json.loads((folder / "block.json").read_text())
+    document["amers:checksums"]["chips/9999.npy"] = "0" * 64
+    (folder / "block.json").write_text(json.dumps(document))
+
+
 def missing_chip_file(folder: Path) -> None:
     (folder / "chips/0000.npy").unlink()
 
@@ -98,6 +105,7 @@ def no_document(folder: Path) -> None:
     ("spoil", "named"),
     [
         (changed_chip, r"chips/0000\.npy: sha256"),
+        (changed_file_that_no_point_names, r"chips/9999\.npy: sha256"),
         (missing_chip_file, r"chips/0000\.npy: no file"),
         (nan_coordinate, r"points\.parquet: geometry lon: row 3: nan found"),
         (truncated_parquet, r"views\.parquet: cannot be read as Parquet"),
