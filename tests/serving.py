@@ -14,6 +14,14 @@ from app.db.embedded import Cluster
 patience_s = 90.0
 
 
+def free_port() -> int:
+    """A port of this machine that nobody listens at."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port: int = free.getsockname()[1]
+    return port
+
+
 class Service:
     """A running `amers serve` with a data folder of its own.
 
@@ -22,14 +30,12 @@ class Service:
         environment: in which commands reach its database.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: str) -> None:
         self.folder = folder
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self.cluster = Cluster(folder / "postgres")
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
-        self.environment = {**inherited, "AMERS_DATA_FOLDER": str(folder)}
+        self.environment = {**inherited, "AMERS_DATA_FOLDER": str(folder), **settings}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port)],
             env=self.environment,

@@ -1,0 +1,174 @@
+"""Clocks that jump: leases and tokens go by the database's, limits by one that never jumps."""
+
+import os
+import shutil
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.tokens import create_token
+from tests.app.flat_world import SIGMA_M, make_flat_world
+from tests.app.workers import ended, running_worker, wait_until
+from tests.serving import free_port
+
+LEASE_S = 3.0
+JUMPS_DAYS = (2.0, -3.0, 14_600.0, -1.0)
+SOURCE = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <sys/mman.h>
+#include <sys/time.h>
+#include <time.h>
+
+static long long wrong_by(void) {
+    static volatile long long *seconds = 0;
+    if (!seconds) {
+        int file = open(getenv("WRONG_CLOCK"), O_RDONLY);
+        seconds = mmap(0, sizeof *seconds, PROT_READ, MAP_SHARED, file, 0);
+    }
+    return *seconds;
+}
+
+int clock_gettime(clockid_t clock, struct timespec *now) {
+    int (*right)(clockid_t, struct timespec *) = dlsym(RTLD_NEXT, "clock_gettime");
+    int answer = right(clock, now);
+    if (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE) now->tv_sec += wrong_by();
+    return answer;
+}
+
+int gettimeofday(struct timeval *restrict now, void *restrict zone) {
+    struct timespec fine;
+    clock_gettime(CLOCK_REALTIME, &fine);
+    now->tv_sec = fine.tv_sec;
+    now->tv_usec = fine.tv_nsec / 1000;
+    return 0;
+}
+
+time_t time(time_t *into) {
+    struct timespec fine;
+    clock_gettime(CLOCK_REALTIME, &fine);
+    if (into) *into = fine.tv_sec;
+    return fine.tv_sec;
+}
+"""
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+@dataclass(frozen=True)
+class WrongClock:
+    """The wall clock of processes, moved by so many seconds as a file says; other clocks go on.
+
+    Attributes:
+        file: eight bytes, a whole number of seconds.
+        environment: of the processes.
+    """
+
+    file: Path
+    environment: dict[str, str]
+
+    def jump(self, days: float) -> None:
+        """Put the clock so far from the right time."""
+        with self.file.open("r+b") as file:
+            file.write(struct.pack("q", round(86_400 * days)))
+
+
+@pytest.fixture
+def clock(tmp_path: Path) -> WrongClock:
+    """A clock that is right to begin with."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler is installed: no clock can be made to jump")
+    source, library, file = (tmp_path / name for name in ("clock.c", "clock.so", "clock"))
+    source.write_text(SOURCE)
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    file.write_bytes(struct.pack("q", 0))
+    return WrongClock(file, {"LD_PRELOAD": str(library), "WRONG_CLOCK": str(file)})
+
+
+def test_a_worker_whose_clock_jumps_keeps_its_job(
+    clock: WrongClock,
+    settings: Settings,
+    client: TestClient,
+    bearer: Bearer,
+    storage: Storage,
+    dsn: str,
+    tmp_path: Path,
+):
+    world = make_flat_world(tmp_path / "world", size=800)
+    with engine.connect(dsn) as connection:
+        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))
+    me = bearer("register")
+    upload = client.post(
+        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=me
+    )
+    body = {"inputs": {"scene": upload.json()["id"], "options": {"fine_passes": 40}}}
+    job = client.post("/processes/register-scene/execution", json=body, headers=me).headers["location"]
+    brisk = settings.model_copy(update={"lease_seconds": LEASE_S})
+    with running_worker(brisk, tmp_path / "worker.log", **clock.environment):
+        wait_until(lambda: client.get(job, headers=me).json()["progress"] > 0, "the work is under way")
+        for days in JUMPS_DAYS:
+            clock.jump(days)
+            before = client.get(job, headers=me).json()["updated"]
+            wait_until(
+                lambda before=before: client.get(job, headers=me).json()["updated"] != before,
+                "the lease is renewed, or the job has ended",
+            )
+        done = ended(client, job, me)
+    assert done["status"] == "successful", done
+    with engine.connect(dsn) as connection:
+        row = connection.execute("select attempt, failures from job").fetchone()
+    assert row == {"attempt": 1, "failures": 0}
+
+
+@pytest.mark.parametrize("wrong_days", [14_600.0, -7_300.0])
+def test_tokens_expire_by_the_clock_of_the_database(
+    clock: WrongClock, settings: Settings, dsn: str, wrong_days: float
+):
+    clock.jump(wrong_days)
+    with engine.connect(dsn) as connection:
+        valid = create_token(connection, "valid for a day", ["read"], 1).secret
+        expired = create_token(connection, "expired", ["read"], 1)
+        connection.execute(
+            "update token set expires_at = now() - interval '1 hour' where id = %s", [expired.token.id]
+        )
+    port = free_port()
+    environment = (
+        os.environ
+        | clock.environment
+        | {
+            "AMERS_DATABASE_URL": dsn,
+            "AMERS_DATA_FOLDER": str(settings.data_folder),
+        }
+    )
+    command = [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)]
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet) as service:
+        try:
+            url = f"http://127.0.0.1:{port}"
+            wait_until(lambda: answers(f"{url}/readyz"), "the service is ready")
+            for secret, status in ((valid, 200), (expired.secret, 401)):
+                headers = {"Authorization": f"Bearer {secret}"}
+                assert httpx.get(f"{url}/jobs", headers=headers, timeout=30).status_code == status
+        finally:
+            service.terminate()
+
+
+def answers(url: str) -> bool:
+    try:
+        return httpx.get(url, timeout=30).status_code == 200
+    except httpx.TransportError:
+        return False

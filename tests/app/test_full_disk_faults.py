@@ -1,0 +1,184 @@
+"""Disks that fill up in the middle of an upload or an ingestion: a clear refusal, nothing half."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine
+from app.db.embedded import Cluster
+from app.errors import is_no_room
+from app.storage import Storage
+from app.usecases import blocks
+from app.usecases.blocks import sweep_storage
+from tests.app.workers import ended, running_worker
+from tests.factories import make_block
+
+MEBIBYTE = 1 << 20
+ROOM = 3 * MEBIBYTE
+TOO_MUCH = b"II*\0" + np.random.default_rng(1).bytes(4 * MEBIBYTE)
+TUS = {"Tus-Resumable": "1.0.0"}
+LEASE_S = 0.5
+DATABASE_ROOM = 300 * MEBIBYTE
+"""For a database, its log and a block, and not much more."""
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+class Disk:
+    """A file system in memory of a size; tests are skipped where none can be made."""
+
+    def __init__(self, folder: Path, size_bytes: int) -> None:
+        if os.geteuid() != 0:
+            pytest.skip("only root can mount a small disk to fill")
+        self.folder = folder
+        folder.mkdir(mode=0o755)
+        self._mount(f"size={size_bytes}", "-t", "tmpfs")
+
+    def grow(self, size_bytes: int) -> None:
+        self._mount(f"remount,size={size_bytes}")
+
+    def remove(self) -> None:
+        subprocess.run(["umount", "--lazy", str(self.folder)], check=True)
+
+    def _mount(self, options: str, *more: str) -> None:
+        command = ["mount", *more, "-o", options, "amers-test", str(self.folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Disk]:
+    """A disk with little room, for the data folder of a test."""
+    disk = Disk(tmp_path / "disk", ROOM)
+    yield disk
+    disk.remove()
+
+
+@pytest.fixture
+def settings(dsn: str, disk: Disk, tmp_path: Path) -> Settings:
+    """An installation whose files lie on the small disk; its database does not."""
+    return Settings(
+        database_url=dsn,
+        data_folder=disk.folder / "data",
+        lease_seconds=LEASE_S,
+        ingest_folder=tmp_path,
+    )
+
+
+def files(storage: Storage) -> list[str]:
+    """All that lies in the storage, finished or not."""
+    return [
+        str(path.relative_to(storage.folder)) for path in storage.folder.rglob("*") if path.is_file()
+    ]
+
+
+def test_an_upload_that_fills_the_disk_is_507_and_leaves_nothing(
+    client: TestClient, bearer: Bearer, storage: Storage, disk: Disk
+):
+    me = bearer("register")
+    refused = client.post("/scenes?name=a.tif", content=TOO_MUCH, headers=me)
+    assert refused.status_code == 507, refused.text
+    assert "full" in refused.json()["detail"]
+    assert refused.headers["content-type"] == "application/problem+json"
+    assert files(storage) == []
+    assert client.get("/scenes", headers=me).json()["scenes"] == []
+
+    disk.grow(4 * ROOM)
+    accepted = client.post("/scenes?name=a.tif", content=TOO_MUCH, headers=me)
+    assert accepted.status_code == 201, accepted.text
+    assert storage.path(f"scenes/{accepted.json()['id']}/a.tif").read_bytes() == TOO_MUCH
+
+
+def test_an_upload_in_pieces_goes_on_where_the_disk_was_full(
+    client: TestClient, bearer: Bearer, storage: Storage, disk: Disk
+):
+    me = bearer("register") | TUS
+    metadata = {"Upload-Metadata": "filename YS50aWY=", "Upload-Length": str(len(TOO_MUCH))}
+    upload = client.post("/uploads", headers=me | metadata).headers["location"]
+    piece = me | {"Content-Type": "application/offset+octet-stream"}
+    refused = client.patch(upload, content=TOO_MUCH, headers=piece | {"Upload-Offset": "0"})
+    assert refused.status_code == 507, refused.text
+
+    arrived = int(client.head(upload, headers=me).headers["upload-offset"])
+    assert 0 < arrived <= ROOM
+    disk.grow(4 * ROOM)
+    rest = client.patch(
+        upload, content=TOO_MUCH[arrived:], headers=piece | {"Upload-Offset": str(arrived)}
+    )
+    assert rest.status_code == 204, rest.text
+    assert storage.path(f"scenes/{rest.headers['amers-scene']}/a.tif").read_bytes() == TOO_MUCH
+    assert len(files(storage)) == 1
+
+
+def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_there_is_room(
+    client: TestClient, bearer: Bearer, settings: Settings, disk: Disk, tmp_path: Path, dsn: str
+):
+    made = make_block(tmp_path / "block", count=100, n_images=4)
+    admin = bearer("admin")
+    storage = Storage(settings.data_folder / "storage")
+
+    def ingested() -> dict[str, object]:
+        asked = client.post("/blocks", json={"path": "block"}, headers=admin)
+        return ended(client, asked.headers["location"], admin)
+
+    with running_worker(settings, tmp_path / "log.txt") as worker:
+        failed = ingested()
+        assert failed["status"] == "failed", failed
+        assert "disk" in str(failed["message"])
+        assert "full" in str(failed["message"])
+        with engine.connect(dsn) as connection:
+            assert blocks.list_blocks(connection) == []
+            sweep_storage(connection, storage)
+        assert files(storage) == []
+
+        disk.grow(20 * ROOM)
+        assert ingested()["status"] == "successful"
+        assert worker.poll() is None
+    with engine.connect(dsn) as connection:
+        (block,) = blocks.list_blocks(connection)
+        assert block.n_points == len(made.points)
+        assert sweep_storage(connection, storage) == []
+
+
+def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is_room(
+    open_folder: Path, tmp_path: Path
+):
+    made = make_block(tmp_path / "block", count=2_000, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
+    storage = Storage(tmp_path / "storage")
+    disk = Disk(open_folder / "full", DATABASE_ROOM)
+    cluster = Cluster(disk.folder / "postgres", durable=False)
+    try:
+        with cluster.lease() as dsn:
+            engine.upgrade(dsn)
+            with engine.connect(dsn) as connection:
+                # A fresh segment of the log, begun: what has no room is the table.
+                connection.execute("select pg_switch_wal()")
+                connection.execute("checkpoint")
+            ballast = disk.folder / "ballast"
+            free = shutil.disk_usage(disk.folder).free
+            ballast.write_bytes(bytes(free - MEBIBYTE // 2))
+            with (
+                pytest.raises(psycopg.OperationalError) as refused,
+                engine.connect(dsn) as connection,
+            ):
+                blocks.ingest_block(connection, storage, made.folder)
+            assert is_no_room(refused.value), refused.value
+            ballast.unlink()
+            # It stops where even its log has no room, and is started again as `amers serve` does.
+            cluster.revive()
+            with engine.connect(dsn) as connection:
+                assert blocks.list_blocks(connection) == []
+                blocks.ingest_block(connection, storage, made.folder)
+            with engine.connect(dsn) as connection:
+                assert [block.n_points for block in blocks.list_blocks(connection)] == [2_000]
+    finally:
+        disk.remove()
