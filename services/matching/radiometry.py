@@ -71,7 +71,7 @@ def clouded(looks: Sequence[Array], found: BoolArray) -> BoolArray:
     ground = np.concatenate([look for look, seen in zip(looks, found, strict=True) if seen])
     bright = np.nanquantile(ground[:, 0], CLOUD_BRIGHTNESS)
     rough = np.nanmedian(ground[:, 1])
-    for row in np.flatnonzero(~found):
+    for row in np.flatnonzero(~found).tolist():
         look = looks[row][np.isfinite(looks[row]).all(axis=1)]
         cloud = (look[:, 0] > bright) & (look[:, 1] < CLOUD_ROUGHNESS * rough)
         hidden[row] = len(look) > 0 and cloud.mean() >= CLOUD_SHARE
