@@ -52,8 +52,8 @@ def looks_of(pixels: FloatImage) -> Array:
     """
     rows, columns = (size // CELL_PX for size in pixels.shape)
     inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
-    cells = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
-    cells = cells.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
+    squares = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
+    cells = squares.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
     rough = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
     return np.column_stack([cells.mean(axis=(1, 2)), rough])
 
