@@ -58,7 +58,7 @@ def _verdicts(axis: Axes, results: Sequence[Result], factor: str, edges: Sequenc
     right = np.array([outcome.delivered and not outcome.wrong for _, outcome in results])
     success = [(right & (row == k)).sum() / n for k, n in zip(classes, count, strict=True)]
     axis.plot(classes, success, "k_", markersize=22, label="delivered and right")
-    names = [f"{a:g} to {b:g}\n{n}" for a, b, n in zip(edges[:-1], edges[1:], count, strict=True)]
+    names = [f"{a:g}\nto {b:g}\n{n}" for a, b, n in zip(edges[:-1], edges[1:], count, strict=True)]
     if factor == "inverted":
         names = [f"{word}\n{n}" for word, n in zip(("no", "yes"), count, strict=True)]
     axis.set_xticks(list(classes), names, fontsize=7)
