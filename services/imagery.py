@@ -185,8 +185,13 @@ def blur_px(ratio: float) -> float:
 
 def image_gsd_m(model: SensorModel, lon_lat_h: Array) -> float:
     """Ground sampling at one point (3,): side of the square as large as a pixel's footprint, metres."""
-    derivative = model.project_derivative(lon_lat_h[None, :])[0]
-    return float(abs(np.linalg.det(derivative[:, :2])) ** -0.5)
+    return float(image_gsds_m(model, lon_lat_h[None, :])[0])
+
+
+def image_gsds_m(model: SensorModel, lon_lat_h: Array) -> Array:
+    """Ground sampling (n,) at points (n, 3), metres; see `image_gsd_m`."""
+    derivative = model.project_derivative(lon_lat_h)
+    return np.asarray(np.abs(np.linalg.det(derivative[:, :, :2])) ** -0.5)
 
 
 def chip_ground(lon_lat_h: Array, gsd_m: float, size: int) -> Array:

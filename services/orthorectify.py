@@ -15,7 +15,7 @@ from services.ortho_mapping import hidden_ground, map_into_image, metres_a_unit
 from services.scene import Scene, scene_gsd_m
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
-from services.types import Array, FloatImage, Progress, no_progress
+from services.types import Array, FloatImage, IntArray, Progress, no_progress
 
 MAX_READ_PIXELS = 24_000_000
 """Pixels of the image read at once, 96 MB; a window of the map that needs more is divided."""
@@ -201,7 +201,7 @@ def _ratio(line_sample: Array) -> float:
 
 
 def _sampled(
-    image: ImageSource, line_sample: Array, first: Array, size: Array, ratio: float, kernel: str
+    image: ImageSource, line_sample: Array, first: IntArray, size: IntArray, ratio: float, kernel: str
 ) -> FloatImage:
     """Pixels of an image at positions (lines, samples, 2)."""
     # Nearly equal pixels are not worth a blur.

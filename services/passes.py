@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.imagery import image_gsd_m
+from services.imagery import image_gsds_m
 from services.matching.points import PointMatches
 from services.scene import Scene, scene_centre
 from services.sensors.correction import CorrectedModel
@@ -74,7 +74,7 @@ def model_uncertainty_m(
     variance = np.diagonal(adjustment.covariance_at(line_sample), axis1=1, axis2=2)
     std_px = np.sqrt(variance.max(axis=1))
     residual_px = float(np.sqrt(np.mean(adjustment.residual_px[adjustment.active] ** 2)))
-    gsd_m = np.array([image_gsd_m(model, ground) for ground in points.lon_lat_h])
+    gsd_m = image_gsds_m(model, points.lon_lat_h)
     return np.asarray(np.nan_to_num(np.hypot(std_px, residual_px) * gsd_m, nan=0.0))
 
 

@@ -6,7 +6,14 @@ import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions
 from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery import ImageSource, ReducedImage, image_gsd_m, reduce_image, render_chip
+from services.imagery import (
+    ImageSource,
+    ReducedImage,
+    image_gsd_m,
+    image_gsds_m,
+    reduce_image,
+    render_chip,
+)
 from services.matching.consensus import vote
 from services.matching.dense import DenseOptions, Places, Reference, match_places, places_seen
 from services.matching.points import PointMatches
@@ -240,7 +247,6 @@ def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
     `ReferenceChips` reads the chips.
     """
     n = len(lon_lat_h)
-    gsd_m = [image_gsd_m(reference.model, ground) for ground in lon_lat_h]
     unknown = np.full(n, np.nan)
     variance = np.array([reference.sigma_m, reference.sigma_m, reference.height_sigma_m]) ** 2
     rows = np.arange(n)
@@ -252,7 +258,7 @@ def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
         health=np.ones(n),
         views=Views(
             start=np.arange(n + 1),
-            gsd_m=np.array(gsd_m),
+            gsd_m=image_gsds_m(reference.model, lon_lat_h),
             image=np.zeros(n, dtype=np.int64),
             incidence_deg=unknown,
             azimuth_deg=unknown,

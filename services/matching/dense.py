@@ -10,7 +10,7 @@ from services.imagery import (
     ImageSource,
     ReducedImage,
     Window,
-    image_gsd_m,
+    image_gsds_m,
     low_pass,
     mean_pixels,
     sample_image,
@@ -143,11 +143,11 @@ def match_places(
     sigma_px = np.full(n, np.nan)
     score = np.full(n, np.nan)
     reason = np.full(n, "", dtype="<U16")
-    for i in range(n):
+    gsds_m = (image_gsds_m(of, places.lon_lat_h) for of in (model, reference.model))
+    ratios = (factor * np.divide(*gsds_m)).tolist()
+    for i, ratio in enumerate(ratios):
         if i % 64 == 0:
             progress(i / n, f"searching {n} places at 1:{factor}")
-        ground = places.lon_lat_h[i]
-        ratio = factor * image_gsd_m(model, ground) / image_gsd_m(reference.model, ground)
         positions = _between_nodes(places.nodes[i], options.window_px)
         chip = sample_image(reference.image, positions, ratio)
         patch = _level_patch(image, places.cell[i], options.window_px // 2 + radius_px, factor)
