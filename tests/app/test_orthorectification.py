@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
 
@@ -17,11 +18,13 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from app.config import Settings
-from app.db import engine, jobs
+from app.db import engine, jobs, registrations
 from app.errors import AmersError
+from app.storage import Storage
 from app.usecases.jobs import do_attempt
 from services.formats.raster import write_raster
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.rpc_text import format_rpc_text, parse_rpc_text
+from services.sensors.rpc import RpcModel
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
 a_pixel = 1.0
@@ -29,15 +32,17 @@ a_pixel = 1.0
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
+def in_the_image(lines_off: int = 0) -> RpcModel:
+    """The model of an image of 300 x 400 pixels, perhaps some lines off."""
+    line, sample = (int(number) for number in MODEL.image_offset)
+    return replace(MODEL, image_offset=MODEL.image_offset - [line - 150 + lines_off, sample - 200])
+
+
 def write_inputs(folder: Path) -> tuple[Path, Path]:
     """An image that shows its own lines, and level ground under it."""
     lon, lat, height_m = (float(number) for number in MODEL.ground_offset)
-    line, sample = (int(number) for number in MODEL.image_offset)
-    model = type(MODEL)(
-        **{**vars(MODEL), "image_offset": MODEL.image_offset - [line - 150, sample - 200]}
-    )
     pixels = np.repeat(np.arange(1, 301, dtype=np.uint16)[:, None], 400, axis=1)
-    write_raster(folder / "scene.tif", pixels, model)
+    write_raster(folder / "scene.tif", pixels, in_the_image())
     heights = np.full((40, 40), height_m, np.float32)
     with rasterio.open(
         folder / "dem.tif",
@@ -94,6 +99,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     client: TestClient,
     bearer: Callable[[str], dict[str, str]],
     settings: Settings,
+    storage: Storage,
     dsn: str,
     tmp_path: Path,
 ) -> None:
@@ -130,6 +136,34 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     with rasterio.open(tmp_path / "served.tif") as ours, rasterio.open(tmp_path / "own.tif") as own:
         assert (ours.crs, ours.transform) == (own.crs, own.transform)
         np.testing.assert_array_equal(ours.read(), own.read())
+    (tmp_path / "refined_RPC.TXT").write_text(format_rpc_text(in_the_image(lines_off=20)))
+    key = storage.put_file("results/a/1/refined_RPC.TXT", tmp_path / "refined_RPC.TXT").key
+    with engine.connect(dsn) as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        registrations.insert_registration(
+            connection,
+            job_id=job.id,
+            scene_id=UUID(scene),
+            block_versions=[],
+            options={},
+            report={},
+            verdict="good",
+            files={"refined_RPC.TXT": key},
+        )
+    refined = client.get(
+        outcome(vertical="ellipsoid", registration=str(job.id))["ortho.tif"]["href"], headers=me
+    )
+    (tmp_path / "refined.tif").write_bytes(refined.content)
+    words = ["--dem", dem, "--vertical", "ellipsoid", "--model", tmp_path / "refined_RPC.TXT"]
+    ortho(image, *words, "-o", tmp_path / "own_refined.tif")
+    with (
+        rasterio.open(tmp_path / "refined.tif") as ours,
+        rasterio.open(tmp_path / "own_refined.tif") as own,
+        rasterio.open(tmp_path / "served.tif") as before,
+    ):
+        np.testing.assert_array_equal(ours.read(), own.read())
+        assert ours.transform != before.transform
     unknown = {"scene": scene, "dem": "dem.tif", "registration": str(UUID(int=1))}
     refused = client.post("/processes/orthorectify/execution", json={"inputs": unknown}, headers=me)
     assert refused.status_code == 422
