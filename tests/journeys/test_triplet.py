@@ -18,10 +18,13 @@ from tests.journeys.ties import independent_tracks
 pytestmark = pytest.mark.real_data
 
 names = ("img_01", "img_02", "img_03")
-injected_shift_px = np.array([40.0, -25.0])
+injected_shift_px = np.array([400.0, -900.0])
+"""492 m on the ground, of a scene 512 m wide."""
 injected_drift_px = 2.0
-injected_sigma_m = "15"
+injected_sigma_m = "200"
 delivered_residual_px = (0.4, 0.7)
+delivered_shift_px = 2.0
+"""How far the views may lie from each other as they were delivered."""
 three_tenths_of_a_pixel = 0.3
 
 
@@ -97,11 +100,15 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     for name in sources:
         models[name] = parse_rpc_text((block / "models" / f"{name}_RPC.TXT").read_text())
     models[third] = wrong
-    assert median_residual_px(list(models.values()), tracks) > 1.0
+    assert not median_residual_px(list(models.values()), tracks) < 1.0  # so far off, no rays meet
     models[third] = parse_rpc_text((out / "refined_RPC.TXT").read_text())
-    assert median_residual_px(list(models.values()), tracks) < three_tenths_of_a_pixel
+    left_px = median_residual_px(list(models.values()), tracks)
+    print(f"{third} from {injected_shift_px} px: {left_px:.3f} px, {done['verdict']}")
+    assert left_px < three_tenths_of_a_pixel
     assert done["verdict"] in ("good", "usable")
-    assert np.allclose(np.array(done["shift_px"]), -injected_shift_px, atol=2.0)
+    drift_there_px = injected_drift_px * np.abs(injected_shift_px) / pixels[third].shape
+    found_px = np.array(done["shift_px"])
+    assert (np.abs(found_px + injected_shift_px) < delivered_shift_px + drift_there_px).all()
     for name in ("report.json", "report.html", "control_points.geojson", f"{scene.stem}_RPC.TXT"):
         assert (out / name).stat().st_size > 0
 
