@@ -90,6 +90,8 @@ def _raw(storage: Storage, here: str, values: dict[str, Any], files: list[ToldFi
     if not values and all(file.by == "reference" for file in files):
         links = [f'<{here}/results/{f.name}>; rel="item"; type="{f.media_type}"' for f in files]
         return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Link": ", ".join(links)})
+    if not values and len(files) == 1:
+        return file_reply(storage, files[0].key, files[0].media_type)
     parts = [
         (name, {"Content-Type": JSON}, json.dumps(value).encode()) for name, value in values.items()
     ]

@@ -13,7 +13,7 @@ from app.usecases.registration_files import media_type
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20
-"""Larger files go by reference whatever was asked for."""
+"""Larger files go by reference whatever was asked for, but for one that is sent alone."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,11 @@ def told_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[ToldF
     asked = job.outputs
     if asked is None:
         return values, [ToldFile(name, key, "reference") for name, key in keys.items()]
+    alone = job.response == "raw" and len(asked) == 1
     files = []
     for name in asked:
         if name in keys:
-            large = storage.size(keys[name]) > LARGEST_VALUE_BYTES
+            large = not alone and storage.size(keys[name]) > LARGEST_VALUE_BYTES
             by: Transmission = "reference" if large or asked[name] == "reference" else "value"
             files.append(ToldFile(name, keys[name], by))
     return {name: values[name] for name in asked if name in values}, files

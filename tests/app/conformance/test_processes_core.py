@@ -14,6 +14,7 @@ from jsonschema import Draft202012Validator, validate
 from app.db import engine, jobs
 from app.db.jobs import Job
 from app.storage import Storage
+from app.usecases import results
 from app.usecases.jobs import PROCESSES, error_details
 from services.errors import NotEnoughPoints
 
@@ -312,6 +313,16 @@ def test_req_core_job_results_async_raw_value_one(get, done):
         reply = get(f"{done(outputs={name: {}}, response='raw')}/results")
         assert (reply.status_code, reply.content) == (200, content)
         assert reply.headers["content-type"] == kind
+
+
+def test_req_core_job_results_async_large_values_go_by_reference_or_alone(get, done, monkeypatch):
+    monkeypatch.setattr(results, "LARGEST_VALUE_BYTES", len(LAYERS) - 1)
+    several: dict[str, Any] = {"residuals.gpkg": {}, "report.json": {}}
+    told = get(f"{done(outputs=several)}/results").json()
+    assert get(told["residuals.gpkg"]["href"]).content == LAYERS
+    assert told["report.json"]["value"] == json.loads(REPORT)
+    alone = get(f"{done(outputs={'residuals.gpkg': {}}, response='raw')}/results")
+    assert (alone.status_code, alone.content) == (200, LAYERS)
 
 
 def test_req_core_job_results_async_raw_value_and_mixed_multi(get, done):
