@@ -199,18 +199,21 @@ class _Problem:
     ) -> tuple[Array, Array]:
         """Parameters (2, 3), covariance (6, 6); drift and skew are expected within `slope_px`."""
         design = np.column_stack([np.ones(len(self.t)), self.t])[active]
+        # Both coordinates have as many free parameters in every order: they are solved at once.
+        columns = np.array([np.flatnonzero(of_one) for of_one in free])
+        weight = 1.0 / self.variance[active].T
+        if weights is not None:
+            weight = weight * weights[active]
+        a = design[:, columns].transpose(1, 2, 0)
+        expected = np.where(columns > 0, slope_px**-2.0, 0.0)[:, :, None] * np.eye(columns.shape[1])
+        weighted = a * weight[:, None, :]
+        inverse = np.linalg.pinv(weighted @ a.transpose(0, 2, 1) + expected, hermitian=True)
+        found = inverse @ (weighted @ self.misfit[active].T[:, :, None])
         parameters = np.zeros((2, 3))
         covariance = np.zeros((6, 6))
         for k in range(2):
-            columns = np.flatnonzero(free[k])
-            weight = 1.0 / self.variance[active, k]
-            if weights is not None:
-                weight = weight * weights[active]
-            a = design[:, columns]
-            expected = np.diag(np.where(columns > 0, slope_px**-2.0, 0.0))
-            inverse = np.linalg.pinv((a * weight[:, None]).T @ a + expected, hermitian=True)
-            parameters[k, columns] = inverse @ (a.T @ (weight * self.misfit[active, k]))
-            covariance[np.ix_(3 * k + columns, 3 * k + columns)] = inverse
+            parameters[k, columns[k]] = found[k, :, 0]
+            covariance[np.ix_(3 * k + columns[k], 3 * k + columns[k])] = inverse[k]
         return parameters, covariance
 
     def likeliest_slope_px(self, active: BoolArray, unit: float, least_px: float) -> float:
