@@ -70,6 +70,7 @@ class Registered:
     correction: ImageCorrection
     tried: int
     views: int
+    agreed: int
     active: int
     verdict: str
     first_s: float
@@ -92,6 +93,7 @@ class Outcome:
     peak_mib: float
     tried: int
     views: int
+    agreed: int
     active: int
     verdict: str
     ce90_before_m: float
@@ -171,6 +173,7 @@ def register_often(folder: Path, repeats: int) -> Registered:
         correction=registration.adjustment.correction,
         tried=int((measures.reason != "not_tried").sum()),
         views=len(registration.views.view),
+        agreed=int(registration.views.agreed.sum()),
         active=int(measures.active.sum()),
         verdict=registration.qualification.verdict,
         first_s=taken_s[0],
@@ -244,7 +247,7 @@ ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
     ("memory before", lambda o: f"{o.start_mib:.0f} MiB"),
     ("peak", lambda o: f"{o.peak_mib:.0f} MiB"),
     ("points tried", lambda o: str(o.tried)),
-    ("views tried, last pass", lambda o: str(o.views)),
+    ("views tried, agreed, last pass", lambda o: f"{o.views}, {o.agreed}"),
     ("active", lambda o: str(o.active)),
     ("CE90 before", lambda o: f"{o.ce90_before_m:.1f} m"),
     ("CE90 after", lambda o: f"{o.ce90_m:.2f} m"),
@@ -256,17 +259,12 @@ def show_beside(scene: Outcome, ours: TiePoints, theirs: TiePoints) -> None:
     """Print the ortho pair by both, and what a point of the scene costs beside its tie points."""
     table = Table("", "tried", "accepted", "CPU", "CPU each", "AROSICS takes", "shift found")
     their_s = theirs.cpu_s / max(theirs.accepted, 1)
-    pair = f"pair of {PAIR_SIZE:,}²"
+    pair, large = f"pair of {PAIR_SIZE:,}²", f"{scene.size_px:,}²"
     for name, tried, accepted, cpu_s, shift in (
         (f"AROSICS, {pair}", theirs.tried, theirs.accepted, theirs.cpu_s, shift_of(theirs)),
         (f"Amers, the same {pair}", ours.tried, ours.accepted, ours.cpu_s, shift_of(ours)),
-        (
-            f"Amers, points of {VIEWS} views, {scene.size_px:,}²",
-            scene.tried,
-            scene.active,
-            scene.again_s,
-            "",
-        ),
+        (f"Amers, views of points, {large}", scene.views, scene.agreed, scene.again_s, ""),
+        (f"Amers, points of {VIEWS} views, {large}", scene.tried, scene.active, scene.again_s, ""),
     ):
         each_s = cpu_s / max(accepted, 1)
         table.add_row(
