@@ -22,7 +22,8 @@ def dump(dsn: str, file: Path) -> None:
         raise Conflict(f"{file} exists")
     unfinished = file.with_name(f".{file.name}.unfinished")
     try:
-        _run(dsn, "pg_dump", "--format=custom", "--no-owner", f"--file={unfinished}")
+        options = ("--format=custom", "--no-owner", "--no-privileges")
+        _run(dsn, "pg_dump", *options, f"--file={unfinished}")
         unfinished.replace(file)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -42,7 +43,9 @@ def restore(dsn: str, file: Path) -> None:
             raise Conflict(
                 "the database has tables already: restore into an empty one (another AMERS_DATA_FOLDER)"
             )
-    _run(dsn, "pg_restore", "--single-transaction", "--exit-on-error", "--no-owner", str(file))
+    # Who may read is granted anew: the roles of the cluster that the archive came from may be gone.
+    whole = ("--single-transaction", "--exit-on-error", "--no-owner", "--no-privileges")
+    _run(dsn, "pg_restore", *whole, str(file))
 
 
 def _program(dsn: str, name: str) -> Path:
