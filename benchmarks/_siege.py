@@ -1,0 +1,228 @@
+"""An installation whose processes are killed at random and started again, as an operator's would be."""
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+import httpx
+import psycopg
+
+from app.db.embedded import Cluster
+from app.db.engine import connect
+from app.usecases.tokens import create_token
+
+LEASE_S = 2.0
+WORKERS = 2
+LONGEST_REST_S = 1.0
+"""A process that was killed is started again after so long at most."""
+PATIENCE_S = 120.0
+VICTIMS = ("api", "worker", "attempt", "database")
+
+
+@dataclass
+class Service:
+    """A command that is started again whenever it has died.
+
+    Attributes:
+        command: of `amers`.
+        environment: all of it.
+        log: where it writes.
+    """
+
+    command: tuple[str, ...]
+    environment: dict[str, str]
+    log: Path
+    process: "subprocess.Popen[bytes] | None" = None
+    rests_until: float = 0.0
+
+    def tend(self, rest_s: float) -> None:
+        """Start the command if it has died and has rested."""
+        if self.process is not None and self.process.poll() is not None:
+            self.process, self.rests_until = None, time.monotonic() + rest_s
+        if self.process is None and time.monotonic() >= self.rests_until:
+            with self.log.open("ab") as output:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-m", "app.cli.main", *self.command],
+                    env=self.environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                )
+
+    def end(self) -> None:
+        """Ask the command to end, and see that it does."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.terminate()
+            self.process.wait(PATIENCE_S)
+
+
+@dataclass
+class Siege:
+    """A running installation and who kills it.
+
+    Attributes:
+        folder: its data folder.
+        rng: of the moments and the victims.
+        kill_every_s: from the moment the service is ready again to the next kill, in the mean;
+            exponentially distributed.
+        killed: how often each kind of process was.
+    """
+
+    folder: Path
+    rng: random.Random
+    kill_every_s: float
+    killed: "Counter[str]" = field(default_factory=Counter)
+    _services: dict[str, Service] = field(default_factory=dict)
+    _threads: list[threading.Thread] = field(default_factory=list)
+    _stop: threading.Event = field(default_factory=threading.Event)
+    _quiet: threading.Event = field(default_factory=threading.Event)
+
+    def __enter__(self) -> "Siege":
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.ingest_folder.mkdir(parents=True)
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
+        environment = inherited | {
+            "AMERS_DATA_FOLDER": str(self.folder),
+            "AMERS_LEASE_SECONDS": str(LEASE_S),
+            "AMERS_INGEST_FOLDER": str(self.ingest_folder),
+        }
+        serve = ("serve", "--no-worker", "--port", str(self.port))
+        self._services["api"] = Service(serve, environment, self.log)
+        for number in range(WORKERS):
+            self._services[f"worker {number}"] = Service(("worker",), environment, self.log)
+        self._services["api"].tend(0.0)
+        try:
+            self.wait_ready()
+        except TimeoutError:
+            self._services["api"].end()
+            raise
+        self._start(self._tend)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._quiet.set()
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+        for service in self._services.values():
+            service.end()
+
+    @property
+    def url(self) -> str:
+        """Where the API is."""
+        return f"http://127.0.0.1:{self.port}"
+
+    @property
+    def ingest_folder(self) -> Path:
+        """Where blocks to be ingested lie."""
+        return self.folder.with_name("ingest")
+
+    @property
+    def log(self) -> Path:
+        """What all processes say."""
+        return self.folder.with_name("log.txt")
+
+    @property
+    def cluster(self) -> Cluster:
+        """The database."""
+        return Cluster(self.folder / "postgres")
+
+    def wait_ready(self) -> None:
+        """Return once the API and the database answer.
+
+        Raises:
+            TimeoutError: they do not.
+        """
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            with suppress(httpx.TransportError):
+                if httpx.get(f"{self.url}/readyz", timeout=10.0).status_code == 200:
+                    return
+            time.sleep(0.1)
+        raise TimeoutError(f"the service is not ready after {PATIENCE_S:g} s: see {self.log}")
+
+    def token(self) -> str:
+        """The secret of an administrator."""
+        with self.cluster.lease() as dsn, connect(dsn) as connection:
+            return create_token(connection, "besieged", ["admin"]).secret
+
+    def open_fire(self) -> None:
+        """Begin to kill."""
+        self._start(self._kill)
+
+    def cease_fire(self) -> None:
+        """Kill no more."""
+        self._quiet.set()
+
+    @contextmanager
+    def inside(self) -> Iterator[psycopg.Connection[dict[str, object]]]:
+        """A connection to the database, for those who look at what is left."""
+        with self.cluster.lease() as dsn, connect(dsn) as connection:
+            yield connection
+
+    def _start(self, work: Callable[[], None]) -> None:
+        thread = threading.Thread(target=work)
+        self._threads.append(thread)
+        thread.start()
+
+    def _tend(self) -> None:
+        rests = random.Random(self.rng.random())
+        while not self._stop.wait(0.05):
+            for service in self._services.values():
+                service.tend(rests.uniform(0.0, LONGEST_REST_S))
+
+    def _kill(self) -> None:
+        while not self._quiet.wait(self.rng.expovariate(1.0 / self.kill_every_s)):
+            victim = self.rng.choice(VICTIMS)
+            numbers = self._numbers(victim)
+            if victim != "database":
+                numbers = [self.rng.choice(numbers)] if numbers else []
+            for number in numbers:
+                with suppress(ProcessLookupError):
+                    os.kill(number, signal.SIGKILL)
+            self.killed[victim] += bool(numbers)
+            with suppress(TimeoutError):
+                self.wait_ready()
+
+    def _numbers(self, victim: str) -> list[int]:
+        """The processes of a kind; all of the server's are one."""
+        if victim == "database":
+            with suppress(OSError, IndexError, ValueError):
+                server = int((self.cluster.data / "postmaster.pid").read_text().splitlines()[0])
+                return [server, *children(server)]
+            return []
+        name = "worker" if victim == "attempt" else victim
+        alive = [
+            service.process.pid
+            for key, service in self._services.items()
+            if key.startswith(name) and service.process is not None and service.process.poll() is None
+        ]
+        return alive if victim != "attempt" else [child for one in alive for child in children(one)]
+
+
+def children(parent: int) -> list[int]:
+    """The processes that a process has started."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError, IndexError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+    return found

@@ -1,0 +1,18 @@
+"""A small siege: processes killed at random moments. The large one is `python -m benchmarks.faults`."""
+
+from pathlib import Path
+
+from benchmarks.faults import besiege
+
+REGISTRATIONS, INGESTIONS = 6, 3
+KILL_EVERY_S = 2.0
+SEED = 7
+
+
+def test_whoever_is_killed_whenever_every_job_ends_once_and_nothing_is_half(open_folder: Path):
+    folder = open_folder / "siege"
+    folder.mkdir(mode=0o755)
+    outcome = besiege(folder, REGISTRATIONS, INGESTIONS, SEED, KILL_EVERY_S)
+    assert outcome["wrong"] == [], outcome
+    assert sum(outcome["ended"].values()) == REGISTRATIONS + INGESTIONS
+    assert sum(outcome["killed"].values()) >= 1, "nobody was killed: this shows nothing"
