@@ -1,13 +1,28 @@
 """`amers serve`: the API and a worker on the private database, and what is left after any end of it."""
 
+import json
 import os
 import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
+import numpy as np
 import pytest
 
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.tokens import create_token
+from tests.factories import make_block
 from tests.serving import Service, until, users_of
+
+POINTS = 2100
+"""More than are made into one text: they are streamed."""
+IMAGE = b"II*\0" + bytes(400_000)
+SMALL_WINDOW = 4096
 
 
 @pytest.fixture
@@ -49,3 +64,70 @@ def test_a_service_that_is_killed_leaves_no_worker_behind(service):
     service.process.kill()
     service.process.wait(timeout=60)
     assert until(lambda: users_of(service.cluster.folder / "lease") == [])
+
+
+def test_requests_under_way_are_answered_when_the_service_is_told_to_end(service, tmp_path):
+    made = make_block(tmp_path / "block", count=POINTS, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
+    storage = Storage(service.folder / "storage")
+    with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
+        publish_block(connection, str(ingest_block(connection, storage, made.folder).block.number))
+        secret = create_token(connection, "slow", ["register"]).secret
+    said = f"Host: amers\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
+    with slow_line(service.port) as reading, slow_line(service.port) as sending:
+        # A streamed reply whose reader is slow, and an upload of which the second half is missing.
+        reading.sendall(f"GET /collections/points/items?limit={POINTS} HTTP/1.1\r\n{said}\r\n".encode())
+        streamed = reading.recv(SMALL_WINDOW)
+        sending.sendall(
+            f"POST /scenes?name=a.tif HTTP/1.1\r\n{said}Content-Length: {len(IMAGE)}\r\n\r\n".encode()
+            + IMAGE[: len(IMAGE) // 2]
+        )
+        assert until(lambda: list(storage.scratch().glob("tmp*"))), "the upload has begun"
+        service.process.send_signal(signal.SIGTERM)
+        assert until(lambda: refuses(service.port)), "new callers are turned away"
+        assert service.process.poll() is None, "those who came before are still served"
+        sending.sendall(IMAGE[len(IMAGE) // 2 :])
+        accepted = to_the_end(sending)
+        streamed += to_the_end(reading)
+    assert service.process.wait(timeout=60) == 128 + signal.SIGTERM
+    head, _, body = accepted.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 201"), accepted
+    assert storage.path(f"scenes/{json.loads(body)['id']}/a.tif").read_bytes() == IMAGE
+    head, _, body = streamed.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 200")
+    text = joined(body) if b"transfer-encoding: chunked" in head.lower() else body
+    assert len(json.loads(text)["features"]) == POINTS
+
+
+@contextmanager
+def slow_line(port: int) -> Iterator[socket.socket]:
+    """A connection that takes in little at once."""
+    with socket.socket() as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SMALL_WINDOW)
+        line.settimeout(60.0)
+        line.connect(("127.0.0.1", port))
+        yield line
+
+
+def to_the_end(line: socket.socket) -> bytes:
+    reply = b""
+    while piece := line.recv(1 << 20):
+        reply += piece
+    return reply
+
+
+def refuses(port: int) -> bool:
+    with socket.socket() as line:
+        line.settimeout(5.0)
+        return line.connect_ex(("127.0.0.1", port)) != 0
+
+
+def joined(chunks: bytes) -> bytes:
+    """A body sent in chunks; an error if it was cut off."""
+    text = b""
+    while True:
+        size, _, chunks = chunks.partition(b"\r\n")
+        length = int(size, 16)
+        if length == 0:
+            return text
+        assert len(chunks) > length, "the reply was cut off"
+        text, chunks = text + chunks[:length], chunks[length + 2 :]
