@@ -253,6 +253,8 @@ def _pool(dsn: str, size: int, options: dict[str, Any]) -> Pool:
 
 def _warm(connection: Connection) -> None:
     """Make a new connection ready for its first query; a database without PostGIS has none to get."""
+    # However long that takes: the limit is for what callers ask. It goes with the transaction.
+    connection.execute("set local statement_timeout = 0")
     with suppress(psycopg.errors.UndefinedFunction, psycopg.errors.UndefinedObject):
         connection.execute(FIRST_SPATIAL_PLAN)
     connection.rollback()
