@@ -1,0 +1,124 @@
+"""Backup and restore as docs/operations.md tells them: what was destroyed answers as before."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from uuid import uuid4
+
+import httpx
+import pytest
+
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.tokens import create_token
+from tests.app.flat_world import SIGMA_M, make_flat_world
+from tests.app.workers import wait_until
+from tests.factories import make_block
+from tests.serving import Service, until
+
+ENDED = ("successful", "failed", "dismissed")
+SAME_HOST = {"Host": "amers.example"}
+PATHS = (
+    "/collections",
+    "/collections/points/items?limit=1000",
+    "/collections/points/items?limit=50&f=csv",
+    "/collections/blocks/items",
+    "/collections/density/items",
+    "/collections/scenes/items",
+    "/blocks/calanques/quality",
+    "/blocks/flat/quality",
+    "/scenes",
+    "/jobs",
+    "/tokens",
+    "/audit?limit=1000",
+)
+
+
+def amers(service: Service, *words: str | Path) -> dict[str, object]:
+    done = subprocess.run(
+        [sys.executable, "-m", "app.cli.main", *map(str, words), "--json"],
+        env=service.environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    answer: dict[str, object] = json.loads(done.stdout)
+    return answer
+
+
+def started(folder: Path) -> Service:
+    service = Service(folder)
+    assert until(service.is_ready)
+    return service
+
+
+def stopped(service: Service) -> None:
+    service.process.terminate()
+    service.process.wait(timeout=60)
+
+
+def answers(service: Service, secret: str, paths: tuple[str, ...]) -> dict[str, tuple[int, bytes]]:
+    """What an administrator is told at each path, wherever the service listens."""
+    headers = SAME_HOST | {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=60.0) as client:
+        replies = {path: client.get(path) for path in paths}
+    return {path: (reply.status_code, reply.content) for path, reply in replies.items()}
+
+
+@pytest.fixture
+def place(open_folder: Path):
+    folder = open_folder / uuid4().hex[:8]
+    folder.mkdir(mode=0o755)
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_a_destroyed_installation_is_restored_and_gives_the_same_answers(place: Path, tmp_path: Path):
+    world = make_flat_world(tmp_path / "world", size=800)
+    service = started(place / "data")
+    try:
+        with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
+            storage = Storage(service.folder / "storage")
+            for block in (world.block, make_block(tmp_path / "block").folder):
+                publish_block(connection, str(ingest_block(connection, storage, block).block.number))
+            secret = create_token(connection, "administrator", ["admin"]).secret
+        headers = SAME_HOST | {"Authorization": f"Bearer {secret}"}
+        with httpx.Client(base_url=service.url, headers=headers, timeout=60.0) as client:
+            image = world.tagged.read_bytes()
+            scene = client.post(f"/scenes?name=s.tif&sigma_m={SIGMA_M}", content=image).json()["id"]
+            body = {"inputs": {"scene": scene}}
+            job = client.post("/processes/register-scene/execution", json=body).json()["jobID"]
+            wait_until(lambda: client.get(f"/jobs/{job}").json()["status"] in ENDED, "the job ends")
+            results = client.get(f"/jobs/{job}/results").json()
+            points = client.get("/collections/points/items?limit=3").json()["features"]
+        files = tuple(f"/jobs/{job}/results/{name}" for name in results if "." in name)
+        assert len(files) >= 3, results
+        chips = tuple(f"/collections/points/items/{point['id']}/chips?f=npz" for point in points)
+        paths = (*PATHS, f"/scenes/{scene}", f"/jobs/{job}", f"/jobs/{job}/results", *files, *chips)
+
+        archive, copy = place / "amers.dump", place / "storage"
+        amers(service, "db", "backup", archive)
+        shutil.copytree(service.folder / "storage", copy, ignore=shutil.ignore_patterns("unfinished"))
+        before = answers(service, secret, paths)
+        assert {path: status for path, (status, _) in before.items() if status != 200} == {}
+    finally:
+        stopped(service)
+
+    shutil.rmtree(place / "data")
+    shutil.copytree(copy, place / "data" / "storage")
+    amers(service, "db", "restore", archive)
+    restored = started(place / "data")
+    try:
+        after = answers(restored, secret, paths)
+        for path, said in before.items():
+            assert after[path] == said, path
+        with httpx.Client(base_url=restored.url, headers=headers, timeout=60.0) as client:
+            again = client.post("/processes/register-scene/execution", json=body).json()["jobID"]
+            wait_until(lambda: client.get(f"/jobs/{again}").json()["status"] in ENDED, "the job ends")
+            assert client.get(f"/jobs/{again}").json()["status"] == "successful", "it works on"
+    finally:
+        stopped(restored)
