@@ -45,15 +45,6 @@ StorageDep = Annotated[Storage, Depends(_storage)]
 ChipsDep = Annotated[StoredChips, Depends(_chips)]
 
 
-def _reading(database: DatabaseDep) -> Iterator[Connection]:
-    with database.reading() as connection:
-        yield connection
-
-
-# Scope "function": committed before the reply is sent, so that a commit that fails is an error reply.
-ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
-
-
 async def _caller(
     request: Request, database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
 ) -> Token | None:
@@ -77,6 +68,16 @@ def _known(issuer: Issuer | None, database: Database, secret: str) -> Token:
 
 
 CallerDep = Annotated[Token | None, Depends(_caller)]
+
+
+def _reading(database: DatabaseDep, caller: CallerDep) -> Iterator[Connection]:
+    """A connection once it is known who calls: who held one and waited for another would block all."""
+    with database.reading() as connection:
+        yield connection
+
+
+# Scope "function": committed before the reply is sent, so that a commit that fails is an error reply.
+ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
 
 
 def _transaction(database: DatabaseDep, caller: CallerDep) -> Iterator[Connection]:
