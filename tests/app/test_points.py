@@ -305,8 +305,9 @@ def test_the_collections_say_what_they_hold_and_where(made, get):
     assert get("/collections/roads").status_code == 404
 
 
-def test_collections_of_an_empty_store_have_no_extent(get):
-    assert "extent" not in get("/collections/points").json()
+def test_collections_of_an_empty_store_state_the_whole_world_since_stac_asks_for_an_extent(get):
+    extent = get("/collections/points").json()["extent"]
+    assert extent["spatial"]["bbox"] == [[-180, -90, 180, 90]]
     empty = get(ITEMS).json()
     assert (empty["features"], empty["numberMatched"], empty["numberReturned"]) == ([], 0, 0)
 
