@@ -4,6 +4,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
+from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -62,6 +63,10 @@ ROUTERS: tuple[APIRouter, ...] = (
     page.router,
 )
 
+THREADS = 256
+"""More than there are requests at once: one that holds a connection must never wait for the thread of
+one that waits for a connection."""
+
 CORS_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 CORS_HEADERS = (
     "Authorization",
@@ -97,6 +102,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        to_thread.current_default_thread_limiter().total_tokens = THREADS
         opening = engine.opened(chosen)
         app.state.settings = chosen
         app.state.database = await run_in_threadpool(opening.__enter__)

@@ -241,6 +241,9 @@ class _Jobs:
     def _end(
         self, client: httpx.Client, asked: httpx.Response, kind: str, ended: "Counter[str]"
     ) -> None:
+        if asked.status_code >= 300:
+            ended[f"{kind} refused: {asked.status_code} {asked.text[:200]}"] += 1
+            return
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             job = client.get(asked.headers["location"]).json()
