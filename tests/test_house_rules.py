@@ -56,6 +56,12 @@ def test_imports_keep_to_their_layers():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_modules_of_tests_have_names_of_their_own():
+    """Pytest knows them by their last name only."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(set(names)) == sorted(names)
+
+
 @pytest.mark.parametrize("path", TOUR)
 def test_a_stop_of_the_tour_exists_and_the_readme_leads_to_it(path):
     assert (ROOT / path).is_file()

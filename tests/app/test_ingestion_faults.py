@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -158,7 +159,8 @@ def kill(cluster: Cluster) -> None:
     processes = [server, *children(server)]
     assert len(processes) > 2
     for process in processes:
-        os.kill(process, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
     deadline = time.monotonic() + PATIENCE_S
     while any(alive(process) for process in processes):
         assert time.monotonic() < deadline

@@ -72,7 +72,7 @@ def test_a_model_is_laid_beside_the_image(client: TestClient, bearer: Bearer, st
 
 
 @pytest.mark.parametrize(
-    ("name", "status"), [("a.tif", 422), ("a.vrt", 422), ("a.aux.xml.sh", 422), ("...", 422)]
+    ("name", "status"), [("a.tif", 409), ("a.vrt", 422), ("a.aux.xml.sh", 422), ("...", 422)]
 )
 def test_only_models_are_laid_beside_an_image(
     client: TestClient, bearer: Bearer, name: str, status: int

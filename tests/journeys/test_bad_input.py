@@ -115,6 +115,7 @@ def spoil_checksum(block: Path) -> None:
     content = bytearray(chips.read_bytes())
     content[-1] ^= 0xFF
     chips.write_bytes(content)
+    rename(block)
 
 
 def lose_chips(block: Path) -> None:
@@ -132,6 +133,13 @@ def lose_coordinates(block: Path) -> None:
     pq.write_table(spoiled, path)
     document = json.loads((block / "block.json").read_text())
     document["amers:checksums"]["points.parquet"] = file_sha256(path)
+    (block / "block.json").write_text(json.dumps(document))
+    rename(block)
+
+
+def rename(block: Path) -> None:
+    """Another block than the one that is in the store already."""
+    document = json.loads((block / "block.json").read_text())
     document["id"] = "nowhere"
     (block / "block.json").write_text(json.dumps(document))
 

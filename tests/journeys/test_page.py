@@ -281,6 +281,7 @@ def test_an_administrator_withdraws_a_block_and_publishes_it_again(
     page = visit("#/blocks", administrator)
     page.get_by_role("link", name="flat").click()
     state = page.locator(".badge")
+    expect(state).to_have_count(1)
     expect(state).to_have_text("published")
     assert served() == points_of_the_block
     until_drawn(page)
