@@ -1,11 +1,10 @@
 """Control points: pages of a box, one point, its chips."""
 
 import json
-from dataclasses import asdict
+from datetime import date
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.encoders import jsonable_encoder
 
 from app.api.deps import ChipsDep, PointsReader, ReadConnection
 from app.api.features import CrsUri, Format
@@ -13,7 +12,7 @@ from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, r
 from app.api.pages import features_page
 from app.db.collections import Viewer
 from app.db.history import PointHistory
-from app.db.points import POINTS, PointDetail
+from app.db.points import POINTS, PointDetail, PointView
 from app.usecases import history, points
 from app.usecases.features import find_feature
 from services.formats.chip_images import (
@@ -52,13 +51,14 @@ def item(
     feature = _feature(point, fared, str(request.url.replace(query="")))
     given = POINTS.storage_crs
     if crs is not None:
-        text, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
-        feature["geometry"] = json.loads(text)["geometry"]
+        found, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
+        feature["geometry"] = json.loads(found)["geometry"]
+    text = json.dumps(feature, default=_plain)
     if chosen_format(request, {"json": GEOJSON, "html": HTML}, f) == "html":
-        shown = {**feature, "properties": {**feature["properties"], "views": len(point.views)}}
-        return features_page(request, POINTS, f"Point {point_id}", [shown], feature["links"])
-    headers = {"Content-Crs": f"<{given.uri}>"}
-    return Response(json.dumps(feature), media_type=GEOJSON, headers=headers)
+        shown = json.loads(text)
+        shown["properties"]["views"] = len(point.views)
+        return features_page(request, POINTS, f"Point {point_id}", [shown], shown["links"])
+    return Response(text, media_type=GEOJSON, headers={"Content-Crs": f"<{given.uri}>"})
 
 
 @router.get("/{point_id}/chips", response_class=Response)
@@ -101,18 +101,19 @@ def _download(content: bytes, kind: str, name: str) -> Response:
 
 
 def _feature(point: PointDetail, fared: PointHistory, url: str) -> dict[str, Any]:
-    known = {**asdict(point), **asdict(fared)}
-    properties = {k: v for k, v in known.items() if k not in NOT_PROPERTIES}
-    feature: dict[str, Any] = jsonable_encoder(
-        {
-            "type": "Feature",
-            "id": point.id,
-            "geometry": {"type": "Point", "coordinates": [point.lon_deg, point.lat_deg, point.height_m]},
-            "properties": properties,
-            "links": [
-                {"rel": "self", "href": url, "type": GEOJSON},
-                {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},
-            ],
-        }
-    )
-    return feature
+    known = {**vars(point), **vars(fared)}
+    return {
+        "type": "Feature",
+        "id": point.id,
+        "geometry": {"type": "Point", "coordinates": [point.lon_deg, point.lat_deg, point.height_m]},
+        "properties": {k: v for k, v in known.items() if k not in NOT_PROPERTIES},
+        "links": [
+            {"rel": "self", "href": url, "type": GEOJSON},
+            {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},
+        ],
+    }
+
+
+def _plain(value: date | PointView) -> Any:
+    """What JSON has no type for: dates, times and views."""
+    return value.isoformat() if isinstance(value, date) else vars(value)
