@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
-from app.api.deps import ChipsDep, PointsReader, ReadConnection
+from app.api.deps import ChipsDep, DatabaseDep, PointsReader, ReadConnection
 from app.api.features import CrsUri, Format
 from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, refuse_unknown
 from app.api.pages import features_page
@@ -39,20 +39,21 @@ PointId = int
 def item(
     point_id: PointId,
     request: Request,
-    connection: ReadConnection,
+    database: DatabaseDep,
     caller: PointsReader,
     crs: CrsUri = None,
     f: Format = None,
 ) -> Response:
     """One point, its views and the images they were cut from, and how registrations fared with it."""
     refuse_unknown(request, {"crs", "f"})
-    point = points.find_point(connection, point_id)
-    fared = history.find_history(connection, point_id)
-    feature = _feature(point, fared, str(request.url.replace(query="")))
     given = POINTS.storage_crs
-    if crs is not None:
-        found, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
-        feature["geometry"] = json.loads(found)["geometry"]
+    with database.reading() as connection:
+        point = points.find_point(connection, point_id)
+        fared = history.find_history(connection, point_id)
+        feature = _feature(point, fared, str(request.url.replace(query="")))
+        if crs is not None:
+            found, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
+            feature["geometry"] = json.loads(found)["geometry"]
     text = json.dumps(feature, default=_plain)
     if chosen_format(request, {"json": GEOJSON, "html": HTML}, f) == "html":
         shown = json.loads(text)
