@@ -69,7 +69,7 @@ def watched(settings: Settings) -> Iterator[None]:
             except Exception as error:
                 log.error("the database could not be started again: %s", error)
 
-    watcher = threading.Thread(target=watch, name="database-watcher")
+    watcher = threading.Thread(target=watch, name="database-watcher", daemon=True)
     watcher.start()
     try:
         yield
@@ -85,7 +85,9 @@ def companion(command: tuple[str, ...] | None) -> Iterator[None]:
         yield
         return
     stop = threading.Event()
-    keeper = threading.Thread(target=_keep_running, args=(command, stop), name="worker-keeper")
+    keeper = threading.Thread(
+        target=_keep_running, args=(command, stop), name="worker-keeper", daemon=True
+    )
     keeper.start()
     try:
         yield

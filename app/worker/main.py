@@ -21,6 +21,7 @@ from app.storage import open_storage
 from app.worker.attempt import Attempts
 from app.worker.sweep import Sweeper
 
+ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0
 """The queue notifies its workers; this is how soon they find an entry that was put off until a time."""
 PAUSE_S = 2.0
@@ -30,8 +31,14 @@ log = logging.getLogger(__name__)
 
 
 def run_worker(settings: Settings) -> None:
-    """Work until SIGTERM or SIGINT; a job under way then goes back to the queue."""
+    """Work until SIGTERM or SIGINT; a job under way then goes back to the queue.
+
+    From the first moment a signal is noted, not raised: an exception thrown into whatever runs while the
+    worker starts can be lost there, and the worker would live on.
+    """
     stop = threading.Event()
+    for number in ENDING:
+        signal.signal(number, lambda *_: stop.set())
     with engine.opened(settings) as database, _sweeping(database, settings, stop):
         asyncio.run(_Worker(database, settings, stop).run())
 
@@ -59,7 +66,7 @@ class _Worker:
         """Fetch and do jobs; an outage of the database ends a round, not the worker."""
         rounds = asyncio.create_task(self._rounds())
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in ENDING:
             loop.add_signal_handler(number, self._stop, rounds)
         try:
             await rounds

@@ -2,7 +2,7 @@
 
 import { get, Refused, setToken, token } from "./api";
 import { fill, h, problem } from "./elements";
-import { go, type ShowView } from "./place";
+import type { ShowView } from "./place";
 
 export interface Caller {
   name: string;
@@ -65,9 +65,9 @@ export const showAccess: ShowView = async ({ panel, scopes }) => {
   }
 };
 
-/** Start afresh as somebody else. */
+/** Start afresh as somebody else; nothing more is shown of what the last caller saw. */
 function enter(secret: string | null): void {
   setToken(secret);
-  go("#/points");
+  history.replaceState(null, "", "#/points");
   location.reload();
 }
