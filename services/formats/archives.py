@@ -27,6 +27,8 @@ LONGEST_ZIP_END = 65_535 + 22 + 20 + 56
 """The records at the end of a zip: the end of its index in both forms, a pointer, a comment."""
 LARGEST_INDEX_BYTES = 16 << 20
 """Of a zip, which is read as a whole; and of a name in a tar."""
+LONGEST_TAR_END = 16 << 20
+"""Zeros that fill the last record of a tar: 10 kB as tools write them, more on old tapes."""
 BROKEN = (
     zipfile.BadZipFile,
     tarfile.TarError,
@@ -166,11 +168,10 @@ def _opened(path: Path) -> Iterator[_Archive]:
             with zipfile.ZipFile(path) as zipped:
                 yield _zip(zipped, path.name)
         elif is_archive(head):
-            with (
-                _plain(path, head) as raw,
-                tarfile.open(fileobj=cast(IO[bytes], _Bounded(raw, path.name)), mode="r:") as tarred,
-            ):
-                yield _tar(tarred, path.name)
+            with _plain(path, head) as raw:
+                bounded = _Bounded(raw, path.name)
+                with tarfile.open(fileobj=cast(IO[bytes], bounded), mode="r:") as tarred:
+                    yield _tar(tarred, bounded, path.name)
         else:
             raise FormatError(f"{path.name} is neither a zip nor a tar")
     except BROKEN as error:
@@ -194,10 +195,15 @@ def _plain(path: Path, head: bytes) -> Iterator[IO[bytes]]:
 
 
 class _Bounded:
-    """A file that is never read in large pieces: the headers of a tar say how much of it is read."""
+    """A file that is never read in large pieces: the headers of a tar say how much of it is read.
+
+    Attributes:
+        last: the piece read last.
+    """
 
     def __init__(self, file: IO[bytes], name: str) -> None:
         self.seek, self.tell = file.seek, file.tell
+        self.last = b""
         self._file = file
         self._name = name
 
@@ -205,7 +211,8 @@ class _Bounded:
         """So many bytes."""
         if size > LARGEST_INDEX_BYTES:
             raise FormatError(f"{self._name} holds a header of {size} bytes, which is not accepted")
-        return self._file.read(size)
+        self.last = self._file.read(size)
+        return self.last
 
 
 def _refuse_large_index(path: Path) -> None:
@@ -245,7 +252,23 @@ def _zip(archive: zipfile.ZipFile, name: str) -> _Archive:
     return _Archive(look, read)
 
 
-def _tar(archive: tarfile.TarFile, name: str) -> _Archive:
+def _refuse_open_end(file: _Bounded, name: str) -> None:
+    """Look how a tar ends, where its reader found no further header.
+
+    The reader stops alike at the end, at a header that is broken and where the file is cut; only the
+    first is a block of zeros with nothing behind it but more of them.
+    """
+    if len(file.last) < tarfile.BLOCKSIZE or any(file.last):
+        raise FormatError(f"{name} is a broken archive: it is cut, or the header of a member is broken")
+    for _ in range(LONGEST_TAR_END // COPY_BYTES):
+        if any(file.read(COPY_BYTES)):
+            raise FormatError(f"{name} is a broken archive: something follows its end")
+        if not file.last:
+            return
+    raise FormatError(f"{name} is followed by more than {LONGEST_TAR_END} bytes, which is not accepted")
+
+
+def _tar(archive: tarfile.TarFile, opened: _Bounded, name: str) -> _Archive:
     def look() -> Iterator[Member]:
         for info in archive:
             path = _checked(info.name, name) if info.name != "." else PurePosixPath()
@@ -253,6 +276,7 @@ def _tar(archive: tarfile.TarFile, name: str) -> _Archive:
                 raise FormatError(f"{name}: {path} is a link, a device or sparse, which is not accepted")
             if info.isreg():
                 yield Member(path, info.size)
+        _refuse_open_end(opened, name)
 
     def read(wanted: set[PurePosixPath]) -> Iterator[tuple[PurePosixPath, IO[bytes]]]:
         for info in archive:

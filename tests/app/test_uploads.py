@@ -3,6 +3,7 @@
 import hashlib
 import io
 import socket
+import tarfile
 import threading
 import time
 import zipfile
@@ -201,12 +202,24 @@ def test_a_piece_that_is_not_as_announced_is_thrown_away(client: TestClient, me:
         assert piece(client, url, me, 200, b"x", **{"Upload-Checksum": unknown}).status_code == 400
 
 
+def tar_with_a_broken_later_header() -> bytes:
+    """An image, which is whole, and a model whose header is not what its checksum says."""
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w") as archive:
+        for name, data in (("a.tif", TIFF[:1000]), ("a_RPC.TXT", b"LINE_OFF: 1")):
+            header = tarfile.TarInfo(name)
+            header.size = len(data)
+            archive.addfile(header, io.BytesIO(data))
+    return out.getvalue().replace(b"a_RPC.TXT", b"b_RPC.TXT")
+
+
 @pytest.mark.parametrize(
     ("data", "metadata", "told"),
     [
         (b"<VRTDataset/>", {"filename": "a.tif"}, "neither TIFF"),
         (TIFF, {"filename": "a.tif", "sha256": "0" * 64}, "sha256"),
         (b"PK\3\4garbage", {"filename": "a.zip"}, "broken archive"),
+        (tar_with_a_broken_later_header(), {"filename": "a.tar"}, "broken archive"),
     ],
 )
 def test_a_file_that_is_not_what_it_should_be_is_refused_and_forgotten(

@@ -159,6 +159,61 @@ def test_a_tar_whose_header_is_a_bomb_is_refused_before_it_is_read(tmp_path: Pat
         check_archive(written(tmp_path, gzip.compress(bomb)), LIMITS)
 
 
+BLOCK = tarfile.BLOCKSIZE
+THREE = {name: b"x" * 700 for name in ("first", "second", "third")}
+SECOND = 3 * BLOCK
+"""Where the header of the second member of THREE begins: header and two blocks of data come before."""
+LAST_DATA = 9 * BLOCK
+"""Where the data of the third end, and the zeros begin."""
+
+
+def wrong_name(tar: bytes) -> bytes:
+    """A byte of a later header is another, and its checksum does not say so."""
+    return tar[:SECOND] + b"S" + tar[SECOND + 1 :]
+
+
+def zeroed(tar: bytes) -> bytes:
+    """A later header is lost, and looks like the end."""
+    return tar[:SECOND] + bytes(BLOCK) + tar[SECOND + BLOCK :]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        wrong_name,
+        zeroed,
+        lambda tar: tar[: SECOND + 100],
+        lambda tar: tar[:SECOND],
+        lambda tar: tar[: SECOND - 10],
+        lambda tar: tar[:LAST_DATA],
+        lambda tar: tar + b"x",
+        lambda tar: tar + bytes(20 << 20),
+    ],
+    ids=["wrong", "zeroed", "cut", "cut between", "cut in data", "no end", "more", "endless"],
+)
+@pytest.mark.parametrize("pack", [bytes, gzip.compress], ids=["tar", "tar.gz"])
+def test_a_tar_that_is_broken_after_its_first_member_is_refused_before_anything_is_kept(
+    tmp_path: Path, pack: Callable[[bytes], bytes], spoil: Callable[[bytes], bytes]
+):
+    whole = tarred(THREE)
+    assert len(check_archive(written(tmp_path, pack(whole)), LIMITS)) == len(THREE)
+    with pytest.raises(FormatError):
+        check_archive(written(tmp_path, pack(spoil(whole))), LIMITS)
+
+
+def test_a_gzipped_tar_whose_checksum_is_wrong_is_refused(tmp_path: Path):
+    packed = bytearray(gzip.compress(tarred(THREE)))
+    packed[-8] ^= 1
+    with pytest.raises(FormatError, match="broken"):
+        check_archive(written(tmp_path, bytes(packed)), LIMITS)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 20, 2048])
+def test_a_tar_ends_with_as_many_zeros_as_its_writer_likes(tmp_path: Path, blocks: int):
+    data = tarred(THREE)[:LAST_DATA] + bytes(blocks * BLOCK)
+    assert len(check_archive(written(tmp_path, data), LIMITS)) == len(THREE)
+
+
 def test_a_zip_whose_index_is_a_bomb_is_refused_before_it_is_read(tmp_path: Path):
     data = bytearray(zipped({"a": b"x"}))
     at = data.rindex(b"PK\5\6")
