@@ -8,8 +8,8 @@ import rasterio
 from rasterio.windows import Window as RasterWindow
 
 from benchmarks._simulated import lay_points
-from services.formats.block import write_block
-from services.formats.block_json import BlockMetadata, BlockSpecification, Provenance
+from services.formats.block_document import BlockMetadata, BlockSpecification, Provenance
+from services.formats.block_writing import write_block
 from services.formats.raster import gdal_rpc
 from services.geodesy import metres_per_degree
 from services.imagery import ImageSource, Window

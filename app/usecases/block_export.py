@@ -18,17 +18,17 @@ from app.db.tokens import Token
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.processes import Commit, Process, Work
-from services.formats.block import write_block
-from services.formats.block_json import (
+from services.formats.block_document import (
     NAME_PATTERN,
     AccuracyFigure,
     BlockDocument,
     BlockMetadata,
     BlockSpecification,
     Provenance,
-    parse_block_json,
     rectangle,
 )
+from services.formats.block_json import parse_block_json
+from services.formats.block_writing import write_block
 from services.types import (
     Array,
     ChipArray,

@@ -16,7 +16,8 @@ from app.storage import Storage, StoredFile
 from services.errors import FormatError
 from services.formats.block import BlockContents, block_member
 from services.formats.block_check import check_block, check_checksums
-from services.formats.block_json import BLOCK_JSON, AccuracyFigure, parse_block_json
+from services.formats.block_document import AccuracyFigure
+from services.formats.block_json import BLOCK_JSON, parse_block_json
 from services.formats.chip_files import ChipFile, read_chip_file
 from services.quality.block import BlockQuality, block_quality
 from services.types import Progress, no_progress, part_of

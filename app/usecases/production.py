@@ -11,8 +11,8 @@ from app.errors import InputError
 from app.usecases.orthorectification import TerrainFile
 from app.usecases.reference import HEIGHT_SIGMA_POSTINGS
 from services.formats.bands import parse_bands
-from services.formats.block import write_block
-from services.formats.block_json import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
+from services.formats.block_document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
+from services.formats.block_writing import write_block
 from services.formats.dem import read_dem
 from services.formats.scenes import read_scene
 from services.ortho_points import Heights, OrthoPointOptions, OrthoPoints, ortho_points

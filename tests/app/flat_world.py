@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import rasterio
 
-from services.formats.block import write_block
+from services.formats.block_writing import write_block
 from services.formats.raster import gdal_rpc
 from services.formats.rpc_text import format_rpc_text
 from services.imagery import ArrayImage, render_chip

@@ -15,7 +15,7 @@ from app.usecases import blocks
 from app.usecases.block_export import ExportBlock, export_block
 from app.usecases.jobs import do_attempt
 from services.formats.block_check import check_block
-from services.formats.block_json import rectangle
+from services.formats.block_document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
 

@@ -22,7 +22,7 @@ from app.main import create_app
 from app.storage import StoredChips
 from app.usecases import blocks
 from app.usecases.jobs import do_attempt
-from services.formats.block_json import rectangle
+from services.formats.block_document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
 

@@ -11,8 +11,8 @@ from app.db import engine, overlaps
 from app.db.overlaps import SAME_PLACE_M
 from app.errors import Conflict, InputError
 from app.usecases import blocks
-from services.formats.block import write_block
-from services.formats.block_json import AccuracyFigure
+from services.formats.block_document import AccuracyFigure
+from services.formats.block_writing import write_block
 from services.types import Array
 from tests.factories import BOX, control_points, metadata, noise_chips
 

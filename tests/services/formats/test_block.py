@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from services.errors import FormatError, InputError
-from services.formats import block as block_module
-from services.formats.block import FolderChips, read_block, write_block
-from services.formats.block_check import BlockProblems, check_block
+from services.formats import block_writing
+from services.formats.block import FolderChips, read_block
+from services.formats.block_check import check_block
 from services.formats.block_json import format_block_json, parse_block_json
+from services.formats.block_problems import BlockProblems
+from services.formats.block_writing import write_block
 from services.formats.hilbert import hilbert_order
 from services.formats.rpc_text import parse_rpc_text
 from services.types import ControlPoints, point_chips
@@ -112,7 +114,7 @@ def test_chips_that_fill_a_file_go_on_in_the_next_without_splitting_a_point(
     tmp_path, monkeypatch, dtype
 ):
     chip_bytes = 101 * 101 * np.dtype(dtype).itemsize
-    monkeypatch.setattr(block_module, "CHIP_FILE_BYTES", 14 * chip_bytes)
+    monkeypatch.setattr(block_writing, "CHIP_FILE_BYTES", 14 * chip_bytes)
 
     block = make_block(tmp_path / "block", count=7, dtype=dtype)
 

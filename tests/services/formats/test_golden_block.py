@@ -8,8 +8,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from services.formats.block import BlockContents, FolderChips, write_block
+from services.formats.block import BlockContents, FolderChips
 from services.formats.block_check import check_block
+from services.formats.block_writing import write_block
 from services.formats.rpc_files import read_text
 from services.formats.rpc_text import parse_rpc_text
 from services.types import point_chips
