@@ -26,7 +26,7 @@ from app.usecases.block_export import EXPORT_BLOCK
 from app.usecases.block_ingestion import INGEST_BLOCK
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work
-from app.usecases.registration import REGISTER_SCENE
+from app.usecases.registration_job import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
     process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)

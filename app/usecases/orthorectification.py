@@ -10,12 +10,13 @@ from uuid import UUID
 import numpy as np
 
 from app.auth import Scope
-from app.db import registrations, scenes
+from app.db import registrations
 from app.db.engine import Connection
 from app.db.tokens import Token
-from app.errors import Conflict, InputError
+from app.errors import InputError
 from app.usecases.processes import Commit, Process, Work
-from app.usecases.scenes import clean_name, local_image, visible_scene
+from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
+from app.usecases.scenes import local_image
 from services.formats.bands import one_band
 from services.formats.dem import read_dem
 from services.formats.ortho_files import write_cog
@@ -196,13 +197,8 @@ def _data_bands(image: RasterImage) -> list[int]:
 
 
 def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> None:
-    scene = visible_scene(connection, caller, inputs.scene)
-    if scene.state != "uploaded":
-        raise Conflict(f"scene {inputs.scene} cannot be rectified: its image is {scene.state}")
-    for name in ("dem", "model", "geoid"):
-        given = getattr(inputs, name)
-        if given is not None and given != clean_name(given):
-            raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
+    check_scene(connection, caller, inputs.scene)
+    check_file_names(inputs, "dem", "model", "geoid")
     if inputs.registration is not None:
         if inputs.model is not None:
             raise InputError("model and registration exclude each other")
@@ -228,11 +224,9 @@ def _run(work: Work) -> Commit:
     """Rectify an uploaded scene; the image is in the storage before the job says so."""
     inputs: OrthorectifyScene = work.inputs
     with work.database.transaction() as connection:
-        scene = scenes.find_scene(connection, inputs.scene)
+        scene = present_scene(connection, inputs.scene)
         asked = inputs.registration
         refined = None if asked is None else _refined_key(connection, inputs.scene, asked)
-    if scene is None or scene.state == "removed":
-        raise Conflict(f"scene {inputs.scene} has been removed")
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
         model = image.with_name(inputs.model) if inputs.model else None

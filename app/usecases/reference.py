@@ -17,7 +17,7 @@ from services.reference import (
     register_on_reference,
 )
 from services.registration import Registration, RegistrationOptions
-from services.reports.report import BlockUsed
+from services.reports.summary import BlockUsed
 from services.scene import Scene
 from services.sensors.ortho import OrthoModel
 from services.types import Array, Progress

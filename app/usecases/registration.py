@@ -1,38 +1,32 @@
 """Registering a scene: read its files, find points, call the science, write the outcome."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Literal, get_args
+from typing import Literal
 from uuid import UUID
 
 import numpy as np
 import shapely
 
-from app.auth import Scope
-from app.db import registrations, scenes
+from app.db import registrations
 from app.db.engine import Connection
-from app.db.tokens import Token
-from app.errors import Conflict, InputError
 from app.usecases import history
 from app.usecases.check_points import read_check_points
-from app.usecases.ground_control import FindPoints, FoundPoints, points_of_store
-from app.usecases.processes import Commit, Process, Work
+from app.usecases.ground_control import FindPoints, FoundPoints
 from app.usecases.reference import FindReference, FoundReference, register_on
-from app.usecases.references import keep_places, references_of_store
-from app.usecases.registration_files import OUTPUTS, write_outputs
-from app.usecases.scenes import clean_name, local_image, visible_scene
+from app.usecases.references import keep_places
+from app.usecases.registration_files import write_outputs
 from services.errors import CoverageError
 from services.formats.bands import parse_bands
 from services.formats.scenes import read_scene
 from services.quality.checks import CheckPoints, check_model, qualified_by
 from services.registration import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
-from services.reports.report import Check, RegistrationReport
-from services.reports.report import Method as ReportedMethod
-from services.scene import Scene, scene_footprint, scene_gsd_m
+from services.reports.report import RegistrationReport
+from services.reports.summary import Check
+from services.scene import Scene, scene_footprint
 from services.types import Array, Progress, no_progress
 
 Method = Literal["auto", "points", "reference"]
@@ -41,36 +35,6 @@ Method = Literal["auto", "points", "reference"]
 METRES_PER_DEGREE = 111_320.0
 REACH_SIGMAS = 3.0
 """A model may be wrong by this many of its standard deviations; points are looked for that far out."""
-
-
-@dataclass(frozen=True)
-class RegisterScene:
-    """What a user says to have a scene registered.
-
-    Files are named that were uploaded beside the image.
-
-    Attributes:
-        scene: id of an uploaded scene.
-        model: name of the file that holds its model; by default it is found.
-        method: "points", "reference", or "auto": on points, on a reference where there is none.
-        bands: what is looked at, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic
-            band or the mean of the visible ones.
-        mask: name of an image of the same ground that is not zero where pixels shall not be used.
-        check_points: name of a file with points that are held out of the registration.
-        check_heights: what the heights in it are above, where its format cannot say.
-        copy_image: whether a GeoTIFF is delivered again with the refined model in its tags.
-        options: of the registration.
-    """
-
-    scene: UUID
-    model: str | None = None
-    method: Method = "auto"
-    bands: str | None = None
-    mask: str | None = None
-    check_points: str | None = None
-    check_heights: str | None = None
-    copy_image: bool = False
-    options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
 
 @dataclass(frozen=True)
@@ -266,91 +230,9 @@ def key_of_file(image: Path) -> str:
     return sha256(said.encode()).hexdigest()
 
 
-def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None:
-    scene = visible_scene(connection, caller, inputs.scene)
-    if scene.state != "uploaded":
-        raise Conflict(f"scene {inputs.scene} cannot be registered: its image is {scene.state}")
-    for name in ("model", "mask", "check_points"):
-        given = getattr(inputs, name)
-        if given is not None and given != clean_name(given):
-            raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
-    if inputs.bands is not None:
-        parse_bands(inputs.bands)
-
-
-def _run(work: Work) -> Commit:
-    """Register an uploaded scene; the files are in the storage before the rows that name them."""
-    inputs: RegisterScene = work.inputs
-    with work.database.transaction() as connection:
-        scene = scenes.find_scene(connection, inputs.scene)
-    if scene is None or scene.state == "removed":
-        raise Conflict(f"scene {inputs.scene} has been removed")
-    find_points = points_of_store(work.database, work.storage)
-    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
-        image = local_image(work.storage, work.settings, scene, Path(scratch))
-        made = run_registration(
-            _files_of(inputs, image, scene.sigma_m),
-            find_points,
-            inputs.options,
-            Path(folder),
-            work.progress,
-            references_of_store(work.database, work.settings),
-            inputs.method,
-            inputs.copy_image,
-        )
-        gsd_m = scene_gsd_m(made.scene)
-        keys = {
-            name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
-            for name, path in made.files.items()
-        }
-
-    def commit(connection: Connection) -> dict[str, Any]:
-        key = scene.sha256 or f"scene {scene.id}"
-        record(connection, made, key, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
-        scenes.set_footprint(connection, inputs.scene, made.footprint)
-        taken, shape = made.scene.acquisition, made.scene.image.shape
-        scenes.describe(connection, inputs.scene, taken, shape, gsd_m)
-        return {"verdict": made.report.verdict, "method": made.report.method, "files": keys}
-
-    return commit
-
-
-def _files_of(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
-    """The files of a scene that lie beside its image, by the names they were uploaded under."""
-
-    def beside(name: str | None) -> Path | None:
-        return None if name is None else image.with_name(name)
-
-    return SceneFiles(
-        image,
-        beside(inputs.model),
-        sigma_m,
-        inputs.bands,
-        beside(inputs.mask),
-        beside(inputs.check_points),
-        inputs.check_heights,
-    )
-
-
 def _grown(outline: Array, metres: float) -> Array:
     """An outline (n, 2) of lon, lat with so many metres more on every side."""
     centre = outline.mean(axis=0)
     scale = METRES_PER_DEGREE * np.array([max(np.cos(np.radians(centre[1])), 0.01), 1.0])
     grown = shapely.buffer(shapely.Polygon((outline - centre) * scale), metres, quad_segs=2)
     return np.asarray(centre + np.array(grown.exterior.coords)[:-1] / scale)
-
-
-REGISTER_SCENE = Process(
-    id="register-scene",
-    title="Register a scene",
-    description="Refine the sensor model of an uploaded scene on the control points of its footprint.",
-    scope=Scope.REGISTER,
-    inputs=RegisterScene,
-    outputs=OUTPUTS,
-    check=_check,
-    run=_run,
-    values={
-        "verdict": {"enum": ["good", "usable", "failed"], "title": "How good it is"},
-        "method": {"enum": list(get_args(ReportedMethod)), "title": "What it was registered on"},
-    },
-)

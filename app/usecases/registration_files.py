@@ -16,16 +16,8 @@ from services.imagery import reduce_image, render_chip
 from services.registration import Registration, RegistrationOptions
 from services.reports.document import format_report
 from services.reports.html import format_html
-from services.reports.report import (
-    BlockUsed,
-    Check,
-    ChipPair,
-    Method,
-    Quicklook,
-    RegistrationReport,
-    RegistrationSummary,
-    build_report,
-)
+from services.reports.report import RegistrationReport, build_report
+from services.reports.summary import BlockUsed, Check, ChipPair, Method, Quicklook, RegistrationSummary
 from services.scene import Scene, scene_footprint, scene_gsd_m
 from services.sensors.ortho import OrthoModel
 from services.types import Array, ChipSource, ControlPoints, Measures, point_chips

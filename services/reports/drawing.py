@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from services.reports.report import Quicklook, RegistrationSummary
+from services.reports.summary import Quicklook, RegistrationSummary
 
 INK, QUIET = "#0a0b0c", "#0a0b0d"
 _PAGE_COLOURS = {INK: "var(--ink)", QUIET: "var(--quiet)"}

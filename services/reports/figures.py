@@ -25,7 +25,8 @@ from services.reports.drawing import (
     shortened,
     style,
 )
-from services.reports.report import RegistrationSummary, count_reasons
+from services.reports.report import count_reasons
+from services.reports.summary import RegistrationSummary
 from services.reports.tables import number, reason_words
 from services.types import Array, BoolArray
 

@@ -14,7 +14,8 @@ from services.quality.qualification import Criterion
 from services.reports import figures
 from services.reports.drawing import svg
 from services.reports.published import published_tables
-from services.reports.report import ChipPair, RegistrationReport, RegistrationSummary
+from services.reports.report import RegistrationReport
+from services.reports.summary import ChipPair, RegistrationSummary
 from services.reports.tables import ABSENT, criterion_way, criterion_words, number, percent, quantile
 from services.types import Array, ChipArray
 

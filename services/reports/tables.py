@@ -10,7 +10,8 @@ from rich.text import Text
 
 from services.quality.accuracy import Quantile, Statistics
 from services.quality.qualification import Criterion
-from services.reports.report import Check, RegistrationReport
+from services.reports.report import RegistrationReport
+from services.reports.summary import Check
 
 ABSENT = "–"  # noqa: RUF001
 CRITERION_NAMES = {

@@ -10,15 +10,8 @@ import pytest
 from services.passes import Pass
 from services.quality.accuracy import accuracy
 from services.quality.qualification import QualificationOptions, qualify
-from services.reports.report import (
-    BlockUsed,
-    Check,
-    ChipPair,
-    Quicklook,
-    RegistrationReport,
-    RegistrationSummary,
-    build_report,
-)
+from services.reports.report import RegistrationReport, build_report
+from services.reports.summary import BlockUsed, Check, ChipPair, Quicklook, RegistrationSummary
 from services.types import Acquisition, FloatImage
 
 

@@ -11,7 +11,8 @@ from services.quality.qualification import Criterion
 from services.reports import figures
 from services.reports.drawing import round_number, svg
 from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
-from services.reports.report import Quicklook, build_report
+from services.reports.report import build_report
+from services.reports.summary import Quicklook
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
 DRAWN = [
