@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from uuid import UUID
 
-from app.db import jobs, scenes, uploads
+from app.db import attempts, scenes, uploads
 from app.db.engine import Connection, Database
 from app.storage import Storage
 
@@ -45,7 +45,7 @@ def _scene_folders(connection: Connection, folders: list[str]) -> set[str]:
 def _attempt_folders(connection: Connection, folders: list[str]) -> set[str]:
     """Those of `results/JOB/ATTEMPT` whose attempt is under way or succeeded."""
     ids = {folder: UUID(folder.split("/")[1]) for folder in folders}
-    counting = jobs.counting_attempts(connection, list(set(ids.values())))
+    counting = attempts.counting_attempts(connection, list(set(ids.values())))
     return {
         folder for folder, job_id in ids.items() if counting.get(job_id) == int(folder.split("/")[2])
     }

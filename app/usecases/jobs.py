@@ -14,10 +14,11 @@ from psycopg import OperationalError
 
 from app.auth import Scope, allows, require
 from app.config import Settings
-from app.db import job_course, jobs
+from app.db import attempts, job_course, jobs
+from app.db.attempts import LostJob
 from app.db.engine import Connection, Database
 from app.db.job_course import JobMessage
-from app.db.jobs import Job, JobFilter, LostJob, Response
+from app.db.jobs import Job, JobFilter, Response
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
@@ -185,11 +186,11 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
         commit = process.run(Work(job, inputs, database, storage, settings, progress))
         with database.transaction() as connection:
             results = commit(connection)
-            jobs.succeed(connection, job.id, attempt, results)
+            attempts.succeed(connection, job.id, attempt, results)
     except AmersError as error:
         log.info("job %s: %s: %s", job.id, type(error).__name__, error)
         with database.transaction() as connection:
-            jobs.fail(connection, job.id, attempt, error_details(error, storage))
+            attempts.fail(connection, job.id, attempt, error_details(error, storage))
 
 
 def error_details(error: AmersError, storage: Storage) -> dict[str, Any]:
@@ -225,6 +226,6 @@ class _ReportedProgress:
         percent = min(max(int(100.0 * fraction), 0), 99)
         try:
             with self.database.transaction() as connection:
-                jobs.report(connection, self.job.id, self.job.attempt, percent, message)
+                attempts.report(connection, self.job.id, self.job.attempt, percent, message)
         except OperationalError as outage:
             log.warning("job %s: progress could not be written: %s", self.job.id, outage)

@@ -19,9 +19,10 @@ from uuid import UUID
 from psycopg import OperationalError
 
 from app.config import Settings
-from app.db import jobs
+from app.db import attempts
+from app.db.attempts import LostJob
 from app.db.engine import Database
-from app.db.jobs import Job, LostJob
+from app.db.jobs import Job
 from app.errors import is_no_room
 from app.origin import Origin, working_for
 from app.storage import UNFINISHED
@@ -80,7 +81,7 @@ class Attempts:
 
     def _do_job(self, job_id: UUID) -> None:
         with self.database.transaction() as connection:
-            job = jobs.claim(connection, job_id, self.worker, self.settings.lease_seconds)
+            job = attempts.claim(connection, job_id, self.worker, self.settings.lease_seconds)
         if job is None:
             log.info("job %s is not to be had", job_id)
             return
@@ -96,7 +97,7 @@ class Attempts:
             code = self._run(job)
         except Stopped:
             with self.database.transaction() as connection:
-                jobs.give_back(connection, job.id, job.attempt)
+                attempts.give_back(connection, job.id, job.attempt)
             log.info("job %s: given back", job.id)
         except TooLong:
             allowed_s = self.settings.job_seconds
@@ -127,12 +128,14 @@ class Attempts:
             )
         else:
             with self.database.transaction() as connection:
-                jobs.try_again(connection, job.id, job.attempt, self.settings.lease_seconds * failures)
+                attempts.try_again(
+                    connection, job.id, job.attempt, self.settings.lease_seconds * failures
+                )
 
     def _fail(self, job: Job, title: str, detail: str) -> None:
         error: dict[str, Any] = {"type": "about:blank", "title": title, "detail": detail}
         with self.database.transaction() as connection:
-            jobs.fail(connection, job.id, job.attempt, error)
+            attempts.fail(connection, job.id, job.attempt, error)
 
     def _run(self, job: Job) -> int:
         """Exit code of the attempt's process; however this ends, the process is gone.
@@ -187,7 +190,7 @@ class Attempts:
         """Renew the lease; False when the database cannot be reached."""
         try:
             with self.database.transaction() as connection:
-                jobs.renew(connection, job.id, job.attempt, self.settings.lease_seconds)
+                attempts.renew(connection, job.id, job.attempt, self.settings.lease_seconds)
         except OperationalError as outage:
             log.warning("job %s: the lease could not be renewed: %s", job.id, outage)
             return False

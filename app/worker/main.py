@@ -15,7 +15,7 @@ import procrastinate
 import psycopg
 
 from app.config import Settings
-from app.db import engine, jobs
+from app.db import engine, job_queue
 from app.db.engine import Database
 from app.storage import open_storage
 from app.worker.attempt import Attempts
@@ -89,14 +89,14 @@ class _Worker:
         app = procrastinate.App(connector=procrastinate.PsycopgConnector(conninfo=self.database.dsn))
         attempts = Attempts(self.database, self.settings, self.name, self.stop.is_set)
 
-        @app.task(name=jobs.TASK, queue=jobs.QUEUE)
+        @app.task(name=job_queue.TASK, queue=job_queue.QUEUE)
         def do_job(job_id: str) -> None:
             attempts.do_job(UUID(job_id))
 
         async with app.open_async():
             log.info("worker %s waits for jobs", self.name)
             await app.run_worker_async(
-                queues=[jobs.QUEUE],
+                queues=[job_queue.QUEUE],
                 name=self.name,
                 delete_jobs="always",
                 fetch_job_polling_interval=min(self.settings.lease_seconds, LONGEST_POLL_S),

@@ -19,8 +19,8 @@ import cv2
 
 from app import logs
 from app.config import read_settings
+from app.db.attempts import LostJob
 from app.db.engine import pooled
-from app.db.jobs import LostJob
 from app.errors import is_no_room
 from app.origin import Origin, working_for
 from app.usecases.jobs import do_attempt

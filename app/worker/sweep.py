@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import psycopg
 
 from app.config import Settings
-from app.db import jobs, scenes
+from app.db import attempts, job_queue, jobs, scenes
 from app.db.engine import Database
 from app.origin import Origin, working_for
 from app.storage import Storage
@@ -66,13 +66,13 @@ class Sweeper:
 def sweep_jobs(database: Database, lease_s: float) -> None:
     """Take back the jobs of dead workers, and put into the queue what was lost from it."""
     with database.transaction() as connection:
-        if not jobs.may_sweep(connection):
+        if not job_queue.may_sweep(connection):
             return
-        for job_id in jobs.take_back(connection, FAILURES_ALLOWED):
+        for job_id in attempts.take_back(connection, FAILURES_ALLOWED):
             log.warning("job %s: taken back from a worker that gave no sign of life", job_id)
-        for job_id in jobs.enqueue_forgotten(connection, lease_s):
+        for job_id in job_queue.enqueue_forgotten(connection, lease_s):
             log.warning("job %s: was not in the queue any more", job_id)
-        jobs.forget_dead_entries(connection, SILENT_WORKER_S)
+        job_queue.forget_dead_entries(connection, SILENT_WORKER_S)
 
 
 def sweep_results(database: Database, result_days: float | None) -> None:

@@ -13,7 +13,7 @@ import httpx
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine, jobs
+from app.db import attempts, engine
 from app.db.engine import Database
 from app.main import create_app
 from app.storage import Storage
@@ -99,7 +99,7 @@ class Besieged:
         """The job that a reply names, after one attempt at it by the code of a worker's process."""
         job_id = UUID(reply.json()["jobID"])
         with self.database.transaction() as connection:
-            job = jobs.claim(connection, job_id, "a worker", 60.0)
+            job = attempts.claim(connection, job_id, "a worker", 60.0)
         assert job is not None
         do_attempt(self.database, self.settings, job_id, job.attempt)
         told = self.client.get(f"/jobs/{job_id}", headers=self.headers["admin"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from app.db import engine, jobs
+from app.db import attempts, engine
 from app.db import points as point_store
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
@@ -131,7 +131,7 @@ def test_a_block_is_exported_by_a_job_as_an_archive(
     job_id = UUID(asked.json()["jobID"])
     with engine.opened(settings) as database:
         with database.transaction() as own:
-            job = jobs.claim(own, job_id, "a worker", 30.0)
+            job = attempts.claim(own, job_id, "a worker", 30.0)
         do_attempt(database, settings, job_id, job.attempt)
     reply = client.get(f"/jobs/{job_id}/results/block.zip", headers=reader)
     assert reply.status_code == 200, reply.text

@@ -15,7 +15,7 @@ from shapely import Polygon
 from typer.testing import CliRunner
 
 from app.cli.main import app as commands
-from app.db import engine, jobs
+from app.db import attempts, engine
 from app.db import points as point_store
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
@@ -222,7 +222,7 @@ def ingested_by_job(client, settings, admin, body: dict) -> dict:
     ingesting = settings.model_copy(update={"ingest_folder": client.app.state.settings.ingest_folder})
     with engine.opened(ingesting) as database:
         with database.transaction() as connection:
-            job = jobs.claim(connection, job_id, "a worker", 30.0)
+            job = attempts.claim(connection, job_id, "a worker", 30.0)
         do_attempt(database, ingesting, job_id, job.attempt)
     return client.get(f"/jobs/{job_id}", headers=admin).json()
 

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from app.cli.main import app as amers
 from app.config import Settings
-from app.db import engine, history, jobs, registrations
+from app.db import attempts, engine, history, jobs, registrations
+from app.db.attempts import LostJob
 from app.db.engine import Connection, Database
-from app.db.jobs import LostJob
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.ground_control import points_of_block, points_of_store
@@ -187,15 +187,15 @@ def test_an_attempt_that_has_lost_its_job_counts_nothing(
     job = jobs.create(connection, "register-scene", {})
     assert job is not None
     for attempt in (1, 2):
-        assert jobs.claim(connection, job.id, "a worker", 30.0)
+        assert attempts.claim(connection, job.id, "a worker", 30.0)
         if attempt == 1:
-            jobs.try_again(connection, job.id, 1, 0.0)
+            attempts.try_again(connection, job.id, 1, 0.0)
     connection.commit()
 
     def end(attempt: int) -> None:
         with database.transaction() as own:
             remembered(own, stored, "a")
-            jobs.succeed(own, job.id, attempt, {})
+            attempts.succeed(own, job.id, attempt, {})
 
     with pytest.raises(LostJob):
         end(1)

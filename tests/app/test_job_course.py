@@ -8,7 +8,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine, job_course, jobs
+from app.db import attempts, engine, job_course, jobs
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
 from app.db.jobs import Job
@@ -39,7 +39,7 @@ def asked(connection: Connection, kind: str = "register-scene") -> Job:
 
 
 def begun(connection: Connection, kind: str = "register-scene") -> Job:
-    job = jobs.claim(connection, asked(connection, kind).id, "w", LEASE_S)
+    job = attempts.claim(connection, asked(connection, kind).id, "w", LEASE_S)
     assert job is not None
     return job
 
@@ -47,7 +47,7 @@ def begun(connection: Connection, kind: str = "register-scene") -> Job:
 def done_in(connection: Connection, seconds: float, kind: str = "register-scene") -> UUID:
     """A job that succeeded so long after a worker had taken it."""
     job = begun(connection, kind)
-    jobs.succeed(connection, job.id, job.attempt, {})
+    attempts.succeed(connection, job.id, job.attempt, {})
     connection.execute(
         "update job set claimed_at = finished_at - make_interval(secs => %s) where id = %s",
         [seconds, job.id],
@@ -67,13 +67,13 @@ def wait_of(connection: Connection, job: Job) -> timedelta:
 
 def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
     job = asked(connection)
-    first = jobs.claim(connection, job.id, "w", LEASE_S)
+    first = attempts.claim(connection, job.id, "w", LEASE_S)
     assert first is not None
-    jobs.report(connection, job.id, 1, 10, "looking for points")
-    jobs.report(connection, job.id, 1, 20, "looking for points")
-    jobs.try_again(connection, job.id, 1, 0.0)
-    jobs.claim(connection, job.id, "w", LEASE_S)
-    jobs.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
+    attempts.report(connection, job.id, 1, 10, "looking for points")
+    attempts.report(connection, job.id, 1, 20, "looking for points")
+    attempts.try_again(connection, job.id, 1, 0.0)
+    attempts.claim(connection, job.id, "w", LEASE_S)
+    attempts.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
     said = job_course.read_messages(connection, job.id, 100)
     assert [(entry.attempt, entry.progress, entry.message) for entry in said] == [
         (0, 0, "waiting for a worker"),
@@ -131,10 +131,10 @@ def test_results_go_after_a_while_and_the_job_says_so(
         for age_days in (3.0, 1.0):
             reply = client.post("/processes/register-scene/execution", json=body, headers=me)
             url = reply.headers["location"]
-            job = jobs.claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
+            job = attempts.claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
             assert job is not None
             key = storage.put(f"results/{job.id}/1/report.json", [b"{}"]).key
-            jobs.succeed(connection, job.id, 1, {"verdict": "good", "files": {"report.json": key}})
+            attempts.succeed(connection, job.id, 1, {"verdict": "good", "files": {"report.json": key}})
             connection.execute(
                 "update job set finished_at = finished_at - make_interval(secs => %s) where id = %s",
                 [86_400.0 * age_days, job.id],

@@ -10,9 +10,10 @@ from fastapi.testclient import TestClient
 from psycopg.errors import UniqueViolation
 
 from app.config import Settings
-from app.db import engine, jobs, registrations, scenes
+from app.db import attempts, engine, jobs, registrations, scenes
+from app.db.attempts import LostJob
 from app.db.engine import Connection, Database
-from app.db.jobs import Job, LostJob
+from app.db.jobs import Job
 from app.main import create_app
 from app.storage import Storage
 from app.worker.attempt import FAILURES_ALLOWED
@@ -56,7 +57,7 @@ def new_job(database: Database) -> Job:
 def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S) -> Job:
     """The job, taken by a worker."""
     with database.transaction() as connection:
-        job = jobs.claim(connection, job_id, worker, lease_s)
+        job = attempts.claim(connection, job_id, worker, lease_s)
     assert job is not None
     return job
 
@@ -215,7 +216,7 @@ def test_a_dismissed_job_stays_dismissed_and_is_never_claimed(
     assert client.delete(here, headers=me).json()["status"] == "dismissed"
     assert client.delete(here, headers=me).json()["status"] == "dismissed"
     with database.transaction() as connection:
-        assert jobs.claim(connection, UUID(job["jobID"]), "w", LEASE_S) is None
+        assert attempts.claim(connection, UUID(job["jobID"]), "w", LEASE_S) is None
     assert client.get(f"{here}/results", headers=me).status_code == 404
 
 
@@ -225,7 +226,7 @@ def test_a_job_that_has_ended_cannot_be_dismissed(
     job = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()
     attempt = claimed(database, UUID(job["jobID"])).attempt
     with database.transaction() as connection:
-        jobs.succeed(connection, UUID(job["jobID"]), attempt, {"verdict": "good"})
+        attempts.succeed(connection, UUID(job["jobID"]), attempt, {"verdict": "good"})
     assert client.delete(f"/jobs/{job['jobID']}", headers=me).status_code == 409
     assert client.get(f"/jobs/{job['jobID']}", headers=me).json()["status"] == "successful"
 
@@ -243,7 +244,7 @@ def test_a_failed_job_tells_why_with_its_numbers(
         "found": 3,
     }
     with database.transaction() as connection:
-        jobs.fail(connection, UUID(job["jobID"]), attempt, error)
+        attempts.fail(connection, UUID(job["jobID"]), attempt, error)
     told = client.get(f"/jobs/{job['jobID']}", headers=me).json()
     assert (told["status"], told["message"], told["error"]) == ("failed", error["detail"], error)
     results = client.get(f"/jobs/{job['jobID']}/results", headers=me)
@@ -260,7 +261,7 @@ def test_a_job_is_claimed_by_one_worker_only(database: Database):
 
         def try_it(worker: int) -> Job | None:
             with database.transaction() as connection:
-                return jobs.claim(connection, job.id, f"w{worker}", LEASE_S)
+                return attempts.claim(connection, job.id, f"w{worker}", LEASE_S)
 
         got = [one for one in threads.map(try_it, range(6)) if one is not None]
     assert [one.attempt for one in got] == [1]
@@ -276,11 +277,11 @@ def test_a_worker_back_from_the_dead_writes_nothing(database: Database):
     with database.transaction() as connection:
         scene_id = scenes.begin_upload(connection, None, "a", "a.tif", None)
     writes: list[Callable[[Connection], None]] = [
-        lambda c: jobs.renew(c, job.id, zombie.attempt, LEASE_S),
-        lambda c: jobs.report(c, job.id, zombie.attempt, 50, "late"),
-        lambda c: jobs.fail(c, job.id, zombie.attempt, {"title": "late"}),
-        lambda c: jobs.give_back(c, job.id, zombie.attempt),
-        lambda c: jobs.try_again(c, job.id, zombie.attempt, 0.0),
+        lambda c: attempts.renew(c, job.id, zombie.attempt, LEASE_S),
+        lambda c: attempts.report(c, job.id, zombie.attempt, 50, "late"),
+        lambda c: attempts.fail(c, job.id, zombie.attempt, {"title": "late"}),
+        lambda c: attempts.give_back(c, job.id, zombie.attempt),
+        lambda c: attempts.try_again(c, job.id, zombie.attempt, 0.0),
         lambda c: finish(c, job.id, zombie.attempt, scene_id),
     ]
     for write in writes:
@@ -307,7 +308,7 @@ def finish(connection: Connection, job_id: UUID, attempt: int, scene_id: UUID) -
         verdict="good",
         files={},
     )
-    jobs.succeed(connection, job_id, attempt, {})
+    attempts.succeed(connection, job_id, attempt, {})
 
 
 def test_a_job_given_back_waits_again_without_counting_a_failure(database: Database):
@@ -316,7 +317,7 @@ def test_a_job_given_back_waits_again_without_counting_a_failure(database: Datab
         attempt = claimed(database, job.id).attempt
         assert attempt == expected
         with database.transaction() as connection:
-            jobs.give_back(connection, job.id, attempt)
+            attempts.give_back(connection, job.id, attempt)
     assert (state_of(database, job.id).state, state_of(database, job.id).failures) == ("accepted", 0)
 
 
@@ -336,7 +337,7 @@ def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):
     job = new_job(database)
     attempt = claimed(database, job.id, lease_s=0.0).attempt
     with database.transaction() as connection:
-        jobs.renew(connection, job.id, attempt, LEASE_S)
+        attempts.renew(connection, job.id, attempt, LEASE_S)
     sweep_jobs(database, LEASE_S)
     assert state_of(database, job.id).state == "running"
 
@@ -377,7 +378,7 @@ def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Dat
     for job in (done, running):
         claimed(database, job.id)
     with database.transaction() as connection:
-        jobs.succeed(connection, done.id, 2, {})
+        attempts.succeed(connection, done.id, 2, {})
         jobs.dismiss(connection, dead.id)
     for job in (done, running, dead):
         for attempt in (1, 2):

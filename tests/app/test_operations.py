@@ -10,7 +10,7 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
 from app import logs
-from app.db import engine, jobs, scenes
+from app.db import attempts, engine, jobs, scenes
 from app.db.audit import list_changes
 from app.errors import TooLarge, TooMany
 from app.main import create_app
@@ -69,9 +69,9 @@ def test_a_change_over_the_api_names_caller_and_request(client, connection, bear
 
 def test_the_progress_of_a_job_is_no_change_and_its_states_are(connection):
     job = jobs.create(connection, "register-scene", {})
-    attempt = jobs.claim(connection, job.id, "w", 30.0)
-    jobs.report(connection, job.id, attempt.attempt, 10, "on the way")
-    jobs.succeed(connection, job.id, attempt.attempt, {})
+    attempt = attempts.claim(connection, job.id, "w", 30.0)
+    attempts.report(connection, job.id, attempt.attempt, 10, "on the way")
+    attempts.succeed(connection, job.id, attempt.attempt, {})
     found = changes(connection, kind="job")
     assert [(change.after or {})["state"] for change in found] == ["accepted", "running", "successful"]
 

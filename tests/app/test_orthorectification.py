@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from app.config import Settings
-from app.db import engine, jobs, registrations
+from app.db import attempts, engine, jobs, registrations
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases.jobs import do_attempt
@@ -116,7 +116,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
         job_id = asked.json()["jobID"]
         with engine.pooled(dsn, settings) as database:
             with database.transaction() as connection:
-                assert jobs.claim(connection, UUID(job_id), "a worker", 30.0)
+                assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
         job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
         if job["status"] == "failed":

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 
 from app.config import Settings
-from app.db import engine, jobs, references
+from app.db import attempts, engine, references
 from app.db.engine import Connection, Database
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
@@ -230,7 +230,7 @@ def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked
             assert asked.status_code == 201, asked.text
             job_id = asked.json()["jobID"]
             with database.transaction() as connection:
-                assert jobs.claim(connection, UUID(job_id), "a worker", 30.0)
+                assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
             job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
             if job["status"] == "successful":

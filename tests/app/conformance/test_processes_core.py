@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 from jsonschema import Draft202012Validator, validate
 
-from app.db import engine, jobs
+from app.db import attempts, engine
 from app.db.jobs import Job
 from app.storage import Storage
 from app.usecases import results
@@ -100,7 +100,7 @@ def done(ask: Callable[..., Any], dsn: str, storage: Storage) -> Callable[..., s
             for name, content in files.items()
         }
         with engine.connect(dsn) as connection:
-            jobs.succeed(connection, job.id, job.attempt, {"verdict": "good", "files": keys})
+            attempts.succeed(connection, job.id, job.attempt, {"verdict": "good", "files": keys})
         return str(reply.headers["location"])
 
     return done
@@ -109,7 +109,7 @@ def done(ask: Callable[..., Any], dsn: str, storage: Storage) -> Callable[..., s
 def begun(dsn: str, job_id: str) -> Job:
     """The job, taken by a worker."""
     with engine.connect(dsn) as connection:
-        job = jobs.claim(connection, UUID(job_id), "a worker", 30.0)
+        job = attempts.claim(connection, UUID(job_id), "a worker", 30.0)
     assert job is not None
     return job
 
@@ -364,7 +364,7 @@ def test_req_core_job_results_failed(get, ask, dsn, storage):
     attempt = begun(dsn, job["jobID"]).attempt
     error = error_details(NotEnoughPoints(3, 6), storage)
     with engine.connect(dsn) as connection:
-        jobs.fail(connection, UUID(job["jobID"]), attempt, error)
+        attempts.fail(connection, UUID(job["jobID"]), attempt, error)
     reply = get(f"/jobs/{job['jobID']}/results")
     assert_exception(reply, 409)
     assert (reply.json()["found"], reply.json()["needed"]) == (3, 6)
@@ -388,7 +388,7 @@ def test_req_job_list_parameters(get, ask, dsn):
     begun(dsn, running["jobID"])
     attempt = begun(dsn, ended["jobID"]).attempt
     with engine.connect(dsn) as connection:
-        jobs.succeed(connection, UUID(ended["jobID"]), attempt, {})
+        attempts.succeed(connection, UUID(ended["jobID"]), attempt, {})
         connection.execute(
             "update job set started_at = finished_at - interval '1 hour' where id = %s", [ended["jobID"]]
         )
