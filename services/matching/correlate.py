@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from services.matching.least_squares import covariance_of, fit_chip
+from services.matching.shadows import ShadowMove, steady_weights
 from services.types import Array, FloatImage
 
 FOUND = ""
@@ -64,7 +65,12 @@ def _rejected(reason: str, score: float = math.nan) -> Peak:
     return Peak(np.full(2, np.nan), score, math.nan, np.zeros((0, 0, 2)), reason)
 
 
-def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) -> Peak:
+def find_chip(
+    patch: FloatImage,
+    chip: FloatImage,
+    options: CorrelationOptions,
+    shadows: ShadowMove | None = None,
+) -> Peak:
     """Find a chip in a larger patch of the same geometry.
 
     Zero-mean normalised correlation in float32 finds the pixel, least squares its fraction.
@@ -73,6 +79,7 @@ def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) 
         patch: (s + 2 r, s + 2 r); NaN where there is nothing to see.
         chip: (s, s); NaN where nodata.
         options: thresholds.
+        shadows: how they have moved from the chip to the patch, where that is known.
     """
     if not np.isfinite(chip).all():
         return _rejected("nodata")
@@ -92,21 +99,27 @@ def find_chip(patch: FloatImage, chip: FloatImage, options: CorrelationOptions) 
         return _rejected("border_peak", score)
     if _second_peak(scores, row, col, options.second_distance_px) > options.max_second * score:
         return _rejected("ambiguous" if score >= options.min_score else "low_score", score)
-    return place_chip(patch, chip, np.array([row, col], dtype=np.float64), score, options)
+    return place_chip(patch, chip, np.array([row, col], dtype=np.float64), score, options, shadows)
 
 
 def place_chip(
-    patch: FloatImage, chip: FloatImage, start: Array, score: float, options: CorrelationOptions
+    patch: FloatImage,
+    chip: FloatImage,
+    start: Array,
+    score: float,
+    options: CorrelationOptions,
+    shadows: ShadowMove | None = None,
 ) -> Peak:
     """The place of a chip whose pixel is known.
 
     Args:
-        patch, chip: as in `find_chip`.
+        patch, chip, shadows: as in `find_chip`.
         start: (2,) row and column of the chip's first pixel in the patch.
         score: normalised correlation there.
         options: thresholds.
     """
-    fit = fit_chip(patch, chip, start)
+    weight = None if shadows is None else steady_weights(chip, score, shadows)
+    fit = fit_chip(patch, chip, start, weight=weight)
     score = score if fit is None else max(score, fit.score)
     if score < options.min_score:
         return _rejected("low_score", score)

@@ -39,7 +39,13 @@ class Fit:
     influence: Array
 
 
-def fit_chip(patch: FloatImage, chip: FloatImage, start: Array, reach_px: float = 1.5) -> Fit | None:
+def fit_chip(
+    patch: FloatImage,
+    chip: FloatImage,
+    start: Array,
+    reach_px: float = 1.5,
+    weight: FloatImage | None = None,
+) -> Fit | None:
     """Lay a chip on a patch by least squares: two displacements, a gain and an offset.
 
     Gauss-Newton with the gradients of the chip, which stay, so that a step costs one interpolation of
@@ -54,6 +60,7 @@ def fit_chip(patch: FloatImage, chip: FloatImage, start: Array, reach_px: float 
         chip: (s, s) without NaN.
         start: (2,) row and column of the chip's first pixel in the patch, to a pixel or so.
         reach_px: how far from there the place may be.
+        weight: (s - 2, s - 2) of the chip's pixels without the outermost; all alike when None.
 
     Returns:
         None where there is no such place, or the patch has nothing beside it.
@@ -62,8 +69,10 @@ def fit_chip(patch: FloatImage, chip: FloatImage, start: Array, reach_px: float 
     first = np.maximum(np.floor(start).astype(int) - margin, 0)
     last = np.minimum(np.ceil(start).astype(int) + chip.shape[0] + margin, patch.shape)
     coefficients = spline_coefficients(patch[first[0] : last[0], first[1] : last[1]])
+    if weight is None:
+        weight = np.ones((chip.shape[0] - 2, chip.shape[1] - 2), dtype=np.float32)
     row, col, score, influence = _fit(
-        coefficients, chip, float(start[0] - first[0]), float(start[1] - first[1]), reach_px
+        coefficients, chip, weight, float(start[0] - first[0]), float(start[1] - first[1]), reach_px
     )
     if not np.isfinite(score):
         return None
@@ -92,11 +101,16 @@ def covariance_of(influence: Array) -> Array:
 
 @njit(cache=True, error_model="numpy")
 def _fit(
-    coefficients: FloatImage, chip: FloatImage, row: float, col: float, reach_px: float
+    coefficients: FloatImage,
+    chip: FloatImage,
+    weight: FloatImage,
+    row: float,
+    col: float,
+    reach_px: float,
 ) -> tuple[float, float, float, Array]:
     side = chip.shape[0] - 2
     lines, samples = coefficients.shape
-    gradients, inverse = _design(chip)
+    gradients, inverse = _design(chip, weight)
     at = np.empty((side, side), dtype=np.float32)
     failed = (np.nan, np.nan, np.nan, np.zeros((1, 1, 2)))
     r, c = row, col
@@ -124,37 +138,45 @@ def _fit(
 
 
 @njit(cache=True, fastmath=_SUMS)
-def _design(chip: FloatImage) -> tuple[FloatImage, Array]:
-    """Gradients of the chip without its own grey values and mean, and their normal matrix inverted."""
+def _design(chip: FloatImage, weight: FloatImage) -> tuple[FloatImage, Array]:
+    """Weighted gradients of the chip without its grey values and mean; their normal matrix inverted.
+
+    What they are multiplied with is weighted by them, and freed of gain and offset.
+    """
     side = chip.shape[0] - 2
     gradients = np.empty((2, side, side), dtype=np.float32)
     mean = np.zeros(3)
+    total = 0.0
     for i in range(side):
         for j in range(side):
+            w = weight[i, j]
             gradients[0, i, j] = np.float32(0.5) * (chip[i + 2, j + 1] - chip[i, j + 1])
             gradients[1, i, j] = np.float32(0.5) * (chip[i + 1, j + 2] - chip[i + 1, j])
-            mean[0] += chip[i + 1, j + 1]
-            mean[1] += gradients[0, i, j]
-            mean[2] += gradients[1, i, j]
-    mean /= side * side
+            total += w
+            mean[0] += w * chip[i + 1, j + 1]
+            mean[1] += w * gradients[0, i, j]
+            mean[2] += w * gradients[1, i, j]
+    mean /= total
     own, across_r, across_c = 0.0, 0.0, 0.0
     for i in range(side):
         for j in range(side):
             value = chip[i + 1, j + 1] - mean[0]
-            own += value * value
-            across_r += value * gradients[0, i, j]
-            across_c += value * gradients[1, i, j]
+            weighted = weight[i, j] * value
+            own += weighted * value
+            across_r += weighted * gradients[0, i, j]
+            across_c += weighted * gradients[1, i, j]
     rr, rc, cc = 0.0, 0.0, 0.0
     for i in range(side):
         for j in range(side):
             value = chip[i + 1, j + 1] - mean[0]
+            w = weight[i, j]
             g = gradients[0, i, j] - mean[1] - across_r / own * value
             h = gradients[1, i, j] - mean[2] - across_c / own * value
-            gradients[0, i, j] = g
-            gradients[1, i, j] = h
-            rr += g * g
-            rc += g * h
-            cc += h * h
+            gradients[0, i, j] = w * g
+            gradients[1, i, j] = w * h
+            rr += w * g * g
+            rc += w * g * h
+            cc += w * h * h
     determinant = rr * cc - rc * rc
     inverse = np.array([[cc, -rc], [-rc, rr]]) / determinant
     return gradients, inverse

@@ -11,6 +11,7 @@ from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
 from services.matching.radiometry import clouded, edges, looks_of
+from services.matching.shadows import ShadowMove, shadow_move
 from services.matching.shared_error import common_covariance_px2
 from services.matching.views import Likeness, choose_views
 from services.sensors.base import SensorModel
@@ -120,12 +121,14 @@ def match_points(
     looks = [np.empty((0, 2))] * n
     scene_gsd_m = np.full(n, np.nan)
     chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
+    shadows = [shadow_move(image, scene, level_m) for image in points.views.images]
     offsets: list[Array] = []
     seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
         if done % 64 == 0:
             progress(done / n, f"searching {n} points with chips of {level_m:g} m")
-        numbers = chosen.row[chosen.start[row] : chosen.start[row + 1]] - points.views.start[row]
+        rows = chosen.row[chosen.start[row] : chosen.start[row + 1]]
+        numbers = rows - points.views.start[row]
         if len(numbers) == 0:
             reason[row] = "no_chip"
             continue
@@ -139,7 +142,8 @@ def match_points(
         ratio = scene_gsd_m[row] / gsd_m
         looks[row] = looks_of(patch)
         like_scene = [_as_seen(stack[number], ratio, reduction) for number in numbers]
-        peaks, combined, by_gradient[row] = _search(patch, like_scene, options)
+        moves = [shadows[image] for image in points.views.image[rows]]
+        peaks, combined, by_gradient[row] = _search(patch, like_scene, moves, options)
         row_col, sigma, agreeing, reason[row] = combined
         for number, peak, agreed in zip(numbers, peaks, agreeing, strict=True):
             seen.append((row, int(number), peak, bool(agreed)))
@@ -177,10 +181,16 @@ Combined = tuple[Array, float, BoolArray, str]
 
 
 def _search(
-    patch: FloatImage, chips: list[FloatImage], options: MatchingOptions
+    patch: FloatImage,
+    chips: list[FloatImage],
+    shadows: list[ShadowMove | None],
+    options: MatchingOptions,
 ) -> tuple[list[Peak], Combined, bool]:
     """The views of a point in a patch: by grey values, else by their edges alone."""
-    peaks = [find_chip(patch, chip, options.correlation) for chip in chips]
+    peaks = [
+        find_chip(patch, chip, options.correlation, moved)
+        for chip, moved in zip(chips, shadows, strict=True)
+    ]
     combined = _combined(peaks, options.agreement_px)
     if combined[-1] == "low_score":
         outlines = edges(patch)

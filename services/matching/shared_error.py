@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from services.matching.shadows import shadow_of
 from services.types import Acquisition, Array, BoolArray, IntArray, Views
 
 COMMON_SIGMA_PX = 0.05
@@ -54,7 +55,7 @@ def common_covariance_px2(
     image = views.image[row[used]]
     for scene_leans, views_lean, sigma_px in (
         (_lean(scene.incidence_deg, scene.azimuth_deg), _leans(views, row[used]), LEAN_SIGMA_PX),
-        (_shadow(scene), np.array([_shadow(i) for i in views.images])[image], SHADOW_SIGMA_PX),
+        (shadow_of(scene), np.array([shadow_of(i) for i in views.images])[image], SHADOW_SIGMA_PX),
     ):
         apart = scene_leans - views_lean
         known = np.isfinite(apart).all(axis=1)
@@ -76,8 +77,3 @@ def _lean(incidence_deg: float, azimuth_deg: float) -> Array:
     """East and north (2,) by which a metre of depth leans towards the sensor."""
     azimuth = np.radians(azimuth_deg)
     return np.tan(np.radians(incidence_deg)) * np.array([np.sin(azimuth), np.cos(azimuth)])
-
-
-def _shadow(image: Acquisition) -> Array:
-    """East and north (2,) by which a metre of height throws its shadow; NaN when unknown."""
-    return _lean(90.0 - image.sun_elevation_deg, image.sun_azimuth_deg + 180.0)

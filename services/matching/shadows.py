@@ -1,0 +1,84 @@
+"""Ends of shadows: edges that lie elsewhere under another sun, and how little they count for a place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from services.types import Acquisition, Array, FloatImage
+
+CASTER_M = 8.0
+"""How high that is which casts shadows: houses of two floors, trees."""
+
+
+@dataclass(frozen=True)
+class ShadowMove:
+    """How the shadows of a chip lie in the image it is searched in.
+
+    Attributes:
+        away: (2,) rows and columns away from the sun of the chip; of any length.
+        move_px: (2,) rows and columns by which the end of a shadow of `CASTER_M` moved, chip pixels.
+    """
+
+    away: Array
+    move_px: Array
+
+
+def shadow_move(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowMove | None:
+    """How shadows have moved from a chip to a scene; None where one of the suns is not known.
+
+    Args:
+        chip: how the image it was cut from was taken.
+        scene: how the scene was taken.
+        gsd_m: of the chip as it is searched.
+    """
+    before, after = shadow_of(chip), shadow_of(scene)
+    if not np.isfinite(before + after).all():
+        return None
+    return ShadowMove(_rows_cols(before), _rows_cols(after - before) * (CASTER_M / gsd_m))
+
+
+def shadow_of(image: Acquisition) -> Array:
+    """East and north (2,) by which a metre of height throws its shadow; NaN when unknown."""
+    azimuth = np.radians(image.sun_azimuth_deg + 180.0)
+    length = np.tan(np.radians(90.0 - image.sun_elevation_deg))
+    return np.asarray(length * np.array([np.sin(azimuth), np.cos(azimuth)]))
+
+
+def steady_weights(chip: FloatImage, score: float, shadows: ShadowMove) -> FloatImage:
+    """How much each pixel of a chip counts for its place: little, where a shadow may have ended.
+
+    Where a chip grows brighter away from its sun, a shadow may end. Under another sun that edge lies
+    elsewhere: it differs there by its slope times the move, which counts as noise beside that of all
+    pixels (variances add; the weight is that of the noise over their sum). Edges of the other sign, such
+    as a roof before its own shadow, stay where they are, and so does their weight; under the same
+    sun all have theirs.
+
+    Args:
+        chip: (s, s) without NaN.
+        score: normalised correlation at the place, which tells the noise of all pixels.
+        shadows: how they have moved.
+
+    Returns:
+        (s - 2, s - 2), 0 to 1: of the chip without its outermost pixels.
+    """
+    noise2 = max(1.0 - score * score, 0.01) * float(chip.var())
+    return _weights(chip, shadows.away, shadows.move_px, noise2)
+
+
+def _rows_cols(east_north: Array) -> Array:
+    return np.array([-east_north[1], east_north[0]])
+
+
+@njit(cache=True)
+def _weights(chip: FloatImage, away: Array, move_px: Array, noise2: float) -> FloatImage:
+    side = chip.shape[0] - 2
+    weight = np.ones((side, side), dtype=np.float32)
+    for i in range(side):
+        for j in range(side):
+            down = 0.5 * (chip[i + 2, j + 1] - chip[i, j + 1])
+            right = 0.5 * (chip[i + 1, j + 2] - chip[i + 1, j])
+            if down * away[0] + right * away[1] > 0.0:
+                changed = down * move_px[0] + right * move_px[1]
+                weight[i, j] = np.float32(noise2 / (noise2 + changed * changed))
+    return weight

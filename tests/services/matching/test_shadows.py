@@ -1,0 +1,98 @@
+"""Ends of shadows, which lie elsewhere under another sun, do not take a chip with them."""
+
+from dataclasses import replace
+from math import radians, tan
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from services.matching.shadows import shadow_move, shadow_of, steady_weights
+from services.types import Acquisition, Array, FloatImage
+from tests.services.textures import texture
+
+SOUTH, WEST = 180.0, 270.0
+JUNE = Acquisition("june", "", None, 5.0, 0.0, 63.0, SOUTH)
+OCTOBER = replace(JUNE, sun_elevation_deg=38.0)
+EVENING = replace(JUNE, sun_elevation_deg=38.0, sun_azimuth_deg=WEST)
+GSD_M = 2.0
+OPTIONS = CorrelationOptions(min_score=0.6)
+SIDE, RADIUS_PX, FINER = 101, 6, 4
+
+what_is_left_of_the_bias = 0.5
+a_twentieth_of_a_pixel = 0.05
+
+
+def village(seed: int, image: Acquisition) -> FloatImage:
+    """Houses of 6 to 10 m on grass, with the shadows of a day, 8 cells of 0.5 m smooth."""
+    rng = np.random.default_rng(seed)
+    cells = (SIDE + 2 * RADIUS_PX) * FINER
+    land = 0.5 + 0.08 * texture(rng, cells, 12.0)
+    east, north = shadow_of(image) * FINER / GSD_M
+    lit = np.ones((cells, cells))
+    houses = []
+    for row, column in rng.integers(30, cells - 60, (60, 2)):
+        height_m, depth, width = rng.uniform(6.0, 10.0), *rng.integers(16, 30, 2)
+        houses.append((slice(row, row + depth), slice(column, column + width), rng.uniform(0.4, 0.8)))
+        for share in np.linspace(0.0, 1.0, 40):
+            down, right = round(-north * height_m * share), round(east * height_m * share)
+            lit[row + down : row + down + depth, column + right : column + right + width] = 0.3
+    seen = land * lit
+    for rows, columns, albedo in houses:
+        seen[rows, columns] = albedo
+    smooth = gaussian_filter(seen, 0.4 * FINER)
+    squares = smooth.reshape(cells // FINER, FINER, cells // FINER, FINER)
+    return np.asarray(4095.0 * squares.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def bias_px(chip_of: Acquisition, patch_of: Acquisition, known: bool) -> Array:
+    """Mean place (2,) of chips whose true place is zero."""
+    move = shadow_move(chip_of, patch_of, GSD_M) if known else None
+    inner = slice(RADIUS_PX, RADIUS_PX + SIDE)
+    places = []
+    for seed in range(12):
+        chip = np.ascontiguousarray(village(seed, chip_of)[inner, inner])
+        peak = find_chip(village(seed, patch_of), chip, OPTIONS, move)
+        assert peak.reason == FOUND
+        places.append(peak.row_col)
+    return np.asarray(np.mean(places, axis=0))
+
+
+def test_a_lower_sun_moves_chips_along_the_shadows_and_knowing_it_takes_most_of_that_away() -> None:
+    taken = bias_px(JUNE, OCTOBER, known=False)
+    known = bias_px(JUNE, OCTOBER, known=True)
+    assert taken[0] < -a_twentieth_of_a_pixel
+    assert abs(known[0]) < what_is_left_of_the_bias * abs(taken[0])
+
+
+def test_so_does_a_higher_one() -> None:
+    taken = bias_px(OCTOBER, JUNE, known=False)
+    known = bias_px(OCTOBER, JUNE, known=True)
+    assert abs(known[0]) < what_is_left_of_the_bias * abs(taken[0])
+
+
+def test_edges_that_no_sun_moves_keep_their_weight() -> None:
+    chip = village(0, JUNE)
+    away_from_a_southern_sun = chip[2:, 1:-1] < chip[:-2, 1:-1]
+    weights = steady_weights(chip, 0.9, shadow_move(JUNE, OCTOBER, GSD_M))
+    assert (weights[~away_from_a_southern_sun] == 1.0).all()
+    assert weights[away_from_a_southern_sun].min() < 0.1
+
+
+def test_under_the_same_sun_all_pixels_count_alike() -> None:
+    assert (steady_weights(village(0, JUNE), 0.9, shadow_move(JUNE, JUNE, GSD_M)) == 1.0).all()
+
+
+def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
+    move = shadow_move(JUNE, EVENING, GSD_M)
+    assert move is not None
+    north = 8.0 / tan(radians(63.0)) / GSD_M
+    east = 8.0 / tan(radians(38.0)) / GSD_M
+    np.testing.assert_allclose(move.move_px, [north, east])
+    np.testing.assert_allclose(move.away / np.linalg.norm(move.away), [-1.0, 0.0], atol=1e-12)
+
+
+def test_where_a_sun_is_not_known_nothing_is_said_of_shadows() -> None:
+    unknown = replace(JUNE, sun_elevation_deg=float("nan"))
+    assert shadow_move(unknown, OCTOBER, GSD_M) is None
+    assert shadow_move(JUNE, unknown, GSD_M) is None
