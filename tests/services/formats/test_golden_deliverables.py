@@ -97,10 +97,12 @@ def test_a_refined_dimap_is_read_as_the_corrected_model(name: str) -> None:
     np.testing.assert_allclose(found, expected, atol=a_millionth_of_a_pixel, rtol=0)
 
 
-def test_gdal_reads_a_refined_dimap_as_the_corrected_model(tmp_path: Path) -> None:
-    text = format_dimap_rpc((GOLDEN / "RPC_invented_v2.XML").read_text(), refined())
+@both_versions
+def test_gdal_reads_a_refined_dimap_as_the_corrected_model(name: str, tmp_path: Path) -> None:
+    text = format_dimap_rpc((GOLDEN / f"{name}.XML").read_text(), refined())
     (tmp_path / "RPC_a.XML").write_text(text)
-    (tmp_path / "DIM_a.XML").write_text("<Dimap_Document/>")
+    identification = re.search(r"<Metadata_Identification>.*</Metadata_Identification>", text, re.S)
+    (tmp_path / "DIM_a.XML").write_text(f"<Dimap_Document>{identification[0]}</Dimap_Document>")
     with rasterio.open(tmp_path / "IMG_a_R1C1.TIF", "w", "GTiff", 8, 8, 1, dtype=np.uint8) as file:
         file.write(np.ones((1, 8, 8), np.uint8))
     with rasterio.open(tmp_path / "IMG_a_R1C1.TIF") as file, RPCTransformer(file.rpcs) as gdal:
