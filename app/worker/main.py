@@ -40,7 +40,9 @@ def run_worker(settings: Settings) -> None:
     for number in ENDING:
         signal.signal(number, lambda *_: stop.set())
     with engine.opened(settings) as database, _sweeping(database, settings, stop):
-        asyncio.run(_Worker(database, settings, stop).run())
+        loop = asyncio.new_event_loop()
+        # Not asyncio.run, which waits without end for a task of the queue that lost its cancellation.
+        loop.run_until_complete(_Worker(database, settings, stop).run())
 
 
 @contextmanager

@@ -1,0 +1,56 @@
+"""A worker that is told to end does end, whatever its queue still runs."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from app.config import Settings
+from tests.app.workers import wait_until
+
+PATIENCE_S = 60
+STUBBORN = """
+import asyncio, procrastinate
+from app.config import read_settings
+from app.worker.main import run_worker
+
+run = procrastinate.App.run_worker_async
+
+async def deaf():
+    while True:
+        try:
+            await asyncio.sleep(3600)
+        except asyncio.CancelledError:
+            print("deaf", flush=True)
+
+async def run_beside(self, **options):
+    self.beside = asyncio.create_task(deaf())
+    await asyncio.sleep(0)
+    print("waits", flush=True)
+    await run(self, **options)
+
+procrastinate.App.run_worker_async = run_beside
+run_worker(read_settings())
+"""
+"""A worker whose queue has left a task behind that does not hear its cancellation."""
+
+
+def test_a_worker_ends_although_a_task_of_its_queue_ignores_its_cancellation(
+    settings: Settings, tmp_path: Path
+) -> None:
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+    told = tmp_path / "told"
+    with told.open("wb") as output:
+        worker = subprocess.Popen([sys.executable, "-c", STUBBORN], env=environment, stdout=output)
+    try:
+        wait_until(lambda: "waits" in told.read_text(), "the worker waits for jobs")
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(timeout=PATIENCE_S) == 0
+    finally:
+        worker.kill()
+        worker.wait()
