@@ -39,19 +39,20 @@ degrees); SPOT 6/7, their technical sheet; WorldView and GeoEye, "better than 5 
 operator; QuickBird, Smiley (2009), the worst quarter of two years.
 """
 
-ORTHO_CE90_M = (("S2", 17.5), ("LC0", 12.0), ("LO0", 12.0))
+ORTHO_CE90_M = (("S2", 17.5), ("LC0", 18.2), ("LO0", 18.2))
 """Horizontal accuracy of ortho-images without control of ours, by the start of the sensor's name.
 
 Sentinel-2: 20 m at two standard deviations without control points (ESA, GMES-GSEG-EOPG-TN-09-0008, table
 4-6), taken as 95 % of a circular normal law, hence 17.5 m CE90. Products refined on the mission's
 reference images, since 2021, reach 8 m at 95 %, but their pixels do not say that they are. Landsat 8 and
-9, terrain-corrected: 12 m CE90 assumed, the requirement that Storey, Choate and Lee (2014) verify.
+9: a scene is of Tier 1 when its radial root mean square error is 12 m at most (USGS, Landsat
+Collections), hence 18.2 m CE90 of a circular normal law; no figure is stated for those of Tier 2.
 """
 
 _SENSOR_IN_NAME = (
     (re.compile(r"(?:^|_)(S2[A-D])_", re.IGNORECASE), "{0}"),
     (re.compile(r"^T\d{2}[A-Z]{3}_\d{8}T\d{6}_", re.IGNORECASE), "S2"),
-    (re.compile(r"(?:^|_)(L[CO]0[89])_L1TP_", re.IGNORECASE), "{0}"),
+    (re.compile(r"(?:^|_)(L[CO]0[89])_L1TP_(?:\d+_){4}T1(?:_|$)", re.IGNORECASE), "{0}"),
 )
 """How producers of ortho-images name the sensor in the name of a file."""
 

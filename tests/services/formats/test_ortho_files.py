@@ -84,6 +84,15 @@ def test_a_sensor_that_the_name_tells_has_its_known_accuracy(tmp_path: Path) -> 
     assert scene.sigma_m == pytest.approx(17.5 * CE90_TO_SIGMA)
 
 
+def test_a_landsat_scene_is_as_good_as_its_tier_says_and_the_second_says_nothing(tmp_path: Path) -> None:
+    largest_radial_rms_m = 12.0
+    scene = read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T1_B8.TIF"))
+    assert scene.acquisition.sensor == "LC08"
+    assert scene.sigma_m == pytest.approx(largest_radial_rms_m / 2.0**0.5, rel=1e-3)
+    with pytest.raises(FormatError, match="unknown sensor"):
+        read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T2_B8.TIF"))
+
+
 def test_an_ortho_scene_of_an_unknown_sensor_asks_for_its_accuracy(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif")
     with pytest.raises(FormatError, match="sigma_m"):
