@@ -11,10 +11,12 @@ from app.db.engine import Connection
 
 Purpose = Literal["image", "model", "block"]
 
-COLUMNS = """id, owner, purpose, scene_id, name, file_name, size_bytes, sha256, metadata, file_key,
-    created_at, expires_at, finished_at, expires_at < now() and finished_at is null as expired"""
 LIFE_HOURS = 24
 """An upload is given up so long after its last piece."""
+IDLE = f"(expires_at < now() and idle_since_s < service_time_s() - {3600 * LIFE_HOURS})"
+"""Nobody went on with it, by the clock and by the time that the service has run."""
+COLUMNS = f"""id, owner, purpose, scene_id, name, file_name, size_bytes, sha256, metadata, file_key,
+    created_at, expires_at, finished_at, {IDLE} and finished_at is null as expired"""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,8 @@ def prolong(connection: Connection, upload_id: UUID) -> UploadRow | None:
     """The upload, whose life begins anew; None when it has been given up."""
     with connection.cursor(row_factory=class_row(UploadRow)) as cursor:
         return cursor.execute(
-            f"""update upload set expires_at = now() + make_interval(hours => %s)
+            f"""update upload set expires_at = now() + make_interval(hours => %s),
+                    idle_since_s = service_time_s()
                 where id = %s returning {COLUMNS}""",
             [LIFE_HOURS, upload_id],
         ).fetchone()
@@ -118,7 +121,7 @@ def delete_expired(connection: Connection) -> list[UUID]:
     """Forget the uploads that nobody went on with."""
     with connection.cursor(row_factory=scalar_row) as cursor:
         expired: list[UUID] = cursor.execute(
-            "delete from upload where finished_at is null and expires_at < now() returning id"
+            f"delete from upload where finished_at is null and {IDLE} returning id"
         ).fetchall()
     return expired
 
@@ -136,8 +139,8 @@ def delete_unwanted_blocks(connection: Connection) -> list[str]:
     """Forget archives that nobody asked for in time and no open job names; returns their keys."""
     with connection.cursor(row_factory=scalar_row) as cursor:
         keys: list[str] = cursor.execute(
-            """delete from upload u where purpose = 'block' and finished_at is not null
-                   and expires_at < now()
+            f"""delete from upload u where purpose = 'block' and finished_at is not null
+                   and {IDLE}
                    and not exists (select from job where state in ('accepted', 'running')
                                    and inputs ->> 'upload' = u.id::text)
                returning file_key"""

@@ -1,5 +1,6 @@
 """Files by key in one folder: written whole or not at all, read by position."""
 
+import fcntl
 import hashlib
 import os
 import re
@@ -9,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import mkstemp
+from tempfile import TemporaryDirectory, mkstemp
 from typing import BinaryIO, Protocol
 
 from app.errors import InputError, NotFound, TooLarge
@@ -142,6 +143,15 @@ class Storage:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         return folder
 
+    @contextmanager
+    def scratch_folder(self, prefix: str) -> Iterator[Path]:
+        """A folder in `scratch` that is removed at the end, and not swept before."""
+        with (
+            TemporaryDirectory(prefix=prefix, dir=self.scratch()) as folder,
+            _held(Path(folder)),
+        ):
+            yield Path(folder)
+
     def fetch(self, key: str, folder: Path) -> Path:
         """A file on this machine, for libraries that open files themselves: never to be changed.
 
@@ -206,17 +216,25 @@ class Storage:
         )
         return sorted(path.relative_to(self.folder).as_posix() for path in found)
 
-    def sweep_unfinished(self, older_than_s: float) -> list[str]:
-        """Remove what writers that were killed left behind; returns the names removed."""
+    def sweep_unfinished(self, older_than_s: float, spare: str) -> list[str]:
+        """Remove what writers that were killed left behind; returns the names removed.
+
+        Whoever still writes holds a lock: he loses nothing to a clock that jumps ahead.
+
+        Args:
+            spare: what begins like this belongs to somebody else.
+        """
         swept = []
         for path in (self.folder / UNFINISHED).glob("*"):
-            with suppress(FileNotFoundError):
-                if time.time() - path.stat().st_mtime >= older_than_s:
+            with suppress(FileNotFoundError, BlockingIOError):
+                if time.time() - path.stat().st_mtime < older_than_s or path.name.startswith(spare):
+                    continue
+                with _held(path, fcntl.LOCK_EX | fcntl.LOCK_NB):
                     if path.is_dir():
                         shutil.rmtree(path, ignore_errors=True)
                     else:
                         path.unlink()
-                    swept.append(path.name)
+                swept.append(path.name)
         return swept
 
     def _place(self, unfinished: Path, key: str) -> None:
@@ -246,6 +264,7 @@ class Storage:
         handle, name = mkstemp(dir=self.scratch())
         try:
             with os.fdopen(handle, "wb") as file:
+                _lock(file.fileno(), fcntl.LOCK_SH)
                 yield Writing(file, Path(name), limit_bytes)
         finally:
             Path(name).unlink(missing_ok=True)
@@ -260,6 +279,26 @@ class _FileReader:
 
     def close(self) -> None:
         os.close(self.descriptor)
+
+
+@contextmanager
+def _held(path: Path, how: int = fcntl.LOCK_SH) -> Iterator[None]:
+    """A lock on a file or folder; the kernel lets go of it however its holder ends."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        _lock(descriptor, how)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, how: int) -> None:
+    try:
+        fcntl.flock(descriptor, how)
+    except BlockingIOError:
+        raise
+    except OSError:
+        return  # a file system that knows no such locks: its files are swept by their age alone
 
 
 def checked_key(key: str) -> str:

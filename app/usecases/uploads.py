@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
 from typing import IO
 from uuid import UUID
 
@@ -314,11 +313,11 @@ def _place_image(
     assert upload.scene_id is not None
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
-    with TemporaryDirectory(prefix="unpacked-", dir=storage.scratch()) as folder:
+    with storage.scratch_folder("unpacked-") as folder:
         models: list[Path] = []
         image, name = path, upload.file_name
         if is_archive(head):
-            image, models = _unpacked(path, Path(folder), settings)
+            image, models = _unpacked(path, folder, settings)
             name = image.name
             with image.open("rb") as file:
                 head = file.read(HEAD_BYTES)

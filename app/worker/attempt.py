@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
 
@@ -25,7 +24,7 @@ from app.db.engine import Database
 from app.db.jobs import Job
 from app.errors import is_no_room
 from app.origin import Origin, working_for
-from app.storage import UNFINISHED
+from app.storage import Storage
 
 FAILURES_ALLOWED = 3
 """A job fails when so many attempts at it have ended without an outcome."""
@@ -144,12 +143,11 @@ class Attempts:
             Stopped, TooLong, LostJob
         """
         arguments = (job.id, job.attempt, os.getpid(), self.settings.job_memory_bytes)
-        unfinished = self.settings.data_folder / "storage" / UNFINISHED
-        unfinished.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=f"job-{job.id}-", dir=unfinished) as folder:
+        storage = Storage(self.settings.data_folder / "storage")
+        with storage.scratch_folder(f"job-{job.id}-") as folder:
             process = subprocess.Popen(
                 [sys.executable, "-m", "app.worker.run", *map(str, arguments)],
-                env=os.environ | LIMITED_LIBRARIES | self._installation() | {"TMPDIR": folder},
+                env=os.environ | LIMITED_LIBRARIES | self._installation() | {"TMPDIR": str(folder)},
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
             )

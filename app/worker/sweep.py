@@ -12,19 +12,22 @@ from dataclasses import dataclass
 import psycopg
 
 from app.config import Settings
-from app.db import attempts, job_queue, jobs, scenes
+from app.db import attempts, job_queue, jobs, scenes, service_time
 from app.db.engine import Database
 from app.origin import Origin, working_for
 from app.storage import Storage
 from app.usecases.block_uploads import sweep_blocks
 from app.usecases.blocks import sweep_storage
 from app.usecases.cleaning import remove_unnamed_files
+from app.usecases.uploads import PREFIX as UPLOADED
 from app.usecases.uploads import sweep_uploads
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
 """A worker of the queue beats every ten seconds; after this long without, its entries are dead."""
 FILES_EVERY_S = 3600.0
+MOST_BETWEEN_S = 2 * FILES_EVERY_S
+"""Believed to have passed between two sweeps of files; a clock that says more has jumped."""
 LONGEST_UPLOAD_S = 3600.0 * scenes.LONGEST_UPLOAD_HOURS
 LONGEST_WAIT_S = 5
 """For ingestions to end: meanwhile this thread takes no job back, and new ingestions queue behind it."""
@@ -90,11 +93,13 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     Raises:
         psycopg.errors.LockNotAvailable: an ingestion is under way; its files are swept another time.
     """
+    with database.transaction() as connection:
+        service_time.go_on(connection, MOST_BETWEEN_S)
     removed = sweep_uploads(database, storage)
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
     removed += remove_unnamed_files(database, storage)
-    removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s)
+    removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s, UPLOADED)
     with database.transaction() as connection:
         connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
         removed += sweep_storage(connection, storage) + sweep_blocks(connection, storage)

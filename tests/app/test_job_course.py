@@ -1,6 +1,7 @@
 """The course of a job as it is told: messages, the expected end, results that go after a while."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime, timedelta
 from uuid import UUID, uuid4
 
@@ -11,7 +12,7 @@ from app.config import Settings
 from app.db import attempts, engine, job_course, jobs
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
-from app.db.jobs import Job
+from app.db.jobs import Job, JobFilter
 from app.storage import Storage
 from app.worker.sweep import sweep_files, sweep_results
 
@@ -29,13 +30,10 @@ def database(settings: Settings) -> Iterator[Database]:
 
 
 def asked(connection: Connection, kind: str = "register-scene") -> Job:
-    """A new job; a transaction gives all it makes one time, real ones are asked for one by one."""
+    """A new job."""
     job = jobs.create(connection, kind, {"scene": str(uuid4())})
     assert job is not None
-    connection.execute("update job set created_at = clock_timestamp() where id = %s", [job.id])
-    found = jobs.find(connection, job.id)
-    assert found is not None
-    return found
+    return job
 
 
 def begun(connection: Connection, kind: str = "register-scene") -> Job:
@@ -118,6 +116,22 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     ended = jobs.find(connection, done_in(connection, 1))
     assert ended is not None
     assert job_course.expected_end(connection, ended) is None
+
+
+def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Connection):
+    made = [asked(connection) for _ in range(6)]
+    queued = connection.execute(
+        "select args ->> 'job_id' as job from procrastinate_jobs order by id"
+    ).fetchall()
+    assert [row["job"] for row in queued] == [str(job.id) for job in made]
+    assert [job_course.position(connection, job) for job in made] == [1, 2, 3, 4, 5, 6]
+    connection.execute("update job set created_at = %s", [made[0].created_at])
+    alike = [replace(job, created_at=made[0].created_at) for job in made]
+    assert sorted(job_course.position(connection, job) for job in alike) == [1, 2, 3, 4, 5, 6]
+    pages = [jobs.newest(connection, None, JobFilter(), 2)]
+    while len(pages[-1]) == 2:
+        pages.append(jobs.newest(connection, None, JobFilter(), 2, after=pages[-1][-1].id))
+    assert sorted(job.id for page in pages for job in page) == sorted(job.id for job in made)
 
 
 def test_results_go_after_a_while_and_the_job_says_so(

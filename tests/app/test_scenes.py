@@ -237,7 +237,9 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
         arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", None)
         cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", None)
         connection.execute(
-            "update scene set created_at = now() - interval '2 days' where id = %s", [cut_off]
+            "update scene set created_at = now() - interval '2 days', begun_at_s = -2 * 86400"
+            " where id = %s",
+            [cut_off],
         )
     for scene_id, name in ((arriving, "b.tif"), (cut_off, "c.tif")):
         storage.put(f"{folder_of(scene_id)}/{name}", [TIFF])

@@ -83,7 +83,7 @@ def test_a_kill_while_writing_shows_no_part_of_the_file(storage):
     subprocess.run([sys.executable, "-c", program, storage.folder], check=False)
     assert not storage.exists("scenes/a")
     assert storage.keys("scenes") == []
-    assert len(storage.sweep_unfinished(older_than_s=0.0)) == 1
+    assert len(storage.sweep_unfinished(0.0, "upload-")) == 1
     assert files(storage) == []
 
 

@@ -22,11 +22,13 @@ from tusclient.client import TusClient
 
 from app.config import Settings
 from app.db import engine
+from app.db.uploads import LIFE_HOURS
 from app.main import create_app
 from app.storage import Storage
 from app.usecases.block_uploads import finished_block
 from app.usecases.uploads import sweep_uploads
 from app.worker.sweep import sweep_files
+from tests.app.ageing import let_pass
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
 LIMIT_BYTES = 400_000
@@ -326,7 +328,7 @@ def test_an_upload_that_is_ended_or_expires_leaves_nothing(
     sweep_uploads(database, storage)
     assert client.head(second.headers["location"], headers=me).status_code == 200
     with database.transaction() as connection:
-        connection.execute("update upload set expires_at = now() - interval '1 minute'")
+        let_pass(connection, hours=LIFE_HOURS + 1)
     assert client.head(second.headers["location"], headers=me).status_code == 404
     sweep_uploads(database, storage)
     assert list(storage.scratch().iterdir()) == []
@@ -396,7 +398,7 @@ def test_archives_lie_alike_and_are_swept_alike_whichever_way_they_came(
         sweep_files(database, storage, 3600.0)
         assert storage.keys("uploads") == keys
         with database.transaction() as connection:
-            connection.execute("update upload set expires_at = now() - interval '1 h'")
+            let_pass(connection, hours=LIFE_HOURS + 1)
         sweep_files(database, storage, 3600.0)
     assert storage.keys("uploads") == []
     gone = client.post(

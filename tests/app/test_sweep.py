@@ -1,0 +1,143 @@
+"""What nobody goes on with is given up after a day of the service's own time, however clocks jump."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.db.engine import Database
+from app.db.uploads import LIFE_HOURS
+from app.storage import Storage
+from app.worker.sweep import MOST_BETWEEN_S, sweep_files
+from tests.app.ageing import jump
+
+JOB_S = 3600.0
+A_YEAR_H = 8760
+TIFF = b"II*\0" + bytes(1000)
+TUS = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream"}
+WRITER = """
+import sys
+from pathlib import Path
+from app.storage import Storage
+storage = Storage(Path(sys.argv[1]))
+with storage.writing("kept/a") as file, storage.scratch_folder("job-") as folder:
+    (folder / "part").write_bytes(b"x")
+    file.write(b"x")
+    print("writing", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def database(client: TestClient) -> Database:
+    found: Database = client.app.state.database  # type: ignore[attr-defined]
+    return found
+
+
+@pytest.fixture
+def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
+    return bearer("register") | TUS
+
+
+def begun(client: TestClient, me: dict[str, str]) -> str:
+    """The address of an upload of which the first ten bytes have arrived."""
+    said = {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="}
+    url: str = client.post("/uploads", headers=me | said).headers["location"]
+    assert client.patch(url, content=TIFF[:10], headers=me | {"Upload-Offset": "0"}).status_code == 204
+    return url
+
+
+def clocks_jump(database: Database, storage: Storage, hours: int) -> None:
+    """All that is noted and all files of the storage are so much older than they were a moment ago."""
+    with database.transaction() as connection:
+        jump(connection, hours)
+    for path in storage.folder.rglob("*"):
+        found = path.stat()
+        os.utime(path, (found.st_atime - 3600 * hours, found.st_mtime - 3600 * hours))
+
+
+@pytest.mark.parametrize("hours", [25, A_YEAR_H, -A_YEAR_H])
+def test_an_upload_outlives_a_clock_that_jumps(
+    client: TestClient, me: dict[str, str], database: Database, storage: Storage, hours: int
+):
+    url = begun(client, me)
+    for _ in range(3):
+        clocks_jump(database, storage, hours)
+        sweep_files(database, storage, JOB_S)
+    assert client.head(url, headers=me).headers["upload-offset"] == "10"
+    last = client.patch(url, content=TIFF[10:], headers=me | {"Upload-Offset": "10"})
+    assert last.status_code == 204
+    assert storage.path(f"scenes/{last.headers['amers-scene']}/a.tif").read_bytes() == TIFF
+
+
+def test_an_upload_nobody_goes_on_with_is_given_up_after_a_day_that_the_service_ran(
+    client: TestClient, me: dict[str, str], database: Database, storage: Storage
+):
+    idle, busy = begun(client, me), begun(client, me)
+    sweeps = 0
+    while client.head(idle, headers=me).status_code == 200:
+        clocks_jump(database, storage, 1)
+        sweep_files(database, storage, JOB_S)
+        # A piece without a byte is a sign of life as well.
+        sign = client.patch(busy, content=b"", headers=me | {"Upload-Offset": "10"})
+        assert sign.status_code == 204
+        sweeps += 1
+        assert sweeps <= LIFE_HOURS + 2
+    assert sweeps >= LIFE_HOURS
+    assert [path.name for path in storage.scratch().iterdir()] == [f"upload-{busy.rsplit('/', 1)[1]}"]
+    assert client.get("/scenes", headers=me).json()["scenes"][0]["state"] == "uploading"
+
+
+def test_the_time_of_the_service_goes_on_by_a_little_at_a_jump_and_never_back(
+    database: Database, storage: Storage
+):
+    def ran_s() -> float:
+        with database.transaction() as connection:
+            row = connection.execute("select service_time_s() as ran").fetchone()
+        assert row is not None
+        return float(row["ran"])
+
+    before = ran_s()
+    for hours, least_s, most_s in (
+        (A_YEAR_H, 0.0, MOST_BETWEEN_S),
+        (-A_YEAR_H, 0.0, 0.0),
+        (1, 3600.0, 3700.0),
+    ):
+        clocks_jump(database, storage, hours)
+        sweep_files(database, storage, JOB_S)
+        assert least_s <= ran_s() - before <= most_s
+        before = ran_s()
+
+
+@contextmanager
+def writing(storage: Storage) -> Iterator["subprocess.Popen[bytes]"]:
+    """A process in the middle of a file and of a folder."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, storage.folder], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"writing\n"
+        yield process
+
+
+def test_what_is_being_written_is_not_swept_and_what_a_killed_writer_left_is(
+    database: Database, storage: Storage
+):
+    with writing(storage) as writer:
+        clocks_jump(database, storage, A_YEAR_H)
+        sweep_files(database, storage, JOB_S)
+        assert len(list(storage.scratch().iterdir())) == 2
+        writer.communicate(b"")
+    assert storage.path("kept/a").read_bytes() == b"x"
+    assert list(storage.scratch().iterdir()) == []
+    with writing(storage) as writer:
+        writer.kill()
+    sweep_files(database, storage, JOB_S)
+    assert len(list(storage.scratch().iterdir())) == 2, "they are young yet"
+    clocks_jump(database, storage, A_YEAR_H)
+    sweep_files(database, storage, JOB_S)
+    assert list(storage.scratch().iterdir()) == []
