@@ -16,13 +16,13 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.tokens import create_token
-from tests.app.flat_world import SIGMA_M, make_flat_world
-from tests.app.workers import ended, running_worker, wait_until
+from tests.app.flat_world import make_flat_world
+from tests.app.workers import ended, running_worker, scene_to_register, under_way, wait_until
 from tests.serving import free_port
 
 LEASE_S = 3.0
+PASSES = 40
 JUMPS_DAYS = (2.0, -3.0, 14_600.0, -1.0)
 SOURCE = """
 #define _GNU_SOURCE
@@ -109,17 +109,11 @@ def test_a_worker_whose_clock_jumps_keeps_its_job(
     tmp_path: Path,
 ):
     world = make_flat_world(tmp_path / "world", size=800)
-    with engine.connect(dsn) as connection:
-        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))
     me = bearer("register")
-    upload = client.post(
-        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=me
-    )
-    body = {"inputs": {"scene": upload.json()["id"], "options": {"fine_passes": 40}}}
-    job = client.post("/processes/register-scene/execution", json=body, headers=me).headers["location"]
+    job = scene_to_register(client, me, storage, dsn, world)(PASSES)
     brisk = settings.model_copy(update={"lease_seconds": LEASE_S})
     with running_worker(brisk, tmp_path / "worker.log", **clock.environment):
-        wait_until(lambda: client.get(job, headers=me).json()["progress"] > 0, "the work is under way")
+        under_way(client, job, me)
         for days in JUMPS_DAYS:
             clock.jump(days)
             before = client.get(job, headers=me).json()["updated"]

@@ -19,9 +19,16 @@ from pydantic import SecretStr
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from tests.app.flat_world import SIGMA_M, make_flat_world
-from tests.app.workers import alive, children, ended, running_worker, wait_until
+from tests.app.flat_world import make_flat_world
+from tests.app.workers import (
+    alive,
+    children,
+    ended,
+    running_worker,
+    scene_to_register,
+    under_way,
+    wait_until,
+)
 
 LEASE_S = 3.0
 PIECE_BYTES = 65_536
@@ -129,18 +136,8 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
     tmp_path: Path,
 ):
     world = make_flat_world(tmp_path / "world", size=800)
-    with engine.connect(dsn) as connection:
-        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))
     me = bearer("register")
-    upload = client.post(
-        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=me
-    )
-
-    def ask(fine_passes: int) -> str:
-        inputs = {"scene": upload.json()["id"], "options": {"fine_passes": fine_passes}}
-        body = {"inputs": inputs}
-        reply = client.post("/processes/register-scene/execution", json=body, headers=me)
-        return str(reply.headers["location"])
+    ask = scene_to_register(client, me, storage, dsn, world)
 
     def by(address: str) -> Settings:
         return settings.model_copy(update={"database_url": SecretStr(address), "lease_seconds": LEASE_S})
@@ -148,7 +145,7 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
     lost, other = machines
     job = ask(40)
     with running_worker(by(reached[0]), tmp_path / "lost.log", *lost.enter) as worker:
-        wait_until(lambda: client.get(job, headers=me).json()["progress"] > 0, "the work is under way")
+        under_way(client, job, me)
         (process,) = children(worker.pid)
         lost.line("down")
         with running_worker(by(reached[1]), tmp_path / "other.log", *other.enter):

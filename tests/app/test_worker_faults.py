@@ -5,7 +5,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 from uuid import UUID
 
 import pytest
@@ -15,11 +14,20 @@ from app.config import Settings
 from app.db import engine, jobs
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
-from tests.app.workers import alive, children, ended, kill, running_worker, wait_until
+from tests.app.flat_world import FlatWorld, make_flat_world
+from tests.app.workers import (
+    alive,
+    children,
+    ended,
+    kill,
+    running_worker,
+    scene_to_register,
+    under_way,
+    wait_until,
+)
 
 LEASE_S = 2.0
+PASSES = 100
 MEBIBYTE = 1 << 20
 
 Bearer = Callable[[str], dict[str, str]]
@@ -48,21 +56,8 @@ def ask(
     client: TestClient, me: dict[str, str], world: FlatWorld, storage: Storage, dsn: str
 ) -> Callable[[], str]:
     """Asks for the registration of the scene, whose points are published; returns the URL of the job."""
-    with engine.connect(dsn) as connection:
-        block = ingest_block(connection, storage, world.block).block
-        publish_block(connection, str(block.number))
-    upload = client.post(
-        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=me
-    )
-    scene = upload.json()["id"]
-
-    def execute() -> str:
-        # One pass is done in a blink; many leave time to do harm in the middle.
-        body = {"inputs": {"scene": scene, "options": {"fine_passes": 100}}}
-        reply = client.post("/processes/register-scene/execution", json=body, headers=me)
-        return str(reply.headers["location"])
-
-    return execute
+    execute = scene_to_register(client, me, storage, dsn, world)
+    return lambda: execute(PASSES)
 
 
 @pytest.fixture
@@ -92,18 +87,6 @@ def results_of(dsn: str, job_url: str) -> int:
     return int(row["n"])
 
 
-def in_the_middle(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str, Any]:
-    """The job, once its work is really under way; an error if it ends before."""
-
-    def told() -> dict[str, Any] | None:
-        job: dict[str, Any] = client.get(job_url, headers=headers).json()
-        assert job["status"] in ("accepted", "running"), job
-        return job if job["progress"] > 0 else None
-
-    job: dict[str, Any] = wait_until(told, "the work is under way")
-    return job
-
-
 def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
     client: TestClient,
     me: dict[str, str],
@@ -115,7 +98,7 @@ def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
 ):
     job = ask()
     with running_worker(settings, log) as first:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         (process,) = children(first.pid)
         kill(first.pid)
         first.wait()
@@ -138,7 +121,7 @@ def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
 ):
     job = ask()
     with running_worker(settings, log) as worker:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         (process,) = children(worker.pid)
         kill(process)
         done = ended(client, job, me)
@@ -156,7 +139,7 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
 ):
     job = ask()
     with running_worker(settings, log) as worker:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         (process,) = children(worker.pid)
         assert client.delete(job, headers=me).json()["status"] == "dismissed"
         wait_until(lambda: not alive(process), "the work stops", 5.0)
@@ -177,7 +160,7 @@ def test_a_worker_told_to_stop_gives_its_job_back_at_once(
     patient = settings.model_copy(update={"lease_seconds": 600.0})
     job = ask()
     with running_worker(patient, log) as worker:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         (process,) = children(worker.pid)
         started = time.monotonic()
         worker.send_signal(signal.SIGTERM)
@@ -238,7 +221,7 @@ def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
 ):
     job = ask()
     with running_worker(settings, log) as sleeper:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         (process,) = children(sleeper.pid)
         sleeper.send_signal(signal.SIGSTOP)
         os.kill(process, signal.SIGSTOP)
@@ -291,7 +274,7 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(
     patient = settings.model_copy(update={"lease_seconds": 15.0})
     job = ask()
     with running_worker(patient, log) as worker:
-        in_the_middle(client, job, me)
+        under_way(client, job, me)
         with engine.connect(dsn) as connection:
             connection.execute(
                 "select pg_terminate_backend(pid) from pg_stat_activity"

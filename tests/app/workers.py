@@ -13,6 +13,10 @@ from typing import Any
 from fastapi.testclient import TestClient
 
 from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from tests.app.flat_world import SIGMA_M, FlatWorld
 
 PATIENCE_S = 240.0
 ENDED = ("successful", "failed", "dismissed")
@@ -99,6 +103,42 @@ def ended(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str
 
     result: dict[str, Any] = wait_until(told, f"{job_url} ends")
     return result
+
+
+def under_way(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str, Any]:
+    """The job, once its work is really under way; an error if it ends before."""
+
+    def told() -> dict[str, Any] | None:
+        job: dict[str, Any] = client.get(job_url, headers=headers).json()
+        assert job["status"] in ("accepted", "running"), job
+        return job if job["progress"] > 0 else None
+
+    job: dict[str, Any] = wait_until(told, "the work is under way")
+    return job
+
+
+def scene_to_register(
+    client: TestClient, headers: dict[str, str], storage: Storage, dsn: str, world: FlatWorld
+) -> Callable[[int], str]:
+    """A scene in a service that has its points.
+
+    Returns:
+        What asks for its registration and returns the address of the job. It takes how many passes
+        the work is made of: one is done in a blink, many leave time to do harm in the middle.
+    """
+    with engine.connect(dsn) as connection:
+        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))
+    upload = client.post(
+        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=headers
+    )
+
+    def ask(passes: int) -> str:
+        inputs = {"scene": upload.json()["id"], "options": {"fine_passes": passes}}
+        body = {"inputs": inputs}
+        reply = client.post("/processes/register-scene/execution", json=body, headers=headers)
+        return str(reply.headers["location"])
+
+    return ask
 
 
 def kill(pid: int) -> None:
