@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from scipy.stats import chi2 as chi2_law
+from scipy.special import gammaincinv
 
 from services.adjustment.robust import cauchy_weights
 from services.errors import NoConvergence, NotEnoughPoints
@@ -146,7 +146,8 @@ def _scale(residual: Array, observations: Observations) -> float:
     """Robust standard deviation of the observations in units of their sigmas."""
     _, point_chi2, freedom = _magnitude(residual, observations)
     held = freedom > 0
-    median = np.median(np.sqrt(point_chi2[held] / chi2_law.ppf(0.5, freedom[held])))
+    typical = 2.0 * gammaincinv(freedom[held] / 2.0, 0.5)  # the median of the chi-square law
+    median = np.median(np.sqrt(point_chi2[held] / typical))
     return max(float(median), 1e-6)
 
 

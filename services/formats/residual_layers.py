@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import pyogrio
 import shapely
 
 from services.formats.control_points_json import measure_status
@@ -93,6 +92,8 @@ def _fields(measures: Measures, image: str) -> Fields:
 
 
 def _write(path: Path, layer: str, kind: str, geometry: npt.NDArray[np.object_], fields: Fields) -> None:
+    import pyogrio  # with what it finds installed: 0.4 s that only these files need
+
     pyogrio.raw.write(
         path,
         shapely.to_wkb(geometry, output_dimension=3),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from services.types import Array, BoolArray
 
@@ -57,7 +57,7 @@ def vote(displacement: Array, tolerance: float, search_radius: float) -> Consens
     members = members if len(members) >= len(largest) else largest
     agreeing[np.flatnonzero(voters)[members]] = True
     by_chance = min(1.0, np.pi * tolerance**2 / (2.0 * search_radius) ** 2)
-    false_alarms = count * float(binom.sf(len(members) - 2, count - 1, by_chance))
+    false_alarms = count * float(bdtrc(len(members) - 2, count - 1, by_chance))
     return Consensus(agreeing, displacement[agreeing].mean(axis=0), false_alarms)
 
 

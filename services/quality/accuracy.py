@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import erf
-from scipy.stats import binom, chi2
+from scipy.special import bdtr, erf, gammaincinv
 
 from services.types import Array
 
@@ -121,7 +120,7 @@ def sample_quantile(values: Array, probability: float = 0.9, confidence: float =
     if n == 0:
         return Quantile(np.nan, np.nan, np.nan, 0, probability, confidence, "no points")
     risk = (1.0 - confidence) / 2.0
-    less_than = binom.cdf(np.arange(-1, n), n, probability)
+    less_than = np.concatenate([[0.0], bdtr(np.arange(n), n, probability)])
     first = int(np.flatnonzero(less_than <= risk)[-1])
     enough = np.flatnonzero(1.0 - less_than <= risk)
     last = int(enough[0]) if len(enough) else 0
@@ -176,8 +175,10 @@ def normalised_error(error: Array, covariance: Array, confidence: float = 0.95) 
     if rows == 0:
         return NormalisedError(np.nan, np.nan, np.nan, 0, confidence)
     weighted = np.linalg.solve(covariance[kept], error[kept][:, :, None])[:, :, 0]
-    lower, upper = chi2.interval(confidence, rows * k) / np.float64(rows * k)
-    mean_square = float(np.sum(weighted * error[kept]) / (rows * k))
+    freedom = rows * k
+    tails = [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0]
+    lower, upper = 2.0 * gammaincinv(freedom / 2.0, tails) / freedom
+    mean_square = float(np.sum(weighted * error[kept]) / freedom)
     return NormalisedError(mean_square, float(lower), float(upper), rows, confidence)
 
 

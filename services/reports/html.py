@@ -11,8 +11,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from services.quality.qualification import Criterion
-from services.reports import figures
-from services.reports.drawing import svg
 from services.reports.published import published_tables
 from services.reports.report import RegistrationReport
 from services.reports.summary import ChipPair, RegistrationSummary
@@ -47,6 +45,9 @@ def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str
         report: the figures.
         summary: what the report was made from; its arrays are drawn.
     """
+    from services.reports import figures  # matplotlib: half a second that only a page needs
+    from services.reports.drawing import svg
+
     page = _environment().get_template("registration.html")
     drawn = (
         figures.ground_overview,
