@@ -72,10 +72,10 @@ def register(
         Path | None, typer.Option(help="Image of the same ground, not zero where not to look.")
     ] = None,
     check_points: Annotated[
-        Path | None, typer.Option(help="Points held out: .gcp, .points, .pts, GeoJSON or OPF.")
+        Path | None, typer.Option(help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.")
     ] = None,
     check_heights: Annotated[
-        str | None, typer.Option(help="What heights of .gcp and .pts are above: ellipsoid, EPSG:…")
+        str | None, typer.Option(help="What their heights are above, where the file is silent: ellipsoid, EPSG:…")
     ] = None,
     copy_image: Annotated[
         bool, typer.Option("--copy-image", help="Copy a GeoTIFF, the refined model in its tags.")

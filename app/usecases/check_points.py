@@ -16,8 +16,8 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     """The check points of a scene: where its file says which points are held out, those; else all.
 
     Args:
-        path: `.gcp`, `.points`, `.pts`, GeoJSON or OPF.
-        heights: what the heights of `.gcp` and `.pts` are above; see `read_control_points`.
+        path: of any format that `read_control_points` reads.
+        heights: what its heights are above, where it does not say; see `read_control_points`.
         image: of the scene; marks in images of other names are left aside.
         scene: an ortho-image needs no heights.
 

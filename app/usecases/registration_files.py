@@ -9,6 +9,8 @@ import numpy as np
 
 from services.formats.control_points import marked_points
 from services.formats.control_points_json import format_measures, format_opf, measure_status
+from services.formats.control_points_odm import format_gcp_list
+from services.formats.control_points_pci import format_pci_text
 from services.formats.control_points_text import format_asp_gcp, format_envi_pts, format_qgis_points
 from services.formats.refined import write_refined
 from services.formats.residual_layers import exaggeration_for, write_residual_layers
@@ -33,7 +35,9 @@ OUTPUTS = {
     "control_points.gcp": "The active control points for the Ames Stereo Pipeline.",
     "control_points.points": "The control points for the georeferencer of QGIS.",
     "control_points.pts": "The active control points for ENVI.",
+    "control_points_pci.txt": "The control points as a text file for the OrthoEngine of PCI.",
     "control_points_opf.json": "The active control points as OPF 1.0.",
+    "gcp_list.txt": "The active control points for OpenDroneMap.",
     "residuals.gpkg": "Residual vectors and control points as layers of a GeoPackage.",
     "correction.json": "The correction found, whatever the model of the scene.",
     "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image, unless none fits.",
@@ -145,7 +149,9 @@ def _exchanged(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]
         "control_points.gcp": format_asp_gcp(marks),
         "control_points.points": format_qgis_points(marks),
         "control_points.pts": format_envi_pts(marks),
+        "control_points_pci.txt": format_pci_text(marks),
         "control_points_opf.json": format_opf(marks),
+        "gcp_list.txt": format_gcp_list(marks),
     }
 
 

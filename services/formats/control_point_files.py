@@ -6,6 +6,8 @@ from pathlib import Path
 from services.errors import FormatError
 from services.formats.control_points import MarkedPoints
 from services.formats.control_points_json import parse_geojson_points, parse_opf
+from services.formats.control_points_odm import parse_gcp_list
+from services.formats.control_points_pci import is_pci_text, parse_pci_text
 from services.formats.control_points_text import parse_asp_gcp, parse_envi_pts, parse_qgis_points
 from services.formats.rpc_files import read_text
 
@@ -17,9 +19,9 @@ def read_control_points(path: Path, heights: str | None = None) -> MarkedPoints:
     """Read ground points marked in images, in any format of `services.formats.control_points`.
 
     Args:
-        path: `.gcp`, `.points`, `.pts`, or `.geojson` and `.json` for GeoJSON and OPF.
-        heights: of `.gcp` and `.pts`, which cannot say what they are above: "ellipsoid" of WGS 84, or a
-            vertical reference system such as "EPSG:5773".
+        path: `.gcp`, `.points`, `.pts`, `.txt` for ODM and PCI, `.geojson` and `.json` for GeoJSON, OPF.
+        heights: of `.gcp`, `.pts` and `.txt`, which may not say what they are above: "ellipsoid" of
+            WGS 84, or a vertical reference system such as "EPSG:5773".
 
     Raises:
         FormatError: when it is none of these files, or one that does not say what it should.
@@ -37,10 +39,16 @@ def _parse_json(text: str, heights: str | None, source: str) -> MarkedPoints:
     return (parse_opf if '"gcps"' in text else parse_geojson_points)(text, source)
 
 
+def _parse_txt(text: str, heights: str | None, source: str) -> MarkedPoints:
+    """PCI where the first line tells its columns, else ODM."""
+    return (parse_pci_text if is_pci_text(text) else parse_gcp_list)(text, heights, source)
+
+
 _PARSERS: dict[str, Parser] = {
     ".gcp": parse_asp_gcp,
     ".points": lambda text, heights, source: parse_qgis_points(text, source),
     ".pts": parse_envi_pts,
+    ".txt": _parse_txt,
     ".geojson": _parse_json,
     ".json": _parse_json,
 }

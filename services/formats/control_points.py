@@ -8,6 +8,8 @@
 | OPF 1.0 | its corner is (0, 0) | axes of its CRS | of its CRS, else the ellipsoid |
 | QGIS `.points` | its corner is (0, 0), lines negative | its `#CRS` | none |
 | ENVI `.pts` | its corner is (1, 1) | `projection info` | above a datum the caller says |
+| ODM `gcp_list.txt` | its centre is (0, 0) | its first line | of its system, else the caller says |
+| PCI text | its corner is (0, 0) | its first line, ours | its first line, else the caller says |
 
 The readers and writers of these formats convert, and nothing else does: inside, the centre of the first
 pixel is (0, 0) and heights are above the WGS 84 ellipsoid.

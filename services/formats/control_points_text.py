@@ -3,12 +3,21 @@
 import csv
 import math
 import re
-from collections.abc import Iterator
 
 import numpy as np
 from pyproj import CRS
 
 from services.errors import FormatError, InputError
+from services.formats.control_point_lines import (
+    coordinate_array,
+    counted_ids,
+    format_deg,
+    format_m,
+    format_mark,
+    format_px,
+    lines_of,
+    numbers_of,
+)
 from services.formats.control_points import (
     ELLIPSOID,
     WGS84_3D,
@@ -17,8 +26,6 @@ from services.formats.control_points import (
     ground_from,
     marked_points,
 )
-from services.formats.rpc_text import parse_number
-from services.types import Array
 
 QGIS_CORNER_PX = 0.5
 """QGIS, as GDAL, counts from the corner of the first pixel."""
@@ -50,14 +57,13 @@ def format_asp_gcp(points: MarkedPoints) -> str:
         i = rows[0]
         lon, lat, height_m = used.lon_lat_h[i]
         east_m, north_m, up_m = (_positive(value, "sigma_m", used.id[i]) for value in used.sigma_m[i])
-        point = (
-            f"{used.id[i]} {_deg(lat)} {_deg(lon)} {_m(height_m)} {_m(north_m)} {_m(east_m)} {_m(up_m)}"
-        )
+        ground = f"{format_deg(lat)} {format_deg(lon)} {format_m(height_m)}"
+        point = f"{used.id[i]} {ground} {format_m(north_m)} {format_m(east_m)} {format_m(up_m)}"
         for k in rows:
             line, sample = used.line_sample[k]
-            sigma = _px(_positive(used.sigma_px[k], "sigma_px", used.id[k]))
+            sigma = format_px(_positive(used.sigma_px[k], "sigma_px", used.id[k]))
             image = re.sub(r"[\s,]", "_", str(used.image[k])) or "image"
-            point += f" {image} {_px(sample)} {_px(line)} {sigma} {sigma}"
+            point += f" {image} {format_px(sample)} {format_px(line)} {sigma} {sigma}"
         lines.append(point)
     return "\n".join(lines) + "\n"
 
@@ -76,18 +82,18 @@ def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file
         VerticalDatumError: when nobody says what the heights are above.
     """
     ids, coordinates, sigmas_m, images, pixels, sigmas_px = [], [], [], [], [], []
-    for where, line in _lines(text, "#", source):
+    for where, line in lines_of(text, "#", source):
         fields = line.replace(",", " ").split()
         if len(fields) < 12 or (len(fields) - 7) % 5:
             raise FormatError(
                 f"{where}: expected id, lat, lon, height, 3 sigmas, then for each image its "
                 f"name, column, row and 2 sigmas, found {len(fields)} fields"
             )
-        lat, lon, height_m, north_m, east_m, up_m = _numbers(
+        lat, lon, height_m, north_m, east_m, up_m = numbers_of(
             fields[1:7], ["lat", "lon", "height", "sigma_lat", "sigma_lon", "sigma_height"], where
         )
         for start in range(7, len(fields), 5):
-            column, row, sigma_column, sigma_row = _numbers(
+            column, row, sigma_column, sigma_row = numbers_of(
                 fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
             )
             ids.append(fields[0])
@@ -96,7 +102,7 @@ def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file
             images.append(fields[start])
             pixels.append((row, column))
             sigmas_px.append(math.sqrt((sigma_column**2 + sigma_row**2) / 2.0))
-    ground = ground_from(_array(coordinates), WGS84_3D.to_2d(), heights, source)
+    ground = ground_from(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
     known = {"sigma_m": sigmas_m, "image": images, "sigma_px": sigmas_px}
     return marked_points(ids, ground, pixels, **known)
 
@@ -113,8 +119,14 @@ def format_qgis_points(points: MarkedPoints) -> str:
         lon, lat, _ = points.lon_lat_h[i]
         line, sample = points.line_sample[i] + QGIS_CORNER_PX
         d_line, d_sample = np.nan_to_num(points.residual_px[i])
-        values = [_deg(lon), _deg(lat), _px(sample), _px(-line), str(int(enabled[i]))]
-        values += [_px(-d_sample), _px(d_line), _px(math.hypot(d_line, d_sample))]
+        values = [
+            format_deg(lon),
+            format_deg(lat),
+            format_px(sample),
+            format_px(-line),
+            str(int(enabled[i])),
+        ]
+        values += [format_px(-d_sample), format_px(d_line), format_px(math.hypot(d_line, d_sample))]
         rows.append(",".join(values))
     wkt = CRS.from_epsg(4326).to_wkt()
     return f"#CRS: {wkt}\n" + "\n".join(rows) + "\n"
@@ -132,7 +144,7 @@ def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
     """
     found = re.match(r"#CRS: *(.*)", text)
     crs = crs_from(found[1].strip(), source) if found and found[1].strip() else CRS.from_epsg(4326)
-    lines = list(_lines(text, "#", source))
+    lines = list(lines_of(text, "#", source))
     if not lines or lines[0][1].split(",")[:4] != _QGIS_COLUMNS:
         raise FormatError(f"{source}: expected a line that starts with {','.join(_QGIS_COLUMNS)}")
     coordinates, pixels, active = [], [], []
@@ -140,13 +152,13 @@ def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
         fields = next(csv.reader([line]))
         if len(fields) < 5:
             raise FormatError(f"{where}: expected 5 fields or more, found {len(fields)}")
-        x, y, column, minus_row = _numbers(fields[:4], _QGIS_COLUMNS, where)
+        x, y, column, minus_row = numbers_of(fields[:4], _QGIS_COLUMNS, where)
         coordinates.append((x, y, 0.0))
         pixels.append((-minus_row - QGIS_CORNER_PX, column - QGIS_CORNER_PX))
         active.append(fields[4].strip() != "0")
-    ground = ground_from(_array(coordinates), crs.to_2d(), ELLIPSOID, source)
+    ground = ground_from(coordinate_array(coordinates), crs.to_2d(), ELLIPSOID, source)
     ground[:, 2] = np.nan
-    return marked_points(_counted(pixels), ground, pixels, active=active)
+    return marked_points(counted_ids(pixels), ground, pixels, active=active)
 
 
 def format_envi_pts(points: MarkedPoints) -> str:
@@ -160,9 +172,7 @@ def format_envi_pts(points: MarkedPoints) -> str:
     ]
     used = points.take(points.active & ~points.check)
     for i in range(len(used)):
-        lon, lat, height_m = used.lon_lat_h[i]
-        line, sample = used.line_sample[i] + ENVI_CORNER_PX
-        lines.append(f"{_deg(lon)} {_deg(lat)} {_m(height_m)} {_px(sample)} {_px(line)}")
+        lines.append(format_mark(used.lon_lat_h[i], used.line_sample[i] + ENVI_CORNER_PX))
     return "\n".join(lines) + "\n"
 
 
@@ -180,19 +190,19 @@ def parse_envi_pts(text: str, heights: str | None = None, source: str = "ENVI po
     """
     crs = _envi_crs(text, source)
     coordinates, pixels = [], []
-    for where, line in _lines(text, ";", source):
+    for where, line in lines_of(text, ";", source):
         fields = line.split()
         if len(fields) != 5:
             raise FormatError(
                 f"{where}: expected map x, y, elevation, image x, y, found {len(fields)} fields"
             )
-        x, y, height_m, column, row = _numbers(
+        x, y, height_m, column, row = numbers_of(
             fields, ["map x", "map y", "elevation", "image x", "image y"], where
         )
         coordinates.append((x, y, height_m))
         pixels.append((row - ENVI_CORNER_PX, column - ENVI_CORNER_PX))
-    ground = ground_from(_array(coordinates), crs, heights, source)
-    return marked_points(_counted(pixels), ground, pixels)
+    ground = ground_from(coordinate_array(coordinates), crs, heights, source)
+    return marked_points(counted_ids(pixels), ground, pixels)
 
 
 def _envi_crs(text: str, source: str) -> CRS:
@@ -209,17 +219,6 @@ def _envi_crs(text: str, source: str) -> CRS:
     )
 
 
-def _lines(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:
-    """Lines that say something, each with its place."""
-    for count, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith(comment):
-            yield f"{source}, line {count}", line.strip()
-
-
-def _numbers(fields: list[str], names: list[str], where: str) -> list[float]:
-    return [parse_number(field, name, where) for field, name in zip(fields, names, strict=True)]
-
-
 def _rows_of_each_point(points: MarkedPoints) -> list[list[int]]:
     rows: dict[str, list[int]] = {}
     for i, point in enumerate(points.id.tolist()):
@@ -231,24 +230,3 @@ def _positive(value: float, name: str, point: str) -> float:
     if not value > 0.0:
         raise InputError(f"point {point}: {name} is {value:g}, this format takes known sigmas only")
     return float(value)
-
-
-def _array(coordinates: list[tuple[float, float, float]]) -> Array:
-    return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
-
-
-def _counted(rows: list[tuple[float, float]]) -> list[str]:
-    return [str(count) for count in range(1, len(rows) + 1)]
-
-
-def _deg(value: float) -> str:
-    """To a tenth of a micrometre."""
-    return f"{value:.12f}"
-
-
-def _m(value: float) -> str:
-    return f"{value:.6f}"
-
-
-def _px(value: float) -> str:
-    return f"{value + 0.0:.9f}"

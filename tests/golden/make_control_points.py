@@ -83,6 +83,21 @@ def utm():
     return [(*to_utm.transform(lon, lat), h) for lon, lat, h in LON_LAT_H]
 
 
+def odm():
+    lines = ["EPSG:4326"]
+    for number, ((lon, lat, h), _, (line, sample), _) in rows():
+        lines.append(f"{lon:.10f} {lat:.10f} {h} {sample!r} {line!r} {IMAGE} {number}")
+    return "\n".join(lines) + "\n"
+
+
+def pci():
+    lines = ["# layout=IDPLXYZePeLS crs=EPSG:4326 heights=ellipsoid"]
+    for number, ((lon, lat, h), _, (line, sample), sigma) in rows():
+        place = f"{sample + 0.5!r} {line + 0.5!r} {lon:.10f} {lat:.10f}"
+        lines.append(f"{number} {place} {h} {sigma} {sigma} G")
+    return "\n".join(lines) + "\n"
+
+
 def opf():
     camera = int(hashlib.sha256(IMAGE.encode()).hexdigest()[:12], 16)
     gcps = []
@@ -136,6 +151,8 @@ if __name__ == "__main__":
         "invented.points": qgis(),
         "invented.pts": envi("Geographic Lat/Lon, WGS-84, units=Degrees", LON_LAT_H),
         "invented_utm.pts": envi("UTM, 33, North, WGS-84, units=Meters", utm()),
+        "invented_gcp_list.txt": odm(),
+        "invented_pci.txt": pci(),
         "invented_opf.json": opf(),
         "invented.geojson": geojson(),
         "invented_orthority.geojson": orthority(),

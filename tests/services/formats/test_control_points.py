@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from affine import Affine
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.control import GroundControlPoint
@@ -21,6 +23,8 @@ from services.formats.control_points_json import (
     parse_geojson_points,
     parse_opf,
 )
+from services.formats.control_points_odm import format_gcp_list, parse_gcp_list
+from services.formats.control_points_pci import format_pci_text, parse_pci_text
 from services.formats.control_points_text import (
     format_asp_gcp,
     format_envi_pts,
@@ -39,6 +43,8 @@ FILES = [
     "invented.points",
     "invented.pts",
     "invented_utm.pts",
+    "invented_gcp_list.txt",
+    "invented_pci.txt",
     "invented_opf.json",
     "invented.geojson",
     "invented_orthority.geojson",
@@ -54,10 +60,12 @@ FORMATS = [
     (format_asp_gcp, lambda text: parse_asp_gcp(text, "ellipsoid"), "invented.gcp"),
     (format_qgis_points, parse_qgis_points, "invented.points"),
     (format_envi_pts, lambda text: parse_envi_pts(text, "ellipsoid"), "invented.pts"),
+    (format_gcp_list, lambda text: parse_gcp_list(text, "ellipsoid"), "invented_gcp_list.txt"),
+    (format_pci_text, parse_pci_text, "invented_pci.txt"),
     (format_opf, parse_opf, "invented_opf.json"),
 ]
 every_format = pytest.mark.parametrize(
-    ("write", "parse", "golden"), FORMATS, ids=["asp", "qgis", "envi", "opf"]
+    ("write", "parse", "golden"), FORMATS, ids=["asp", "qgis", "envi", "odm", "pci", "opf"]
 )
 
 
@@ -75,7 +83,8 @@ def gdal_position(points: MarkedPoints) -> np.ndarray:
 def numbers(text: str) -> list[list[float]]:
     """All numbers of the lines that are not comments, without the code under test."""
     lines = [line for line in text.splitlines() if line[:1] not in "#;m"]
-    return [[float(v) for v in re.split(r"[ ,]+", line) if not v.endswith(".tif")] for line in lines]
+    fields = [[v for v in re.split(r"[ ,]+", line) if re.fullmatch(r"[-\d.]+", v)] for line in lines]
+    return [[float(v) for v in row] for row in fields if row]
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -102,6 +111,12 @@ def test_a_format_keeps_the_sigmas_and_names_it_has_a_place_for() -> None:
         assert points.image.tolist() == ["invented.tif"] * 5
         np.testing.assert_array_equal(points.sigma_m, expected.sigma_m)
         np.testing.assert_allclose(points.sigma_px, expected.sigma_px, rtol=1e-15)
+    odm, pci = (
+        read_control_points(GOLDEN / f"invented_{name}.txt", "ellipsoid") for name in ("gcp_list", "pci")
+    )
+    assert odm.id.tolist() == pci.id.tolist() == expected.id.tolist()
+    assert odm.image.tolist() == ["invented.tif"] * 5
+    np.testing.assert_allclose(pci.sigma_px, expected.sigma_px, rtol=1e-15)
 
 
 @every_format
@@ -157,13 +172,43 @@ def test_qgis_marks_of_a_map_image_give_gdal_back_its_geotransform() -> None:
     assert (fitted.a, fitted.e) == pytest.approx((step, -step), rel=1e-9)
 
 
+def test_the_middle_of_an_image_is_the_middle_for_odm() -> None:
+    """ODM counts from the middle of an image in sizes of its longer side, half a pixel added first."""
+    lines, samples = 3000, 4000
+    middle = marked_points(["a"], [(12.0, 42.0, 0.0)], [((lines - 1) / 2, (samples - 1) / 2)])
+    _, _, _, im_x, im_y, *_ = numbers(format_gcp_list(middle))[0]
+    assert ((im_x + 0.5 - samples / 2) / samples, (im_y + 0.5 - lines / 2) / samples) == (0.0, 0.0)
+
+
+def test_the_points_of_a_pci_text_in_a_file_of_pci_give_gdal_back_the_place_of_a_map_image(
+    tmp_path: Path,
+) -> None:
+    place = Affine(1e-4, 0.0, 12.0, 0.0, -1e-4, 42.0)
+    line_sample = np.array([[0.0, 0.0], [0.0, 999.0], [799.0, 999.0], [799.0, 0.0], [400.0, 500.0]])
+    lon, lat = place @ (line_sample.T[::-1] + CORNER_OF_FIRST_PIXEL)
+    points = marked_points(["a", "b", "c", "d", "e"], np.column_stack([lon, lat, 0 * lon]), line_sample)
+    gcps = [
+        GroundControlPoint(row=line, col=pixel, x=x, y=y, z=z)
+        for pixel, line, x, y, z in numbers(format_pci_text(points))
+    ]
+    path = tmp_path / "a.pix"
+    with rasterio.open(path, "w", "PCIDSK", 1000, 800, 1, dtype=np.uint8, gcps=gcps, crs="EPSG:4326"):
+        pass
+    with rasterio.open(path) as file:
+        found = from_gcps(file.gcps[0])
+    assert found.almost_equals(place, precision=a_nanodegree)
+
+
 def test_only_active_points_are_control_and_qgis_keeps_the_others_switched_off() -> None:
     points = replace(golden_points(), active=np.array([True, False, True, True, True]))
     held_out = replace(points, check=np.array([False, False, False, True, False]))
     assert len(numbers(format_asp_gcp(held_out))) == len(numbers(format_envi_pts(held_out))) == 3
     assert parse_qgis_points(format_qgis_points(held_out)).active.tolist() == [1, 0, 1, 0, 1]
-    opf = parse_opf(format_opf(held_out))
-    assert opf.check.tolist() == [False, False, True, False]
+    for write, parse in (FORMATS[3][:2], FORMATS[5][:2]):
+        assert parse(write(held_out)).check.tolist() == [False, False, True, False]
+    pci = parse_pci_text(format_pci_text(held_out))
+    assert pci.active.tolist() == [True, False, True, True, True]
+    assert pci.check.tolist() == held_out.check.tolist()
 
 
 def test_a_point_seen_in_two_images_is_one_point_with_two_marks() -> None:
@@ -194,7 +239,44 @@ def test_a_format_that_asks_for_sigmas_is_not_given_invented_ones(write) -> None
         write(replace(golden_points(), sigma_px=np.full(5, np.nan)))
 
 
-@pytest.mark.parametrize("name", ["invented.gcp", "invented.pts"])
+def test_a_gcp_list_in_utm_is_read_and_points_without_names_are_told_apart_by_their_ground() -> None:
+    marks = numbers(TEXTS["invented_utm.pts"])
+    lines = [
+        f"{x!r}\t{y!r}\t{h!r}\t{px - 1.5!r} {py - 1.5!r} {i}.tif"
+        for i in "ab"
+        for x, y, h, px, py in marks
+    ]
+    points = parse_gcp_list("\n".join(["WGS84 UTM 33N", "# a comment", *lines]), "ellipsoid")
+    assert points.id.tolist() == ["1", "2", "3", "4", "5"] * 2
+    expected = golden_points()
+    assert np.abs(points.lon_lat_h[:5] - expected.lon_lat_h).max() < a_micrometre
+    assert np.abs(points.line_sample[5:] - expected.line_sample).max() < a_millionth_of_a_pixel
+
+
+def test_points_of_a_gcp_list_without_heights_have_none() -> None:
+    points = golden_points()
+    flat = replace(points, lon_lat_h=points.lon_lat_h * [1.0, 1.0, np.nan])
+    assert np.isnan(parse_gcp_list(format_gcp_list(flat)).lon_lat_h[:, 2]).all()
+
+
+def test_a_pci_text_may_have_its_columns_in_any_order_with_names_of_several_words() -> None:
+    text = '# layout=SXYPLID crs=EPSG:4326\nC,12.5,42.5,10.5,20.5,"old mill"\nG\t12.5\t42.5\t1\t2\tb\n'
+    points = parse_pci_text(text)
+    assert points.id.tolist() == ["old mill", "b"]
+    assert points.check.tolist() == [True, False]
+    assert points.line_sample.tolist() == [[20.0, 10.0], [1.5, 0.5]]
+    assert np.isnan(points.lon_lat_h[:, 2]).all()
+    assert np.isnan(points.sigma_px).all()
+
+
+def test_a_pci_text_holds_errors_of_pixels_only_when_all_are_known() -> None:
+    points = golden_points()
+    partly = replace(points, sigma_px=np.array([0.1, np.nan, 0.1, 0.1, 0.1]))
+    assert "ePeL" not in format_pci_text(partly)
+    assert len(parse_pci_text(format_pci_text(partly))) == 5
+
+
+@pytest.mark.parametrize("name", ["invented.gcp", "invented.pts", "invented_gcp_list.txt"])
 def test_heights_whose_datum_nobody_says_are_refused(name: str) -> None:
     with pytest.raises(VerticalDatumError, match="does not say what its heights are above"):
         read_control_points(GOLDEN / name)
@@ -246,6 +328,26 @@ def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
         ("invented.points", "EPSG:4326", "moon", "expected a reference system, found 'moon'"),
         ("invented.pts", "WGS-84", "NAD27", "expected a projection info .* found 'Geographic"),
         ("invented.pts", " 105.25", "", "line 5: expected map x, y, elevation, image x, y"),
+        (
+            "invented_gcp_list.txt",
+            "EPSG:4326",
+            "the moon",
+            "expected a reference system, found 'the moon'",
+        ),
+        ("invented_gcp_list.txt", " invented.tif 11", "", "line 2: expected geo_x, .* found 5 fields"),
+        ("invented_gcp_list.txt", "105.25", "high", "line 2: geo_z should be a number, found 'high'"),
+        ("invented_pci.txt", "EPSG:4326", "moon", "expected a reference system, found 'moon'"),
+        (
+            "invented_pci.txt",
+            "IDPLXYZ",
+            "IDPLXYQ",
+            "layout should be made of ID P L .* found 'IDPLXYQeP",
+        ),
+        ("invented_pci.txt", "IDPLXYZ", "IDPLXZZ", "each once, found 'IDPLXZZ"),
+        ("invented_pci.txt", "PLXYZ", "PLZ", "layout should have P, L, X and Y, found no X, Y"),
+        ("invented_pci.txt", " 105.25", "", "line 2: expected 9 fields, IDPLXYZePeLS, found 8"),
+        ("invented_pci.txt", "105.25", "high", "line 2: Z should be a number, found 'high'"),
+        ("invented_pci.txt", "0.11 G", "0.11 X", "line 2: S should be G, I or C, found 'X'"),
         ("invented_opf.json", '"1.0"', '"2.0"', "expected OPF 1, found version '2.0'"),
         ("invented_opf.json", "application/opf-input", "x", "expected a document of the format"),
         ("invented_opf.json", "position_px", "place", "gcp 1: position_px should be 2 numbers"),
@@ -290,6 +392,7 @@ def test_a_garbled_file_gives_points_or_an_error_of_ours(name: str, data: st.Dat
         ".pts": lambda t: parse_envi_pts(t, "ellipsoid"),
         ".json": parse_opf,
         ".geojson": parse_geojson_points,
+        ".txt": parse_pci_text if "pci" in name else lambda t: parse_gcp_list(t, "ellipsoid"),
     }[Path(name).suffix]
     try:
         parse(garbled)
