@@ -75,7 +75,10 @@ def register(
         Path | None, typer.Option(help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.")
     ] = None,
     check_heights: Annotated[
-        str | None, typer.Option(help="What their heights are above, where the file is silent: ellipsoid, EPSG:…")
+        str | None,
+        typer.Option(
+            help="What their heights are above, where the file does not say: ellipsoid, EPSG:…"
+        ),
     ] = None,
     copy_image: Annotated[
         bool, typer.Option("--copy-image", help="Copy a GeoTIFF, the refined model in its tags.")
