@@ -6,14 +6,14 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
-from app.api.deps import ChipsDep, DatabaseDep, PointsReader, ReadConnection
+from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import CrsUri, Format
 from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, refuse_unknown
 from app.api.pages import features_page
 from app.db.collections import Viewer
-from app.db.history import PointHistory
-from app.db.points import POINTS, PointDetail, PointView
-from app.usecases import history, points
+from app.db.point_detail import PointDetail, PointView
+from app.db.points import POINTS
+from app.usecases import points
 from app.usecases.features import find_feature
 from services.formats.chip_images import (
     format_chip_png,
@@ -26,7 +26,16 @@ router = APIRouter(prefix="/collections/points/items", tags=["points"])
 
 PNG = "image/png"
 CHIPS_NEVER_CHANGE = {"Cache-Control": "private, max-age=86400"}
-NOT_PROPERTIES = {"id", "lon_deg", "lat_deg", "height_m", "chip_key", "chip_row", "chip_count"}
+NOT_PROPERTIES = {
+    "id",
+    "lon_deg",
+    "lat_deg",
+    "height_m",
+    "chip_key",
+    "chip_row",
+    "chip_count",
+    "history",
+}
 
 PointId = int
 
@@ -49,8 +58,7 @@ def item(
     given = POINTS.storage_crs
     with database.reading() as connection:
         point = points.find_point(connection, point_id)
-        fared = history.find_history(connection, point_id)
-        feature = _feature(point, fared, str(request.url.replace(query="")))
+        feature = _feature(point, str(request.url.replace(query="")))
         if crs is not None:
             found, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
             feature["geometry"] = json.loads(found)["geometry"]
@@ -65,13 +73,15 @@ def item(
 @router.get("/{point_id}/chips", response_class=Response)
 def chips(
     point_id: PointId,
-    connection: ReadConnection,
+    database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
     f: Annotated[Literal["npz", "png"], Query(description="png: all chips on one sheet.")] = "npz",
 ) -> Response:
     """All chips of a point: raw values with what they show, or a sheet to look at."""
-    labelled = points.read_chips(stored, points.find_point(connection, point_id))
+    with database.reading() as connection:
+        point = points.find_point(connection, point_id)
+    labelled = points.read_chips(stored, point)
     if f == "png":
         return Response(format_sheet_png(labelled), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
     return _download(format_chips_npz(labelled), NPZ, f"{point_id}.npz")
@@ -81,13 +91,15 @@ def chips(
 def chip(
     point_id: PointId,
     view: int,
-    connection: ReadConnection,
+    database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
     f: Annotated[Literal["png", "tif", "npz"], Query(description="tif: GeoTIFF of raw values.")] = "png",
 ) -> Response:
     """One chip: stretched to look at, or its raw values."""
-    labelled = points.read_chip(stored, points.find_point(connection, point_id), view)
+    with database.reading() as connection:
+        point = points.find_point(connection, point_id)
+    labelled = points.read_chip(stored, point, view)
     if f == "png":
         return Response(format_chip_png(labelled.chips[0]), media_type=PNG, headers=CHIPS_NEVER_CHANGE)
     if f == "npz":
@@ -101,8 +113,8 @@ def _download(content: bytes, kind: str, name: str) -> Response:
     return Response(content, media_type=kind, headers={**CHIPS_NEVER_CHANGE, **disposition})
 
 
-def _feature(point: PointDetail, fared: PointHistory, url: str) -> dict[str, Any]:
-    known = {**vars(point), **vars(fared)}
+def _feature(point: PointDetail, url: str) -> dict[str, Any]:
+    known = {**vars(point), **vars(point.history)}
     return {
         "type": "Feature",
         "id": point.id,

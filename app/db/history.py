@@ -32,17 +32,18 @@ STATES = ("served", "proposed", "suspended")
 STATE = f"""case when p.suspended_at is not null then 'suspended'
     when {HEALTH} < {SUSPECT_HEALTH} then 'proposed' else 'served' end"""
 
-HISTORY_OF_POINT = f"""p.id, {STATE} as state, coalesce(h.attempts, 0) as attempts,
+FARED_OF_POINT = f"""{STATE} as state, coalesce(h.attempts, 0) as attempts,
     coalesce(h.successes, 0) as successes, coalesce(h.expected, 0) as expected, {HEALTH} as health,
     h.last_attempt, h.last_success, h.sum_residual_px / nullif(h.matched, 0) as mean_residual_px,
     h.sum_east_m / nullif(h.matched, 0) as mean_east_m,
     h.sum_north_m / nullif(h.matched, 0) as mean_north_m, p.suspended_at, p.suspended_because"""
+"""How a point `p` fared, by its row `h` of sums."""
 
 HISTORY = Collection(
     id="point-history",
     title="History of points",
     description="Points that registrations have tried, how they fared, and which should be suspended.",
-    source=f"""(select {HISTORY_OF_POINT}, p.geom, p.block_number
+    source=f"""(select p.id, {FARED_OF_POINT}, p.geom, p.block_number
         from point_history h join point p on p.id = h.point_id) t""",
     key=Property("id", "bigint", "Identifier of the point"),
     properties=(
@@ -235,7 +236,7 @@ def find_history(connection: Connection, point_id: int) -> PointHistory | None:
     """How a point of any block fared; None when there is no such point."""
     with connection.cursor(row_factory=class_row(PointHistory)) as cursor:
         return cursor.execute(
-            f"""select {HISTORY_OF_POINT} from point p left join point_history h on h.point_id = p.id
+            f"""select p.id, {FARED_OF_POINT} from point p left join point_history h on h.point_id = p.id
                 where p.id = %s""",
             [point_id],
         ).fetchone()
@@ -245,7 +246,7 @@ def list_histories(connection: Connection, state: str, limit: int) -> list[Point
     """The points of published blocks in a state, the worst first."""
     with connection.cursor(row_factory=class_row(PointHistory)) as cursor:
         return cursor.execute(
-            f"""select {HISTORY_OF_POINT} from point_history h join point p on p.id = h.point_id
+            f"""select p.id, {FARED_OF_POINT} from point_history h join point p on p.id = h.point_id
                 where {STATE} = %s and p.block_number = any(array({PUBLISHED}))
                 order by health, attempts desc, p.id limit %s""",
             [state, limit],

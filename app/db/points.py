@@ -1,8 +1,7 @@
-"""Control points of published blocks: by box, by outline, one by one."""
+"""Control points of published blocks: as a collection, and as arrays by outline and by ids."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date, datetime
 from typing import Any
 
 import numpy as np
@@ -95,52 +94,6 @@ VIEW_KINDS = (
 )
 
 
-@dataclass(frozen=True)
-class PointView:
-    """A view of a point and the image it was cut from; None where unknown."""
-
-    view: int
-    gsd_m: float
-    incidence_deg: float | None
-    azimuth_deg: float | None
-    image_id: str
-    sensor: str
-    acquired_at: datetime | None
-    sun_elevation_deg: float | None
-    sun_azimuth_deg: float | None
-
-
-@dataclass(frozen=True)
-class PointDetail:
-    """One point with all that is known of it.
-
-    Attributes:
-        chip_key: where the storage has its chips; `chip_row` is the first, `chip_count` their number.
-    """
-
-    id: int
-    lon_deg: float
-    lat_deg: float
-    height_m: float
-    sigma_east_m: float
-    sigma_north_m: float
-    sigma_up_m: float
-    corr_east_north: float
-    corr_east_up: float
-    corr_north_up: float
-    n_views: int
-    saliency: float
-    typology: str | None
-    first_view: date | None
-    last_view: date | None
-    block: str
-    block_version: str
-    chip_key: str
-    chip_row: int
-    chip_count: int
-    views: tuple[PointView, ...]
-
-
 _FRAME_SIGMA = '$."amers:accuracy"."absolute"[*] ? (@.name == "frame_sigma_m").value'
 
 
@@ -169,31 +122,6 @@ class StoredPoints:
 
     points: ControlPoints
     blocks: tuple[BlockVersion, ...]
-
-
-def find_point(connection: Connection, point_id: int) -> PointDetail | None:
-    """One published point."""
-    row = connection.execute(
-        """select p.id, st_x(geom) as lon_deg, st_y(geom) as lat_deg, st_z(geom) as height_m,
-                sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
-                p.n_views, saliency, typology, first_view, last_view, b.id as block,
-                b.version as block_version, f.storage_key as chip_key, chip_row, chip_count
-            from point p join block b on b.number = p.block_number join chip_file f on f.id = p.chip_file
-            where p.id = %s and b.state = 'published'""",
-        [point_id],
-    ).fetchone()
-    if row is None:
-        return None
-    views = connection.execute(
-        """select v.view, v.gsd_m, nullif(v.incidence_deg, 'NaN') as incidence_deg,
-               nullif(v.azimuth_deg, 'NaN') as azimuth_deg, i.image_id, i.sensor, i.acquired_at,
-               nullif(i.sun_elevation_deg, 'NaN') as sun_elevation_deg,
-               nullif(i.sun_azimuth_deg, 'NaN') as sun_azimuth_deg
-           from view v join image i on i.block_number = %s and i.image = v.image
-           where v.point_id = %s order by v.view""",
-        [point_id >> ID_BITS, point_id],
-    ).fetchall()
-    return PointDetail(**row, views=tuple(PointView(**view) for view in views))
 
 
 def control_points(connection: Connection, outline: Array, limit: int | None = None) -> StoredPoints:

@@ -7,15 +7,17 @@ from datetime import datetime
 
 import psycopg
 
-from app.db import features
+from app.db import feature_counts, feature_text, features
 from app.db.collections import Collection, Viewer
 from app.db.crs import Crs
 from app.db.density import DENSITY
 from app.db.engine import Connection
-from app.db.features import Count, Key, Reading, Selection
+from app.db.feature_counts import Count
+from app.db.features import Reading
 from app.db.history import HISTORY
 from app.db.outlines import BLOCKS, SCENES
 from app.db.points import POINTS
+from app.db.selection import Key, Selection
 from app.errors import InvalidParameter, NotFound
 from app.usecases.page_tokens import format_token
 from app.usecases.questions import Asked, Question, condition_of, crs_of
@@ -118,7 +120,7 @@ def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tu
     """West, south, east, north of what the viewer may see of a collection, None without any."""
     # Points lie in the outlines of their blocks, which are fewer; so do cells, to a tenth of a degree.
     whose = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
-    found = features.extent(connection, whose, viewer if whose is collection else Viewer())
+    found = feature_counts.extent(connection, whose, viewer if whose is collection else Viewer())
     if found is None or found[2] <= 180.0:
         return found
     return (-180.0, found[1], 180.0, found[3])
@@ -130,7 +132,7 @@ def period(
     """The first and the last time of what the viewer may see of scenes; unknown for the others."""
     if collection is not SCENES:
         return None, None
-    return features.period(connection, collection, viewer)
+    return feature_counts.period(connection, collection, viewer)
 
 
 def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
@@ -149,7 +151,7 @@ def _matched(connection: Connection, asked: Asked, last: Key | None, returned: i
         return asked.matched
     if last is None and asked.after is None:
         return Count(returned, exact=True)
-    return features.count(connection, asked.selection)
+    return feature_counts.count(connection, asked.selection)
 
 
 def _next(asked: Asked, last: Key | None, matched: Count, secret: bytes) -> str | None:
@@ -168,4 +170,4 @@ def page_secret(connection: Connection) -> bytes:
 
 def csv_header(selection: Selection) -> str:
     """The names of the columns of CSV."""
-    return features.csv_header(selection)
+    return feature_text.csv_header(selection)

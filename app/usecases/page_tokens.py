@@ -4,7 +4,8 @@ import base64
 import hmac
 import json
 
-from app.db.features import Count, Key
+from app.db.feature_counts import Count
+from app.db.selection import Key
 from app.errors import InvalidParameter
 
 

@@ -6,11 +6,15 @@ from typing import Literal
 
 import numpy as np
 
-from app.db import features, points
+from app.db import feature_counts, features, point_detail, points
 from app.db.collections import Viewer
 from app.db.engine import Connection
-from app.db.features import Count, Reading, Selection
-from app.db.points import POINTS, PointDetail, PointView
+from app.db.feature_counts import Count
+from app.db.feature_text import csv_header
+from app.db.features import Reading
+from app.db.point_detail import PointDetail, PointView
+from app.db.points import POINTS
+from app.db.selection import Selection
 from app.errors import InvalidParameter, NotFound
 from app.usecases.features import everything_in
 from app.usecases.questions import MOST_FEATURES, Question, condition_of
@@ -27,7 +31,7 @@ MOST_POINTS_WITH_CHIPS = 1_000
 
 def count_points(connection: Connection, bbox: str) -> Count:
     """How many published points a box holds: exact up to 10,000, an estimate beyond."""
-    return features.count(connection, everything_in(POINTS, bbox))
+    return feature_counts.count(connection, everything_in(POINTS, bbox))
 
 
 def geojson(connection: Connection, bbox: str) -> Iterator[bytes]:
@@ -40,7 +44,7 @@ def geojson(connection: Connection, bbox: str) -> Iterator[bytes]:
 def csv(connection: Connection, bbox: str) -> Iterator[bytes]:
     """All published points of a box as CSV with a header, in pieces."""
     selection, after = everything_in(POINTS, bbox), None
-    yield features.csv_header(selection).encode() + b"\r\n"
+    yield csv_header(selection).encode() + b"\r\n"
     while True:
         page = features.page(connection, selection, "csv", after, MOST_FEATURES)
         if page.body:
@@ -102,7 +106,7 @@ def find_point(connection: Connection, point_id: int) -> PointDetail:
     Raises:
         NotFound: there is no such point, or its block is not published.
     """
-    found = points.find_point(connection, point_id) if abs(point_id) < 2**63 else None
+    found = point_detail.find_point(connection, point_id) if abs(point_id) < 2**63 else None
     if found is None:
         raise NotFound(f"no point {point_id}")
     return found

@@ -13,7 +13,8 @@ from app.db.conditions import ANYTHING, Condition, in_box, in_time
 from app.db.cql2 import geometry_condition, translate
 from app.db.cql2_reading import check_size, parse_instant, parse_json, parse_text
 from app.db.crs import CRS84, EVERY, Crs
-from app.db.features import Count, Key, Order, Selection
+from app.db.feature_counts import Count
+from app.db.selection import Key, Order, Selection
 from app.errors import InvalidParameter
 from app.usecases.page_tokens import parse_token
 

@@ -13,10 +13,11 @@ from rasterio.io import MemoryFile
 from typer.testing import CliRunner
 
 from app.cli.main import app as commands
-from app.db import features
+from app.db import feature_counts, features
 from app.db.collections import Viewer
-from app.db.features import Count, Selection
+from app.db.feature_counts import Count
 from app.db.points import POINTS
+from app.db.selection import Selection
 from app.errors import InputError
 from app.usecases import blocks, points
 from app.usecases.features import everything_in
@@ -182,7 +183,7 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     middle = (ordered[9_999] + ordered[10_000]) / 2
 
     def count(bbox):
-        return features.count(connection, everything_in(POINTS, bbox))
+        return feature_counts.count(connection, everything_in(POINTS, bbox))
 
     assert count(f"4,42,{middle},44") == Count(10_000, exact=True)
     assert count(None) == Count(12_500, exact=True)
@@ -197,7 +198,9 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
 
     question = Question(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
     condition = condition_of(POINTS, question)
-    estimate = features.count(connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition))
+    estimate = feature_counts.count(
+        connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition)
+    )
     true = (many.points.saliency > 0.1).sum()
     assert not estimate.exact
     assert true > 10_000
