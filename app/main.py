@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -13,6 +13,7 @@ from app.api import (
     blocks,
     chips,
     collections,
+    deps,
     features,
     history,
     jobs,
@@ -63,10 +64,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     page.router,
 )
 
-THREADS = 256
-"""More than there are requests at once: one that holds a connection must never wait for the thread of
-one that waits for a connection."""
-
 CORS_METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
 CORS_HEADERS = (
     "Authorization",
@@ -102,7 +99,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        to_thread.current_default_thread_limiter().total_tokens = THREADS
+        to_thread.current_default_thread_limiter().total_tokens = deps.threads_for(chosen)
         opening = engine.opened(chosen)
         app.state.settings = chosen
         app.state.database = await run_in_threadpool(opening.__enter__)
@@ -135,6 +132,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         expose_headers=CORS_EXPOSED,
     )
     app.state.metrics = RequestMetrics()
+    app.state.upload_turns = CapacityLimiter(deps.UPLOADS_AT_ONCE)
     app.state.issuer = None if chosen.oidc_issuer is None else Issuer(chosen)
     app.add_middleware(Watch, metrics=app.state.metrics)
     replies.install(app)

@@ -11,14 +11,14 @@ from app.api.deps import (
     Admin,
     DatabaseDep,
     PointsReader,
-    ReadConnection,
     SettingsDep,
     StorageDep,
-    WriteConnection,
+    UploadTurn,
 )
 from app.api.jobs import job_url, status_info
 from app.auth import Scope, allows
 from app.db.blocks import Block
+from app.db.engine import Connection
 from app.db.tokens import Token
 from app.usecases import block_uploads, blocks, jobs
 from app.usecases.block_ingestion import INGEST_BLOCK
@@ -59,7 +59,12 @@ BINARY_BODY = {
 }
 
 
-@router.put("/blocks/uploads/{name}", status_code=201, openapi_extra={"requestBody": BINARY_BODY})
+@router.put(
+    "/blocks/uploads/{name}",
+    status_code=201,
+    dependencies=[UploadTurn],
+    openapi_extra={"requestBody": BINARY_BODY},
+)
 def upload_block(
     name: str,
     request: Request,
@@ -82,7 +87,7 @@ def ingest(
     body: BlockToIngest,
     request: Request,
     response: Response,
-    connection: WriteConnection,
+    database: DatabaseDep,
     settings: SettingsDep,
     caller: Admin,
     idempotency_key: Annotated[str | None, Header()] = None,
@@ -92,46 +97,50 @@ def ingest(
     The same as an execution of the process `ingest-block`.
     """
     inputs = body.model_dump(mode="json", exclude_none=True)
-    job = jobs.execute(connection, settings, caller, INGEST_BLOCK.id, inputs, idempotency_key)
+    with database.transaction() as connection:
+        job = jobs.execute(connection, settings, caller, INGEST_BLOCK.id, inputs, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     return status_info(request, job)
 
 
 @router.get("/blocks/{reference}/quality")
-def quality(reference: str, connection: ReadConnection, caller: PointsReader) -> dict[str, Any]:
+def quality(reference: str, database: DatabaseDep, caller: PointsReader) -> dict[str, Any]:
     """The quality figures of a block; `cells` list west, south, area in km2, number of points.
 
     `accuracy` is what the producer of the block measured, and against what.
     """
-    block = _visible(connection, reference, caller)
-    report = blocks.block_report(connection, block)
+    with database.reading() as connection:
+        block = _visible(connection, reference, caller)
+        report = blocks.block_report(connection, block)
     return {**quality_document(report.quality), "accuracy": [vars(f) for f in report.accuracy]}
 
 
 @router.post("/blocks/{reference}/publish")
-def publish(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+def publish(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block visible, and the version of it that was visible before no longer."""
-    return _published(blocks.publish_block(connection, reference))
+    with database.transaction() as connection:
+        return _published(blocks.publish_block(connection, reference))
 
 
 @router.post("/blocks/{reference}/restore")
-def restore(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+def restore(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
-    return _published(blocks.restore_block(connection, reference))
+    with database.transaction() as connection:
+        return _published(blocks.restore_block(connection, reference))
 
 
 @router.patch("/blocks/{reference}")
-def prioritise(
-    reference: str, body: Priority, connection: WriteConnection, caller: Admin
-) -> dict[str, Any]:
+def prioritise(reference: str, body: Priority, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Let a block win or lose against other blocks over the same place."""
-    return {"block": _properties(blocks.prioritise_block(connection, reference, body.priority))}
+    with database.transaction() as connection:
+        return {"block": _properties(blocks.prioritise_block(connection, reference, body.priority))}
 
 
 @router.post("/blocks/{reference}/withdraw")
-def withdraw(reference: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+def withdraw(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block invisible; it can be published again."""
-    return {"block": _properties(blocks.withdraw_block(connection, reference))}
+    with database.transaction() as connection:
+        return {"block": _properties(blocks.withdraw_block(connection, reference))}
 
 
 def _published(published: Published) -> dict[str, Any]:
@@ -142,7 +151,7 @@ def _published(published: Published) -> dict[str, Any]:
     }
 
 
-def _visible(connection: ReadConnection, reference: str, caller: Token | None) -> Block:
+def _visible(connection: Connection, reference: str, caller: Token | None) -> Block:
     """The block a caller may see: any for an administrator, the published one for others."""
     if _is_admin(caller):
         return blocks.find_block(connection, reference)

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from app.api import stac
-from app.api.deps import PointsReader, ReadConnection, SettingsDep
+from app.api.deps import DatabaseDep, PointsReader, SettingsDep
 from app.api.documents import document_of, geometry_schema, property_schema
 from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
 from app.api.negotiation import (
@@ -34,7 +34,7 @@ REL = "http://www.opengis.net/def/rel/ogc/1.0"
 @router.get("/collections", response_class=Response, responses=document_of("Collections"))
 def collections(
     request: Request,
-    connection: ReadConnection,
+    database: DatabaseDep,
     caller: PointsReader,
     settings: SettingsDep,
     f: Format = None,
@@ -47,10 +47,9 @@ def collections(
             seen.append((collection, viewer_of(collection, caller, settings)))
         except NotAllowed:
             continue
-    document = {
-        "links": _self_links(request, "collections"),
-        "collections": [describe(request, connection, *one) for one in seen],
-    }
+    with database.reading() as connection:
+        described = [describe(request, connection, *one) for one in seen]
+    document = {"links": _self_links(request, "collections"), "collections": described}
     if chosen_format(request, DOCUMENTS, f) == "json":
         return JSONResponse(document)
     rows = [
@@ -70,12 +69,13 @@ def one_collection(
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
-    connection: ReadConnection,
+    database: DatabaseDep,
     f: Format = None,
 ) -> Response:
     """One collection."""
     refuse_unknown(request, {"f"})
-    document = describe(request, connection, collection, viewer)
+    with database.reading() as connection:
+        document = describe(request, connection, collection, viewer)
     if chosen_format(request, DOCUMENTS, f) == "json":
         return JSONResponse(document)
     box = document.get("extent", {}).get("spatial", {}).get("bbox", [None])[0]

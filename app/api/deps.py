@@ -1,22 +1,33 @@
 """What endpoints ask for: settings, store, storage, and a caller who may.
 
-What does not wait is `async`: it costs a call, where anything else costs a change of threads.
+What does not wait is `async`: it costs a call, where anything else costs a change of threads. Endpoints
+take a connection in their own thread, for as long as they need it: who held one and waited for a thread
+would wait for those who have a thread and wait for a connection.
 """
 
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from typing import Annotated
 
+from anyio import CapacityLimiter, WouldBlock
 from fastapi import Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 
 from app import origin
 from app.auth import Scope, authenticate, authenticate_identity, require
 from app.config import Settings
-from app.db.engine import Connection, Database
+from app.db.engine import Database
 from app.db.tokens import Token
 from app.errors import NotAllowed
 from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
+
+UPLOADS_AT_ONCE = 32
+
+
+def threads_for(settings: Settings) -> int:
+    """Threads for endpoints: with all uploads under way, one for each connection is left."""
+    return UPLOADS_AT_ONCE + 2 * settings.pool_size
 
 
 async def _settings(request: Request) -> Settings:
@@ -70,23 +81,21 @@ def _known(issuer: Issuer | None, database: Database, secret: str) -> Token:
 CallerDep = Annotated[Token | None, Depends(_caller)]
 
 
-def _reading(database: DatabaseDep, caller: CallerDep) -> Iterator[Connection]:
-    """A connection once it is known who calls: who held one and waited for another would block all."""
-    with database.reading() as connection:
-        yield connection
+async def _turn(request: Request, caller: CallerDep) -> AsyncIterator[None]:
+    """A turn among those who send files: each holds a thread for as long as sending takes."""
+    turns: CapacityLimiter = request.app.state.upload_turns
+    try:
+        turns.acquire_on_behalf_of_nowait(request)
+    except WouldBlock:
+        said = f"{UPLOADS_AT_ONCE} files are being sent already, as many as are taken at once: try again"
+        raise HTTPException(503, said, {"Retry-After": "5"}) from None
+    try:
+        yield
+    finally:
+        turns.release_on_behalf_of(request)
 
 
-# Scope "function": committed before the reply is sent, so that a commit that fails is an error reply.
-ReadConnection = Annotated[Connection, Depends(_reading, scope="function")]
-
-
-def _transaction(database: DatabaseDep, caller: CallerDep) -> Iterator[Connection]:
-    """A transaction that begins when it is known who calls: the record of changes says so."""
-    with database.transaction() as connection:
-        yield connection
-
-
-WriteConnection = Annotated[Connection, Depends(_transaction, scope="function")]
+UploadTurn = Depends(_turn, scope="function")
 
 
 async def _reader(caller: CallerDep) -> Token:

@@ -1,18 +1,18 @@
 """Features of every collection: pages of items in six formats, one item, search by POST."""
 
 import json
-from collections.abc import Callable, Iterator
-from itertools import chain, islice
+from collections.abc import Callable, Generator
+from itertools import islice
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import features_page
+from app.api.streams import Streamed
 from app.auth import Scope, allows, require
 from app.db.collections import Collection, Viewer
 from app.db.engine import Database
@@ -260,7 +260,7 @@ def _answer(
         headers = _headers(asked, FEATURES["json"])
         if len(ahead) < 3:
             return Response(b"".join(ahead), media_type=GEOJSON, headers=headers)
-        return StreamingResponse(chain(ahead, pieces), media_type=GEOJSON, headers=headers)
+        return Streamed(ahead, pieces, GEOJSON, headers)
     with database.reading() as connection:
         if form in FILES:
             table, answer = features.table(connection, asked, secret)
@@ -284,7 +284,7 @@ def _answer(
 
 def _streamed(
     request: Request, database: Database, asked: Asked, secret: bytes, next_link: Any
-) -> Iterator[bytes]:
+) -> Generator[bytes, None, None]:
     with database.reading() as connection:
         opened = b'{"type":"FeatureCollection","features":['
         for piece in features.stream(connection, asked, secret):

@@ -7,7 +7,7 @@ from fastapi import APIRouter
 from fastapi.encoders import jsonable_encoder
 from pydantic import BaseModel, ConfigDict
 
-from app.api.deps import Admin, WriteConnection
+from app.api.deps import Admin, DatabaseDep
 from app.db.history import PointHistory
 from app.usecases import history
 
@@ -23,17 +23,17 @@ class Suspension(BaseModel):
 
 
 @router.post("/{point_id}/suspend")
-def suspend(
-    point_id: int, body: Suspension, connection: WriteConnection, caller: Admin
-) -> dict[str, Any]:
+def suspend(point_id: int, body: Suspension, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Serve a point no longer; what is proposed for it is in the collection `point-history`."""
-    return _told(history.suspend_point(connection, point_id, body.because))
+    with database.transaction() as connection:
+        return _told(history.suspend_point(connection, point_id, body.because))
 
 
 @router.post("/{point_id}/reinstate")
-def reinstate(point_id: int, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+def reinstate(point_id: int, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Serve a suspended point again; its history begins anew."""
-    return _told(history.reinstate_point(connection, point_id))
+    with database.transaction() as connection:
+        return _told(history.reinstate_point(connection, point_id))
 
 
 def _told(found: PointHistory) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Depends, Query, Request
 
-from app.api.deps import ReadConnection, Reader, WriteConnection
+from app.api.deps import DatabaseDep, Reader
 from app.db.jobs import Job, JobFilter, JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs
@@ -16,7 +16,7 @@ router = APIRouter(tags=["jobs"])
 MOST_LISTED = 1000
 
 
-def _job_id(job_id: str) -> UUID:
+async def _job_id(job_id: str) -> UUID:
     try:
         return UUID(job_id)
     except ValueError:
@@ -29,7 +29,7 @@ JobId = Annotated[UUID, Depends(_job_id)]
 @router.get("/jobs")
 def list_jobs(
     request: Request,
-    connection: ReadConnection,
+    database: DatabaseDep,
     caller: Reader,
     process_id: Annotated[list[str] | None, Query(alias="processID")] = None,
     status: Annotated[list[JobState] | None, Query()] = None,
@@ -52,7 +52,8 @@ def list_jobs(
     wanted = JobFilter(
         tuple(process_id or ()), tuple(status or ()), since, until, min_duration, max_duration
     )
-    found = jobs.list_jobs(connection, caller, wanted, limit + 1, after)
+    with database.reading() as connection:
+        found = jobs.list_jobs(connection, caller, wanted, limit + 1, after)
     page = found[:limit]
     links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
     if len(found) > limit:
@@ -62,29 +63,29 @@ def list_jobs(
 
 
 @router.get("/jobs/{job_id}")
-def show_job(
-    job_id: JobId, request: Request, connection: ReadConnection, caller: Reader
-) -> dict[str, Any]:
+def show_job(job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> dict[str, Any]:
     """Where a job stands.
 
     While it waits, `amers:queuePosition` counts the jobs to be begun up to it; until it ends,
     `amers:estimatedEnd` says when it may, from the durations of jobs before it.
     """
-    job = jobs.visible_job(connection, caller, job_id)
-    course = {
-        "amers:queuePosition": jobs.queue_position(connection, job),
-        "amers:estimatedEnd": jobs.expected_end(connection, job),
-    }
+    with database.reading() as connection:
+        job = jobs.visible_job(connection, caller, job_id)
+        course = {
+            "amers:queuePosition": jobs.queue_position(connection, job),
+            "amers:estimatedEnd": jobs.expected_end(connection, job),
+        }
     told = {name: value for name, value in course.items() if value is not None}
     return {**status_info(request, job), **told}
 
 
 @router.get("/jobs/{job_id}/messages")
 def show_messages(
-    job_id: JobId, request: Request, connection: ReadConnection, caller: Reader
+    job_id: JobId, request: Request, database: DatabaseDep, caller: Reader
 ) -> dict[str, Any]:
     """What a job has said on its way, the oldest message first: the last thousand."""
-    said = jobs.read_messages(connection, caller, job_id)
+    with database.reading() as connection:
+        said = jobs.read_messages(connection, caller, job_id)
     here = f"{request.base_url}jobs/{job_id}"
     return {
         "messages": [vars(message) for message in said],
@@ -97,10 +98,11 @@ def show_messages(
 
 @router.delete("/jobs/{job_id}")
 def dismiss_job(
-    job_id: JobId, request: Request, connection: WriteConnection, caller: Reader
+    job_id: JobId, request: Request, database: DatabaseDep, caller: Reader
 ) -> dict[str, Any]:
     """Dismiss a job that has not ended; work on it stops within seconds."""
-    return status_info(request, jobs.dismiss(connection, caller, job_id))
+    with database.transaction() as connection:
+        return status_info(request, jobs.dismiss(connection, caller, job_id))
 
 
 def job_url(request: Request, job: Job) -> str:

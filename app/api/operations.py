@@ -10,7 +10,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
-from app.api.deps import Admin, MetricsReader, ReadConnection, SettingsDep
+from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
 from app.usecases import operations
 from app.usecases.operations import Installation
 
@@ -19,10 +19,11 @@ router = APIRouter(tags=["operations"])
 
 @router.get("/metrics", response_class=Response)
 def metrics(
-    request: Request, connection: ReadConnection, settings: SettingsDep, caller: MetricsReader
+    request: Request, database: DatabaseDep, settings: SettingsDep, caller: MetricsReader
 ) -> Response:
     """Figures for Prometheus: requests of this process, jobs, queue, blocks, points, disk."""
-    figures = operations.installation_figures(connection, settings.data_folder)
+    with database.reading() as connection:
+        figures = operations.installation_figures(connection, settings.data_folder)
     now = CollectorRegistry()
     now.register(_Figures(figures))
     text = generate_latest(request.app.state.metrics.registry) + generate_latest(now)
@@ -32,7 +33,7 @@ def metrics(
 @router.get("/audit")
 def audit(
     request: Request,
-    connection: ReadConnection,
+    database: DatabaseDep,
     caller: Admin,
     limit: Annotated[int, Query(ge=1, le=operations.MOST_CHANGES)] = 100,
     before: Annotated[
@@ -42,7 +43,8 @@ def audit(
     subject: Annotated[str | None, Query(description="Id of one of them.", max_length=300)] = None,
 ) -> dict[str, Any]:
     """Every change of a token, a block, a scene or a job, the newest first; it only grows."""
-    found = operations.list_changes(connection, limit, before, kind, subject)
+    with database.reading() as connection:
+        found = operations.list_changes(connection, limit, before, kind, subject)
     links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
     if len(found) == limit:
         following = str(request.url.include_query_params(before=found[-1].id))

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response, status
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import Reader, SettingsDep, WriteConnection
+from app.api.deps import DatabaseDep, Reader, SettingsDep
 from app.api.jobs import job_url, status_info
 from app.errors import InputError
 from app.usecases import jobs
@@ -97,7 +97,7 @@ def execute(
     body: Execute,
     request: Request,
     response: Response,
-    connection: WriteConnection,
+    database: DatabaseDep,
     settings: SettingsDep,
     caller: Reader,
     idempotency_key: Annotated[str | None, Header()] = None,
@@ -110,9 +110,10 @@ def execute(
     inputs = {name: _plain(request, name, value) for name, value in body.inputs.items()}
     asked = body.outputs
     outputs = None if asked is None else {name: one.transmission_mode for name, one in asked.items()}
-    job = jobs.execute(
-        connection, settings, caller, process_id, inputs, idempotency_key, outputs, body.response
-    )
+    with database.transaction() as connection:
+        job = jobs.execute(
+            connection, settings, caller, process_id, inputs, idempotency_key, outputs, body.response
+        )
     response.headers["Location"] = job_url(request, job)
     if "respond-async" in (prefer or ""):
         response.headers["Preference-Applied"] = "respond-async"

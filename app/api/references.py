@@ -6,7 +6,7 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.encoders import jsonable_encoder
 
-from app.api.deps import Admin, ReadConnection, Registrar, SettingsDep, WriteConnection
+from app.api.deps import Admin, DatabaseDep, Registrar, SettingsDep
 from app.db.references import ReferenceRow
 from app.usecases import references
 from app.usecases.references import NewReference
@@ -15,23 +15,26 @@ router = APIRouter(prefix="/references", tags=["references"])
 
 
 @router.get("")
-def list_references(connection: ReadConnection, caller: Registrar) -> dict[str, Any]:
+def list_references(database: DatabaseDep, caller: Registrar) -> dict[str, Any]:
     """The reference images, by name."""
-    return {"references": [_told(row) for row in references.list_references(connection)]}
+    with database.reading() as connection:
+        return {"references": [_told(row) for row in references.list_references(connection)]}
 
 
 @router.post("", status_code=201)
 def add_reference(
-    body: NewReference, connection: WriteConnection, settings: SettingsDep, caller: Admin
+    body: NewReference, database: DatabaseDep, settings: SettingsDep, caller: Admin
 ) -> dict[str, Any]:
     """Let scenes be registered on a reference image below AMERS_REFERENCE_FOLDER."""
-    return _told(references.add_reference(connection, settings, body))
+    with database.transaction() as connection:
+        return _told(references.add_reference(connection, settings, body))
 
 
 @router.delete("/{name}", status_code=204)
-def remove_reference(name: str, connection: WriteConnection, caller: Admin) -> None:
+def remove_reference(name: str, database: DatabaseDep, caller: Admin) -> None:
     """Use a reference image no longer; its files stay where they are."""
-    references.remove_reference(connection, name)
+    with database.transaction() as connection:
+        references.remove_reference(connection, name)
 
 
 def _told(row: ReferenceRow) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
 from app import errors
-from app.api.deps import ReadConnection, Reader, StorageDep
+from app.api.deps import DatabaseDep, Reader, StorageDep
 from app.api.files import file_reply
 from app.api.jobs import JobId, job_url
 from app.api.negotiation import JSON, SCHEMA_JSON
@@ -29,10 +29,11 @@ router = APIRouter(tags=["jobs"])
 
 @router.get("/jobs/{job_id}/results", response_class=Response)
 def show_results(
-    job_id: JobId, request: Request, connection: ReadConnection, storage: StorageDep, caller: Reader
+    job_id: JobId, request: Request, database: DatabaseDep, storage: StorageDep, caller: Reader
 ) -> Response:
     """What a job made, as its request asked for: all of it in a document if it said nothing."""
-    job = jobs.visible_job(connection, caller, job_id)
+    with database.reading() as connection:
+        job = jobs.visible_job(connection, caller, job_id)
     if job.state == "failed":
         return _failed(job)
     if job.state != "successful":
@@ -53,10 +54,11 @@ def show_results(
 
 @router.get("/jobs/{job_id}/results/{name}", response_class=Response)
 def download_result(
-    job_id: JobId, name: str, connection: ReadConnection, storage: StorageDep, caller: Reader
+    job_id: JobId, name: str, database: DatabaseDep, storage: StorageDep, caller: Reader
 ) -> Response:
     """One file of the results."""
-    job = jobs.visible_job(connection, caller, job_id)
+    with database.reading() as connection:
+        job = jobs.visible_job(connection, caller, job_id)
     return file_reply(storage, results.result_key(job, name), media_type(name))
 
 

@@ -10,7 +10,7 @@ from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
 from pydantic import BaseModel, Field
 
 from app.api.body import body_chunks
-from app.api.deps import DatabaseDep, ReadConnection, Registrar, SettingsDep, StorageDep, WriteConnection
+from app.api.deps import DatabaseDep, Registrar, SettingsDep, StorageDep, UploadTurn
 from app.api.files import file_reply
 from app.db.scenes import SceneRow
 from app.errors import InputError
@@ -38,7 +38,12 @@ class SceneOnServer(BaseModel):
     sigma_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
 
-@router.post("/scenes", status_code=status.HTTP_201_CREATED, openapi_extra={"requestBody": BINARY_BODY})
+@router.post(
+    "/scenes",
+    status_code=status.HTTP_201_CREATED,
+    dependencies=[UploadTurn],
+    openapi_extra={"requestBody": BINARY_BODY},
+)
 def upload_scene(
     request: Request,
     response: Response,
@@ -63,7 +68,11 @@ def upload_scene(
     return _scene(scene)
 
 
-@router.put("/scenes/{scene_id}/files/{name}", openapi_extra={"requestBody": BINARY_BODY})
+@router.put(
+    "/scenes/{scene_id}/files/{name}",
+    dependencies=[UploadTurn],
+    openapi_extra={"requestBody": BINARY_BODY},
+)
 def upload_beside(
     scene_id: UUID,
     name: str,
@@ -85,10 +94,11 @@ def upload_beside(
 
 @router.get("/scenes/{scene_id}/files/{name}", response_class=Response)
 def download_file(
-    scene_id: UUID, name: str, connection: ReadConnection, storage: StorageDep, caller: Registrar
+    scene_id: UUID, name: str, database: DatabaseDep, storage: StorageDep, caller: Registrar
 ) -> Response:
     """The image of a scene, or a file that was laid beside it, as it was sent."""
-    key = scenes.file_key(connection, caller, scene_id, name)
+    with database.reading() as connection:
+        key = scenes.file_key(connection, caller, scene_id, name)
     return file_reply(storage, key, scene_media_type(name))
 
 
@@ -97,44 +107,48 @@ def refer_to_scene(
     body: SceneOnServer,
     request: Request,
     response: Response,
-    connection: WriteConnection,
+    database: DatabaseDep,
     settings: SettingsDep,
     caller: Registrar,
 ) -> dict[str, Any]:
     """Take in a scene that lies on the server, below the folder of `AMERS_SCENE_FOLDER`."""
-    scene = scenes.refer_to_scene(connection, settings, caller, body.path, body.sigma_m)
+    with database.transaction() as connection:
+        scene = scenes.refer_to_scene(connection, settings, caller, body.path, body.sigma_m)
     response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
     return _scene(scene)
 
 
 @router.get("/scenes")
 def list_scenes(
-    connection: ReadConnection,
+    database: DatabaseDep,
     caller: Registrar,
     limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
 ) -> dict[str, Any]:
     """The caller's scenes, the newest first; everybody's for an administrator."""
-    found = scenes.list_scenes(connection, caller, limit)
+    with database.reading() as connection:
+        found = scenes.list_scenes(connection, caller, limit)
     return {"scenes": [_scene(scene) for scene in found]}
 
 
 @router.get("/scenes/{scene_id}")
-def show_scene(scene_id: UUID, connection: ReadConnection, caller: Registrar) -> dict[str, Any]:
+def show_scene(scene_id: UUID, database: DatabaseDep, caller: Registrar) -> dict[str, Any]:
     """One scene."""
-    scene = scenes.visible_scene(connection, caller, scene_id)
+    with database.reading() as connection:
+        scene = scenes.visible_scene(connection, caller, scene_id)
     return _scene(scene)
 
 
 @router.delete("/scenes/{scene_id}", status_code=status.HTTP_204_NO_CONTENT)
 def remove_scene(
     scene_id: UUID,
-    connection: WriteConnection,
+    database: DatabaseDep,
     storage: StorageDep,
     caller: Registrar,
     after_commit: BackgroundTasks,
 ) -> None:
     """Remove the files of a scene; its record, its jobs and their results stay."""
-    scenes.remove_scene(connection, caller, scene_id)
+    with database.transaction() as connection:
+        scenes.remove_scene(connection, caller, scene_id)
     after_commit.add_task(scenes.delete_files, storage, scene_id)
 
 

@@ -111,7 +111,7 @@ class ItemSearch(BaseModel):
         )
 
 
-def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
+async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
     return viewer_of(SCENES, caller, settings)
 
 

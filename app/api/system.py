@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from app.api import processes, stac
-from app.api.deps import ReadConnection
+from app.api.deps import DatabaseDep
 from app.api.documents import document_of
 from app.api.features import Format
 from app.api.negotiation import DOCUMENTS, HTML, JSON, OPENAPI_JSON, chosen_format, refuse_unknown
@@ -116,7 +116,8 @@ def alive() -> dict[str, str]:
 
 
 @router.get("/readyz")
-def ready(connection: ReadConnection) -> dict[str, str]:
+def ready(database: DatabaseDep) -> dict[str, str]:
     """The database answers too."""
-    connection.execute("select postgis_version()")
+    with database.reading() as connection:
+        connection.execute("select postgis_version()")
     return {"status": "ready"}

@@ -5,7 +5,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from app.api.deps import ReadConnection
+from app.api.deps import DatabaseDep
 from app.api.documents import json_of
 from app.api.features import CollectionDep, ViewerDep
 from app.api.negotiation import JSON, MVT
@@ -94,16 +94,17 @@ def tile(
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
-    connection: ReadConnection,
+    database: DatabaseDep,
 ) -> Response:
     """A vector tile; z, y, x are tile matrix, row and column."""
     _refuse_other(matrix_set)
-    said = f"{tiles.version(connection)} {collection.id} {z} {y} {x} {viewer.is_admin}"
-    tag = f'"{hashlib.sha256(said.encode()).hexdigest()[:20]}"'
-    headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
-    if request.headers.get("if-none-match") == tag:
-        return Response(status_code=304, headers=headers)
-    content = tiles.tile(connection, collection.id, z, y, x, viewer)
+    with database.reading() as connection:
+        said = f"{tiles.version(connection)} {collection.id} {z} {y} {x} {viewer.is_admin}"
+        tag = f'"{hashlib.sha256(said.encode()).hexdigest()[:20]}"'
+        headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        content = tiles.tile(connection, collection.id, z, y, x, viewer)
     return Response(content, media_type=MVT, headers=headers)
 
 

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.encoders import jsonable_encoder
 from pydantic import BaseModel, ConfigDict
 
-from app.api.deps import Admin, CallerDep, ReadConnection, WriteConnection
+from app.api.deps import Admin, CallerDep, DatabaseDep
 from app.auth import Scope
 from app.db.tokens import Token
 from app.errors import NotAllowed
@@ -37,21 +37,23 @@ class TokenToMake(BaseModel):
 
 @router.post("", status_code=201)
 def create(
-    body: TokenToMake, request: Request, response: Response, connection: WriteConnection, caller: Admin
+    body: TokenToMake, request: Request, response: Response, database: DatabaseDep, caller: Admin
 ) -> dict[str, Any]:
     """Make a token; the reply holds its secret, this once."""
-    new = tokens.create_token(
-        connection, body.name, body.scopes, body.days, body.upload_quota_bytes, body.job_quota
-    )
+    with database.transaction() as connection:
+        new = tokens.create_token(
+            connection, body.name, body.scopes, body.days, body.upload_quota_bytes, body.job_quota
+        )
     response.headers["Location"] = f"{request.base_url}tokens/{new.token.id}"
     response.headers["Cache-Control"] = "no-store"
     return {**_record(new.token), "secret": new.secret}
 
 
 @router.get("")
-def list_tokens(connection: ReadConnection, caller: Admin) -> dict[str, Any]:
+def list_tokens(database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """All tokens, the newest first, revoked and expired ones too; never a secret."""
-    return {"tokens": [_record(token) for token in tokens.list_tokens(connection)]}
+    with database.reading() as connection:
+        return {"tokens": [_record(token) for token in tokens.list_tokens(connection)]}
 
 
 @router.get("/self")
@@ -63,9 +65,10 @@ def own_token(caller: CallerDep) -> dict[str, Any]:
 
 
 @router.delete("/{token_id}")
-def revoke(token_id: str, connection: WriteConnection, caller: Admin) -> dict[str, Any]:
+def revoke(token_id: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Refuse a token from now on, by its id or its name."""
-    return _record(tokens.revoke_token(connection, token_id))
+    with database.transaction() as connection:
+        return _record(tokens.revoke_token(connection, token_id))
 
 
 def _record(token: Token) -> dict[str, Any]:

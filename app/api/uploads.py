@@ -14,11 +14,10 @@ from starlette.requests import ClientDisconnect
 from app.api.body import body_chunks
 from app.api.deps import (
     DatabaseDep,
-    ReadConnection,
     Registrar,
     SettingsDep,
     StorageDep,
-    WriteConnection,
+    UploadTurn,
 )
 from app.api.replies import problem
 from app.db.uploads import UploadRow
@@ -37,7 +36,7 @@ PIECE_BODY = {"content": {PIECE: {"schema": {"type": "string", "format": "binary
 Size = Annotated[int, Header(ge=0)]
 
 
-def _version(tus_resumable: Annotated[str | None, Header()] = None) -> None:
+async def _version(tus_resumable: Annotated[str | None, Header()] = None) -> None:
     if tus_resumable != VERSION:
         told = {"Tus-Version": VERSION}
         raise HTTPException(412, f"Tus-Resumable: this is tus {VERSION}, not {tus_resumable}", told)
@@ -62,7 +61,7 @@ def capabilities(settings: SettingsDep) -> Response:
 @router.post("", status_code=201, dependencies=[Version])
 def create(
     request: Request,
-    connection: WriteConnection,
+    database: DatabaseDep,
     storage: StorageDep,
     settings: SettingsDep,
     caller: Registrar,
@@ -76,15 +75,17 @@ def create(
     the reply is the scene.
     """
     new = _announced(upload_length, upload_metadata)
-    upload = uploads.begin(connection, storage, settings, caller, new)
+    with database.transaction() as connection:
+        upload = uploads.begin(connection, storage, settings, caller, new)
     place = {"Location": f"{request.base_url}uploads/{upload.id}"}
     return Response(status_code=201, headers=_headers(upload) | place)
 
 
 @router.head("/{upload_id}", dependencies=[Version])
-def ask(upload_id: UUID, connection: ReadConnection, storage: StorageDep, caller: Registrar) -> Response:
+def ask(upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar) -> Response:
     """How much has arrived."""
-    upload = uploads.find(connection, caller, upload_id)
+    with database.reading() as connection:
+        upload = uploads.find(connection, caller, upload_id)
     told = {
         "Upload-Offset": str(uploads.offset(storage, upload)),
         "Upload-Length": str(upload.size_bytes),
@@ -95,10 +96,11 @@ def ask(upload_id: UUID, connection: ReadConnection, storage: StorageDep, caller
 
 @router.get("/{upload_id}")
 def show(
-    upload_id: UUID, connection: ReadConnection, storage: StorageDep, caller: Registrar
+    upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar
 ) -> dict[str, Any]:
     """An upload, for those who do not speak tus."""
-    upload = uploads.find(connection, caller, upload_id)
+    with database.reading() as connection:
+        upload = uploads.find(connection, caller, upload_id)
     return {
         "id": upload.id,
         "state": "arriving" if upload.finished_at is None else "finished",
@@ -115,7 +117,7 @@ def show(
 @router.patch(
     "/{upload_id}",
     status_code=204,
-    dependencies=[Version],
+    dependencies=[Version, UploadTurn],
     openapi_extra={"requestBody": PIECE_BODY},
 )
 def send(
@@ -153,11 +155,10 @@ def send(
 
 
 @router.delete("/{upload_id}", status_code=204, dependencies=[Version])
-def end(
-    upload_id: UUID, connection: WriteConnection, storage: StorageDep, caller: Registrar
-) -> Response:
+def end(upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar) -> Response:
     """End an upload that is not complete; what has arrived of it is forgotten."""
-    uploads.drop(connection, storage, uploads.find(connection, caller, upload_id))
+    with database.transaction() as connection:
+        uploads.drop(connection, storage, uploads.find(connection, caller, upload_id))
     return Response(status_code=204, headers=TUS)
 
 

@@ -1,6 +1,7 @@
 """Connections, pools and the version of the schema."""
 
 import logging
+import select
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -54,7 +55,11 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """One read-only transaction; every statement of it has the time limit of the settings."""
+        """A connection that can only read; every statement has the time limit of the settings.
+
+        Each statement is a transaction: several in one would see what others commit between them all the
+        same, for two exchanges with the database more.
+        """
         with self.reader.connection() as connection:
             yield connection
 
@@ -110,7 +115,7 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
     else:
         log.warning("reading as the role of the database's owner: there is no usable %s", READER)
     with (
-        _pool(dsn, settings.pool_size, {"options": reading}) as reader,
+        _pool(dsn, settings.pool_size, {"options": reading, "autocommit": True}) as reader,
         _pool(dsn, settings.pool_size, {}) as writer,
     ):
         yield Database(dsn, reader, writer)
@@ -246,18 +251,31 @@ def _pool(dsn: str, size: int, options: dict[str, Any]) -> Pool:
         timeout=10.0,
         connection_class=psycopg.Connection[DictRow],
         kwargs={"row_factory": dict_row, **options},
-        check=ConnectionPool.check_connection,
+        check=_ask_if_suspect,
         configure=_warm,
     )
 
 
+def _ask_if_suspect(connection: Connection) -> None:
+    """Ask the database for a sign of life where the line is not silent: it tells of its end unasked.
+
+    Raises:
+        OperationalError: there is none; the pool takes another connection.
+    """
+    line = select.poll()
+    line.register(connection.fileno(), select.POLLIN)
+    if line.poll(0):
+        ConnectionPool.check_connection(connection)
+
+
 def _warm(connection: Connection) -> None:
     """Make a new connection ready for its first query; a database without PostGIS has none to get."""
-    # However long that takes: the limit is for what callers ask. It goes with the transaction.
-    connection.execute("set local statement_timeout = 0")
-    with suppress(psycopg.errors.UndefinedFunction, psycopg.errors.UndefinedObject):
+    without_postgis = (psycopg.errors.UndefinedFunction, psycopg.errors.UndefinedObject)
+    with suppress(*without_postgis), connection.transaction():
+        # However long that takes: the limit is for what callers ask. It goes with the transaction.
+        connection.execute("set local statement_timeout = 0")
         connection.execute(FIRST_SPATIAL_PLAN)
-    connection.rollback()
+    connection.commit()
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from app.api import replies
-from app.api.deps import Admin, PointsReader, ReadConnection, Reader, Registrar, WriteConnection
+from app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
 from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
 from app.main import create_app
 from app.usecases.tokens import create_token, list_tokens
@@ -23,8 +23,9 @@ def app(settings):
     app.add_api_route("/door/points", door(PointsReader))
 
     @app.get("/number/{number}")
-    def number(number: int, connection: ReadConnection) -> int:
-        return connection.execute("select %s / nullif(%s, 0) as it", [10, number]).fetchone()["it"]
+    def number(number: int, database: DatabaseDep) -> int:
+        with database.reading() as connection:
+            return connection.execute("select %s / nullif(%s, 0) as it", [10, number]).fetchone()["it"]
 
     @app.post("/echo")
     def echo(body: dict) -> dict:
@@ -35,15 +36,17 @@ def app(settings):
         return body
 
     @app.post("/token/{name}")
-    def keep(name: str, connection: WriteConnection) -> str:
-        create_token(connection, name, ["read"])
-        if name == "spoiled":
-            raise Conflict("spoiled")
+    def keep(name: str, database: DatabaseDep) -> str:
+        with database.transaction() as connection:
+            create_token(connection, name, ["read"])
+            if name == "spoiled":
+                raise Conflict("spoiled")
         return name
 
     @app.get("/slow")
-    def slow(connection: ReadConnection) -> None:
-        connection.execute("select pg_sleep(20)")
+    def slow(database: DatabaseDep) -> None:
+        with database.reading() as connection:
+            connection.execute("select pg_sleep(20)")
 
     return app
 

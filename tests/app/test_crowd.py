@@ -1,0 +1,124 @@
+"""Many more requests at once than there are threads and connections: all are answered."""
+
+from collections.abc import AsyncIterator
+from itertools import cycle, islice
+from pathlib import Path
+
+import anyio
+import httpx
+import pytest
+from anyio import to_thread
+from fastapi import FastAPI
+
+from app.api import deps
+from app.config import Settings
+from app.db import engine, features
+from app.main import create_app
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from tests.factories import make_block
+
+POINTS = 60
+TIMES_MORE = 6
+FIRST_ID = 1 << 26
+CONNECTIONS = 1
+ITEMS = "/collections/points/items"
+SCENES = "/scenes?name=a.tif"
+IMAGE = b"II*\0"
+
+
+@pytest.fixture
+def app(dsn: str, tmp_path: Path) -> FastAPI:
+    """An application with one connection for reading and one for writing, and a block of 60 points."""
+    settings = Settings(database_url=dsn, data_folder=tmp_path / "data", pool_size=CONNECTIONS)
+    with engine.connect(dsn) as connection:
+        made = make_block(tmp_path / "block", count=POINTS)
+        ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
+        publish_block(connection, "calanques")
+    return create_app(settings)
+
+
+def client_of(app: FastAPI, headers: dict[str, str] | None = None) -> httpx.AsyncClient:
+    """A client within the process of a started application."""
+    return httpx.AsyncClient(
+        transport=httpx.ASGITransport(app), base_url="http://service", headers=headers
+    )
+
+
+async def answered(app: FastAPI, requests: list[httpx.Request]) -> list[httpx.Response]:
+    """The replies to requests that are all sent at once."""
+    replies: list[httpx.Response] = []
+    async with app.router.lifespan_context(app), anyio.create_task_group() as tasks:
+        client = client_of(app)
+
+        async def send(request: httpx.Request) -> None:
+            replies.append(await client.send(request))
+
+        for request in requests:
+            tasks.start_soon(send, request)
+    return replies
+
+
+def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
+    app: FastAPI, bearer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Pages of more pieces than are read ahead: they hold their connection while others wait for it.
+    monkeypatch.setattr(features, "ROWS_AT_ONCE", POINTS // 6)
+    kinds = [
+        ("GET", f"http://service{ITEMS}/{FIRST_ID}", 200),
+        ("GET", f"http://service{ITEMS}?limit=10000", 200),
+        ("GET", f"http://service{ITEMS}/{FIRST_ID + 1}/chips", 200),
+        ("GET", "http://service/tokens", 200),
+        ("POST", "http://service/tokens", 201),
+    ]
+    headers = bearer("admin")
+    body = {"name": "one of many", "scopes": ["read"]}
+    many = TIMES_MORE * deps.threads_for(Settings(pool_size=CONNECTIONS))
+    requests = [
+        httpx.Request(how, url, headers=headers, json=body if how == "POST" else None)
+        for how, url, _ in islice(cycle(kinds), many)
+    ]
+    replies = anyio.run(answered, app, requests)
+    assert len(replies) == many
+    told = {(reply.request.method, str(reply.url), reply.status_code) for reply in replies}
+    assert told == set(kinds)
+    pages = [reply.json() for reply in replies if reply.url.path.endswith("/items")]
+    assert {page["numberReturned"] for page in pages} == {POINTS}
+
+
+def test_an_upload_too_many_is_told_to_come_again_and_nobody_else_notices(app: FastAPI, bearer) -> None:
+    async def crowded() -> None:
+        arrived, go_on = anyio.Event(), anyio.Event()
+
+        async def slowly() -> AsyncIterator[bytes]:
+            yield IMAGE
+            arrived.set()
+            await go_on.wait()
+
+        async with app.router.lifespan_context(app), anyio.create_task_group() as tasks:
+            app.state.upload_turns.total_tokens = 1
+            client = client_of(app, bearer("register"))
+
+            async def send() -> None:
+                assert (await client.post(SCENES, content=slowly())).status_code == 201
+
+            tasks.start_soon(send)
+            await arrived.wait()
+            refused = await client.post(SCENES, content=IMAGE)
+            assert refused.status_code == 503
+            assert refused.headers["retry-after"]
+            assert (await client.get(f"{ITEMS}/{FIRST_ID}")).status_code == 200
+            go_on.set()
+            while app.state.upload_turns.borrowed_tokens:
+                await anyio.sleep(0.01)
+            assert (await client.post(SCENES, content=IMAGE)).status_code == 201
+
+    anyio.run(crowded)
+
+
+def test_uploads_leave_threads_for_all_connections(app: FastAPI) -> None:
+    async def threads() -> float:
+        async with app.router.lifespan_context(app):
+            return to_thread.current_default_thread_limiter().total_tokens
+
+    assert anyio.run(threads) - deps.UPLOADS_AT_ONCE >= 2 * CONNECTIONS
