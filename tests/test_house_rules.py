@@ -14,6 +14,7 @@ from app.cli.main import app
 from app.config import Settings
 
 ROOT = Path(__file__).parent.parent
+HEAVY = {"numba", "scipy", "cv2", "rasterio", "matplotlib", "pyarrow", "fastapi"}
 README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
 TOUR = (
@@ -85,6 +86,19 @@ def test_a_command_is_documented_and_explains_itself(words):
     for word in words.split()[1:]:
         command = command.commands[word]
     assert command.help
+
+
+def test_a_command_starts_without_what_only_others_need():
+    program = (
+        "import atexit, sys; from app.cli.main import main\n"
+        f"atexit.register(lambda: print({HEAVY} & set(sys.modules)))\n"
+        "sys.argv = ['amers', 'token', '--help']\n"
+        "main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "set()", done.stdout + done.stderr
 
 
 def test_only_the_settings_read_the_environment():

@@ -5,34 +5,67 @@ Exit codes: 0 done, 2 the input cannot be used, 3 the scene could not be registe
 
 import signal
 import sys
+from collections import UserDict
+from importlib import import_module
 from types import FrameType
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command, get_group
 
-from app.cli import audit, block, db, demo, points, production, reference, scene, serve, token, worker
 from app.errors import AmersError, ComputationError
 
 EXIT_REFUSED = 2
 EXIT_NOT_REGISTERED = 3
 EXIT_INTERRUPTED = 130
 
+NAMES = (
+    "block",
+    "points",
+    "scene",
+    "reference",
+    "production",
+    "db",
+    "token",
+    "demo",
+    "serve",
+    "worker",
+    "audit",
+)
+"""Groups of commands, and commands, each in the module of its name."""
+
+
+class Commands(UserDict[str, Any]):
+    """The commands by name; the file of one is read when it is asked for: some bring all the science."""
+
+    def __getitem__(self, name: str) -> Any:
+        if self.data[name] is None:
+            module = import_module(f"app.cli.{name}")
+            self.data[name] = get_group(module.app) if hasattr(module, "app") else _single(module, name)
+            self.data[name].name = name
+        return self.data[name]
+
+
+class Amers(TyperGroup):
+    """The group of all commands."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(**more)
+        self.commands = Commands(dict.fromkeys(NAMES))
+
+
 app = typer.Typer(
     name="amers",
-    help="An open base of 3D ground control points, and the registration of satellite scenes on them.",
+    cls=Amers,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-app.add_typer(block.app, name="block")
-app.add_typer(points.app, name="points")
-app.add_typer(scene.app, name="scene")
-app.add_typer(reference.app, name="reference")
-app.add_typer(production.app, name="production")
-app.add_typer(db.app, name="db")
-app.add_typer(token.app, name="token")
-app.command("demo")(demo.demo)
-app.command("serve")(serve.serve)
-app.command("worker")(worker.worker)
-app.command("audit")(audit.audit)
+
+
+@app.callback()
+def amers() -> None:
+    """An open base of 3D ground control points, and the registration of satellite scenes on them."""
 
 
 def main() -> None:
@@ -47,6 +80,13 @@ def main() -> None:
         sys.exit(EXIT_NOT_REGISTERED if isinstance(error, ComputationError) else EXIT_REFUSED)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
+
+
+def _single(module: Any, name: str) -> Any:
+    """A command that is no group: the function of its name."""
+    one = typer.Typer(add_completion=False)
+    one.command(name)(getattr(module, name))
+    return get_command(one)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
