@@ -10,6 +10,8 @@ from services.types import Array, BoolArray, ControlPoints
 _CHIPS_TO_SCENE = 1.25
 """How much coarser than the scene chips may be that are not the finest."""
 _NEARLY_AS_MANY = 0.8
+_SURE_PX = 1e-3
+"""A place known better than this is known."""
 
 
 def fine_gsd_m(scene: Scene, points: ControlPoints, uncertainty_m: Array) -> float:
@@ -37,9 +39,14 @@ def fine_gsd_m(scene: Scene, points: ControlPoints, uncertainty_m: Array) -> flo
 
 
 def chance_of_being_shown(
-    scene: Scene, points: ControlPoints, line_sample: Array, gsd_m: float, uncertainty_m: Array
+    scene: Scene,
+    points: ControlPoints,
+    line_sample: Array,
+    gsd_m: float,
+    uncertainty_m: Array,
+    share: float = 1.0,
 ) -> Array:
-    """Chance (n,) that the scene shows the chips of points whole, its error being normal.
+    """Chance (n,) that the scene shows the chips of points, its error being normal.
 
     Args:
         scene: where it is does not count, only its size.
@@ -47,11 +54,12 @@ def chance_of_being_shown(
         line_sample: (n, 2) where they are expected.
         gsd_m: ground sampling of the chips.
         uncertainty_m: (n,) standard deviation of that.
+        share: of the side of the chips, round their points, that has to be shown.
     """
     middle = points.lon_lat_h[len(points) // 2 : len(points) // 2 + 1]
     derivative = np.abs(scene.model.project_derivative(middle)[0, :, :2])
-    reach_px = CHIP_CENTRE * gsd_m * derivative.sum(axis=1)
-    sigma_px = (uncertainty_m / scene_gsd_m(scene))[:, None]
+    reach_px = share * CHIP_CENTRE * gsd_m * derivative.sum(axis=1)
+    sigma_px = np.maximum(uncertainty_m / scene_gsd_m(scene), _SURE_PX)[:, None]
     room_px = np.array(scene.image.shape) - 1.0 - reach_px
     inside = ndtr((room_px - line_sample) / sigma_px) - ndtr((reach_px - line_sample) / sigma_px)
     return np.asarray(np.nan_to_num(np.maximum(inside, 0.0)).prod(axis=1))

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
-from services.chip_choice import chance_of_being_shown, fine_gsd_m
+from services.chip_choice import fine_gsd_m
 from services.coarse import CoarseOptions, search_coarsely
-from services.errors import CoverageError, InputError, NoConsensus, NotEnoughPoints
+from services.errors import InputError, NoConsensus, NotEnoughPoints
 from services.imagery import KeptWindows
 from services.matching.consensus import agreeing_points, consensus_tolerance_px
 from services.matching.points import MatchingOptions, PointMatches, match_points
-from services.matching.predict import inside, spread_over_image
 from services.passes import (
     Pass,
     adjust_on,
@@ -21,6 +20,7 @@ from services.passes import (
     search_radius_px,
     summarised,
 )
+from services.point_choice import points_to_try, start_uncertainty_m, visible_points
 from services.quality.qualification import Qualification, QualificationOptions, qualify
 from services.scene import Scene, scene_gsd_m
 from services.sensors.base import SensorModel
@@ -37,10 +37,6 @@ from services.types import (
     no_progress,
     part_of,
 )
-
-WORTH_TRYING = 0.2
-"""Where there are more points than are tried, those are left out whose chip the scene shows whole with a
-chance less than this share of the best one's."""
 
 
 @dataclass(frozen=True)
@@ -114,18 +110,18 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
     """
-    visible, chosen = _choose_points(scene, points, options)
-    tried = points.take(chosen)
+    visible = visible_points(scene, points)
+    shown = points.take(visible)
     model = CorrectedModel(scene.model, no_correction(scene.image.shape))
-    uncertainty_m = _start_uncertainty(scene, tried)
-    fine_m = fine_gsd_m(scene, tried, uncertainty_m)
+    uncertainty_m = start_uncertainty_m(scene, shown)
+    fine_m = fine_gsd_m(scene, shown, uncertainty_m)
     passes: list[Pass] = []
 
     if 3.0 * uncertainty_m.max() / fine_m > options.coarse.max_fine_radius_px:
         model, uncertainty_m, done = search_coarsely(
             scene,
             model,
-            tried,
+            shown,
             chips,
             uncertainty_m,
             options.coarse,
@@ -136,7 +132,9 @@ def register_scene(
         passes.append(done)
     image = KeptWindows(scene.image)
     for number in range(options.fine_passes):
-        radius_px = search_radius_px(uncertainty_m, fine_m, options.coarse.max_search_px)
+        chosen = points_to_try(scene, model, shown, uncertainty_m, options.max_points)
+        tried = shown.take(chosen)
+        radius_px = search_radius_px(uncertainty_m[chosen], fine_m, options.coarse.max_search_px)
         part = part_of(progress, 0.3 + 0.6 * number / options.fine_passes, 0.6 / options.fine_passes)
         matches = match_points(
             image,
@@ -153,13 +151,13 @@ def register_scene(
         adjustment = adjust_on(scene, tried, matches, agreeing, options.adjustment)
         passes.append(summarised("fine", fine_m, radius_px, matches, agreeing))
         model = CorrectedModel(scene.model, adjustment.correction)
-        uncertainty_m = model_uncertainty_m(model, tried, adjustment)
+        uncertainty_m = model_uncertainty_m(model, shown, adjustment)
 
     progress(0.95, "qualifying the result")
     registration = qualified(
         scene,
         points,
-        (visible, chosen),
+        (visible, visible[chosen]),
         matches,
         adjustment,
         tuple(passes),
@@ -216,50 +214,6 @@ def qualified(
     model = CorrectedModel(scene.model, adjustment.correction)
     views = replace(matches.tried, point=row_of_tried[matches.tried.point])
     return Registration(model, adjustment, measures, views, passes, qualification)
-
-
-def _choose_points(
-    scene: Scene, points: ControlPoints, options: RegistrationOptions
-) -> tuple[IntArray, IntArray]:
-    """Rows of the points the scene may show, and of those to try; both ascending."""
-    if len(points) == 0:
-        raise CoverageError("no control point lies in the footprint of the scene")
-    predicted = scene.model.project(points.lon_lat_h)
-    margin_px = 3.0 * scene.sigma_m / scene_gsd_m(scene)
-    visible = np.flatnonzero(inside(predicted, scene.image.shape, margin_px))
-    if len(visible) == 0:
-        raise CoverageError(
-            f"none of the {len(points)} control points lies in the scene, "
-            f"even with {margin_px:.0f} px of margin for its accuracy of {scene.sigma_m:g} m"
-        )
-    spread_m2 = np.trace(points.covariance_m2[visible], axis1=1, axis2=2)
-    preference = points.saliency[visible] * points.health[visible]
-    preference /= 1.0 + spread_m2 / max(float(np.median(spread_m2)), 1e-12)
-    count = options.max_points or len(visible)
-    likely = _likely_shown(scene, points.take(visible), predicted[visible], count)
-    best = spread_over_image(
-        predicted[visible[likely]],
-        points.lon_lat_h[visible[likely], 2],
-        preference[likely],
-        scene.image.shape,
-        count,
-    )
-    return visible, np.sort(visible[likely[best]])
-
-
-def _likely_shown(scene: Scene, points: ControlPoints, line_sample: Array, count: int) -> IntArray:
-    """Rows of the points to choose from: all, or when they are many those likely to be shown whole."""
-    if len(points) <= count:
-        return np.arange(len(points))
-    uncertainty_m = _start_uncertainty(scene, points)
-    finest_m = float(points.views.gsd_m.min())
-    chance = chance_of_being_shown(scene, points, line_sample, finest_m, uncertainty_m)
-    return np.flatnonzero(chance >= WORTH_TRYING * chance.max())
-
-
-def _start_uncertainty(scene: Scene, points: ControlPoints) -> Array:
-    """Standard deviation (n,) of where the delivered model expects the points, metres."""
-    return np.asarray(np.sqrt(scene.sigma_m**2 + points.covariance_m2[:, [0, 1], [0, 1]].max(axis=1)))
 
 
 def agreement(

@@ -10,6 +10,7 @@ from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, r
 from services.intersection import move_metres
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
+from services.matching.middle import middle_of, shown_half_side
 from services.matching.radiometry import clouded, edges, looks_of
 from services.matching.shadows import ShadowMove, shadow_move
 from services.matching.shared_error import common_covariance_px2
@@ -111,7 +112,7 @@ def match_points(
         reduction: chips are degraded to so many times their ground sampling before they are searched.
     """
     n = len(points)
-    level_m, size = gsd_m * reduction, 2 * (CHIP_CENTRE // reduction + radius_px) + 1
+    level_m, whole = gsd_m * reduction, CHIP_CENTRE // reduction
     displacement_m = np.full((n, 2), np.nan)
     sigma_m = np.full(n, np.nan)
     score = np.full(n, np.nan)
@@ -133,7 +134,7 @@ def match_points(
             reason[row] = "no_chip"
             continue
         ground = points.lon_lat_h[row]
-        patch = render_chip(image, model, ground, level_m, size)
+        patch = render_chip(image, model, ground, level_m, 2 * (whole + radius_px) + 1)
         if not np.isfinite(patch).any():
             reason[row] = "nodata"
             continue
@@ -141,7 +142,9 @@ def match_points(
         stack = point_chips(points, chips, row)
         ratio = scene_gsd_m[row] / gsd_m
         looks[row] = looks_of(patch)
-        like_scene = [_as_seen(stack[number], ratio, reduction) for number in numbers]
+        half = shown_half_side(patch, whole, radius_px)
+        patch = middle_of(patch, half + radius_px)
+        like_scene = [middle_of(_as_seen(stack[number], ratio, reduction), half) for number in numbers]
         moves = [shadows[image] for image in points.views.image[rows]]
         peaks, combined, by_gradient[row] = _search(patch, like_scene, moves, options)
         row_col, sigma, agreeing, reason[row] = combined

@@ -7,8 +7,8 @@ from numba import njit
 
 from services.types import Acquisition, Array, FloatImage
 
-CASTER_M = 8.0
-"""How high that is which casts shadows: houses of two floors, trees."""
+CASTER_M = 6.0
+"""How high that is which casts shadows: houses of two floors, small trees."""
 
 
 @dataclass(frozen=True)

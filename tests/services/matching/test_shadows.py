@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.shadows import shadow_move, shadow_of, steady_weights
+from services.matching.shadows import CASTER_M, shadow_move, shadow_of, steady_weights
 from services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
 
@@ -86,8 +86,8 @@ def test_under_the_same_sun_all_pixels_count_alike() -> None:
 def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
     move = shadow_move(JUNE, EVENING, GSD_M)
     assert move is not None
-    north = 8.0 / tan(radians(63.0)) / GSD_M
-    east = 8.0 / tan(radians(38.0)) / GSD_M
+    north = CASTER_M / tan(radians(63.0)) / GSD_M
+    east = CASTER_M / tan(radians(38.0)) / GSD_M
     np.testing.assert_allclose(move.move_px, [north, east])
     np.testing.assert_allclose(move.away / np.linalg.norm(move.away), [-1.0, 0.0], atol=1e-12)
 

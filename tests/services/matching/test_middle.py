@@ -1,0 +1,52 @@
+"""Where a scene ends beside a point, the middle of its chip is searched."""
+
+import numpy as np
+import pytest
+
+from services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from services.matching.middle import middle_of, shown_half_side
+from services.types import FloatImage
+from tests.services.textures import as_pixels, moved, texture
+
+HALF, RADIUS_PX = 50, 6
+SIDE = 2 * (HALF + RADIUS_PX) + 1
+a_twentieth_of_a_pixel = 0.05
+
+
+def patch_without(columns: int) -> FloatImage:
+    patch = np.ones((SIDE, SIDE), dtype=np.float32)
+    patch[:, :columns] = np.nan
+    return patch
+
+
+def test_a_patch_without_gaps_shows_the_whole_chip() -> None:
+    assert shown_half_side(patch_without(0), HALF, RADIUS_PX) == HALF
+
+
+@pytest.mark.parametrize("missing", [1, 10, 25])
+def test_what_is_missing_at_one_side_is_left_out_at_all(missing: int) -> None:
+    assert shown_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF - missing
+
+
+@pytest.mark.parametrize("missing", [26, 56, SIDE])
+def test_less_than_half_of_a_chip_is_not_searched(missing: int) -> None:
+    assert shown_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF
+
+
+def test_one_missing_pixel_decides_wherever_it_lies() -> None:
+    patch = patch_without(0)
+    patch[SIDE // 2 + 40, SIDE // 2 - 3] = np.nan
+    assert shown_half_side(patch, HALF, RADIUS_PX) == 39 - RADIUS_PX
+
+
+def test_the_middle_of_a_chip_is_found_where_the_whole_one_is() -> None:
+    ground = texture(np.random.default_rng(5), 128, 1.5)
+    shift = 1.3, -2.4
+    chip = as_pixels(ground[RADIUS_PX : RADIUS_PX + 2 * HALF + 1, RADIUS_PX : RADIUS_PX + 2 * HALF + 1])
+    patch = as_pixels(moved(ground, *shift)[:SIDE, :SIDE])
+    patch[:, :17] = np.nan
+    half = shown_half_side(patch, HALF, RADIUS_PX)
+    peak = find_chip(middle_of(patch, half + RADIUS_PX), middle_of(chip, half), CorrelationOptions())
+    assert peak.reason == FOUND
+    np.testing.assert_allclose(peak.row_col, shift, atol=a_twentieth_of_a_pixel)
+    assert find_chip(patch, chip, CorrelationOptions()).reason == "nodata"
