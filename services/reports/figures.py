@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from services.quality.accuracy import statistics
 from services.reports.drawing import (
@@ -133,6 +134,7 @@ def residual_histograms(summary: RegistrationSummary) -> Figure:
     ):
         style(axes)
         axes.set_xlabel(f"{name}, px")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=4, prune="both"))
         finite = values[np.isfinite(values)]
         if not len(finite):
             continue

@@ -83,6 +83,7 @@ def _environment() -> Environment:
     )
     environment.filters.update(
         number=number,
+        angle=lambda value: ABSENT if value != value else f"{value:.1f}°",
         percent=percent,
         quantile=quantile,
         words=criterion_words,

@@ -121,7 +121,7 @@ def test_the_page_shows_the_figures_of_the_report(summarised):
         f"{found.coverage.percent:.0f} %",
         f"{found.predicted.worst_m:.2f} m",
         f"{found.image_residuals_px.x.std:.3f}",
-        "calanques 1",
+        "calanques, version 1",
     ):
         assert shown in texts
 
