@@ -1,5 +1,13 @@
-# The API and the worker: one image, two commands. Without AMERS_DATABASE_URL it would need PostgreSQL's
-# binaries, which it does not have: see docker-compose.yml.
+# The API with its map page, and the worker: one image, two commands. Without AMERS_DATABASE_URL it would
+# need PostgreSQL's binaries, which it does not have: see docker-compose.yml.
+FROM node:22-bookworm-slim AS page
+
+WORKDIR /build/web
+COPY web/package.json web/package-lock.json ./
+RUN --mount=type=cache,target=/root/.npm npm ci --ignore-scripts --no-audit --no-fund
+COPY web ./
+RUN npm run check && npm run build
+
 FROM python:3.12-slim-bookworm AS build
 
 WORKDIR /build
@@ -9,6 +17,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY app app
 COPY migrations migrations
 COPY services services
+COPY --from=page /build/app/web/built app/web/built
 RUN --mount=type=cache,target=/root/.cache/pip /opt/amers/bin/pip install -c constraints.txt .
 
 FROM python:3.12-slim-bookworm

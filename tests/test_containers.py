@@ -1,4 +1,4 @@
-"""The files for containers say what the product has: nobody runs them here, so they are read closely."""
+"""The files for containers say what the product has: they are read closely, not run."""
 
 import re
 import shlex
@@ -10,6 +10,7 @@ from typer.main import get_command
 from app.cli.main import app
 from app.config import Settings
 from app.main import create_app
+from app.web import page
 
 ROOT = Path(__file__).parent.parent
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
@@ -90,7 +91,15 @@ def test_no_secret_stands_in_the_files_and_only_this_machine_is_listened_to():
     assert all(port.startswith("127.0.0.1:") for port in ports)
 
 
-def test_what_the_image_copies_is_there():
+def test_what_the_image_copies_is_there_and_not_kept_from_it():
+    let_in = [line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")]
     for line in re.findall(r"^COPY (?!--from)(.*)$", DOCKERFILE, re.MULTILINE):
         *sources, _ = shlex.split(line)
         assert all((ROOT / source).exists() for source in sources), line
+        assert all(Path(source).parts[0] in let_in for source in sources), line
+
+
+def test_the_image_has_the_page_built_where_the_service_looks_for_it():
+    (source, target) = re.findall(r"^COPY --from=page (\S+) (\S+)$", DOCKERFILE, re.MULTILINE)[0]
+    assert source == f"/build/{target}"
+    assert ROOT / target == page.BUILT
