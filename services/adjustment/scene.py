@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.robust import MAD_TO_STD, cauchy_weights, deactivate
+from services.adjustment.robust import MAD_TO_STD, cauchy_weights, deactivate, likeliest_variance
 from services.errors import NotEnoughPoints
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
@@ -20,6 +20,9 @@ _FREE = {
     "affine": np.ones((2, 3), dtype=bool),
 }
 ORDERS: tuple[Order, ...] = ("shift", "drift", "affine")
+
+_MUCH_BETTER = 0.5
+"""Residuals this small, in units of what is declared, are no chance: points are better than declared."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,8 @@ def adjust_scene(
     """Find the correction of a model that best explains where control points were seen.
 
     Weighted least squares on `line_sample - model.project(lon_lat_h)`. Weights come from each
-    measure's own sigma and from its point's covariance seen in the image. Robust weights find a first
+    measure's own sigma and from its point's covariance seen in the image, or from less of that where the
+    measures show their points to be much better than declared. Robust weights find a first
     solution; then the worst measure beyond tolerance leaves, one at a time, until all agree.
 
     Drift and skew too small to be seen beside the errors of the points are still there. They are not
@@ -136,12 +140,15 @@ def adjust_scene(
         )
     derivative = np.nan_to_num(model.project_derivative(lon_lat_h))
     covariance_px2 = derivative @ covariance_m2 @ derivative.transpose(0, 2, 1)
-    variance = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2 + np.diagonal(covariance_px2, 0, 1, 2)
+    own = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2
+    of_points = np.diagonal(covariance_px2, 0, 1, 2)
     frame = no_correction(shape)
     t = (line_sample - misfit - frame.centre) / frame.half_size
-    problem = _Problem(t, np.where(usable[:, None], misfit, 0.0), variance)
+    declared = _Problem(t, np.where(usable[:, None], misfit, 0.0), own + of_points)
 
-    order, validation = _choose_order(problem, usable, options)
+    order, validation = _choose_order(declared, usable, options)
+    start = declared.robust_solution(usable, _FREE[order])
+    problem = declared.as_they_scatter(start, usable, of_points)
     start = problem.robust_solution(usable, _FREE[order])
     scale = max(problem.scale(start, usable), 1e-9)
     agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
@@ -157,10 +164,10 @@ def adjust_scene(
         return np.asarray(problem.magnitude(parameters) / scale)
 
     active = deactivate(magnitude, agreeing, options.tolerance, options.min_points)
-    sigma0 = problem.sigma0(active, free, slope_px)
+    sigma0 = declared.sigma0(active, free, slope_px)
+    parameters, _ = problem.less_sure(sigma0).solution(active, free, slope_px)
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
-    honest = replace(problem, variance=variance * max(sigma0, 1.0) ** 2)
-    parameters, covariance = honest.solution(active, free, slope_px)
+    _, covariance = declared.less_sure(sigma0).solution(active, free, slope_px)
     if common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += common_covariance_px2
     return SceneAdjustment(
@@ -172,7 +179,7 @@ def adjust_scene(
         residual_px=np.where(usable[:, None], problem.residual(parameters), np.nan),
         active=active,
         sigma0=sigma0,
-        point_sigma_px=np.sqrt(np.diagonal(covariance_px2, 0, 1, 2)[active].mean(axis=0)),
+        point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
     )
 
 
@@ -189,6 +196,19 @@ class _Problem:
     t: Array
     misfit: Array
     variance: Array
+
+    def as_they_scatter(self, parameters: Array, active: BoolArray, of_points: Array) -> "_Problem":
+        """The same with the variances that residuals much smaller than declared show."""
+        if self.scale(parameters, active) >= _MUCH_BETTER:
+            return self
+        variance = self.variance.copy()
+        own = (variance - of_points)[active]
+        variance[active] = likeliest_variance(self.residual(parameters)[active], own, of_points[active])
+        return replace(self, variance=variance)
+
+    def less_sure(self, sigma0: float) -> "_Problem":
+        """The same with variances larger by a standard deviation of unit weight above 1."""
+        return replace(self, variance=self.variance * max(sigma0, 1.0) ** 2)
 
     def solution(
         self,

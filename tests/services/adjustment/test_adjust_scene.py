@@ -311,3 +311,30 @@ def test_a_third_of_blunders_does_not_hide_the_order():
         with_blunders(seen(TRUTH["affine"], rng), 12, rng).adjust().order for _ in range(TRIALS // 4)
     ]
     assert orders.count("affine") >= 0.9 * len(orders)
+
+
+def test_measures_less_sharp_than_others_stay_where_their_points_are_better_than_declared() -> None:
+    rng = np.random.default_rng(8)
+    sigma_px = rng.choice([0.01, 0.2], 200)
+    points = seen(TRUTH["shift"], rng, n=200, noise_px=0.0)
+    noise_px = sigma_px[:, None] * rng.normal(size=(200, 2))
+    points = replace(
+        points,
+        line_sample=points.line_sample + noise_px,
+        sigma_px=sigma_px,
+        covariance_m2=np.tile((3.0 * GSD_M) ** 2 * np.eye(3), (200, 1, 1)),
+    )
+    found = points.adjust()
+    assert found.active.mean() > 0.95
+    assert np.abs(found.correction.parameters[:, 0] - TRUTH["shift"][:, 0]).max() < 5.0 * a_millipixel
+    # What is declared of points is not made smaller by how well they fit.
+    assert found.covariance[0, 0] > 3.0**2 / 200
+
+
+def test_wrong_measures_still_leave_where_points_are_better_than_declared() -> None:
+    rng = np.random.default_rng(9)
+    points = with_blunders(seen(TRUTH["shift"], rng, n=200, noise_px=0.05), 40, rng, size_px=0.5)
+    declared = np.tile((3.0 * GSD_M) ** 2 * np.eye(3), (200, 1, 1))
+    found = replace(points, covariance_m2=declared).adjust()
+    assert not found.active[:40].any()
+    assert found.active[40:].mean() > 0.95
