@@ -6,14 +6,15 @@ export OMP_NUM_THREADS := 1
 BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
+LONG := faults load stress
 
-.PHONY: demo test check serve bench bench-registration postgis page chromium
+.PHONY: demo test check serve bench bench-registration bench-load bench-faults postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
 
 test: check postgis page chromium
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 check: $(READY)
 	$(BIN)/ruff format --check .
@@ -25,7 +26,14 @@ serve: postgis page
 	$(BIN)/amers serve
 
 bench: postgis
-	set -e; for script in benchmarks/[a-z]*.py; do $(BIN)/python -m benchmarks.$$(basename $$script .py); done
+	set -e; for name in $(filter-out $(LONG),$(basename $(notdir $(wildcard benchmarks/[a-z]*.py)))); do \
+		$(BIN)/python -m benchmarks.$$name; done
+
+bench-load: postgis
+	$(BIN)/python -m benchmarks.load --clients 64 --seconds 60
+
+bench-faults: postgis
+	$(BIN)/python -m benchmarks.faults --registrations 50 --ingestions 20
 
 bench-registration: $(READY)
 	$(BIN)/python -m benchmarks.stress

@@ -19,6 +19,8 @@ from tests.app.workers import wait_until
 from tests.factories import make_block
 from tests.serving import Service, until
 
+pytestmark = pytest.mark.long
+
 ENDED = ("successful", "failed", "dismissed")
 SAME_HOST = {"Host": "amers.example"}
 PATHS = (

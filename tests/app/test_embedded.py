@@ -18,6 +18,8 @@ from app.db.binaries import find_binaries, server_user
 from app.db.embedded import LONGEST_SOCKET_PATH, Cluster
 from app.errors import InputError
 
+pytestmark = pytest.mark.long
+
 USER = """
 import itertools, sys
 from pathlib import Path

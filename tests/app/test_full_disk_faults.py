@@ -21,6 +21,8 @@ from app.usecases.blocks import sweep_storage
 from tests.app.workers import ended, running_worker
 from tests.factories import make_block
 
+pytestmark = pytest.mark.long
+
 MEBIBYTE = 1 << 20
 ROOM = 3 * MEBIBYTE
 TOO_MUCH = b"II*\0" + np.random.default_rng(1).bytes(4 * MEBIBYTE)

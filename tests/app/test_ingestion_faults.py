@@ -23,6 +23,8 @@ from app.usecases import blocks
 from services.errors import FormatError
 from tests.factories import make_block
 
+pytestmark = pytest.mark.long
+
 TABLES = ("block", "image", "chip_file", "point", "view")
 PATIENCE_S = 30.0
 

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.load import run
+
+pytestmark = pytest.mark.long
 
 CLIENTS, SECONDS, SEED = 8, 5.0, 1
 KINDS = {"chips", "footprint", "point", "tile"}

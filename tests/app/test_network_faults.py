@@ -30,6 +30,8 @@ from tests.app.workers import (
     wait_until,
 )
 
+pytestmark = pytest.mark.long
+
 LEASE_S = 3.0
 PIECE_BYTES = 65_536
 

@@ -21,6 +21,8 @@ from app.config import Settings
 from app.main import create_app
 from tests.app.served import Served, service_with_a_block
 
+pytestmark = pytest.mark.long
+
 CASES = int(os.environ.get("AMERS_API_CASES", "5"))
 CONFIG = {
     "generation": {"max-examples": CASES, "deterministic": "AMERS_API_CASES" not in os.environ},

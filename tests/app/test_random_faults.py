@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.faults import besiege
+
+pytestmark = pytest.mark.long
 
 REGISTRATIONS, INGESTIONS = 6, 3
 KILL_EVERY_S = 2.0

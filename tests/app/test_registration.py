@@ -34,6 +34,8 @@ from services.sensors.rpc import RpcModel
 from tests.app.flat_world import CENTRE, GROUND_H, SIGMA_M, FlatWorld, make_flat_world
 from tests.app.workers import ended, running_worker, wait_until
 
+pytestmark = pytest.mark.long
+
 A_TENTH_OF_A_PIXEL = 0.1
 A_MILLIONTH_OF_A_PIXEL = 1e-6
 MASKED_LINES = 400

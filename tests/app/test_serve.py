@@ -19,6 +19,8 @@ from app.usecases.tokens import create_token
 from tests.factories import make_block
 from tests.serving import Service, until, users_of
 
+pytestmark = pytest.mark.long
+
 POINTS = 2100
 """More than are made into one text: they are streamed."""
 IMAGE = b"II*\0" + bytes(400_000)

@@ -26,6 +26,8 @@ from tests.app.workers import (
     wait_until,
 )
 
+pytestmark = pytest.mark.long
+
 LEASE_S = 2.0
 PASSES = 100
 MEBIBYTE = 1 << 20

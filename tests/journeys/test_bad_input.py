@@ -18,6 +18,8 @@ from services.formats.rpc_text import format_rpc_text, parse_rpc_text
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.serving import Service
 
+pytestmark = pytest.mark.long
+
 patience_s = 120.0
 degrees_away = 3.0
 

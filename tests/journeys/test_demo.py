@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 half_a_pixel = 0.5
 injected_m = 50.0
 

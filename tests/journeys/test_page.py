@@ -26,6 +26,8 @@ from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.factories import make_block
 from tests.serving import Service, until
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 BUILT = ROOT / "app" / "web" / "built" / "index.html"
 AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"

@@ -15,7 +15,7 @@ from services.sensors.correction import ImageCorrection, fold_into_rpc, no_corre
 from services.sensors.rpc import RpcModel
 from tests.journeys.ties import independent_tracks
 
-pytestmark = pytest.mark.real_data
+pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
 names = ("img_01", "img_02", "img_03")
 injected_shift_px = np.array([400.0, -900.0])

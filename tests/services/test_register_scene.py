@@ -17,6 +17,8 @@ from services.simulation.view import SimulatedView, simulate_view
 from services.types import Array, Observations
 from tests.services.simulated import block, block_views, plan, production, spoiled_view, world
 
+pytestmark = pytest.mark.long
+
 half_a_pixel = 0.5
 a_quarter_of_a_pixel = 0.25
 a_micropixel = 1e-6

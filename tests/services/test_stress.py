@@ -15,6 +15,8 @@ from benchmarks.stress import by_factor, read_outcomes, summary
 from services.imagery import Window
 from services.registration import Registration, RegistrationOptions, register_scene
 
+pytestmark = pytest.mark.long
+
 SMALL = Place("small", 5, 1_700.0, 1.0, 40.0, 0.0, (0.8, 1.4), 1150, points=22)
 NOMINAL = replace(SMALL, gsd_m=(0.5, 0.5), lines=2900)
 OPTIONS = RegistrationOptions(max_points=100)
