@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.errors import NoConsensus, NotEnoughPoints
 from services.imagery import image_gsds_m
+from services.matching.consensus import agreeing_points, consensus_tolerance_px
 from services.matching.points import PointMatches
 from services.scene import Scene, scene_centre
+from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import Array, BoolArray, ControlPoints
 
@@ -60,6 +63,40 @@ def adjust_on(
         candidates,
         ground_to_px @ matches.common_covariance_m2 @ ground_to_px.T,
     )
+
+
+def agreement(
+    model: SensorModel,
+    points: ControlPoints,
+    matches: PointMatches,
+    radius_m: float,
+    min_points: int,
+) -> BoolArray:
+    """Points whose measures fit one affine displacement, or an error that says why there are too few."""
+    predicted = model.project(points.lon_lat_h)
+    found = matches.reason == ""
+    if found.sum() < min_points:
+        raise NotEnoughPoints(
+            int(found.sum()),
+            min_points,
+            f"{len(points)} tried within {radius_m:.1f} m, {reasons_in_words(matches.reason)}",
+        )
+    sigma_px = float(np.median(_point_sigma_px(model, points, matches)[found]))
+    agreeing, scale = agreeing_points(predicted, matches.line_sample - predicted, found, sigma_px)
+    tolerance_px = consensus_tolerance_px(scale * sigma_px)
+    if agreeing.sum() < min_points:
+        raise NoConsensus(
+            f"{int(found.sum())} points found of {len(points)} tried, but only {int(agreeing.sum())} "
+            f"agree within {tolerance_px:.1f} px, {min_points} needed"
+        )
+    return agreeing
+
+
+def _point_sigma_px(model: SensorModel, points: ControlPoints, matches: PointMatches) -> Array:
+    """Standard deviation (n,) of the measures against the points' own positions, pixels."""
+    derivative = model.project_derivative(points.lon_lat_h)
+    covariance = derivative @ points.covariance_m2 @ derivative.transpose(0, 2, 1)
+    return np.asarray(np.sqrt(matches.sigma_px**2 + np.trace(covariance, axis1=1, axis2=2) / 2.0))
 
 
 def model_uncertainty_m(

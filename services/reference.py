@@ -18,9 +18,16 @@ from services.matching.consensus import vote
 from services.matching.dense import DenseOptions, Places, Reference, match_places, places_seen
 from services.matching.points import PointMatches
 from services.matching.predict import inside
-from services.passes import Pass, adjust_on, model_uncertainty_m, reasons_in_words, summarised
+from services.passes import (
+    Pass,
+    adjust_on,
+    agreement,
+    model_uncertainty_m,
+    reasons_in_words,
+    summarised,
+)
 from services.quality.qualification import QualificationOptions
-from services.registration import Registration, RegistrationOptions, agreement, qualified
+from services.registration import Registration, RegistrationOptions, qualified
 from services.scene import Scene, scene_gsd_m
 from services.sensors.correction import CorrectedModel, no_correction
 from services.types import (

@@ -8,25 +8,23 @@ import numpy as np
 from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
 from services.chip_choice import fine_gsd_m
 from services.coarse import CoarseOptions, search_coarsely
-from services.errors import InputError, NoConsensus, NotEnoughPoints
+from services.errors import InputError
 from services.imagery import KeptWindows
-from services.matching.consensus import agreeing_points, consensus_tolerance_px
 from services.matching.points import MatchingOptions, PointMatches, match_points
+from services.measures import measures_of
 from services.passes import (
     Pass,
     adjust_on,
+    agreement,
     model_uncertainty_m,
-    reasons_in_words,
     search_radius_px,
     summarised,
 )
 from services.point_choice import points_to_try, start_uncertainty_m, visible_points
 from services.quality.qualification import Qualification, QualificationOptions, qualify
 from services.scene import Scene, scene_gsd_m
-from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, no_correction
 from services.types import (
-    Array,
     BoolArray,
     ChipSource,
     ControlPoints,
@@ -192,7 +190,7 @@ def qualified(
     """
     visible, chosen = rows
     tried = points.take(chosen)
-    measures = _measures(scene, points, visible, chosen, matches, adjustment)
+    measures = measures_of(scene, points, rows, matches, adjustment)
     row_of_tried = np.searchsorted(visible, chosen)
 
     def refit(held: BoolArray) -> SceneAdjustment:
@@ -214,89 +212,3 @@ def qualified(
     model = CorrectedModel(scene.model, adjustment.correction)
     views = replace(matches.tried, point=row_of_tried[matches.tried.point])
     return Registration(model, adjustment, measures, views, passes, qualification)
-
-
-def agreement(
-    model: SensorModel,
-    points: ControlPoints,
-    matches: PointMatches,
-    radius_m: float,
-    min_points: int,
-) -> BoolArray:
-    """Points whose measures fit one affine displacement, or an error that says why there are too few."""
-    predicted = model.project(points.lon_lat_h)
-    found = matches.reason == ""
-    if found.sum() < min_points:
-        raise NotEnoughPoints(
-            int(found.sum()),
-            min_points,
-            f"{len(points)} tried within {radius_m:.1f} m, {reasons_in_words(matches.reason)}",
-        )
-    sigma_px = float(np.median(_point_sigma_px(model, points, matches)[found]))
-    agreeing, scale = agreeing_points(predicted, matches.line_sample - predicted, found, sigma_px)
-    tolerance_px = consensus_tolerance_px(scale * sigma_px)
-    if agreeing.sum() < min_points:
-        raise NoConsensus(
-            f"{int(found.sum())} points found of {len(points)} tried, but only {int(agreeing.sum())} "
-            f"agree within {tolerance_px:.1f} px, {min_points} needed"
-        )
-    return agreeing
-
-
-def _point_sigma_px(model: SensorModel, points: ControlPoints, matches: PointMatches) -> Array:
-    """Standard deviation (n,) of the measures against the points' own positions, pixels."""
-    derivative = model.project_derivative(points.lon_lat_h)
-    covariance = derivative @ points.covariance_m2 @ derivative.transpose(0, 2, 1)
-    return np.asarray(np.sqrt(matches.sigma_px**2 + np.trace(covariance, axis1=1, axis2=2) / 2.0))
-
-
-def _measures(
-    scene: Scene,
-    points: ControlPoints,
-    visible: IntArray,
-    chosen: IntArray,
-    matches: PointMatches,
-    adjustment: SceneAdjustment,
-) -> Measures:
-    """One row for every visible point; those that were not tried say so."""
-    n = len(visible)
-    rows = np.searchsorted(visible, chosen)
-
-    def scattered(values: Array, width: int = 0) -> Array:
-        out = np.full((n, width) if width else n, np.nan)
-        out[rows] = values
-        return out
-
-    derivative = CorrectedModel(scene.model, adjustment.correction).project_derivative(
-        points.lon_lat_h[chosen]
-    )
-    residual_m = np.asarray(
-        np.linalg.solve(derivative[:, :, :2], adjustment.residual_px[:, :, None])[:, :, 0], np.float64
-    )
-    matched = np.zeros(n, dtype=bool)
-    matched[rows] = matches.reason == ""
-    active = np.zeros(n, dtype=bool)
-    active[rows] = adjustment.active
-    reason = np.full(n, "not_tried", dtype="<U16")
-    reason[rows] = np.where(
-        adjustment.active, "", np.where(matches.reason == "", "deactivated", matches.reason)
-    )
-    views = np.zeros(n, dtype=np.int64)
-    views[rows] = matches.views
-    by_gradient = np.zeros(n, dtype=bool)
-    by_gradient[rows] = matches.by_gradient
-    return Measures(
-        point_id=points.id[visible],
-        lon_lat_h=points.lon_lat_h[visible],
-        predicted=scene.model.project(points.lon_lat_h[visible]),
-        line_sample=scattered(matches.line_sample, 2),
-        sigma_px=scattered(matches.sigma_px),
-        score=scattered(matches.score),
-        views=views,
-        by_gradient=by_gradient,
-        residual_px=scattered(adjustment.residual_px, 2),
-        residual_m=scattered(residual_m, 2),
-        matched=matched,
-        active=active,
-        reason=reason,
-    )

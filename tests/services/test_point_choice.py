@@ -1,0 +1,86 @@
+"""Points are tried where the scene should show enough of their chips, as far as its model is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.conventions import CHIP_CENTRE
+from services.errors import CoverageError
+from services.imagery import ArrayImage
+from services.intersection import move_metres
+from services.matching.middle import LEAST_SHARE
+from services.point_choice import points_to_try, start_uncertainty_m, visible_points
+from services.scene import Scene
+from services.sensors.base import SensorModel
+from services.simulation.view import plan_geometry
+from services.types import Array, BoolArray, ControlPoints
+from tests.services.simulated import block, plan, world
+
+SIZE_PX = 360
+"""Chips of a metre are 101 m wide: a scene of this size shows ten points of the block."""
+SIGMA_M = 60.0
+FEW = 8
+
+
+def small_scene() -> Scene:
+    """Where its model says it is."""
+    geometry = plan_geometry(world(), plan(shape=(SIZE_PX, SIZE_PX)), np.random.default_rng(0))
+    blank = ArrayImage(np.zeros((SIZE_PX, SIZE_PX), dtype=np.float32))
+    return Scene(blank, geometry.true_model, geometry.acquisition, SIGMA_M)
+
+
+def enough_shown(scene: Scene, line_sample: Array) -> BoolArray:
+    """Whether the scene shows the middle of a chip of a metre, to a few pixels of its turn."""
+    reach_px = LEAST_SHARE * CHIP_CENTRE
+    return np.asarray(((line_sample > reach_px) & (line_sample < SIZE_PX - reach_px)).all(axis=1))
+
+
+def tried(scene: Scene, model: SensorModel, points: ControlPoints, sigma_m: float) -> ControlPoints:
+    rows = points_to_try(scene, model, points, np.full(len(points), sigma_m), FEW)
+    assert (np.diff(rows) > 0).all()
+    return points.take(rows)
+
+
+def test_of_a_scene_that_is_known_well_only_points_are_tried_that_it_shows() -> None:
+    scene, points = small_scene(), block()[0]
+    chosen = tried(scene, scene.model, points, 0.5)
+    assert len(chosen) == FEW
+    assert enough_shown(scene, scene.model.project(chosen.lon_lat_h)).all()
+
+
+def test_the_better_the_model_is_known_the_more_of_the_points_tried_are_shown() -> None:
+    scene, points = small_scene(), block()[0]
+    true_place = scene.model.project
+    # The delivered model is a hundred metres off: it takes other points for those in the middle.
+    shifted = replace(
+        points, lon_lat_h=move_metres(points.lon_lat_h, np.tile([90.0, -60.0, 0.0], (len(points), 1)))
+    )
+    before = points_to_try(scene, scene.model, shifted, np.full(len(points), SIGMA_M), FEW)
+    after = points_to_try(scene, scene.model, points, np.full(len(points), 0.5), FEW)
+    shown = [enough_shown(scene, true_place(points.lon_lat_h[rows])).sum() for rows in (before, after)]
+    assert shown[0] < shown[1] == FEW
+
+
+def test_where_there_are_few_points_or_all_are_asked_for_all_are_tried() -> None:
+    scene, points = small_scene(), block()[0]
+    uncertainty_m = start_uncertainty_m(scene, points)
+    for count in (len(points), 0):
+        rows = points_to_try(scene, scene.model, points, uncertainty_m, count)
+        np.testing.assert_array_equal(rows, np.arange(len(points)))
+
+
+def test_points_are_visible_as_far_as_the_scene_may_be_off() -> None:
+    scene, points = small_scene(), block()[0]
+    visible = visible_points(scene, points)
+    sure = visible_points(replace(scene, sigma_m=0.0), points)
+    assert set(sure.tolist()) < set(visible.tolist())
+
+
+def test_a_scene_beside_all_points_is_refused() -> None:
+    scene, points = small_scene(), block()[0]
+    elsewhere = replace(points, lon_lat_h=points.lon_lat_h + [0.5, 0.0, 0.0])
+    with pytest.raises(CoverageError, match="lies in the scene, even with"):
+        visible_points(scene, elsewhere)
+    with pytest.raises(CoverageError, match="no control point"):
+        visible_points(scene, points.take(np.arange(0)))
