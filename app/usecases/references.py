@@ -13,6 +13,7 @@ from app.db.references import ReferenceRow
 from app.errors import Conflict, InputError, NotFound
 from app.usecases.orthorectification import TerrainFile
 from app.usecases.reference import FindReference, FoundReference, ReferenceFiles, read_reference
+from app.usecases.server_files import file_below
 from services.geodesy import ecef_from_lon_lat_h
 from services.matching.dense import DenseOptions
 from services.registration import Registration
@@ -171,15 +172,7 @@ def _files(
 
 
 def _below(settings: Settings, name: str, path: str) -> Path:
-    """A file below AMERS_REFERENCE_FOLDER, all links followed and still below it."""
+    """A file below AMERS_REFERENCE_FOLDER."""
     if settings.reference_folder is None:
         raise InputError("no reference image can be used: AMERS_REFERENCE_FOLDER is not set")
-    folder = settings.reference_folder.resolve()
-    try:
-        found = (folder / path).resolve()
-        usable = found.is_relative_to(folder) and found.is_file()
-    except (OSError, ValueError):
-        usable = False
-    if not usable:
-        raise InputError(f"{name}: {path[:200]!r} is no file below the folder of AMERS_REFERENCE_FOLDER")
-    return found
+    return file_below(settings.reference_folder, path, name, "AMERS_REFERENCE_FOLDER")

@@ -17,6 +17,7 @@ from app.db.tokens import Token
 from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge
 from app.storage import Storage, StoredFile
 from app.usecases import quotas
+from app.usecases.server_files import file_below
 from services.errors import FormatError
 from services.formats.raster import DRIVER_OF_SIGNATURE
 
@@ -166,27 +167,21 @@ def refer_to_scene(
     Raises:
         InputError: no folder is open, or the path is not one of a file below it.
     """
-    if settings.scene_folder is None:
-        raise InputError("scenes on the server cannot be used: AMERS_SCENE_FOLDER is not set")
     found = referred_image(settings, path)
+    assert settings.scene_folder is not None
     relative = found.relative_to(settings.scene_folder.resolve()).as_posix()
     return scenes.insert_reference(connection, owner.id, found.name, relative, sigma_m)
 
 
 def referred_image(settings: Settings, path: str) -> Path:
-    """The file of a scene below AMERS_SCENE_FOLDER, all links followed and still below it.
+    """The file of a scene below AMERS_SCENE_FOLDER.
 
     Raises:
         InputError: there is no such file there.
     """
-    folder = (settings.scene_folder or Path("/nonexistent")).resolve()
-    try:
-        found = (folder / path).resolve()
-        usable = found.is_relative_to(folder) and found.is_file()
-    except (OSError, ValueError):
-        usable = False
-    if not usable:
-        raise InputError(f"path: {path[:200]!r} is no file below the folder of AMERS_SCENE_FOLDER")
+    if settings.scene_folder is None:
+        raise InputError("scenes on the server cannot be used: AMERS_SCENE_FOLDER is not set")
+    found = file_below(settings.scene_folder, path, "path", "AMERS_SCENE_FOLDER")
     with found.open("rb") as file:
         refuse_strange(file.read(LONGEST_SIGNATURE))
     return found

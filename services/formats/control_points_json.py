@@ -36,14 +36,7 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
     numbers = {
         "predicted_line": measures.predicted[:, 0],
         "predicted_sample": measures.predicted[:, 1],
-        "line": measures.line_sample[:, 0],
-        "sample": measures.line_sample[:, 1],
-        "sigma_px": measures.sigma_px,
-        "score": measures.score,
-        "residual_line_px": measures.residual_px[:, 0],
-        "residual_sample_px": measures.residual_px[:, 1],
-        "residual_east_m": measures.residual_m[:, 0],
-        "residual_north_m": measures.residual_m[:, 1],
+        **measured_numbers(measures),
         "sigma_east_m": sigma_m[:, 0],
         "sigma_north_m": sigma_m[:, 1],
         "sigma_up_m": sigma_m[:, 2],
@@ -70,6 +63,20 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
         "features": features,
     }
     return json.dumps(document, allow_nan=False) + "\n"
+
+
+def measured_numbers(measures: Measures) -> dict[str, Array]:
+    """What was measured of each point (n,), by the names it has in files; NaN where it was not found."""
+    return {
+        "line": measures.line_sample[:, 0],
+        "sample": measures.line_sample[:, 1],
+        "sigma_px": measures.sigma_px,
+        "score": measures.score,
+        "residual_line_px": measures.residual_px[:, 0],
+        "residual_sample_px": measures.residual_px[:, 1],
+        "residual_east_m": measures.residual_m[:, 0],
+        "residual_north_m": measures.residual_m[:, 1],
+    }
 
 
 def measure_status(measures: Measures, row: int) -> str:

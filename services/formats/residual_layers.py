@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.formats.control_points_json import measure_status
+from services.formats.control_points_json import measure_status, measured_numbers
 from services.geodesy import metres_per_degree_at
-from services.types import Array, Measures
+from services.types import Measures
 
 CRS_3D = "EPSG:4979"
 """Longitude, latitude, height above the WGS 84 ellipsoid."""
@@ -69,25 +69,15 @@ def exaggeration_for(measures: Measures, share: float = 0.04) -> float:
 def _fields(measures: Measures, image: str) -> Fields:
     """Attributes of all points."""
     n = len(measures.point_id)
-    numbers: dict[str, Array] = {
-        "line": measures.line_sample[:, 0],
-        "sample": measures.line_sample[:, 1],
-        "sigma_px": measures.sigma_px,
-        "score": measures.score,
-        "residual_line_px": measures.residual_px[:, 0],
-        "residual_sample_px": measures.residual_px[:, 1],
-        "residual_east_m": measures.residual_m[:, 0],
-        "residual_north_m": measures.residual_m[:, 1],
-        "residual_m": np.hypot(*measures.residual_m.T),
-        "height_m": measures.lon_lat_h[:, 2],
-    }
     return {
         "point_id": measures.point_id,
         "image": np.full(n, image, dtype=object),
         "status": np.array([measure_status(measures, i) for i in range(n)], dtype=object),
         "reason": measures.reason.astype(object),
         "views": measures.views,
-        **numbers,
+        **measured_numbers(measures),
+        "residual_m": np.hypot(*measures.residual_m.T),
+        "height_m": measures.lon_lat_h[:, 2],
     }
 
 
