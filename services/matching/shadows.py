@@ -1,7 +1,9 @@
 """Ends of shadows: edges that lie elsewhere under another sun, and how little they count for a place."""
 
+import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -62,23 +64,28 @@ def steady_weights(chip: FloatImage, score: float, shadows: ShadowMove) -> Float
     Returns:
         (s - 2, s - 2), 0 to 1: of the chip without its outermost pixels.
     """
-    noise2 = max(1.0 - score * score, 0.01) * float(chip.var())
-    return _weights(chip, shadows.away, shadows.move_px, noise2)
+    spread = float(cv2.meanStdDev(chip)[1][0, 0])
+    noise = math.sqrt(max(1.0 - score * score, 0.01)) * spread
+    # Half of it: differences of neighbours are over two pixels.
+    move = np.float32(0.5 / noise) * shadows.move_px.astype(np.float32)
+    return _weights(chip, shadows.away.astype(np.float32), move)
 
 
 def _rows_cols(east_north: Array) -> Array:
     return np.array([-east_north[1], east_north[0]])
 
 
-@njit(cache=True)
-def _weights(chip: FloatImage, away: Array, move_px: Array, noise2: float) -> FloatImage:
+@njit(cache=True, fastmath=True)
+def _weights(chip: FloatImage, away: FloatImage, move: FloatImage) -> FloatImage:
     side = chip.shape[0] - 2
-    weight = np.ones((side, side), dtype=np.float32)
+    one = np.float32(1.0)
+    weight = np.empty((side, side), dtype=np.float32)
+    away_r, away_c, move_r, move_c = away[0], away[1], move[0], move[1]
     for i in range(side):
         for j in range(side):
-            down = 0.5 * (chip[i + 2, j + 1] - chip[i, j + 1])
-            right = 0.5 * (chip[i + 1, j + 2] - chip[i + 1, j])
-            if down * away[0] + right * away[1] > 0.0:
-                changed = down * move_px[0] + right * move_px[1]
-                weight[i, j] = np.float32(noise2 / (noise2 + changed * changed))
+            down = chip[i + 2, j + 1] - chip[i, j + 1]
+            right = chip[i + 1, j + 2] - chip[i + 1, j]
+            changed = down * move_r + right * move_c
+            tip = down * away_r + right * away_c > np.float32(0.0)
+            weight[i, j] = one / (one + changed * changed) if tip else one
     return weight
