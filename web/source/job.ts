@@ -147,13 +147,27 @@ function summary(report: Report, exaggeration: number): HTMLElement[] {
   ];
 }
 
+/** The criteria in the words of the report's page, each with its unit. */
+const CRITERIA: Record<string, [words: string, unit?: string]> = {
+  active_points: ["Active points"],
+  coverage_percent: ["Coverage of the image", "%"],
+  active_of_matched: ["Active / matched"],
+  residual_std_px: ["Unexplained residual", "px"],
+  displacement_px: ["Displacement with fewer points", "px"],
+  predicted_ce90_px: ["Predicted CE90, worst place", "px"],
+  unit_weight: ["Residuals over what is expected"],
+  rival_share: ["Points that tell another story"],
+  check_points: ["Check points over what is expected"],
+};
+
 function criterion({ name, value, comparison, limit, needed_for, passed }: Report["criteria"][number]): HTMLElement {
+  const [words, unit] = CRITERIA[name] ?? [name.replaceAll("_", " ")];
   return h(
     "tr",
     {},
-    h("th", { scope: "row" }, name.replaceAll("_", " ")),
-    h("td", {}, figure(value)),
-    h("td", {}, `${comparison} ${figure(limit)}`),
+    h("th", { scope: "row" }, words),
+    h("td", {}, figure(value, unit)),
+    h("td", {}, `${comparison} ${figure(limit, unit)}`),
     h("td", { class: passed ? "" : "missed" }, passed ? "yes" : `no, not ${needed_for}`),
   );
 }
