@@ -48,7 +48,9 @@ def property_schema(item: Property) -> Schema:
 
 def geometry_schema(collection: Collection) -> Schema:
     """The geometry of a collection, as OGC API - Features - Part 5 says it."""
-    return {"title": "Geometry", "format": f"geometry-{collection.geometry_type.lower()}"}
+    # Outlines are cut at 180 degrees.
+    kind = "point" if collection.geometry_type == "Point" else "polygon-or-multipolygon"
+    return {"title": "Geometry", "format": f"geometry-{kind}"}
 
 
 def feature_schema(collection: Collection) -> Schema:

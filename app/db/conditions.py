@@ -50,9 +50,6 @@ def in_box(collection: Collection, box: Box) -> Condition:
     geometry = collection.geometry
     srid = 4979 if collection.has_height else 4326
     ranges = [(box.west, 180.0), (-180.0, box.east)] if box.east < box.west else [(box.west, box.east)]
-    if collection.geometry_type != "Point":
-        # Outlines across 180 degrees are kept in one piece, with longitudes beyond.
-        ranges = [(west + turn, east + turn) for turn in (0.0, -360.0, 360.0) for west, east in ranges]
     parameters: dict[str, Any] = {"south": box.south, "north": box.north}
     near, exact = [], []
     for i, (west, east) in enumerate(ranges):

@@ -13,7 +13,7 @@ from typing import Any
 from app.db.collections import Collection, Property
 from app.db.conditions import Condition
 from app.db.cql2_reading import MOST_NODES, parse_geometry, parse_instant
-from app.db.crs import Crs
+from app.db.crs import CRS84, Crs
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
@@ -74,14 +74,17 @@ def translate(expression: Any, collection: Collection, crs: Crs, prefix: str = "
     return Condition(f"({sql})", translator.parameters, _is_spatial(expression), beside=f"({sql})")
 
 
-def geometry_condition(collection: Collection, geometry: Any, crs: Crs) -> Condition:
-    """The condition that a feature meets a GeoJSON geometry.
+def geometry_condition(collection: Collection, geometry: Any, where: str) -> Condition:
+    """The condition that a feature meets a GeoJSON geometry, longitude first.
 
     Raises:
-        InvalidParameter: it is not a geometry that can be used.
+        InvalidParameter: it is not a geometry that can be used; naming `where` it stood.
     """
-    meets = {"op": "s_intersects", "args": [{"property": "geometry"}, geometry]}
-    return translate(meets, collection, crs, prefix="g")
+    srid = collection.storage_crs.srid
+    literal = f"st_setsrid(%({where})s::geometry, {srid})"
+    sql = f"st_intersects({collection.geometry}, {literal})"
+    shape = parse_geometry(geometry, CRS84, where)
+    return Condition(sql, {where: shape}, spatial=True, beside=sql)
 
 
 @dataclass(frozen=True)
@@ -262,16 +265,12 @@ class _Translator:
         return f"{SPATIAL[op]}({sides[0]}, {sides[1]})"
 
     def _geometry(self, node: Any) -> str:
-        if not isinstance(node, dict):
-            raise InvalidParameter(f"filter: a geometry expected, {json.dumps(node)!s:.60} found")
-        if "property" in node:
+        if isinstance(node, dict) and "property" in node:
             if node["property"] not in GEOMETRY:
                 raise InvalidParameter(f"filter: {node['property']!r:.60} is not a geometry")
             return self.collection.geometry
-        srid = 4979 if self.collection.has_height else 4326
-        literal = self._bind(parse_geometry(node, self.crs), "geometry")
-        if self.crs.srid == 3857:
-            return f"st_setsrid(st_transform(st_setsrid({literal}, 3857), 4326), {srid})"
+        srid = self.collection.storage_crs.srid
+        literal = self._bind(parse_geometry(node, self.crs, "filter"), "geometry")
         return f"st_setsrid({literal}, {srid})"
 
     def _temporal(self, op: str, args: list[Any]) -> str:

@@ -12,7 +12,8 @@ from typing import Any
 import cql2
 import shapely
 
-from app.db.crs import Crs
+from app.db.antimeridian import on_the_map
+from app.db.crs import Crs, lon_lat_from_mercator
 from app.errors import InvalidParameter
 
 LONGEST_TEXT = 4_000
@@ -58,15 +59,15 @@ def parse_json(text: str) -> Any:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InvalidParameter(f"filter: not JSON: {error!s:.200}") from None
-    check_size(found)
+    check_size(found, "filter")
     return _parsed(cql2.parse_json, text)
 
 
-def check_size(document: Any) -> None:
+def check_size(document: Any, where: str) -> None:
     """Refuse a document that is too deep or has too many parts, without recursion.
 
     Raises:
-        InvalidParameter: with the limit.
+        InvalidParameter: with the limit, and `where` the document stood.
     """
     level, vertices, nodes = [document], 0, 0
     for _ in range(DEEPEST_JSON):
@@ -81,11 +82,11 @@ def check_size(document: Any) -> None:
         level = below
         if vertices > MOST_VERTICES or nodes > MOST_NODES + 2 * MOST_VERTICES:
             raise InvalidParameter(
-                f"filter: too large: {MOST_NODES} parts and {MOST_VERTICES} positions at most"
+                f"{where}: too large: {MOST_NODES} parts and {MOST_VERTICES} positions at most"
             )
         if not level:
             return
-    raise InvalidParameter(f"filter: deeper than {DEEPEST_JSON} levels")
+    raise InvalidParameter(f"{where}: deeper than {DEEPEST_JSON} levels")
 
 
 def parse_instant(text: Any, where: str) -> datetime:
@@ -110,28 +111,36 @@ def parse_instant(text: Any, where: str) -> datetime:
     return instant if instant.tzinfo else instant.replace(tzinfo=UTC)
 
 
-def parse_geometry(node: dict[str, Any], crs: Crs) -> bytes:
-    """A GeoJSON geometry, or a bbox, as WKB with longitude or east first.
+def parse_geometry(node: Any, crs: Crs, where: str) -> bytes:
+    """A GeoJSON geometry, or a bbox, as WKB with longitude first, cut at 180 degrees.
+
+    Args:
+        crs: of its coordinates; longitudes may go on beyond 180 degrees.
 
     Raises:
-        InvalidParameter: it is not a valid geometry within the bounds of its reference system.
+        InvalidParameter: it is not a valid geometry within the bounds of its reference system; naming
+            `where` it stood.
     """
+    if not isinstance(node, dict):
+        raise InvalidParameter(f"{where}: a geometry expected, {json.dumps(node)!s:.60} found")
     try:
         shape = _box(node["bbox"]) if "bbox" in node else shapely.from_geojson(json.dumps(node))
     except (shapely.errors.ShapelyError, TypeError, ValueError) as error:
-        raise InvalidParameter(f"filter: not a GeoJSON geometry: {error!s:.200}") from None
+        raise InvalidParameter(f"{where}: not a GeoJSON geometry: {error!s:.200}") from None
     shape = shapely.force_2d(shape)
     if crs.lat_first:
         shape = shapely.transform(shape, lambda position: position[:, ::-1])
     coordinates = shapely.get_coordinates(shape)
-    limit = (180.0, 90.0) if crs.in_degrees else (2.1e7, 2.6e8)
+    limit = (360.0, 90.0) if crs.in_degrees else (4.1e7, 2.6e8)
     if not len(coordinates) or not (abs(coordinates) <= limit).all():
         raise InvalidParameter(
-            f"filter: a geometry is empty or beyond {limit[0]:g} and {limit[1]:g}, the bounds of its crs"
+            f"{where}: a geometry is empty or beyond {limit[0]:g} and {limit[1]:g}, its bounds"
         )
     if not shapely.is_valid(shape):
-        raise InvalidParameter(f"filter: geometry: {shapely.is_valid_reason(shape):.200}")
-    return bytes(shapely.to_wkb(shape))
+        raise InvalidParameter(f"{where}: geometry: {shapely.is_valid_reason(shape):.200}")
+    if not crs.in_degrees:
+        shape = shapely.transform(shape, lon_lat_from_mercator)
+    return bytes(shapely.to_wkb(on_the_map(shape)))
 
 
 def _box(values: Any) -> Any:

@@ -2,6 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from services.types import Array
+
+EARTH_RADIUS_M = 6_378_137.0
+"""Of the sphere that EPSG:3857 takes the Earth for."""
 OGC = "http://www.opengis.net/def/crs/"
 
 
@@ -52,3 +58,10 @@ def from_storage(geometry: str, crs: Crs) -> str:
 def in_own_order(geometry: str, crs: Crs) -> str:
     """SQL of a geometry with the axes in the order of the reference system itself."""
     return f"st_flipcoordinates({geometry})" if crs.lat_first else geometry
+
+
+def lon_lat_from_mercator(east_north_m: Array) -> Array:
+    """Positions (n, 2) in EPSG:3857 as longitude and latitude; longitudes go on beyond 180 degrees."""
+    east, north = (east_north_m / EARTH_RADIUS_M).T
+    lon_lat: Array = np.degrees(np.column_stack([east, np.arctan(np.sinh(north))]))
+    return lon_lat

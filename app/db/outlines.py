@@ -23,7 +23,7 @@ BLOCKS = Collection(
         Property("state_changed_at", "timestamptz", "When its state changed last"),
     ),
     geometry_type="Polygon",
-    geometry="t.extent",
+    geometry="t.extent_on_map",
     visible="(t.state = 'published' or %(admin)s::boolean)",
     interval=("created_at", "created_at"),
     found_by="(t.number::text = %(key)s or t.id || '@' || t.version = %(key)s"
@@ -79,7 +79,7 @@ SCENES = Collection(
         ),
     ),
     geometry_type="Polygon",
-    geometry="t.footprint",
+    geometry="t.footprint_on_map",
     visible="(%(admin)s::boolean or t.owner = %(viewer)s::uuid)",
     interval=("datetime", "datetime"),
     is_open=False,

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import shapely
 from psycopg import sql
 
+from app.db.antimeridian import on_the_map
 from app.db.binary_copy import parse_copy
 from app.db.blocks import ID_BITS, PUBLISHED
 from app.db.collections import Collection, Property
@@ -136,7 +137,8 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
     Returns:
         Points in the order of their ids.
     """
-    area = sql.Literal(shapely.to_wkb(_on_the_map(outline), include_srid=True, hex=True))
+    place = shapely.set_srid(on_the_map(shapely.make_valid(shapely.Polygon(outline))), 4979)
+    area = sql.Literal(shapely.to_wkb(place, include_srid=True, hex=True))
     return _with_views(connection, _points_query(area, limit))
 
 
@@ -257,15 +259,3 @@ def _versions(connection: Connection, numbers: IntArray) -> tuple[BlockVersion, 
         [_FRAME_SIGMA, numbers.tolist()],
     ).fetchall()
     return tuple(BlockVersion(**row) for row in rows)
-
-
-def _on_the_map(outline: Array) -> shapely.Geometry:
-    """An outline with continuous longitudes as its parts between -180 and 180 degrees."""
-    polygon = shapely.make_valid(shapely.Polygon(outline))
-    world = shapely.box(-180.0, -90.0, 180.0, 90.0)
-    turned = [
-        shapely.transform(polygon, lambda lon_lat, turn=turn: lon_lat + [turn, 0.0])
-        for turn in (-360.0, 0.0, 360.0)
-    ]
-    parts = shapely.union_all([shapely.intersection(part, world) for part in turned])
-    return shapely.set_srid(parts, 4979)

@@ -120,10 +120,7 @@ def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tu
     """West, south, east, north of what the viewer may see of a collection, None without any."""
     # Points lie in the outlines of their blocks, which are fewer; so do cells, to a tenth of a degree.
     whose = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
-    found = feature_counts.extent(connection, whose, viewer if whose is collection else Viewer())
-    if found is None or found[2] <= 180.0:
-        return found
-    return (-180.0, found[1], 180.0, found[3])
+    return feature_counts.extent(connection, whose, viewer if whose is collection else Viewer())
 
 
 def period(

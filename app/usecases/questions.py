@@ -12,7 +12,7 @@ from app.db.collections import Collection, Property, Viewer
 from app.db.conditions import ANYTHING, Condition, in_box, in_time
 from app.db.cql2 import geometry_condition, translate
 from app.db.cql2_reading import check_size, parse_instant, parse_json, parse_text
-from app.db.crs import CRS84, EVERY, Crs
+from app.db.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
 from app.db.feature_counts import Count
 from app.db.selection import Key, Order, Selection
 from app.errors import InvalidParameter
@@ -22,7 +22,6 @@ DEFAULT_LIMIT = 100
 MOST_FEATURES = 10_000
 FILTER_LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
 """The last one is what GDAL calls CQL2 text: the name of the draft."""
-EARTH_RADIUS_M = 6_378_137.0
 
 
 @dataclass(frozen=True)
@@ -112,8 +111,8 @@ def condition_of(collection: Collection, question: Question) -> Condition:
     if question.datetime is not None:
         parts.append(in_time(collection, *parse_interval(question.datetime)))
     if question.intersects is not None:
-        check_size(question.intersects)
-        parts.append(geometry_condition(collection, question.intersects, CRS84))
+        check_size(question.intersects, "intersects")
+        parts.append(geometry_condition(collection, question.intersects, "intersects"))
     if question.filter is not None:
         crs = crs_of("filter-crs", question.filter_crs, None) if question.filter_crs else CRS84
         parts.append(translate(_filter(question), collection, crs))

@@ -88,12 +88,16 @@ def _properties(known: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bbox(geometry: dict[str, Any] | None) -> list[float] | None:
-    """West, south, east, north of a polygon; west is greater than east across the antimeridian."""
+    """West, south, east, north of an outline; west is greater than east across the antimeridian."""
     if geometry is None:
         return None
-    lon, lat = zip(*geometry["coordinates"][0], strict=True)
-    west, east = min(lon), max(lon)
-    return [west, min(lat), east - 360.0 if east > 180.0 else east, max(lat)]
+    whole = geometry["type"] == "Polygon"
+    polygons = [geometry["coordinates"]] if whole else geometry["coordinates"]
+    lon, lat = zip(*(position for rings in polygons for position in rings[0]), strict=True)
+    # What is in parts was cut at 180 degrees.
+    west = min(lon) if whole else min(value for value in lon if value > 0.0)
+    east = max(lon) if whole else max(value for value in lon if value < 0.0)
+    return [west, min(lat), east, max(lat)]
 
 
 def _assets(files: SceneFiles, base: str) -> dict[str, dict[str, Any]]:

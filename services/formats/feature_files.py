@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
@@ -37,7 +39,8 @@ class FeatureTable:
 
     Attributes:
         rows: properties, and WKB in the column `geometry`, longitude or east first.
-        geometry_type: as GeoPackage names it, with Z where there are heights.
+        geometry_type: as GeoPackage names it, with Z where there are heights; polygons of which one is
+            in parts, cut at 180 degrees, are all MultiPolygon.
         srid: EPSG code of the coordinates.
     """
 
@@ -83,9 +86,19 @@ def read_feature_csv(
         shapes = shapely.points(*(read[axis].to_numpy() for axis in axes))
     else:
         shapes = shapely.from_wkb(read["wkb"].to_numpy(zero_copy_only=False))
+        if (shapely.get_type_id(shapes) == shapely.GeometryType.MULTIPOLYGON).any():
+            geometry_type, shapes = "MultiPolygon", _in_parts(shapes)
     geometry = pa.array(shapely.to_wkb(shapes, flavor="iso"), pa.binary())
     rows = read.select([column.name for column in columns]).append_column("geometry", geometry)
     return FeatureTable(rows, geometry_type + (" Z" if has_height else ""), srid), last
+
+
+def _in_parts(polygons: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
+    """Polygons and such of several parts, all as such of several parts; None where there is none."""
+    parts, owner = shapely.get_parts(polygons, return_index=True)
+    out = np.full(len(polygons), None)
+    shapely.multipolygons(parts, indices=owner, out=out)
+    return out
 
 
 def format_parquet(features: FeatureTable, layer: str) -> bytes:
