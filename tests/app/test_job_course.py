@@ -1,15 +1,12 @@
 """The course of a job as it is told: messages, the expected end, results that go after a while."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, timedelta
 from uuid import UUID, uuid4
 
-import pytest
 from fastapi.testclient import TestClient
 
-from app.config import Settings
-from app.db import attempts, engine, job_course, jobs
+from app.db import attempts, job_course, jobs
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
 from app.db.jobs import Job, JobFilter
@@ -20,13 +17,6 @@ LEASE_S = 30.0
 LONGEST_JOB_S = 3600.0
 a_slow_machine = timedelta(seconds=15)
 """What a test may take between its steps; jobs that run grow old meanwhile."""
-
-
-@pytest.fixture
-def database(settings: Settings) -> Iterator[Database]:
-    assert settings.database_url is not None
-    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
-        yield database
 
 
 def asked(connection: Connection, kind: str = "register-scene") -> Job:

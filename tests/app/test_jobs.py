@@ -1,36 +1,21 @@
-"""Jobs: asked for once, seen by their owner, claimed under a lease, fenced against the dead."""
+"""Jobs as callers have them: asked for once, seen by their owner, dismissed, counted."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from uuid import UUID, uuid4
 
 import pytest
 from fastapi.testclient import TestClient
-from psycopg.errors import UniqueViolation
 
 from app.config import Settings
-from app.db import attempts, engine, jobs, registrations, scenes
-from app.db.attempts import LostJob
-from app.db.engine import Connection, Database
-from app.db.jobs import Job
+from app.db import attempts, engine, jobs
+from app.db.engine import Database
 from app.main import create_app
-from app.storage import Storage
-from app.worker.attempt import FAILURES_ALLOWED
-from app.worker.sweep import sweep_files, sweep_jobs
-
-LEASE_S = 30.0
+from tests.app.queued import LEASE_S, claimed, queue_entries
 
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"
-
-
-@pytest.fixture
-def database(settings: Settings) -> Iterator[Database]:
-    """The test's database with its pools."""
-    assert settings.database_url is not None
-    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
-        yield database
 
 
 @pytest.fixture
@@ -44,51 +29,6 @@ def scene(client: TestClient, me: dict[str, str]) -> str:
     """The id of an uploaded scene."""
     reply = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me)
     return str(reply.json()["id"])
-
-
-def new_job(database: Database) -> Job:
-    """An accepted job."""
-    with database.transaction() as connection:
-        job = jobs.create(connection, "register-scene", {"scene": str(uuid4())})
-    assert job is not None
-    return job
-
-
-def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S) -> Job:
-    """The job, taken by a worker."""
-    with database.transaction() as connection:
-        job = attempts.claim(connection, job_id, worker, lease_s)
-    assert job is not None
-    return job
-
-
-def state_of(database: Database, job_id: UUID) -> Job:
-    """The job as it is now."""
-    with database.transaction() as connection:
-        job = jobs.find(connection, job_id)
-    assert job is not None
-    return job
-
-
-def let_lease_lapse(database: Database, job_id: UUID) -> None:
-    """As if the worker had been silent for too long."""
-    with database.transaction() as connection:
-        connection.execute(
-            "update job set lease_until = now() - interval '1 second' where id = %s", [job_id]
-        )
-
-
-def queue_entries(connection: Connection, job_id: UUID) -> int:
-    """How many entries of the queue wait to be fetched for a job."""
-    row = connection.execute(
-        "select count(*) as n from procrastinate_jobs where status = 'todo' and args ->> 'job_id' = %s",
-        [str(job_id)],
-    ).fetchone()
-    assert row is not None
-    return int(row["n"])
-
-
-# What a caller can do
 
 
 def test_processes_are_described_with_the_schema_of_their_inputs(client: TestClient):
@@ -250,146 +190,6 @@ def test_a_failed_job_tells_why_with_its_numbers(
     results = client.get(f"/jobs/{job['jobID']}/results", headers=me)
     assert (results.status_code, results.json()["found"]) == (409, 3)
     assert results.headers["content-type"] == "application/problem+json"
-
-
-# Leases and fences
-
-
-def test_a_job_is_claimed_by_one_worker_only(database: Database):
-    job = new_job(database)
-    with ThreadPoolExecutor(6) as threads:
-
-        def try_it(worker: int) -> Job | None:
-            with database.transaction() as connection:
-                return attempts.claim(connection, job.id, f"w{worker}", LEASE_S)
-
-        got = [one for one in threads.map(try_it, range(6)) if one is not None]
-    assert [one.attempt for one in got] == [1]
-
-
-def test_a_worker_back_from_the_dead_writes_nothing(database: Database):
-    job = new_job(database)
-    zombie = claimed(database, job.id, "zombie")
-    let_lease_lapse(database, job.id)
-    sweep_jobs(database, LEASE_S)
-    heir = claimed(database, job.id, "heir")
-    assert (zombie.attempt, heir.attempt) == (1, 2)
-    with database.transaction() as connection:
-        scene_id = scenes.begin_upload(connection, None, "a", "a.tif", None)
-    writes: list[Callable[[Connection], None]] = [
-        lambda c: attempts.renew(c, job.id, zombie.attempt, LEASE_S),
-        lambda c: attempts.report(c, job.id, zombie.attempt, 50, "late"),
-        lambda c: attempts.fail(c, job.id, zombie.attempt, {"title": "late"}),
-        lambda c: attempts.give_back(c, job.id, zombie.attempt),
-        lambda c: attempts.try_again(c, job.id, zombie.attempt, 0.0),
-        lambda c: finish(c, job.id, zombie.attempt, scene_id),
-    ]
-    for write in writes:
-        with pytest.raises(LostJob), database.transaction() as connection:
-            write(connection)
-    assert state_of(database, job.id).state == "running"
-    with database.transaction() as connection:
-        assert registrations.find_by_job(connection, job.id) is None, "the late result was rolled back"
-        finish(connection, job.id, heir.attempt, scene_id)
-    assert state_of(database, job.id).state == "successful"
-    with pytest.raises(UniqueViolation), database.transaction() as connection:
-        finish(connection, job.id, heir.attempt, scene_id)
-
-
-def finish(connection: Connection, job_id: UUID, attempt: int, scene_id: UUID) -> None:
-    """Write a result and end the job, as a worker does."""
-    registrations.insert_registration(
-        connection,
-        job_id=job_id,
-        scene_id=scene_id,
-        block_versions=[],
-        options={},
-        report={},
-        verdict="good",
-        files={},
-    )
-    attempts.succeed(connection, job_id, attempt, {})
-
-
-def test_a_job_given_back_waits_again_without_counting_a_failure(database: Database):
-    job = new_job(database)
-    for expected in (1, 2, 3, 4, 5):
-        attempt = claimed(database, job.id).attempt
-        assert attempt == expected
-        with database.transaction() as connection:
-            attempts.give_back(connection, job.id, attempt)
-    assert (state_of(database, job.id).state, state_of(database, job.id).failures) == ("accepted", 0)
-
-
-def test_a_job_that_outlives_too_many_workers_fails(database: Database):
-    job = new_job(database)
-    for _ in range(FAILURES_ALLOWED):
-        claimed(database, job.id)
-        let_lease_lapse(database, job.id)
-        sweep_jobs(database, LEASE_S)
-    failed = state_of(database, job.id)
-    assert failed.state == "failed"
-    assert failed.error is not None
-    assert f"died {FAILURES_ALLOWED} times" in failed.error["detail"]
-
-
-def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):
-    job = new_job(database)
-    attempt = claimed(database, job.id, lease_s=0.0).attempt
-    with database.transaction() as connection:
-        attempts.renew(connection, job.id, attempt, LEASE_S)
-    sweep_jobs(database, LEASE_S)
-    assert state_of(database, job.id).state == "running"
-
-
-def test_a_job_that_the_queue_has_lost_is_put_back_into_it(database: Database):
-    lost, queued = new_job(database), new_job(database)
-    with database.transaction() as connection:
-        connection.execute("delete from procrastinate_jobs where args ->> 'job_id' = %s", [str(lost.id)])
-        connection.execute("update job set updated_at = now() - interval '1 hour'")
-    sweep_jobs(database, LEASE_S)
-    sweep_jobs(database, LEASE_S)
-    with database.transaction() as connection:
-        assert queue_entries(connection, lost.id) == 1
-        assert queue_entries(connection, queued.id) == 1
-
-
-def test_entries_of_the_queue_that_died_with_their_worker_are_forgotten(database: Database):
-    new_job(database)
-    with database.transaction() as connection:
-        connection.execute(
-            "insert into procrastinate_workers (last_heartbeat) values (now() - interval '1 h')"
-        )
-        connection.execute(
-            "update procrastinate_jobs set status = 'doing',"
-            " worker_id = (select id from procrastinate_workers)"
-        )
-    sweep_jobs(database, LEASE_S)
-    with database.transaction() as connection:
-        assert connection.execute("select id from procrastinate_jobs").fetchall() == []
-
-
-def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Database, storage: Storage):
-    done, running, dead = new_job(database), new_job(database), new_job(database)
-    for job in (done, running, dead):
-        claimed(database, job.id)
-        let_lease_lapse(database, job.id)
-    sweep_jobs(database, LEASE_S)
-    for job in (done, running):
-        claimed(database, job.id)
-    with database.transaction() as connection:
-        attempts.succeed(connection, done.id, 2, {})
-        jobs.dismiss(connection, dead.id)
-    for job in (done, running, dead):
-        for attempt in (1, 2):
-            storage.put(f"results/{job.id}/{attempt}/report.json", [b"{}"])
-    sweep_files(database, storage, LEASE_S)
-    assert storage.keys("results") == sorted(
-        f"results/{job.id}/2/report.json" for job in (done, running)
-    )
-
-
-# Many jobs
 
 
 def test_jobs_are_listed_page_by_page_and_by_kind_and_state(

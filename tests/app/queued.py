@@ -1,0 +1,51 @@
+"""Jobs in the queue of a test, as a worker would have them."""
+
+from uuid import UUID, uuid4
+
+from app.db import attempts, jobs
+from app.db.engine import Connection, Database
+from app.db.jobs import Job
+
+LEASE_S = 30.0
+
+
+def new_job(database: Database) -> Job:
+    """An accepted job."""
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {"scene": str(uuid4())})
+    assert job is not None
+    return job
+
+
+def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S) -> Job:
+    """The job, taken by a worker."""
+    with database.transaction() as connection:
+        job = attempts.claim(connection, job_id, worker, lease_s)
+    assert job is not None
+    return job
+
+
+def state_of(database: Database, job_id: UUID) -> Job:
+    """The job as it is now."""
+    with database.transaction() as connection:
+        job = jobs.find(connection, job_id)
+    assert job is not None
+    return job
+
+
+def let_lease_lapse(database: Database, job_id: UUID) -> None:
+    """As if the worker had been silent for too long."""
+    with database.transaction() as connection:
+        connection.execute(
+            "update job set lease_until = now() - interval '1 second' where id = %s", [job_id]
+        )
+
+
+def queue_entries(connection: Connection, job_id: UUID) -> int:
+    """How many entries of the queue wait to be fetched for a job."""
+    row = connection.execute(
+        "select count(*) as n from procrastinate_jobs where status = 'todo' and args ->> 'job_id' = %s",
+        [str(job_id)],
+    ).fetchone()
+    assert row is not None
+    return int(row["n"])
