@@ -33,7 +33,7 @@ export class Atlas {
       return;
     }
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
-    map.on("dataloading", () => container.setAttribute("aria-busy", "true"));
+    for (const begun of ["movestart", "dataloading"] as const) map.on(begun, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
       const { x, y } = event.point;
