@@ -3,14 +3,21 @@
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
+from uuid import UUID
 
+import geopandas
 import numpy as np
 import pytest
+import shapely
 from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine
+from app.db.antimeridian import on_the_map
+from app.db.crs import EPSG_3857
 from app.db.points import control_points
+from app.db.scenes import set_footprint
 from app.storage import Storage
 from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.ground_control import points_of_store
@@ -113,6 +120,142 @@ def test_boxes_find_what_lies_on_their_side(
     assert points["numberReturned"] == expected
     blocks = client.get(f"/collections/blocks/{asked}", headers=bearer("admin")).json()
     assert blocks["numberReturned"] == 1
+
+
+def outlines_of(client: TestClient, headers: dict[str, str], how: str = "GET", **asked: Any) -> Any:
+    path = "/collections/blocks/items" if how == "GET" else "/collections/blocks/search"
+    place = {"params": asked} if how == "GET" else {"json": asked}
+    return client.request(how, path, headers=headers, **place).json()["features"]
+
+
+def test_an_outline_is_told_in_two_parts_counterclockwise(
+    published: None, client: TestClient, bearer
+) -> None:
+    (block,) = outlines_of(client, bearer("read"))
+    assert block["geometry"]["type"] == "MultiPolygon"
+    parts = [shapely.Polygon(*rings) for rings in block["geometry"]["coordinates"]]
+    assert all(part.exterior.is_ccw for part in parts)
+    west, east = sorted(parts, key=lambda part: -part.bounds[0])
+    assert west.bounds[2] == 180.0
+    assert east.bounds[0] == -180.0
+    assert west.bounds[0] > 179.9
+    assert east.bounds[2] < -179.9
+
+
+@pytest.mark.parametrize("form", ["parquet", "fgb", "gpkg"])
+def test_files_hold_both_parts(
+    published: None, client: TestClient, bearer, tmp_path: Path, form: str
+) -> None:
+    reply = client.get(f"/collections/blocks/items?f={form}", headers=bearer("read"))
+    path = tmp_path / f"blocks.{form}"
+    path.write_bytes(reply.content)
+    read = geopandas.read_parquet(path) if form == "parquet" else geopandas.read_file(path)
+    assert read.geometry.geom_type.tolist() == ["MultiPolygon"]
+    assert read.total_bounds[[0, 2]].tolist() == [-180.0, 180.0]
+
+
+@pytest.mark.parametrize("x", [0, 255], ids=["west of America", "east of Asia"])
+def test_tiles_of_both_sides_show_the_block(published: None, client: TestClient, bearer, x: int) -> None:
+    row = int((1.0 - np.arcsinh(np.tan(np.radians(CENTRE[1]))) / np.pi) / 2.0 * 256)
+    tile = client.get(f"/collections/blocks/tiles/WebMercatorQuad/8/{row}/{x}", headers=bearer("read"))
+    assert b"dateline" in tile.content
+
+
+AROUND = [[179.9, -17.1], [180.1, -17.1], [180.1, -16.9], [179.9, -16.9], [179.9, -17.1]]
+BEFORE = [[lon if lon < 180.0 else 180.0, lat] for lon, lat in AROUND]
+TURNED = [[lon - 360.0, lat] for lon, lat in AROUND]
+BEYOND = [[-180.0 if lon < 180.0 else lon - 360.0, lat] for lon, lat in AROUND]
+
+
+@pytest.mark.parametrize("ring", [AROUND, TURNED, BEFORE, BEYOND], ids=["on", "turned", "west", "east"])
+def test_geometries_of_questions_meet_what_lies_on_either_side(
+    made: Made, published: None, client: TestClient, bearer, ring: list[list[float]]
+) -> None:
+    lon = check_block(made.block).points.lon_lat_h[:, 0]
+    inside = np.ones(len(lon), bool) if ring in (AROUND, TURNED) else (lon > 0.0) == (ring is BEFORE)
+    polygon = {"type": "Polygon", "coordinates": [ring]}
+    text = ", ".join(f"{x} {y}" for x, y in ring)
+    questions = (
+        {"intersects": polygon},
+        {"filter": {"op": "s_intersects", "args": [{"property": "geometry"}, polygon]}},
+        {"filter": f"s_intersects(geometry, polygon(({text})))"},
+    )
+    for question in questions:
+        asked = {**question, "limit": 1000}
+        points = client.post("/collections/points/search", json=asked, headers=bearer("read")).json()
+        assert points["numberReturned"] == inside.sum()
+        assert len(outlines_of(client, bearer("read"), "POST", **question)) == 1
+
+
+def test_a_geometry_in_metres_goes_on_beyond_the_edge_of_the_map(
+    made: Made, published: None, client: TestClient, bearer
+) -> None:
+    east, north = 20_037_508.342789244, -1_920_000.0
+    ring = [(east + x, north + y) for x, y in [(-9e4, -9e4), (9e4, -9e4), (9e4, 9e4), (-9e4, 9e4)]]
+    text = ", ".join(f"{x} {y}" for x, y in [*ring, ring[0]])
+    question = {
+        "filter": f"s_intersects(geometry, polygon(({text})))",
+        "filter-crs": EPSG_3857.uri,
+        "limit": 1000,
+    }
+    found = client.post("/collections/points/search", json=question, headers=bearer("read")).json()
+    assert found["numberReturned"] == len(check_block(made.block).points)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [0, 1], [1, 0], [0, 0]]]},
+        {"type": "Point", "coordinates": [361.0, 0.0]},
+        {"type": "Circle"},
+    ],
+    ids=["crosses itself", "too far", "no geometry"],
+)
+def test_a_geometry_that_cannot_be_used_is_refused_by_the_name_it_came_under(
+    client: TestClient, bearer, wrong: dict[str, Any]
+) -> None:
+    meets = {"op": "s_intersects", "args": [{"property": "geometry"}, wrong]}
+    for name, value in (("intersects", wrong), ("filter", meets)):
+        reply = client.post("/collections/points/search", json={name: value}, headers=bearer("read"))
+        assert reply.status_code == 400
+        assert reply.json()["detail"].startswith(f"{name}: ")
+
+
+def test_a_scene_across_is_a_stac_item_whose_box_begins_in_the_east(
+    client: TestClient, bearer, made: Made, dsn: str
+) -> None:
+    headers = bearer("register")
+    sent = client.post("/scenes?name=a.tif", content=made.scene.read_bytes(), headers=headers).json()
+    outline = np.array([(179.5, -17.0), (180.5, -17.0), (180.5, -16.0), (179.5, -16.0)])
+    with engine.connect(dsn) as connection:
+        set_footprint(connection, UUID(sent["id"]), outline)
+    item = client.get(f"/collections/scenes/items/{sent['id']}", headers=headers).json()
+    assert item["geometry"]["type"] == "MultiPolygon"
+    assert item["bbox"] == [179.5, -17.0, -179.5, -16.0]
+    found = client.get("/search?bbox=-180,-17,-179.9,-16", headers=headers).json()
+    assert [one["id"] for one in found["features"]] == [sent["id"]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        ("POLYGON ((179 0, 181 0, 181 1, 179 1, 179 0))", 2),
+        ("POLYGON ((180 0, 181 0, 181 1, 180 1, 180 0))", 1),
+        ("POLYGON ((-200 0, 200 0, 200 1, -200 1, -200 0))", 1),
+        ("LINESTRING (170 0, 190 10)", 2),
+        ("POINT (181 5)", 1),
+        ("MULTIPOINT (181 5, 10 5)", 2),
+    ],
+)
+def test_what_lies_across_is_cut_and_nothing_of_it_is_lost(shape: str, expected: int) -> None:
+    whole = shapely.from_wkt(shape)
+    cut = on_the_map(whole)
+    assert len(shapely.get_parts(cut)) == expected
+    assert shapely.get_dimensions(cut) == shapely.get_dimensions(whole)
+    assert np.abs(shapely.get_coordinates(cut)[:, 0]).max() <= 180.0
+    overlap = 40.0 if "-200" in shape else 0.0
+    assert cut.area == pytest.approx(whole.area - overlap)
+    assert cut.length == pytest.approx(whole.length) or whole.area > 0.0
 
 
 def test_a_scene_is_registered_on_points_of_the_store(
