@@ -27,7 +27,7 @@ def svg(draw: Callable[[RegistrationSummary], Figure], summary: RegistrationSumm
     """A figure as markup for a page: no address, no fixed size, colours and fonts of the page.
 
     Args:
-        draw: one of `services.reports.figures`.
+        draw: one of `services.reports.figures.FIGURES`.
         summary: what it draws.
     """
     name = draw.__name__

@@ -45,25 +45,15 @@ def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str
         report: the figures.
         summary: what the report was made from; its arrays are drawn.
     """
-    from services.reports import figures  # matplotlib: half a second that only a page needs
-    from services.reports.drawing import svg
+    from services.reports.drawing import svg  # matplotlib: half a second that only a page needs
+    from services.reports.figures import FIGURES
 
     page = _environment().get_template("registration.html")
-    drawn = (
-        figures.ground_overview,
-        figures.residual_map,
-        figures.coverage_map,
-        figures.residual_histograms,
-        figures.funnel,
-        figures.residuals_along,
-        figures.residuals_by_height,
-        figures.predicted_map,
-    )
     return page.render(
         report=report,
         verdict_words=_VERDICTS[report.verdict],
         unmet=unmet_criteria(report),
-        figures={draw.__name__: Markup(svg(draw, summary)) for draw in drawn},
+        figures={draw.__name__: Markup(svg(draw, summary)) for draw in FIGURES},
         gallery=choose_pairs(summary.gallery),
         published=published_tables(report),
         unused=unused_points(summary),

@@ -8,23 +8,15 @@ import numpy as np
 import pytest
 
 from services.quality.qualification import Criterion
-from services.reports import figures
+from services.reports.charts import funnel
 from services.reports.drawing import round_number, svg
+from services.reports.figures import FIGURES
 from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
+from services.reports.maps import residual_map
 from services.reports.report import build_report
 from services.reports.summary import Quicklook
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
-DRAWN = [
-    figures.ground_overview,
-    figures.residual_map,
-    figures.coverage_map,
-    figures.residual_histograms,
-    figures.funnel,
-    figures.residuals_along,
-    figures.residuals_by_height,
-    figures.predicted_map,
-]
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
@@ -155,7 +147,7 @@ def test_hostile_names_are_shown_and_not_run(summarised):
 def test_a_page_is_made_of_any_registration(summarised, poor):
     found = Page(page(poor(summarised())))
     assert "Registration report" in found.texts
-    assert [name for name, _ in found.attributes].count("aria-label") == len(DRAWN) + 2
+    assert [name for name, _ in found.attributes].count("aria-label") == len(FIGURES) + 2
 
 
 def test_a_page_of_thousands_of_points_stays_light(summarised):
@@ -165,12 +157,12 @@ def test_a_page_of_thousands_of_points_stays_light(summarised):
 
 
 def test_the_same_registration_gives_the_same_figure(summarised):
-    assert svg(figures.residual_map, summarised()) == svg(figures.residual_map, summarised())
+    assert svg(residual_map, summarised()) == svg(residual_map, summarised())
 
 
 def test_figures_on_one_page_share_no_identifier(summarised):
     summary = summarised()
-    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, summary))) for draw in DRAWN]
+    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, summary))) for draw in FIGURES]
     assert sum(map(len, seen)) == len(set.union(*seen))
 
 
@@ -179,7 +171,7 @@ def test_the_residual_arrows_point_where_the_residuals_do(summarised):
     summary = summarised()
     residual = np.tile([1.0, 2.0], (60, 1))
     measures = replace(summary.measures, residual_px=residual)
-    axes = figures.residual_map(replace(summary, measures=measures)).axes[0]
+    axes = residual_map(replace(summary, measures=measures)).axes[0]
     arrows = axes.collections[0]
     assert axes.yaxis_inverted()
     assert (arrows.U > 0).all()
@@ -188,7 +180,7 @@ def test_the_residual_arrows_point_where_the_residuals_do(summarised):
 
 def test_the_funnel_ends_where_the_equipment_says(summarised):
     summary = summarised()
-    axes = figures.funnel(summary).axes[0]
+    axes = funnel(summary).axes[0]
     widths = dict(zip([label.get_text() for label in axes.get_yticklabels()], axes.patches, strict=True))
     equipment = summary.qualification.equipment
     assert widths["visible"].get_width() == equipment.visible

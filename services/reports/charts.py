@@ -1,0 +1,168 @@
+"""The charts of a report: what became of the points, how residuals are spread and what they follow."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from services.quality.accuracy import statistics
+from services.reports.drawing import (
+    ACTIVE,
+    DEACTIVATED,
+    INK,
+    MANY_POINTS,
+    MATCHED,
+    NOT_MATCHED,
+    QUIET,
+    TEXT_PT,
+    WIDTH_IN,
+    plain_axes,
+    shortened,
+    style,
+)
+from services.reports.report import count_reasons
+from services.reports.summary import RegistrationSummary
+from services.reports.tables import number, reason_words
+from services.types import Array
+
+
+def residual_histograms(summary: RegistrationSummary) -> Figure:
+    """Distribution of the residuals of the active points in x, y and xy."""
+    figure = Figure(figsize=(WIDTH_IN, 2.3), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    line, sample = summary.measures.residual_px[summary.measures.active].T
+    for axes, name, values in zip(
+        panels, ("x (sample)", "y (line)", "xy"), (sample, line, np.hypot(line, sample)), strict=True
+    ):
+        style(axes)
+        axes.set_xlabel(f"{name}, px")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=4, prune="both"))
+        finite = values[np.isfinite(values)]
+        if not len(finite):
+            continue
+        reach = max(float(np.abs(finite).max()), 0.01)
+        bins = np.linspace(0.0 if name == "xy" else -reach, reach, 17)
+        axes.hist(finite, bins=bins, color=ACTIVE, alpha=0.85)
+        found = statistics(finite)
+        axes.axvline(found.mean, color=INK, linewidth=1.0)
+        axes.set_title(f"{number(found.mean, 3)} ± {number(found.std, 3)}", color=INK, fontsize=TEXT_PT)
+    panels[0].set_ylabel("points")
+    panels[0].yaxis.get_major_locator().set_params(integer=True)
+    return figure
+
+
+def funnel(summary: RegistrationSummary) -> Figure:
+    """From visible to matched to active points, with what was lost on the way and why."""
+    equipment = summary.qualification.equipment
+    reasons = count_reasons(summary.measures)
+    bars: list[tuple[str, int, int, str]] = [("visible", 0, equipment.visible, QUIET)]
+    left = equipment.visible
+    for stage, total, colour in (
+        ("not matched", equipment.matched, MATCHED),
+        ("deactivated", equipment.active, ACTIVE),
+    ):
+        for reason in (r for r in reasons if r.stage == stage):
+            left -= reason.count
+            bars.append((shortened(reason_words(reason.reason)), left, reason.count, NOT_MATCHED))
+        bars.append(("matched" if stage == "not matched" else "active", 0, total, colour))
+    figure, axes = plain_axes(height_in=0.5 + 0.26 * len(bars))
+    for row, (_, start, width, colour) in enumerate(bars):
+        axes.barh(row, width, left=start, height=0.62, color=colour)
+        axes.annotate(
+            str(width),
+            (start + width, row),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            color=INK,
+            fontsize=TEXT_PT,
+        )
+    axes.set_yticks(range(len(bars)), [name for name, *_ in bars])
+    axes.invert_yaxis()
+    axes.set_xlim(0, max(equipment.visible, 1) * 1.12)
+    axes.set_xlabel("points")
+    return figure
+
+
+def residuals_along(summary: RegistrationSummary) -> Figure:
+    """Residuals of the active points against line and sample: what drift and jitter leave."""
+    figure = Figure(figsize=(WIDTH_IN, 3.8), layout="constrained")
+    panels = figure.subplots(2, 2, sharex="col", sharey="row")
+    active = summary.measures.active
+    residual, place = summary.measures.residual_px[active], summary.measures.line_sample[active]
+    for k, residual_name in enumerate(("y (line)", "x (sample)")):
+        for j, place_name in enumerate(("line", "sample")):
+            axes = panels[k, j]
+            style(axes)
+            axes.axhline(0.0, color=QUIET, linewidth=0.7)
+            axes.scatter(
+                place[:, j],
+                residual[:, k],
+                s=7,
+                color=ACTIVE,
+                alpha=0.7,
+                linewidths=0,
+                rasterized=len(place) > MANY_POINTS,
+            )
+            axes.plot(*_running_median(place[:, j], residual[:, k]), color=DEACTIVATED, linewidth=1.4)
+            axes.set_xlim(0, summary.shape[j])
+            axes.locator_params(axis="x", nbins=4)
+            if k == 1:
+                axes.set_xlabel(place_name)
+            if j == 0:
+                axes.set_ylabel(f"{residual_name}, px")
+    return figure
+
+
+def residuals_by_height(summary: RegistrationSummary) -> Figure:
+    """Residuals of the active points on the ground against their height, along and across the view."""
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    measures = summary.measures
+    azimuth = np.radians(summary.acquisition.azimuth_deg)
+    names = ("along the view", "across the view") if np.isfinite(azimuth) else ("north", "east")
+    north_first = np.nan_to_num(azimuth)
+    away = np.array([-np.sin(north_first), -np.cos(north_first)])
+    if not np.isfinite(azimuth):
+        away = -away
+    across = np.array([-away[1], away[0]]) if np.isfinite(azimuth) else np.array([1.0, 0.0])
+    height_m = measures.lon_lat_h[measures.active, 2]
+    for axes, name, direction in zip(panels, names, (away, across), strict=True):
+        residual_m = measures.residual_m[measures.active] @ direction
+        style(axes)
+        axes.axhline(0.0, color=QUIET, linewidth=0.7)
+        axes.scatter(
+            height_m,
+            residual_m,
+            s=7,
+            color=ACTIVE,
+            alpha=0.7,
+            linewidths=0,
+            rasterized=len(height_m) > MANY_POINTS,
+        )
+        axes.plot(*_running_median(height_m, residual_m), color=DEACTIVATED, linewidth=1.4)
+        axes.locator_params(axis="x", nbins=4)
+        axes.set_xlabel("height, m")
+        axes.set_title(name, color=INK, fontsize=TEXT_PT, loc="left")
+    panels[0].set_ylabel("residual, m")
+    return figure
+
+
+def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
+    """Medians of equal parts of the points in order of position; empty with too few of them.
+
+    Four parts at least and 40 at most, of a dozen points where there are so many: few points show a
+    slope, many show what oscillates, and neither shows noise for it.
+    """
+    finite = np.isfinite(position) & np.isfinite(value)
+    n = int(finite.sum())
+    bins = min(40, max(4, n // 12))
+    if n < 6 * bins:
+        return np.empty(0), np.empty(0)
+    order = np.argsort(position[finite])
+    parts = zip(
+        np.array_split(position[finite][order], bins),
+        np.array_split(value[finite][order], bins),
+        strict=True,
+    )
+    medians = np.array([(np.median(place), np.median(part)) for place, part in parts])
+    return medians[:, 0], medians[:, 1]
