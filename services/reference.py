@@ -4,16 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions
-from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery import (
-    ImageSource,
-    ReducedImage,
-    image_gsd_m,
-    image_gsds_m,
-    reduce_image,
-    render_chip,
-)
+from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
+from services.errors import ComputationError, CoverageError, InputError, NoConsensus
+from services.homologous import homologous_points
+from services.imagery import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import vote
 from services.matching.dense import DenseOptions, Places, Reference, match_places, places_seen
 from services.matching.points import PointMatches
@@ -27,20 +21,11 @@ from services.passes import (
     summarised,
 )
 from services.quality.qualification import QualificationOptions
+from services.quality.stability import image_places
 from services.registration import Registration, RegistrationOptions, qualified
 from services.scene import Scene, scene_gsd_m
-from services.sensors.correction import CorrectedModel, no_correction
-from services.types import (
-    Acquisition,
-    Array,
-    BoolArray,
-    ChipArray,
-    ControlPoints,
-    Progress,
-    Views,
-    no_progress,
-    part_of,
-)
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.types import Array, BoolArray, ControlPoints, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -48,10 +33,15 @@ class ReferenceOptions:
     """How a scene is registered on a reference ortho-image.
 
     Attributes:
-        places: how many are searched at every level, evenly over the scene.
+        places: how many are searched at the finest level, evenly over the scene.
+        leading_places: how many are searched before that, to lead there; where less than a quarter
+            of them agree, `places` are.
         first_radius_px: the first level is so coarse that three standard deviations of the model are
             searched within so many of its pixels.
-        fine_passes: how many times the finest level is searched, each time through the last model.
+        fine_passes: how many times the finest level is searched at most, each time through the last
+            model.
+        settled_px: a search of the finest level that moves no corner of the image by more is the last,
+            pixels of the level.
         enough: a level on which the scene has fewer whole windows than this is left out.
         max_false_alarms: a first consensus that chance would give more often than this is refused.
         seed: of the random draws of the stability test.
@@ -59,8 +49,10 @@ class ReferenceOptions:
     """
 
     places: int = 900
+    leading_places: int = 100
     first_radius_px: int = 16
     fine_passes: int = 2
+    settled_px: float = 0.25
     enough: int = 12
     max_false_alarms: float = 1e-4
     seed: int = 0
@@ -70,7 +62,7 @@ class ReferenceOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no registration can be made with."""
-        for name in ("places", "first_radius_px", "fine_passes", "enough"):
+        for name in ("places", "leading_places", "first_radius_px", "fine_passes", "enough"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: {getattr(self, name)} given, 1 or more expected")
 
@@ -86,7 +78,8 @@ def register_on_reference(
 
     From a level coarse enough for the error of the model down to the finest that both images have:
     places evenly over the scene are searched, those that agree refine the model, which predicts the
-    next level. Source: the method of ANDORRE (CNES, Spot Image).
+    next level. A few places lead to the finest level, where all are searched. Source: the method of
+    ANDORRE (CNES, Spot Image).
 
     Args:
         scene: its model may be wrong by three times `scene.sigma_m`.
@@ -105,35 +98,25 @@ def register_on_reference(
         NoConsensus: the places found do not agree on one correction.
         InputError: heights move what the scene shows, and there is no terrain.
     """
-    gsd_m = scene_gsd_m(scene)
     finest = _finest_factor(scene, reference)
-    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
-    factor = _factor(3.0 * scene.sigma_m / gsd_m, scene, finest, options)
-    radius_px = _radius_px(scene.sigma_m / gsd_m, factor)
+    state = _start(scene, finest, options)
     passes: list[Pass] = []
-    fine = 0
-    while fine < options.fine_passes:
-        known_here = known if factor == finest else None
-        places = _places(scene, model, reference, factor, radius_px, options, known_here)
-        image = _image_at(scene, factor, len(places.cell), radius_px, options.dense.window_px)
-        part = part_of(progress, min(0.25 * len(passes), 0.8), 0.15)
-        matches = match_places(image, model, reference, places, radius_px, options.dense, part)
-        ground = homologous_points(places.lon_lat_h, reference)
-        level_m = factor * gsd_m
-        if not passes:
-            agreeing = _first_consensus(matches, level_m, radius_px, options)
-        else:
-            agreeing = agreement(
-                model, ground, matches, radius_px * level_m, options.adjustment.min_points
-            )
-        adjustment = adjust_on(scene, ground, matches, agreeing, options.adjustment)
-        passes.append(summarised("dense", level_m, radius_px, matches, agreeing))
-        model = CorrectedModel(scene.model, adjustment.correction)
-        uncertainty_m = model_uncertainty_m(model, ground, adjustment)
-        fine += factor == finest
-        reach_px = 3.0 * float(np.percentile(uncertainty_m, 95)) / gsd_m
-        factor = max(finest, min(-(-factor // 2), _factor(reach_px, scene, finest, options)))
-        radius_px = _radius_px(reach_px / 3.0, factor)
+    while not passes or state.factor > finest:
+        part = part_of(progress, min(0.1 * len(passes), 0.4), 0.1)
+        search = _lead(scene, reference, state, not passes, options, part)
+        state = _after(scene, state, search, finest, options)
+        passes.append(search.summary)
+    for number in range(options.fine_passes):
+        part = part_of(progress, 0.5 + 0.45 * number / options.fine_passes, 0.45 / options.fine_passes)
+        before = state.model.correction
+        search = _search(scene, reference, state, options.places, False, options, part, known)
+        state = _after(scene, state, search, finest, options)
+        passes.append(search.summary)
+        if _largest_move_px(before, state.model.correction, scene.image.shape) <= (
+            options.settled_px * finest
+        ):
+            break
+    ground, matches, adjustment = search.ground, search.matches, search.adjustment
     progress(0.95, "qualifying the result")
     everything = np.arange(len(ground))
     registration = qualified(
@@ -150,6 +133,104 @@ def register_on_reference(
     )
     progress(1.0, "registered")
     return registration
+
+
+@dataclass(frozen=True)
+class _State:
+    """What the next search starts from.
+
+    Attributes:
+        model: of the scene, as far as it is known.
+        factor: pixels of the scene to one of the level that is searched.
+        radius_px: how far, pixels of the level.
+    """
+
+    model: CorrectedModel
+    factor: int
+    radius_px: int
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What one search found, and the adjustment on it."""
+
+    ground: ControlPoints
+    matches: PointMatches
+    adjustment: SceneAdjustment
+    agreeing: int
+    summary: Pass
+
+
+def _start(scene: Scene, finest: int, options: ReferenceOptions) -> _State:
+    """The delivered model, and the level at which its error is searched."""
+    sigma_px = scene.sigma_m / scene_gsd_m(scene)
+    factor = _factor(3.0 * sigma_px, scene, finest, options)
+    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
+    return _State(model, factor, _radius_px(sigma_px, factor))
+
+
+def _after(
+    scene: Scene, state: _State, search: _Search, finest: int, options: ReferenceOptions
+) -> _State:
+    """The refined model, and the level and the radius that what is left of its error asks for."""
+    model = CorrectedModel(scene.model, search.adjustment.correction)
+    uncertainty_m = model_uncertainty_m(model, search.ground, search.adjustment)
+    reach_px = 3.0 * float(np.percentile(uncertainty_m, 95)) / scene_gsd_m(scene)
+    factor = max(finest, min(-(-state.factor // 2), _factor(reach_px, scene, finest, options)))
+    return _State(model, factor, _radius_px(reach_px / 3.0, factor))
+
+
+def _lead(
+    scene: Scene,
+    reference: Reference,
+    state: _State,
+    first: bool,
+    options: ReferenceOptions,
+    progress: Progress,
+) -> _Search:
+    """A search that only leads to the finest level: few places, as long as these agree."""
+    if options.leading_places < options.places:
+        try:
+            search = _search(scene, reference, state, options.leading_places, first, options, progress)
+        except (CoverageError, ComputationError):
+            pass
+        else:
+            if search.agreeing >= options.leading_places / 4.0:
+                return search
+    return _search(scene, reference, state, options.places, first, options, progress)
+
+
+def _search(
+    scene: Scene,
+    reference: Reference,
+    state: _State,
+    count: int,
+    first: bool,
+    options: ReferenceOptions,
+    progress: Progress,
+    known: Array | None = None,
+) -> _Search:
+    """Search places of a level, and adjust on those that agree."""
+    model, factor, radius_px = state.model, state.factor, state.radius_px
+    places = _places(scene, model, reference, factor, count, options, known)
+    image = _image_at(scene, factor, len(places.cell), radius_px, options.dense.window_px)
+    matches = match_places(image, model, reference, places, radius_px, options.dense, progress)
+    ground = homologous_points(places.lon_lat_h, reference)
+    level_m = factor * scene_gsd_m(scene)
+    if first:
+        agreeing = _first_consensus(matches, level_m, radius_px, options)
+    else:
+        least = options.adjustment.min_points
+        agreeing = agreement(model, ground, matches, radius_px * level_m, least)
+    adjustment = adjust_on(scene, ground, matches, agreeing, options.adjustment)
+    summary = summarised("dense", level_m, radius_px, matches, agreeing)
+    return _Search(ground, matches, adjustment, int(agreeing.sum()), summary)
+
+
+def _largest_move_px(before: ImageCorrection, after: ImageCorrection, shape: tuple[int, int]) -> float:
+    """How far two corrections of an image are apart at the worse of its corners."""
+    places = image_places(shape)
+    return float(np.linalg.norm(after.apply(places) - before.apply(places), axis=1).max())
 
 
 def _finest_factor(scene: Scene, reference: Reference) -> int:
@@ -186,7 +267,7 @@ def _places(
     model: CorrectedModel,
     reference: Reference,
     factor: int,
-    radius_px: int,
+    count: int,
     options: ReferenceOptions,
     known: Array | None,
 ) -> Places:
@@ -194,12 +275,12 @@ def _places(
     margin = options.dense.window_px // 2 * factor
     size = np.array(scene.image.shape, dtype=np.float64)
     room = np.maximum(size - 2.0 * margin, 1.0)
-    side = max(np.sqrt(room[0] * room[1] / options.places), 2.0 * factor)
-    count = np.maximum(np.round(room / side), 1.0).astype(int)
-    axes = [margin + (np.arange(c) + 0.5) * r / c - 0.5 for c, r in zip(count, room, strict=True)]
+    side = max(np.sqrt(room[0] * room[1] / count), 2.0 * factor)
+    counts = np.maximum(np.round(room / side), 1.0).astype(int)
+    axes = [margin + (np.arange(c) + 0.5) * r / c - 0.5 for c, r in zip(counts, room, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     if known is not None and len(known):
-        grid = _with_known(grid, model.project(known), room / count, size, margin)
+        grid = _with_known(grid, model.project(known), room / counts, size, margin)
     places = places_seen(model, reference, grid, factor, options.dense.window_px)
     if len(places.cell) < options.adjustment.min_points:
         raise CoverageError(
@@ -246,60 +327,3 @@ def _first_consensus(
             f"alone: {consensus.false_alarms:.2g} times); {reasons_in_words(matches.reason)}"
         )
     return consensus.agreeing
-
-
-def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
-    """Places on the ground (n, 3) as control points, whose one chip is cut from the reference.
-
-    `ReferenceChips` reads the chips.
-    """
-    n = len(lon_lat_h)
-    unknown = np.full(n, np.nan)
-    variance = np.array([reference.sigma_m, reference.sigma_m, reference.height_sigma_m]) ** 2
-    rows = np.arange(n)
-    return ControlPoints(
-        id=rows,
-        lon_lat_h=lon_lat_h,
-        covariance_m2=np.tile(np.diag(variance), (n, 1, 1)),
-        saliency=np.ones(n),
-        health=np.ones(n),
-        views=Views(
-            start=np.arange(n + 1),
-            gsd_m=image_gsds_m(reference.model, lon_lat_h),
-            image=np.zeros(n, dtype=np.int64),
-            incidence_deg=unknown,
-            azimuth_deg=unknown,
-            health=np.ones(n),
-            images=(Acquisition("reference"),),
-        ),
-        chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=rows,
-        chip_files=("reference",),
-    )
-
-
-@dataclass(frozen=True)
-class ReferenceChips:
-    """Chips of homologous points, cut from the reference when they are asked for.
-
-    Attributes:
-        reference: what they are cut from.
-        lon_lat_h: (n, 3) the points, by their rows.
-    """
-
-    reference: Reference
-    lon_lat_h: Array
-
-    def read(self, file: str, row: int, count: int) -> ChipArray:
-        """Chips (count, 101, 101) uint16, each stretched over all values; 0 is nodata."""
-        return np.stack([self._chip(ground) for ground in self.lon_lat_h[row : row + count]])
-
-    def _chip(self, ground: Array) -> ChipArray:
-        gsd_m = image_gsd_m(self.reference.model, ground)
-        pixels = render_chip(self.reference.image, self.reference.model, ground, gsd_m)
-        seen = np.isfinite(pixels)
-        if not seen.any():
-            return np.zeros(pixels.shape, dtype=np.uint16)
-        low, high = float(pixels[seen].min()), float(pixels[seen].max())
-        stretched = 1.0 + (pixels - low) * (65534.0 / max(high - low, 1e-12))
-        return np.where(seen, stretched, 0.0).astype(np.uint16)

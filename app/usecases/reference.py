@@ -9,13 +9,9 @@ from app.usecases.ground_control import FoundPoints
 from app.usecases.orthorectification import TerrainFile
 from services.formats.dem import read_dem
 from services.formats.raster import map_grid_of, open_raster
+from services.homologous import ReferenceChips, homologous_points
 from services.matching.dense import Reference
-from services.reference import (
-    ReferenceChips,
-    ReferenceOptions,
-    homologous_points,
-    register_on_reference,
-)
+from services.reference import ReferenceOptions, register_on_reference
 from services.registration import Registration, RegistrationOptions
 from services.reports.summary import BlockUsed
 from services.scene import Scene

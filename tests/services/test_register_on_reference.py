@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery import ArrayImage, sample_image
+from services.imagery import ArrayImage, Window, sample_image
 from services.map_grid import MapGrid, utm_of
 from services.matching.dense import DenseOptions, Reference
 from services.reference import ReferenceOptions, register_on_reference
@@ -97,6 +97,30 @@ def test_levels_go_down_to_full_resolution_and_their_searches_shrink() -> None:
     assert gsd_m[0] > 1.5 * gsd_m[-1]
     assert passes[-1].search_radius_m < passes[0].search_radius_m / 4.0
     assert passes[-1].move_m < 2.0 * gsd_m[-1]
+
+
+def test_few_places_lead_to_the_finest_level_where_all_are_searched() -> None:
+    first, *_, last = registered().passes
+    assert first.tried <= OPTIONS.leading_places
+    assert last.tried > 2 * OPTIONS.leading_places
+
+
+def test_all_places_lead_where_few_of_the_few_are_to_be_seen() -> None:
+    hidden = reference().image.read(Window(0, 0, *reference().image.shape)).copy()
+    hidden[:, hidden.shape[1] * 2 // 5 :] = np.nan
+    scene = spoiled_view().as_scene(SIGMA_M)
+    found = register_on_reference(scene, replace(reference(), image=ArrayImage(hidden)), OPTIONS)
+    assert found.passes[0].tried > OPTIONS.leading_places
+
+
+def test_the_last_search_is_one_that_hardly_moves_the_image() -> None:
+    options = replace(OPTIONS, fine_passes=5)
+    scene = spoiled_view().as_scene(SIGMA_M)
+    settled = register_on_reference(scene, reference(), options)
+    finest = [one for one in settled.passes if one.tried == settled.passes[-1].tried]
+    assert len(finest) < options.fine_passes
+    error = error_px(settled)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < ERROR_ALLOWED_PX
 
 
 def test_places_found_before_are_the_first_to_be_searched_again() -> None:

@@ -1,0 +1,66 @@
+"""Places of a reference image that scenes were found by, as control points with chips cut from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.imagery import image_gsd_m, image_gsds_m, render_chip
+from services.matching.dense import Reference
+from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
+
+
+def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
+    """Places on the ground (n, 3) as control points, whose one chip is cut from the reference.
+
+    `ReferenceChips` reads the chips.
+    """
+    n = len(lon_lat_h)
+    unknown = np.full(n, np.nan)
+    variance = np.array([reference.sigma_m, reference.sigma_m, reference.height_sigma_m]) ** 2
+    rows = np.arange(n)
+    return ControlPoints(
+        id=rows,
+        lon_lat_h=lon_lat_h,
+        covariance_m2=np.tile(np.diag(variance), (n, 1, 1)),
+        saliency=np.ones(n),
+        health=np.ones(n),
+        views=Views(
+            start=np.arange(n + 1),
+            gsd_m=image_gsds_m(reference.model, lon_lat_h),
+            image=np.zeros(n, dtype=np.int64),
+            incidence_deg=unknown,
+            azimuth_deg=unknown,
+            health=np.ones(n),
+            images=(Acquisition("reference"),),
+        ),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=rows,
+        chip_files=("reference",),
+    )
+
+
+@dataclass(frozen=True)
+class ReferenceChips:
+    """Chips of homologous points, cut from the reference when they are asked for.
+
+    Attributes:
+        reference: what they are cut from.
+        lon_lat_h: (n, 3) the points, by their rows.
+    """
+
+    reference: Reference
+    lon_lat_h: Array
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """Chips (count, 101, 101) uint16, each stretched over all values; 0 is nodata."""
+        return np.stack([self._chip(ground) for ground in self.lon_lat_h[row : row + count]])
+
+    def _chip(self, ground: Array) -> ChipArray:
+        gsd_m = image_gsd_m(self.reference.model, ground)
+        pixels = render_chip(self.reference.image, self.reference.model, ground, gsd_m)
+        seen = np.isfinite(pixels)
+        if not seen.any():
+            return np.zeros(pixels.shape, dtype=np.uint16)
+        low, high = float(pixels[seen].min()), float(pixels[seen].max())
+        stretched = 1.0 + (pixels - low) * (65534.0 / max(high - low, 1e-12))
+        return np.where(seen, stretched, 0.0).astype(np.uint16)
