@@ -3,7 +3,6 @@
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -21,6 +20,7 @@ import psycopg
 from app.db.embedded import Cluster
 from app.db.engine import connect
 from app.usecases.tokens import create_token
+from tests.serving import free_port
 
 LEASE_S = 2.0
 WORKERS = 2
@@ -89,9 +89,7 @@ class Siege:
     _quiet: threading.Event = field(default_factory=threading.Event)
 
     def __enter__(self) -> "Siege":
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self.ingest_folder.mkdir(parents=True)
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
         environment = inherited | {

@@ -1,10 +1,13 @@
 """What every test may ask for."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from tests.runs import end_dead_runs, run_folder
 
 settings.register_profile("amers", deadline=None)
 settings.load_profile("amers")
@@ -17,6 +20,14 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long modules first: one that is begun last leaves the other cores without work."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
+@pytest.fixture(scope="session")
+def open_folder() -> Iterator[Path]:
+    """A short temporary folder that the server's user can pass, unlike pytest's own."""
+    end_dead_runs()
+    with run_folder() as folder:
+        yield folder
 
 
 @pytest.fixture(scope="session")

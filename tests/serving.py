@@ -5,6 +5,8 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from itertools import cycle, islice
 from pathlib import Path
 
 import httpx
@@ -12,14 +14,18 @@ import httpx
 from app.db.embedded import Cluster
 
 patience_s = 90.0
+PORTS = range(20_000, 32_000)
+"""Below those that Linux gives to outgoing connections."""
+_ports = islice(cycle(PORTS), 37 * os.getpid() % len(PORTS), None)
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens at."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[1]
-    return port
+    """A port that nobody has, and that no outgoing connection is given before its service listens."""
+    for port in _ports:
+        with socket.socket() as free, suppress(OSError):
+            free.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("an endless row of ports has ended")
 
 
 class Service:
@@ -27,6 +33,7 @@ class Service:
 
     Attributes:
         folder: its data folder.
+        log: what it says.
         environment: in which commands reach its database.
     """
 
@@ -36,12 +43,19 @@ class Service:
         self.cluster = Cluster(folder / "postgres")
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
         self.environment = {**inherited, "AMERS_DATA_FOLDER": str(folder), **settings}
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port)],
-            env=self.environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        self.log = folder.with_suffix(".log")
+        with self.log.open("ab") as output:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port)],
+                env=self.environment,
+                stdout=output,
+                stderr=output,
+            )
+
+    def end(self) -> None:
+        """Ask it to end, and see that it does."""
+        self.process.terminate()
+        self.process.wait(timeout=patience_s)
 
     @property
     def url(self) -> str:

@@ -1,7 +1,5 @@
 """A real PostGIS for the tests: one private cluster a session, one database a test."""
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,21 +14,12 @@ from pydantic import SecretStr
 from app.config import Settings
 from app.db import engine
 from app.db.embedded import Cluster
-from app.db.engine import Connection
+from app.db.engine import Connection, Database
 from app.main import create_app
 from app.storage import Storage
 from app.usecases.tokens import create_token
 
 TEMPLATE = "amers_template"
-
-
-@pytest.fixture(scope="session")
-def open_folder() -> Iterator[Path]:
-    """A short temporary folder that the server's user can pass, unlike pytest's own."""
-    folder = Path(tempfile.mkdtemp(prefix="amers-test-", dir="/tmp"))
-    folder.chmod(0o755)
-    yield folder
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
@@ -82,6 +71,14 @@ def settings(dsn: str, tmp_path: Path) -> Settings:
 def storage(settings: Settings) -> Storage:
     """The storage that the client of the same test uses."""
     return Storage(settings.data_folder / "storage")
+
+
+@pytest.fixture
+def database(settings: Settings) -> Iterator[Database]:
+    """The test's database with its pools."""
+    assert settings.database_url is not None
+    with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
+        yield database
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
-"""A service as a process of its own, on a database of the tests with one published block."""
+"""A service as a process of its own, on a database of the tests."""
 
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,8 +18,9 @@ from app.usecases import blocks
 from app.usecases.tokens import create_token
 from services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.workers import wait_until
 from tests.factories import make_block
-from tests.serving import until
+from tests.serving import free_port, until
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,7 @@ def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator
             blocks.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
             blocks.publish_block(connection, "calanques")
             secret = create_token(connection, "a client", [scope]).secret
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
+        port = free_port()
         environment = {
             **os.environ,
             "AMERS_DATABASE_URL": dsn,
@@ -79,3 +77,23 @@ def _answers(url: str) -> bool:
         return httpx.get(f"{url}/readyz").status_code == 200
     except httpx.TransportError:
         return False
+
+
+@contextmanager
+def running_service(settings: Settings, log: Path) -> Iterator[str]:
+    """`amers serve` on the installation of a test; yields its address."""
+    assert settings.database_url is not None
+    port = free_port()
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+    command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)]
+    with log.open("wb") as output:
+        service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
+    try:
+        wait_until(lambda: "running on" in log.read_text(), "the service answers")
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        service.terminate()
+        service.wait(30)

@@ -31,12 +31,11 @@ SMALL_WINDOW = 4096
 def service(open_folder):
     service = Service(open_folder / uuid4().hex[:8])
     try:
-        assert until(service.is_ready)
-        assert until(service.workers)
+        assert until(service.is_ready), service.log.read_text()
+        assert until(service.workers), service.log.read_text()
         yield service
     finally:
-        service.process.terminate()
-        service.process.wait(timeout=60)
+        service.end()
         with service.cluster.lease():
             pass
 

@@ -4,10 +4,10 @@ import json
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 
@@ -17,18 +17,17 @@ Amers = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def service() -> Iterator[Service]:
+def service(open_folder: Path) -> Iterator[Service]:
     """A running service with an empty store."""
-    folder = Path(tempfile.mkdtemp(prefix="amers-journey-", dir="/tmp"))
-    folder.chmod(0o755)
+    folder = open_folder / uuid4().hex[:8]
+    folder.mkdir(mode=0o755)
     service = Service(folder / "data")
     try:
-        assert until(service.is_ready)
-        assert until(service.workers)
+        assert until(service.is_ready), service.log.read_text()
+        assert until(service.workers), service.log.read_text()
         yield service
     finally:
-        service.process.terminate()
-        service.process.wait(timeout=60)
+        service.end()
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -1,0 +1,73 @@
+"""A folder for each run of the tests, and the end of what runs that were killed have left."""
+
+import fcntl
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+PREFIX = "amers-test-"
+MARK = "run"
+"""A file that is locked as long as the process lives that runs the tests."""
+PATIENCE_S = 10.0
+
+
+@contextmanager
+def run_folder(where: Path = Path("/tmp")) -> Iterator[Path]:
+    """A short temporary folder that the server's user can pass, unlike pytest's own."""
+    folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=where))
+    folder.chmod(0o755)
+    with (folder / f"{MARK}.new").open("w") as mark:
+        fcntl.flock(mark, fcntl.LOCK_EX)
+        # Under its own name only once it is locked, so that nobody takes a beginner for dead.
+        (folder / f"{MARK}.new").rename(folder / MARK)
+        yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def end_dead_runs(where: Path = Path("/tmp")) -> list[Path]:
+    """Kill what runs that were killed have left running, and remove their folders; returns these."""
+    ended = []
+    for mark in where.glob(f"{PREFIX}*/{MARK}"):
+        with suppress(OSError), mark.open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _end_processes_in(mark.parent)
+            shutil.rmtree(mark.parent, ignore_errors=True)
+            ended.append(mark.parent)
+    return ended
+
+
+def processes_in(folder: Path) -> dict[int, bool]:
+    """The processes that work in a folder (true), or have a file of it open."""
+    found: dict[int, bool] = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            works_there = process.joinpath("cwd").readlink().is_relative_to(folder)
+            links = [] if works_there else list(process.joinpath("fd").iterdir())
+            if works_there or any(_leads_into(link, folder) for link in links):
+                found[int(process.name)] = works_there
+    found.pop(os.getpid(), None)
+    return found
+
+
+def _leads_into(link: Path, folder: Path) -> bool:
+    with suppress(OSError):
+        return link.readlink().is_relative_to(folder)
+    return False
+
+
+def _end_processes_in(folder: Path) -> None:
+    """PostgreSQL, which works in its data, is told to end at once; it puts its shared memory away."""
+    deadline = time.monotonic() + PATIENCE_S
+    while (left := processes_in(folder)) and time.monotonic() < deadline:
+        for number, works_there in left.items():
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGQUIT if works_there else signal.SIGKILL)
+        time.sleep(0.1)
+    for number in left:
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
