@@ -15,7 +15,7 @@ from app.usecases.blocks import ingest_block, publish_block
 from services.formats.rpc_files import read_rpc
 from tests.app.buckets import running_bucket
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
-from tests.app.test_registration import A_TENTH_OF_A_PIXEL, largest_error_px
+from tests.app.registered import A_TENTH_OF_A_PIXEL, largest_error_px
 from tests.app.workers import ended, running_worker
 
 Bearer = Callable[[str], dict[str, str]]

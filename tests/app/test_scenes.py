@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import socket
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +19,8 @@ from app.main import create_app
 from app.storage import KEY, Storage
 from app.usecases.scenes import clean_name, folder_of
 from app.worker.sweep import sweep_files
+from tests.app.served import running_service
+from tests.app.workers import wait_until
 
 TIFF = b"II*\0" + bytes(100_000)
 LIMIT_BYTES = 200_000
@@ -261,3 +264,26 @@ def test_an_upload_survives_no_failure_of_the_database(settings: Settings, beare
         assert reply.status_code == 500
         assert stored_files(Storage(settings.data_folder / "storage")) == []
         assert client.get("/scenes", headers=me).json() == {"scenes": []}
+
+
+def test_an_upload_cut_off_by_its_sender_leaves_nothing(
+    token: Callable[[str], str], settings: Settings, storage: Storage, tmp_path: Path, dsn: str
+):
+    with running_service(settings, tmp_path / "serve.log") as url:
+        port = int(url.rsplit(":", 1)[1])
+        head = (
+            "POST /scenes?name=a.tif HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10000000\r\n"
+            f"Authorization: Bearer {token('register')}\r\n\r\n"
+        )
+        with socket.create_connection(("127.0.0.1", port)) as sender:
+            sender.sendall(head.encode() + b"II*\0" + bytes(1_000_000))
+            unfinished = storage.folder / "unfinished"
+            wait_until(lambda: list(unfinished.glob("*")), "the upload has begun", 20.0)
+
+        def forgotten() -> bool:
+            with engine.connect(dsn) as connection:
+                row = connection.execute("select count(*) as n from scene").fetchone()
+            return row == {"n": 0}
+
+        wait_until(forgotten, "the scene is forgotten", 20.0)
+        assert [path for path in storage.folder.rglob("*") if path.is_file()] == []

@@ -1,0 +1,236 @@
+"""`amers scene register`: on a block folder, on the store, and by a service elsewhere."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jsonschema import validate
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
+from services.formats.rpc_files import read_rpc
+from services.reports.document import report_schema
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+from tests.app.registered import (
+    A_TENTH_OF_A_PIXEL,
+    CHECK_POINTS,
+    COMMON_FILES,
+    assert_masked,
+    assert_registered,
+    largest_error_px,
+    write_check_points,
+    write_mask,
+)
+from tests.app.served import running_service
+
+pytestmark = pytest.mark.long
+
+Amers = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    """A block and a scene whose model is wrong by a known shift."""
+    return make_flat_world(tmp_path_factory.mktemp("world"))
+
+
+@pytest.fixture
+def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
+    """The points of the world, in the store and visible."""
+    with engine.connect(dsn) as connection:
+        block = ingest_block(connection, storage, world.block).block
+        publish_block(connection, str(block.number))
+
+
+@pytest.fixture
+def amers(settings: Settings, tmp_path: Path) -> Amers:
+    """Runs the command `amers` on the installation of the test."""
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+
+    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        return subprocess.run(
+            [sys.executable, "-m", "app.cli.main", *map(str, arguments)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    return run
+
+
+def test_the_command_registers_straight_from_a_block_folder(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    folder = tmp_path / "out"
+    done = amers(
+        "scene",
+        "register",
+        world.tagged,
+        "--block",
+        world.block,
+        "--sigma-m",
+        SIGMA_M,
+        "-o",
+        folder,
+        "--json",
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["verdict"] in ("good", "usable")
+    assert np.allclose(told["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
+    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged_RPC.TXT"}
+    assert_registered(folder, world)
+    beside = read_rpc(world.tagged, folder / "tagged_RPC.TXT").model
+    assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
+
+
+def test_points_held_out_are_told_in_the_report_and_can_take_a_good_verdict_away(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    def register(moved_px: float) -> dict:
+        write_check_points(tmp_path / "checks.geojson", world, moved_px)
+        command = ("scene", "register", world.tagged, "--block", world.block, "--sigma-m", SIGMA_M)
+        done = amers(
+            *command, "--check-points", tmp_path / "checks.geojson", "-o", tmp_path / "out", "--json"
+        )
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["check_points"] == CHECK_POINTS
+        report: dict = json.loads((tmp_path / "out" / "report.json").read_text())
+        validate(report, report_schema())
+        return report
+
+    report = register(moved_px=0.0)
+    (check,) = report["checks"]
+    half_a_pixel_m = 0.25
+    assert check["accuracy"]["n"] == CHECK_POINTS
+    assert 0.0 < check["accuracy"]["ce90_m"]["value"] < half_a_pixel_m
+    assert check["image_residuals_px"]["xy"]["rms"] < A_TENTH_OF_A_PIXEL
+    (criterion,) = [one for one in report["criteria"] if one["name"] == "check_points"]
+    assert criterion["passed"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "independent check points of checks.geojson" in page
+    (criterion,) = [one for one in register(5.0)["criteria"] if one["name"] == "check_points"]
+    assert not criterion["passed"]
+    assert criterion["value"] > criterion["limit"]
+
+
+def test_check_points_of_another_image_are_refused_by_name(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    write_check_points(tmp_path / "checks.geojson", world)
+    document = json.loads((tmp_path / "checks.geojson").read_text())
+    (tmp_path / "checks.geojson").write_text(json.dumps({**document, "image": "other.tif"}))
+    done = amers(
+        "scene",
+        "register",
+        world.tagged,
+        "--block",
+        world.block,
+        "-o",
+        tmp_path / "out",
+        "--check-points",
+        tmp_path / "checks.geojson",
+    )
+    assert done.returncode == 2
+    assert "checks.geojson: expected marks in tagged.tif, found marks in other.tif" in done.stderr
+
+
+def test_the_command_registers_with_the_store_and_remembers_the_measures(
+    amers: Amers, world: FlatWorld, published: None, tmp_path: Path, dsn: str
+):
+    folder = tmp_path / "out"
+    command = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
+    done = amers(*command, "--model", world.rpc_text)
+    assert done.returncode == 0, done.stderr
+    assert "verdict" in done.stdout
+    assert_registered(folder, world)
+    with engine.connect(dsn) as connection:
+        rows = connection.execute(
+            "select count(*) as n from registration join measure on registration_id = registration.id"
+        ).fetchone()
+    assert rows == {"n": 40}
+
+
+def test_the_command_says_by_its_exit_code_what_went_wrong(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    def register(*arguments: object) -> tuple[int, str]:
+        done = amers("scene", "register", *arguments, "--block", world.block, "-o", tmp_path / "out")
+        assert "Traceback" not in done.stderr
+        return done.returncode, done.stderr
+
+    half = tmp_path / "half.tif"
+    half.write_bytes(world.tagged.read_bytes()[:100_000])
+    assert register(half)[0] == 2
+    assert register(tmp_path / "missing.tif")[0] == 2
+    bare = tmp_path / "bare.tif"
+    bare.write_bytes(world.image.read_bytes())
+    code, told = register(bare)
+    assert code == 2
+    assert "no sensor model" in told
+    # The points are 8 m from where a model that claims a tenth of a metre expects them.
+    code, told = register(world.tagged, "--sigma-m", 0.1)
+    assert code == 3
+    assert "found" in told
+
+
+def test_the_command_lets_a_service_register(
+    amers: Amers,
+    token: Callable[[str], str],
+    world: FlatWorld,
+    published: None,
+    settings: Settings,
+    tmp_path: Path,
+):
+    log, folder = tmp_path / "serve.log", tmp_path / "out"
+    scene = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
+    write_mask(tmp_path / "mask.tif")
+    write_check_points(tmp_path / "checks.geojson", world)
+    beside = ("--mask", tmp_path / "mask.tif", "--check-points", tmp_path / "checks.geojson")
+    with running_service(settings, log) as url:
+        refused = amers(*scene, "--server", url, "--token", "wrong")
+        assert (refused.returncode, "token" in refused.stderr) == (2, True), refused.stderr
+        done = amers(*scene, *beside, "--server", url, "--token", token("register"), "--json")
+        assert done.returncode == 0, done.stderr + log.read_text()
+        assert json.loads(done.stdout)["check_points"] == CHECK_POINTS
+        assert_registered(folder, world)
+        assert_masked(folder)
+        (check,) = json.loads((folder / "report.json").read_text())["checks"]
+        assert check["image_residuals_px"]["xy"]["rms"] < A_TENTH_OF_A_PIXEL
+        garbled = tmp_path / "garbled.geojson"
+        garbled.write_text("{")
+        wrong = (*scene, "--check-points", garbled, "--server", url, "--token", token("register"))
+        refused = amers(*wrong)
+        assert (refused.returncode, "garbled.geojson" in refused.stderr) == (2, True), refused.stderr
+    gone = amers(*scene, "--server", url, "--token", "any")
+    assert (gone.returncode, "Traceback" in gone.stderr) == (1, False)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--reference", "land.tif"), "--server excludes --reference"),
+        (("--block", "folder"), "--server excludes --reference and --block"),
+        (("--dem", "heights.tif"), "--dem is the ground of a --reference"),
+    ],
+)
+def test_what_a_service_has_of_its_own_is_not_sent_to_it(
+    amers: Amers, world: FlatWorld, tmp_path: Path, words: tuple[str, str], told: str
+):
+    scene = ("scene", "register", world.tagged, "--server", "http://127.0.0.1:1", "-o", tmp_path / "out")
+    refused = amers(*scene, *words)
+    assert (refused.returncode, told in refused.stderr) == (2, True), refused.stderr
+    assert not (tmp_path / "out").exists()
