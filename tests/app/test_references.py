@@ -17,6 +17,7 @@ from app.db import attempts, engine, references
 from app.db.engine import Connection, Database
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
+from app.storage import open_storage
 from app.usecases.jobs import do_attempt
 from app.usecases.references import (
     NewReference,
@@ -30,6 +31,8 @@ from services.errors import CoverageError
 from services.imagery import ArrayImage, sample_image
 from services.registration import RegistrationOptions
 from services.types import FloatImage
+from tests.app.buckets import running_bucket
+from tests.app.workers import ended, running_worker
 
 SHIFT_PX = np.array([5.3, -3.6])
 A_TENTH_OF_A_PIXEL = 0.1
@@ -246,3 +249,40 @@ def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked
         assert "no control point" in gone["error"]["detail"]
         changes = client.get("/audit?kind=reference_image", headers=admin).json()["changes"]
         assert [change["action"] for change in changes] == ["deleted", "created"]
+
+
+def test_a_service_whose_files_are_in_a_bucket_registers_on_a_reference(
+    settings: Settings,
+    bearer: Callable[[str], dict[str, str]],
+    folder: Path,
+    dsn: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    admin, me = bearer("admin"), bearer("register")
+    with running_bucket(monkeypatch) as url:
+        monkeypatch.setenv("AMERS_STORAGE_URL", url)
+        monkeypatch.setenv("AMERS_REFERENCE_FOLDER", str(folder / "allowed"))
+        elsewhere = settings.model_copy(update={"storage_url": url})
+        with (
+            TestClient(create_app(elsewhere), raise_server_exceptions=False) as client,
+            running_worker(elsewhere, tmp_path / "log"),
+        ):
+            body = {"name": "land", "image": "reference.tif", "sigma_m": 3.0}
+            assert client.post("/references", json=body, headers=admin).status_code == 201
+            image = (folder / "first.tif").read_bytes()
+            upload = client.post(f"/scenes?name=first.tif&sigma_m={SIGMA_M}", content=image, headers=me)
+            asked = {"inputs": {"scene": upload.json()["id"]}}
+            job = client.post("/processes/register-scene/execution", json=asked, headers=me)
+            done = ended(client, job.headers["location"], me)
+            assert done["status"] == "successful", done
+            results = client.get(f"{job.headers['location']}/results", headers=me).json()
+            assert (results["verdict"], results["method"]) == ("good", "reference image")
+            report = client.get(results["report.json"]["href"], headers=me).json()
+        shift_px = np.array(report["correction"]["shift_px"])
+        assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+        kept = open_storage(elsewhere).keys(f"results/{done['jobID']}")
+        assert any(key.endswith("report.json") for key in kept)
+    assert not [path for path in settings.data_folder.rglob("*") if path.is_file()], "all in the bucket"
+    with engine.connect(dsn) as connection:
+        assert len(places(connection)) > 20, "where the scene was found is kept for the next"

@@ -1,0 +1,116 @@
+"""`amers reference`: an administrator's reference images, from the command line."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.cli.main import main
+from app.config import Settings
+from tests.app.test_references import GSD_M, SIZE, write
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a command ended and what it said."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Amers = Callable[..., Said]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The folder that references may lie in, and one beside it."""
+    flat = np.full((SIZE, SIZE), 300.0, np.float32)
+    for path in ("allowed/land.tif", "allowed/heights.tif", "beside/land.tif"):
+        write(tmp_path / path, flat)
+    return tmp_path / "allowed"
+
+
+@pytest.fixture
+def amers(
+    settings: Settings,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Amers:
+    """Runs `amers reference` on the installation of the test, in this process."""
+    assert settings.database_url is not None
+    monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
+    monkeypatch.setenv("AMERS_REFERENCE_FOLDER", str(folder))
+
+    def run(*words: object) -> Said:
+        monkeypatch.setattr(sys, "argv", ["amers", "reference", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        return Said(int(end.value.code or 0), said.out, said.err)
+
+    return run
+
+
+def listed(amers: Amers) -> list[dict[str, object]]:
+    done = amers("list", "--json")
+    assert done.returncode == 0, done.stderr
+    found: list[dict[str, object]] = json.loads(done.stdout)
+    return found
+
+
+def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
+    heights = ("--dem", "heights.tif", "--vertical", "ellipsoid", "--sigma-m", 2.5)
+    done = amers("add", "land.tif", "--name", "Ventoux", *heights, "--json")
+    assert done.returncode == 0, done.stderr
+    added = json.loads(done.stdout)
+    assert (added["name"], added["image"], added["dem"]) == ("Ventoux", "land.tif", "heights.tif")
+    assert (added["vertical"], added["sigma_m"]) == ("ellipsoid", 2.5)
+    the_scale_of_the_map = 1e-3
+    assert added["gsd_m"] == pytest.approx(GSD_M, rel=the_scale_of_the_map)
+    assert amers("add", "land.tif", "--name", "Alps").returncode == 0
+    assert [one["name"] for one in listed(amers)] == ["Alps", "Ventoux"]
+    assert "Ventoux" in amers("list").stdout
+    again = amers("add", "land.tif", "--name", "Ventoux")
+    assert (again.returncode, "there is a reference" in again.stderr) == (2, True)
+    done = amers("remove", "Ventoux")
+    assert (done.returncode, done.stdout.strip()) == (0, "removed Ventoux")
+    assert [one["name"] for one in listed(amers)] == ["Alps"]
+    assert (folder / "land.tif").exists(), "its files stay where they are"
+    gone = amers("remove", "Ventoux")
+    assert (gone.returncode, "no reference Ventoux" in gone.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("../beside/land.tif", "--name", "x"), "no file below the folder"),
+        (("none.tif", "--name", "x"), "no file below the folder"),
+        (("land.tif", "--name", " "), "1 to 120 characters"),
+        (("land.tif", "--name", "x", "--dem", "heights.tif"), "heights.tif"),
+        (("land.tif", "--name", "x", "--vertical", "ellipsoid"), "of the heights of a dem"),
+        (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "no file below the folder"),
+    ],
+)
+def test_what_can_be_no_reference_is_refused_in_one_line(
+    amers: Amers, words: tuple[str, ...], told: str
+):
+    done = amers("add", *words)
+    assert (done.returncode, told in done.stderr) == (2, True), done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert listed(amers) == []
+
+
+def test_without_a_folder_of_references_the_setting_is_named(
+    amers: Amers, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("AMERS_REFERENCE_FOLDER")
+    done = amers("add", "land.tif", "--name", "x")
+    assert done.returncode == 2
+    assert "AMERS_REFERENCE_FOLDER" in done.stderr
