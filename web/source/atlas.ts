@@ -68,7 +68,7 @@ export class Atlas {
 
   /** Bring something into view; `closest` keeps small things in their surroundings. */
   fit(geometry: Shape | null | undefined, closest = 14): void {
-    const positions = geometry ? positionsOf(geometry) : [];
+    const positions = geometry ? inOnePlace(positionsOf(geometry)) : [];
     if (!this.map || positions.length === 0) return;
     const box = positions.reduce((box, position) => box.extend([position[0]!, position[1]!]), new LngLatBounds());
     const padding = Math.min(60, this.map.getContainer().clientHeight / 6);
@@ -131,6 +131,17 @@ function opened(container: HTMLElement): MapLibre | null {
 
 function wrapped(longitude: number): number {
   return ((((longitude + 180) % 360) + 360) % 360) - 180;
+}
+
+/** Positions on both sides of 180 degrees lie beside each other if longitudes go on: outlines are cut there. */
+function inOnePlace(positions: Position[]): Position[] {
+  const onwards = positions.map(([lon, lat]): Position => [lon! < 0 ? lon! + 360 : lon!, lat!]);
+  return width(positions) > 180 && width(onwards) < width(positions) ? onwards : positions;
+}
+
+function width(positions: Position[]): number {
+  const [west, east] = positions.reduce(([west, east], [lon]) => [Math.min(west!, lon!), Math.max(east!, lon!)], [360, -180]);
+  return east! - west!;
 }
 
 function positionsOf(geometry: Shape): Position[] {
