@@ -140,7 +140,7 @@ def residuals_by_height(summary: RegistrationSummary) -> Figure:
             rasterized=len(height_m) > MANY_POINTS,
         )
         axes.plot(*_running_median(height_m, residual_m), color=DEACTIVATED, linewidth=1.4)
-        axes.locator_params(axis="x", nbins=4)
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=4, prune="both"))
         axes.set_xlabel("height, m")
         axes.set_title(name, color=INK, fontsize=TEXT_PT, loc="left")
     panels[0].set_ylabel("residual, m")
@@ -148,7 +148,7 @@ def residuals_by_height(summary: RegistrationSummary) -> Figure:
 
 
 def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
-    """Medians of equal parts of the points in order of position; empty with too few of them.
+    """Medians of equal parts of the points in order of position; empty with too few, or all in one place.
 
     Four parts at least and 40 at most, of a dozen points where there are so many: few points show a
     slope, many show what oscillates, and neither shows noise for it.
@@ -156,7 +156,7 @@ def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
     finite = np.isfinite(position) & np.isfinite(value)
     n = int(finite.sum())
     bins = min(40, max(4, n // 12))
-    if n < 6 * bins:
+    if n < 6 * bins or np.ptp(position[finite]) == 0.0:
         return np.empty(0), np.empty(0)
     order = np.argsort(position[finite])
     parts = zip(
