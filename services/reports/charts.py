@@ -148,7 +148,7 @@ def residuals_by_height(summary: RegistrationSummary) -> Figure:
 
 
 def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
-    """Medians of equal parts of the points in order of position; empty with too few, or all in one place.
+    """Medians of equal parts of the points in order of position; empty with too few or one position.
 
     Four parts at least and 40 at most, of a dozen points where there are so many: few points show a
     slope, many show what oscillates, and neither shows noise for it.
