@@ -275,7 +275,6 @@ def _warm(connection: Connection) -> None:
         # However long that takes: the limit is for what callers ask. It goes with the transaction.
         connection.execute("set local statement_timeout = 0")
         connection.execute(FIRST_SPATIAL_PLAN)
-    connection.commit()
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from fastapi.testclient import TestClient
 
 from app.api import replies
 from app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
+from app.db import engine
 from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
 from app.main import create_app
 from app.usecases.tokens import create_token, list_tokens
@@ -85,6 +86,14 @@ def test_the_landing_page_links_to_what_there_is(client, bearer):
 def test_a_ready_service_has_a_database_that_answers(client):
     assert client.get("/healthz").json() == {"status": "alive"}
     assert client.get("/readyz").json() == {"status": "ready"}
+
+
+def test_connections_that_the_database_has_ended_are_noticed_before_they_are_used(client, dsn):
+    ours = "datname = current_database() and pid <> pg_backend_pid()"
+    with engine.connect(dsn) as connection:
+        connection.execute(f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}")
+    for _ in range(5):
+        assert client.get("/readyz").json() == {"status": "ready"}
 
 
 def test_the_description_of_the_api_is_openapi_3_1(client):
