@@ -56,10 +56,10 @@ def me(bearer: Bearer) -> dict[str, str]:
 @pytest.fixture
 def ask(
     client: TestClient, me: dict[str, str], world: FlatWorld, storage: Storage, dsn: str
-) -> Callable[[], str]:
+) -> Callable[..., str]:
     """Asks for the registration of the scene, whose points are published; returns the URL of the job."""
     execute = scene_to_register(client, me, storage, dsn, world)
-    return lambda: execute(PASSES)
+    return lambda passes=PASSES: execute(passes)
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def results_of(dsn: str, job_url: str) -> int:
 def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     storage: Storage,
@@ -116,7 +116,7 @@ def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
 def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -134,7 +134,7 @@ def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
 def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -145,7 +145,7 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
         (process,) = children(worker.pid)
         assert client.delete(job, headers=me).json()["status"] == "dismissed"
         wait_until(lambda: not alive(process), "the work stops", 5.0)
-        other = ended(client, ask(), me)
+        other = ended(client, ask(1), me)
     assert other["status"] == "successful", "the worker lives on"
     assert client.get(job, headers=me).json()["status"] == "dismissed"
     assert results_of(dsn, job) == 0
@@ -154,7 +154,7 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
 def test_a_worker_told_to_stop_gives_its_job_back_at_once(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -182,7 +182,7 @@ def test_a_worker_told_to_stop_gives_its_job_back_at_once(
 def test_a_job_over_its_memory_limit_fails_cleanly_and_the_worker_lives_on(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -199,7 +199,7 @@ def test_a_job_over_its_memory_limit_fails_cleanly_and_the_worker_lives_on(
 def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -216,7 +216,7 @@ def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
 def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -268,7 +268,7 @@ def test_a_truncated_scene_fails_for_good_and_says_so(
 def test_a_worker_outlives_the_loss_of_all_its_connections(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[[], str],
+    ask: Callable[..., str],
     settings: Settings,
     dsn: str,
     log: Path,
@@ -283,7 +283,7 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(
                 " where datname = current_database() and pid <> pg_backend_pid()"
             )
         done = ended(client, job, me)
-        other = ended(client, ask(), me)
+        other = ended(client, ask(1), me)
         assert worker.poll() is None
     assert (done["status"], results_of(dsn, job)) == ("successful", 1)
     assert other["status"] == "successful", "the worker still hears of new jobs"

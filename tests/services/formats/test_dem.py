@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
@@ -144,6 +144,7 @@ def test_a_geoid_of_elsewhere_is_refused(tmp_path: Path) -> None:
         read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
 
 
+@settings(max_examples=40)
 @given(cut=st.integers(0, 6700), start=st.integers(0, 60), noise=st.binary(min_size=1, max_size=40))
 def test_a_damaged_geoid_is_refused_or_is_one(
     tmp_path_factory: pytest.TempPathFactory, cut: int, start: int, noise: bytes
