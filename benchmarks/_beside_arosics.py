@@ -1,4 +1,4 @@
-"""An ortho pair of simulated ground by AROSICS and by the dense method, at as many places."""
+"""An ortho pair of simulated ground by AROSICS and by the dense method, on grids as dense."""
 
 import json
 import subprocess
@@ -12,14 +12,15 @@ import numpy as np
 import rasterio
 from rasterio.windows import Window as RasterWindow
 
+from benchmarks._measuring import memory_mib
 from services.formats.scenes import read_scene
-from services.geodesy import metres_per_degree
 from services.imagery import Window
 from services.matching.dense import Reference
 from services.reference import ReferenceOptions, register_on_reference
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.simulation.world import make_world
+from services.types import Array
 
 GSD_M = 0.5
 SHIFT_M = (6.0, -4.0)
@@ -31,20 +32,38 @@ _STRIP = 512
 
 
 @dataclass(frozen=True)
+class Errors:
+    """Of accepted tie points against the shift that was put in, pixels.
+
+    Attributes:
+        shift_px: of their median.
+        median_px, rms_px: of one of them, length.
+    """
+
+    shift_px: float
+    median_px: float
+    rms_px: float
+
+
+@dataclass(frozen=True)
 class TiePoints:
-    """What was found in the pair.
+    """What was found in the pair, by a process of its own.
 
     Attributes:
         tried, accepted: tie points.
-        cpu_s: on one core, without imports.
-        east_m, north_m: median shift of the accepted ones: what the second image has to be moved by.
+        cpu_s: of the first run in the process, all threads, without imports.
+        again_s: median of those after it; NaN where there was none.
+        start_mib, peak_mib: resident memory before the first run, imports included, and at its highest.
+        errors: of the accepted.
     """
 
     tried: int
     accepted: int
     cpu_s: float
-    east_m: float
-    north_m: float
+    again_s: float
+    start_mib: float
+    peak_mib: float
+    errors: Errors
 
 
 def make_pair(folder: Path, size: int) -> None:
@@ -77,22 +96,40 @@ def make_pair(folder: Path, size: int) -> None:
                 file.write(strip.astype(np.uint16), 1, window=window)
 
 
-def register_pair(folder: Path, count: int, repeats: int) -> TiePoints:
-    """Tie points of the pair at about `count` places by the dense method; median CPU time."""
+def register_pair(folder: Path, repeats: int) -> TiePoints:
+    """Tie points of the pair by the dense method as it is by default."""
+    start_mib = memory_mib("VmRSS")
     taken_s = []
     for _ in range(1 + repeats):
         start = time.process_time()
         base = read_scene(folder / "ortho_0.tif", sigma_m=1.0)
         scene = read_scene(folder / "ortho_1.tif", sigma_m=largest_shift_m() / 3.0)
         reference = Reference(base.image, base.model, None, 0.5 * GSD_M, 0.0, 0.1 * GSD_M)
-        found = register_on_reference(scene, reference, ReferenceOptions(places=count))
+        found = register_on_reference(scene, reference)
         taken_s.append(time.process_time() - start)
     active = found.measures.active
-    seen = scene.model.locate(found.measures.line_sample[active], np.zeros(int(active.sum())))
-    shift_deg = np.median(found.measures.lon_lat_h[active] - seen, axis=0)[:2]
-    metres = np.array(metres_per_degree(float(seen[0, 1]), 0.0))
-    east_m, north_m = (shift_deg * metres).tolist()
-    return TiePoints(len(active), int(active.sum()), median(taken_s[1:]), east_m, north_m)
+    line, sample = (found.measures.predicted - found.measures.line_sample)[active].T
+    shift_m = GSD_M * np.column_stack([sample, -line])
+    return TiePoints(
+        tried=len(active),
+        accepted=int(active.sum()),
+        cpu_s=taken_s[0],
+        again_s=median(taken_s[1:]),
+        start_mib=start_mib,
+        peak_mib=memory_mib("VmHWM"),
+        errors=errors_of(shift_m),
+    )
+
+
+def errors_of(shift_m: Array) -> Errors:
+    """Errors of shifts (n, 2) east, north, by which the second image has to be moved."""
+    error_px = (shift_m + np.array(SHIFT_M)) / GSD_M
+    length_px = np.hypot(error_px[:, 0], error_px[:, 1])
+    return Errors(
+        shift_px=float(np.hypot(*np.median(error_px, axis=0))),
+        median_px=float(np.median(length_px)),
+        rms_px=float(np.sqrt((length_px**2).mean())),
+    )
 
 
 def largest_shift_m() -> float:
@@ -100,9 +137,9 @@ def largest_shift_m() -> float:
     return LARGEST_SHIFT_PX * GSD_M
 
 
-def find_tie_points(python: str, folder: Path, size: int, count: int) -> TiePoints:
-    """Tie points of the pair on a grid of about `count` places, by an interpreter that has AROSICS."""
-    grid_px = int(size / np.sqrt(count))
+def find_tie_points(python: str, folder: Path, size: int) -> TiePoints:
+    """Tie points of the pair on a grid of as many places, by an interpreter that has AROSICS."""
+    grid_px = int(size / np.sqrt(ReferenceOptions().places))
     script = Path(__file__).with_name("_arosics_run.py")
     names = [str(folder / f"ortho_{number}.tif") for number in range(2)]
     done = subprocess.run(
@@ -112,4 +149,6 @@ def find_tie_points(python: str, folder: Path, size: int, count: int) -> TiePoin
         text=True,
         cwd=folder,
     )
-    return TiePoints(**json.loads(done.stdout.strip().splitlines()[-1]))
+    told = json.loads(done.stdout.strip().splitlines()[-1])
+    shift_m = np.column_stack([told.pop("east_m"), told.pop("north_m")])
+    return TiePoints(again_s=float("nan"), accepted=len(shift_m), errors=errors_of(shift_m), **told)

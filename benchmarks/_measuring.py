@@ -1,4 +1,4 @@
-"""CPU times taken in turn, and where figures are kept."""
+"""CPU times taken in turn, memory, and where figures are kept."""
 
 import json
 import time
@@ -30,3 +30,12 @@ def keep(name: str, outcome: Any) -> None:
     """Write the figures of a benchmark where the last ones were."""
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(outcome, indent=1) + "\n")
+
+
+def memory_mib(name: str) -> float:
+    """Resident memory of this process, now (VmRSS) or at its highest (VmHWM).
+
+    `getrusage` would tell the peak of the parent where that was higher: it survives `exec`.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith(f"{name}:"))

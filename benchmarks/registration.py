@@ -12,8 +12,9 @@ loads compiled code, and the median of those after it; the peak of resident memo
 had before beside it; and where the time goes, as CPU time under a profiler. CE90 is that of a grid of
 25 x 25 places of the image, between where the registered model locates them and what they truly show.
 
-AROSICS (local co-registration) finds as many tie points in an ortho pair of the same ground, when an
-interpreter that has it is given; the dense method registers the same pair at as many places.
+When an interpreter is given that has AROSICS, its local co-registration finds tie points in an ortho
+pair of simulated ground, on a grid as dense as the places at which the dense method registers the same
+pair by default. Errors of the accepted tie points are told against the shift that was put in.
 Run: python -m benchmarks.registration [--sizes 5000,40000] [--arosics PYTHON]
 """
 
@@ -36,7 +37,7 @@ from rich.table import Table
 
 from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair, register_pair
 from benchmarks._large_scene import SIGMA_M, make_case
-from benchmarks._measuring import keep
+from benchmarks._measuring import keep, memory_mib
 from services.formats.block import FolderChips, read_block
 from services.formats.scenes import read_scene
 from services.geodesy import metres_per_degree
@@ -119,9 +120,9 @@ def main() -> None:
     else:
         with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
             apart(make_pair, Path(name), PAIR_SIZE)
-            ours = apart(register_pair, Path(name), POINTS, arguments.repeats)
-            theirs = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE, POINTS)
-        show_beside(outcomes[-1], ours, theirs)
+            ours = apart(register_pair, Path(name), arguments.repeats)
+            theirs = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE)
+        show_beside(outcomes, ours, theirs)
         kept |= {"pair": asdict(ours), "pair_arosics": asdict(theirs)}
     keep("registration", kept)
 
@@ -195,7 +196,7 @@ def register(folder: Path) -> Registration:
 def stages_s(profile: cProfile.Profile) -> dict[str, float]:
     """CPU time of the stages, and of all the rest."""
     stats = pstats.Stats(profile)
-    taken = {}
+    taken: dict[str, float] = {}
     for stage, file, function, within in STAGES:
         spent = sum(
             values[3]
@@ -205,15 +206,6 @@ def stages_s(profile: cProfile.Profile) -> dict[str, float]:
         taken[stage] = spent - taken.get(within, 0.0)
     taken["everything else"] = stats.total_tt - sum(taken.values())  # type: ignore[attr-defined]
     return taken
-
-
-def memory_mib(name: str) -> float:
-    """Resident memory of this process, now (VmRSS) or at its highest (VmHWM).
-
-    `getrusage` would tell the peak of the parent where that was higher: it survives `exec`.
-    """
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith(f"{name}:"))
 
 
 def ce90_m(found: Array, true: Array) -> float:
@@ -255,33 +247,50 @@ ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
 )
 
 
-def show_beside(scene: Outcome, ours: TiePoints, theirs: TiePoints) -> None:
-    """Print the ortho pair by both, and what a point of the scene costs beside its tie points."""
-    table = Table("", "tried", "accepted", "CPU", "CPU each", "AROSICS takes", "shift found")
-    their_s = theirs.cpu_s / max(theirs.accepted, 1)
-    pair, large = f"pair of {PAIR_SIZE:,}²", f"{scene.size_px:,}²"
-    for name, tried, accepted, cpu_s, shift in (
-        (f"AROSICS, {pair}", theirs.tried, theirs.accepted, theirs.cpu_s, shift_of(theirs)),
-        (f"Amers, the same {pair}", ours.tried, ours.accepted, ours.cpu_s, shift_of(ours)),
-        (f"Amers, views of points, {large}", scene.views, scene.agreed, scene.again_s, ""),
-        (f"Amers, points of {VIEWS} views, {large}", scene.tried, scene.active, scene.again_s, ""),
-    ):
-        each_s = cpu_s / max(accepted, 1)
-        table.add_row(
-            name,
-            str(tried),
-            str(accepted),
-            f"{cpu_s:.1f} s",
-            f"{1e3 * each_s:.1f} ms",
-            f"{their_s / each_s:.1f} x",
-            shift,
-        )
-    Console(width=105).print(table)
+def show_beside(scenes: list[Outcome], ours: TiePoints, theirs: TiePoints) -> None:
+    """Print the ortho pair by both, and what points of the scenes cost beside tie points of AROSICS."""
+    pair = Table(
+        "",
+        "AROSICS",
+        "Amers",
+        title=f"tie points of one ortho pair of {PAIR_SIZE:,}² px",
+        caption="errors: of the accepted tie points against the shift that was put in, in pixels",
+    )
+    for name, tell in PAIR_ROWS:
+        pair.add_row(name, tell(theirs), tell(ours))
+    each_s = theirs.cpu_s / theirs.accepted
+    ours_s = (ours.cpu_s / ours.accepted, ours.again_s / ours.accepted)
+    pair.add_row(
+        "AROSICS takes", "", " … ".join(f"{each_s / own:.1f}" for own in ours_s) + " times as long"
+    )
+    table = Table("of a scene", "found", "CPU", "CPU each", "a tie point of AROSICS takes")
+    for scene in scenes:
+        for what, found in (("views", scene.agreed), (f"points of {VIEWS} views", scene.active)):
+            own_s = scene.again_s / max(found, 1)
+            table.add_row(
+                f"{what}, {scene.size_px:,}²",
+                str(found),
+                f"{scene.again_s:.1f} s",
+                f"{1e3 * own_s:.1f} ms",
+                f"{each_s / own_s:.1f} times as long",
+            )
+    console = Console(width=105)
+    console.print(pair)
+    console.print(table)
 
 
-def shift_of(found: TiePoints) -> str:
-    """East and north, in words."""
-    return f"{found.east_m:+.2f}, {found.north_m:+.2f} m"
+PAIR_ROWS: tuple[tuple[str, Callable[[TiePoints], str]], ...] = (
+    ("tried", lambda t: str(t.tried)),
+    ("accepted", lambda t: str(t.accepted)),
+    ("CPU, first in its process", lambda t: f"{t.cpu_s:.2f} s"),
+    ("CPU, again", lambda t: f"{t.again_s:.2f} s"),
+    ("CPU for each accepted", lambda t: f"{1e3 * t.cpu_s / max(t.accepted, 1):.1f} ms"),
+    ("memory before", lambda t: f"{t.start_mib:.0f} MiB"),
+    ("peak", lambda t: f"{t.peak_mib:.0f} MiB"),
+    ("error of the median shift", lambda t: f"{t.errors.shift_px:.4f} px"),
+    ("error of one, median", lambda t: f"{t.errors.median_px:.4f} px"),
+    ("error of one, root mean square", lambda t: f"{t.errors.rms_px:.4f} px"),
+)
 
 
 if __name__ == "__main__":
