@@ -155,7 +155,8 @@ def match_points(
         score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
         displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
         sigma_m[row] = sigma * level_m
-    reason[clouded(looks, reason == FOUND)] = "cloud"
+    # Where the scene ends it is not a cloud that hides a point.
+    reason[clouded(looks, reason == FOUND) & (reason != "nodata")] = "cloud"
     moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     found_views = np.array([np.isfinite(offset).all() for offset in offsets], dtype=bool)
     view_row = np.array([points.views.start[row] + number for row, number, *_ in seen], dtype=np.int64)
