@@ -1,16 +1,19 @@
 """Many more requests at once than there are threads and connections: all are answered."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, MutableMapping
+from contextlib import suppress
 from itertools import cycle, islice
 from pathlib import Path
+from typing import Any
 
 import anyio
 import httpx
 import pytest
 from anyio import to_thread
 from fastapi import FastAPI
+from starlette.requests import ClientDisconnect
 
-from app.api import deps
+from app.api import deps, streams
 from app.config import Settings
 from app.db import engine, features
 from app.main import create_app
@@ -22,6 +25,8 @@ POINTS = 60
 TIMES_MORE = 6
 FIRST_ID = 1 << 26
 CONNECTIONS = 1
+SOON_S = 0.2
+PATIENCE_S = 60.0
 ITEMS = "/collections/points/items"
 SCENES = "/scenes?name=a.tif"
 IMAGE = b"II*\0"
@@ -84,6 +89,43 @@ def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
     assert told == set(kinds)
     pages = [reply.json() for reply in replies if reply.url.path.endswith("/items")]
     assert {page["numberReturned"] for page in pages} == {POINTS}
+
+
+@pytest.mark.parametrize("leaves", [True, False], ids=["leaves", "falls silent"])
+def test_a_reader_of_a_page_in_pieces_who_is_gone_gives_the_only_connection_back(
+    app: FastAPI, bearer, monkeypatch: pytest.MonkeyPatch, leaves: bool
+) -> None:
+    monkeypatch.setattr(features, "ROWS_AT_ONCE", POINTS // 6)
+    monkeypatch.setattr(streams, "STALLED_S", SOON_S)
+    token = bearer("read")
+    scope = {
+        **{"type": "http", "method": "GET", "scheme": "http", "path": ITEMS, "root_path": ""},
+        "query_string": b"limit=10000",
+        "headers": [(b"host", b"service"), (b"authorization", token["Authorization"].encode())],
+    }
+
+    async def read_on() -> None:
+        taken = anyio.Event()
+
+        async def receive() -> dict[str, str]:
+            await taken.wait()
+            await anyio.sleep(0.0 if leaves else PATIENCE_S)
+            return {"type": "http.disconnect"}
+
+        async def send(message: MutableMapping[str, Any]) -> None:
+            if message["type"] == "http.response.body":
+                taken.set()
+                await anyio.sleep_forever()
+
+        async with app.router.lifespan_context(app):
+            with anyio.fail_after(PATIENCE_S), suppress(ClientDisconnect):
+                await app(scope, receive, send)
+            assert taken.is_set()
+            reader = app.state.database.reader.get_stats()
+            assert reader["pool_available"] == CONNECTIONS
+            assert (await client_of(app, token).get(f"{ITEMS}/{FIRST_ID}")).status_code == 200
+
+    anyio.run(read_on)
 
 
 def test_an_upload_too_many_is_told_to_come_again_and_nobody_else_notices(app: FastAPI, bearer) -> None:
