@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from psycopg.rows import class_row
 
+from app.db.antimeridian import TURNS_DEG, on_the_map
 from app.db.engine import Connection
 from services.types import Array, BoolArray, IntArray
 
@@ -100,12 +101,12 @@ def best_reference(connection: Connection, outline: Array) -> ReferenceRow | Non
     """The reference that shows most of an outline (m, 2); of those that show as much, the finest."""
     with connection.cursor(row_factory=class_row(ReferenceRow)) as cursor:
         return cursor.execute(
-            f"""with asked as (select st_geomfromwkb(%s, 4326) as area)
+            f"""with asked as (select st_geomfromwkb(%s, 4326) as area, %s::float as area_deg2)
                 select {COLUMNS} from reference_image, asked
                 where st_intersects(footprint, area)
-                order by round((st_area(st_intersection(footprint, area)) / st_area(area))::numeric, 2)
+                order by round((st_area(st_intersection(footprint, area)) / area_deg2)::numeric, 2)
                     desc, gsd_m, id desc limit 1""",
-            [_wkb(outline)],
+            [_wkb_all_round(outline), shapely.Polygon(outline).area],
         ).fetchone()
 
 
@@ -117,12 +118,13 @@ def places_inside(
     Args:
         worthwhile: without those that are not found any more.
     """
+    area = on_the_map(shapely.Polygon(outline))
     rows = connection.execute(
         """select id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h from homologous_place
            where reference_id = %s and st_intersects(geom, st_setsrid(st_geomfromwkb(%s), 4979))
                and not (%s and tried >= %s and 2 * found < tried)
            order by found::real / tried desc, found desc, id""",
-        [reference_id, _wkb(outline), worthwhile, FEW_TRIES],
+        [reference_id, shapely.to_wkb(area), worthwhile, FEW_TRIES],
     ).fetchall()
     return HomologousPlaces(
         np.array([row["id"] for row in rows], dtype=np.int64),
@@ -161,3 +163,12 @@ def lock_reference(connection: Connection, reference_id: int) -> bool:
 
 def _wkb(outline: Array) -> bytes:
     return bytes(shapely.to_wkb(shapely.Polygon(outline)))
+
+
+def _wkb_all_round(outline: Array) -> bytes:
+    """An outline a turn to the west, as it is, and a turn to the east.
+
+    Footprints go on beyond 180 degrees on the side where they begin, which may be the other one.
+    """
+    around = [shapely.Polygon(outline + [turn, 0.0]) for turn in TURNS_DEG]
+    return bytes(shapely.to_wkb(shapely.MultiPolygon(around)))

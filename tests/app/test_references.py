@@ -29,6 +29,7 @@ from app.usecases.references import (
 from app.usecases.registration import RegisteredScene, SceneFiles, run_registration
 from services.errors import CoverageError
 from services.imagery import ArrayImage, sample_image
+from services.map_grid import MapGrid, xy_of_lon_lat
 from services.registration import RegistrationOptions
 from services.types import FloatImage
 from tests.app.buckets import running_bucket
@@ -42,12 +43,15 @@ SIGMA_M = 40.0
 OPTIONS = RegistrationOptions()
 
 
-def write(path: Path, pixels: FloatImage) -> Path:
-    """An image on a map, in Germany."""
-    grid = Affine(GSD_M, 0, 5e5, 0, -GSD_M, 5e6)
-    profile = {"driver": "GTiff", "width": SIZE, "height": SIZE, "count": 1, "dtype": "uint16"}
+def write(
+    path: Path, pixels: FloatImage, crs: str = "EPSG:32632", corner: tuple[float, float] = (5e5, 5e6)
+) -> Path:
+    """An image on a map, in Germany if not said otherwise."""
+    grid = Affine(GSD_M, 0, corner[0], 0, -GSD_M, corner[1])
+    lines, samples = pixels.shape
+    profile = {"driver": "GTiff", "width": samples, "height": lines, "count": 1, "dtype": "uint16"}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with rasterio.open(path, "w", crs="EPSG:32632", transform=grid, **profile) as file:
+    with rasterio.open(path, "w", crs=crs, transform=grid, **profile) as file:
         file.write(np.clip(pixels, 1, 65535).astype(np.uint16), 1)
     return path
 
@@ -286,3 +290,45 @@ def test_a_service_whose_files_are_in_a_bucket_registers_on_a_reference(
     assert not [path for path in settings.data_folder.rglob("*") if path.is_file()], "all in the bucket"
     with engine.connect(dsn) as connection:
         assert len(places(connection)) > 20, "where the scene was found is kept for the next"
+
+
+EAST_OF_180, WEST_OF_180 = "EPSG:32701", "EPSG:32760"
+
+
+def centred_on_180(crs: str) -> MapGrid:
+    """A map of a UTM zone beside 180 degrees, its middle on it."""
+    step = np.array([[0.0, GSD_M], [-GSD_M, 0.0]])
+    middle = xy_of_lon_lat(crs, np.array([[180.0, -17.0]]))[0]
+    return MapGrid(crs, middle - step @ np.full(2, (SIZE - 1) / 2.0), step, (SIZE, SIZE))
+
+
+def test_scenes_on_either_side_of_180_degrees_are_registered_on_a_reference_across_it(
+    database: Database, connection: Connection, settings: Settings, tmp_path: Path
+) -> None:
+    ground = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(512, 512)), (0, 0), 1.5)
+    ground = (500.0 + 80.0 * ground / ground.std()).astype(np.float32)
+    of_reference, of_scene = centred_on_180(EAST_OF_180), centred_on_180(WEST_OF_180)
+    pixel = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij"), -1).astype(float)
+    shown = of_reference.line_sample(of_scene.lon_lat((pixel - SHIFT_PX).reshape(-1, 2)))
+    half = SIZE // 2 + 10
+
+    def corner(of: MapGrid, sample: int = 0) -> tuple[float, float]:
+        x, y = of.origin_xy + of.step_xy @ [-0.5, sample - 0.5]
+        return float(x), float(y)
+
+    def seen(places: np.ndarray) -> FloatImage:
+        return sample_image(ArrayImage(ground), places + 40.0, 1.0)
+
+    allowed = settings.model_copy(update={"reference_folder": tmp_path})
+    write(tmp_path / "reference.tif", seen(pixel), EAST_OF_180, corner(of_reference))
+    add_reference(connection, allowed, NewReference("land", "reference.tif"))
+    connection.commit()
+    east = seen((pixel - SHIFT_PX)[:, half:])
+    write(tmp_path / "east.tif", east, EAST_OF_180, corner(of_reference, half))
+    write(tmp_path / "across.tif", seen(shown.reshape(SIZE, SIZE, 2)), WEST_OF_180, corner(of_scene))
+    for name in ("east", "across"):
+        made = registered(database, allowed, tmp_path / f"{name}.tif", tmp_path / name)
+        shift_px = made.registration.adjustment.correction.parameters[:, 0]
+        assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+    # What the scene east of 180 degrees was found by is looked for in the one across it.
+    assert sum(tried == 2 for tried, _ in places(connection)) > 10
