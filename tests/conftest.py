@@ -18,8 +18,17 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long modules first: one that is begun last leaves the other cores without work."""
-    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+    """Long modules first: one that is begun last leaves the other cores without work.
+
+    Of these, those of the science come before those of services whose workers are killed while they
+    work: these find the kernels compiled.
+    """
+    items.sort(
+        key=lambda item: (
+            item.get_closest_marker("long") is None,
+            not item.nodeid.startswith("tests/services/"),
+        )
+    )
 
 
 @pytest.fixture(scope="session")
