@@ -99,7 +99,8 @@ def test_owslib_has_a_scene_registered(http: httpx.Client, job: dict[str, Any]):
     said = [entry["message"] for entry in http.get(f"/jobs/{job['jobID']}/messages").json()["messages"]]
     assert said[:2] == ["waiting for a worker", "started"]
     assert said[-1] == job["message"]
-    assert len(said) > 4, "steps of the work between"
+    # Steps are told every half second: a quick registration tells of one.
+    assert len(said) > 3, "steps of the work between"
     results = http.get(f"/jobs/{job['jobID']}/results").json()
     assert results["verdict"] in ("good", "usable")
     files = {name for name, value in results.items() if isinstance(value, dict)}
