@@ -93,11 +93,13 @@ def opened(settings: Settings) -> Iterator[Database]:
     Raises:
         InputError: the database cannot be used; the message says what to do.
     """
-    with embedded.database(settings) as dsn, pooled(dsn, settings) as database:
+    with embedded.database(settings) as dsn:
+        # First: the schema grants what the role of the reading connections needs.
         ensure_schema(dsn, upgradable=settings.database_url is None)
-        for pool in (database.reader, database.writer):
-            pool.wait()
-        yield database
+        with pooled(dsn, settings) as database:
+            for pool in (database.reader, database.writer):
+                pool.wait()
+            yield database
 
 
 @contextmanager

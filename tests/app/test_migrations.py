@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import psycopg
 import pytest
@@ -50,6 +51,13 @@ def test_an_empty_database_gets_the_tables_of_the_store_and_the_queue(empty_dsn)
     engine.upgrade(empty_dsn)
     assert engine.status(empty_dsn).current
     assert tables(empty_dsn) >= OURS | {"procrastinate_jobs", "spatial_ref_sys"}
+
+
+def test_whoever_opens_a_new_database_reads_as_a_reader_at_once(empty_dsn, monkeypatch, tmp_path):
+    monkeypatch.setattr(engine.embedded, "database", lambda settings: nullcontext(empty_dsn))
+    with engine.opened(Settings(data_folder=tmp_path)) as database, database.reading() as connection:
+        row = connection.execute("select current_user as who").fetchone()
+    assert row["who"] == engine.READER
 
 
 def test_two_upgrades_at_once_do_the_work_of_one(empty_dsn):
