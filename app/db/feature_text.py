@@ -14,18 +14,19 @@ METRE_DIGITS = 4
 def feature_text(selection: Selection) -> str:
     """SQL of one feature as GeoJSON text; texts and dates are quoted by to_json, numbers are finite."""
     collection = selection.collection
-    names = ",".join(f"{json.dumps(item.name)}:%%s" for item in selection.properties)
     digits = DEGREE_DIGITS if selection.crs.in_degrees else METRE_DIGITS
     geometry = in_own_order(from_storage(collection.geometry, selection.crs), selection.crs)
-    values = [
+    parts = [
+        """'{"type":"Feature","id":'""",
         _json(collection.key),
+        """',"geometry":'""",
         f"coalesce(st_asgeojson({geometry}, {digits}, 0), 'null')",
-        *(_json(item) for item in selection.properties),
-        *([collection.members] if collection.members else []),
+        """',"properties":{'""",
     ]
-    members = "%%s" if collection.members else ""
-    pattern = f'{{"type":"Feature","id":%%s,"geometry":%%s,"properties":{{{names}}}{members}}}'
-    return f"format('{pattern}', {', '.join(values)})"
+    for number, item in enumerate(selection.properties):
+        parts += [f"'{',' if number else ''}{json.dumps(item.name)}:'", _json(item)]
+    parts += ["'}'", *([collection.members] if collection.members else []), "'}'"]
+    return f"concat({', '.join(parts)})"
 
 
 def csv_header(selection: Selection) -> str:
