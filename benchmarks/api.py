@@ -42,6 +42,7 @@ PAGE_POINTS = 15_000
 CHIP_POINTS, CHIP_VIEWS = 250, 8
 TILE_ZOOM = 8
 WARM_UP = 3
+KEPT_REPEATS = 4
 MEBIBYTE = 1 << 20
 
 Ask = Callable[[Server, np.random.Generator], str]
@@ -91,7 +92,7 @@ def main() -> None:
             servers = [store.server, *peers(stack, store, arguments, console)]
             same_points(servers, store.ground)
             times = latencies(servers, store.ground, arguments.repeats)
-            times.append(chips(store, arguments.repeats))
+            times += [*kept_open(store, arguments.repeats), chips(store, arguments.repeats)]
             outcome["times"] = [asdict(one) for one in times]
             outcome["throughput_per_s"] = rates = throughput(
                 servers, store.ground, arguments.clients, arguments.seconds
@@ -201,16 +202,28 @@ def in_turn(what: str, ways: Mapping[str, tuple[Server, Ask]], repeats: int) -> 
                 taken[name].append(time.perf_counter() - start)
                 size[name].append(len(body))
             connection.close()
-    return [
-        Times(
-            what,
-            name,
-            1000.0 * float(np.median(taken[name])),
-            1000.0 * float(np.quantile(taken[name], 0.95)),
-            float(np.median(size[name])) / 1e6,
-        )
-        for name in ways
-    ]
+    return [times_of(what, name, taken[name], float(np.median(size[name]))) for name in ways]
+
+
+def times_of(what: str, server: str, taken_s: Sequence[float], size: float) -> Times:
+    """The median and the 95 % of times, and the size of a reply."""
+    median_s, most_s = np.quantile(taken_s, [0.5, 0.95])
+    return Times(what, server, 1000.0 * float(median_s), 1000.0 * float(most_s), size / 1e6)
+
+
+def kept_open(store: Store, repeats: int) -> list[Times]:
+    """Times of our service alone, on a connection that is kept, as most clients do."""
+    found, open_one = [], store.server.connect()
+    for what, ask in list(kinds(store.ground).items())[:2]:
+        taken, size = [], 0
+        for turn in range(KEPT_REPEATS * repeats + WARM_UP):
+            path = ask(store.server, np.random.default_rng(turn))
+            start = time.perf_counter()
+            size = len(get(open_one, path))
+            if turn >= WARM_UP:
+                taken.append(time.perf_counter() - start)
+        found.append(times_of(f"{what}, connection kept", "amers", taken, size))
+    return found
 
 
 def get(connection: http.client.HTTPConnection, path: str, body: bytes | None = None) -> bytes:
@@ -274,9 +287,9 @@ def chips(store: Store, repeats: int) -> Times:
         start = time.perf_counter()
         size = len(get(open_one, "/collections/points/chips", asked))
         if turn >= WARM_UP:
-            taken.append(1000.0 * (time.perf_counter() - start))
+            taken.append(time.perf_counter() - start)
     what = f"chips of {CHIP_POINTS} points, {CHIP_POINTS * CHIP_VIEWS:,} views"
-    return Times(what, "amers", float(np.median(taken)), float(np.quantile(taken, 0.95)), size / 1e6)
+    return times_of(what, "amers", taken, size)
 
 
 def page_memory(store: Store, repeats: int) -> dict[str, float]:
