@@ -7,6 +7,9 @@ import cv2
 import numpy as np
 import rasterio
 
+from app.db import engine
+from app.storage import Storage
+from app.usecases.blocks import ingest_block, publish_block
 from services.formats.block_writing import write_block
 from services.formats.raster import gdal_rpc
 from services.formats.rpc_text import format_rpc_text
@@ -143,3 +146,9 @@ def _control_points(lon_lat_h: Array, count: int) -> ControlPoints:
         chip_row=np.zeros(count, dtype=np.int64),
         chip_files=(),
     )
+
+
+def publish_world(dsn: str, storage: Storage, world: FlatWorld) -> None:
+    """Put the points of a world into the store, visible."""
+    with engine.connect(dsn) as connection:
+        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))

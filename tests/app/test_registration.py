@@ -12,14 +12,13 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
 from app.usecases.ground_control import points_of_block, points_of_store
 from app.usecases.registration import SceneFiles, run_registration
 from services.formats.rpc_files import read_rpc
 from services.registration import RegistrationOptions
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
-from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registered import (
     A_TENTH_OF_A_PIXEL,
     CHECK_POINTS,
@@ -44,9 +43,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 @pytest.fixture
 def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
     """The points of the world, in the store and visible."""
-    with engine.connect(dsn) as connection:
-        block = ingest_block(connection, storage, world.block).block
-        publish_block(connection, str(block.number))
+    publish_world(dsn, storage, world)
 
 
 def test_the_delivered_model_is_wrong_before(world: FlatWorld):

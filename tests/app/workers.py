@@ -13,10 +13,8 @@ from typing import Any
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from tests.app.flat_world import SIGMA_M, FlatWorld
+from tests.app.flat_world import SIGMA_M, FlatWorld, publish_world
 
 PATIENCE_S = 240.0
 ENDED = ("successful", "failed", "dismissed")
@@ -126,8 +124,7 @@ def scene_to_register(
         What asks for its registration and returns the address of the job. It takes how many passes
         the work is made of: one is done in a blink, many leave time to do harm in the middle.
     """
-    with engine.connect(dsn) as connection:
-        publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))
+    publish_world(dsn, storage, world)
     upload = client.post(
         f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=headers
     )
