@@ -8,7 +8,7 @@ import logging
 import time
 from typing import Any, Literal
 
-from app import origin
+from app import request_context
 from app.config import Settings
 
 Format = Literal["text", "json"]
@@ -61,7 +61,7 @@ _FIRST = ("time", "level", "logger", "message")
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
     moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-    where = origin.current()
+    where = request_context.current()
     known = {"request_id": where.request_id, "job_id": where.job_id, "actor": where.actor}
     return {
         "time": f"{moment}.{int(record.msecs):03d}Z",

@@ -14,6 +14,7 @@ from app.api import (
     chips,
     collections,
     deps,
+    error_responses,
     features,
     history,
     jobs,
@@ -22,7 +23,6 @@ from app.api import (
     points,
     processes,
     references,
-    replies,
     results,
     scenes,
     stac,
@@ -32,7 +32,7 @@ from app.api import (
     uploads,
 )
 from app.api.body import BodyLimit
-from app.api.watch import RequestMetrics, Watch
+from app.api.request_log import RequestMetrics, Watch
 from app.config import Settings, read_settings
 from app.db import engine
 from app.oidc import Issuer
@@ -135,7 +135,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.upload_turns = CapacityLimiter(deps.UPLOADS_AT_ONCE)
     app.state.issuer = None if chosen.oidc_issuer is None else Issuer(chosen)
     app.add_middleware(Watch, metrics=app.state.metrics)
-    replies.install(app)
+    error_responses.install(app)
     openapi.install(app)
     for router in ROUTERS:
         app.include_router(router)

@@ -13,10 +13,10 @@ import rasterio
 from rasterio.windows import Window as RasterWindow
 
 from benchmarks._measuring import memory_mib
-from services.formats.scenes import read_scene
-from services.imagery import Window
-from services.matching.dense import Reference
-from services.reference import ReferenceOptions, register_on_reference
+from services.formats.images.scenes import read_scene
+from services.imagery.source import Window
+from services.matching.reference_image import Reference
+from services.registration.on_reference import ReferenceOptions, register_on_reference
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.simulation.world import make_world

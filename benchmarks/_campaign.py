@@ -8,11 +8,11 @@ import numpy as np
 
 from benchmarks._trials import Trial
 from benchmarks._worlds import FINE_GSD_M, Block, Place, world_of
+from services.adjustment.intersection import move_metres
 from services.errors import AmersError
-from services.intersection import move_metres
+from services.imagery.scene import Scene
 from services.quality.accuracy import CIRCULAR_CE90, accuracy, normalised_error
-from services.registration import Registration, RegistrationOptions, register_scene
-from services.scene import Scene
+from services.registration.on_points import Registration, RegistrationOptions, register_scene
 from services.simulation.conditions import Conditions
 from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView

@@ -15,7 +15,7 @@ from app.db import engine
 from app.db.blocks import ID_BITS
 from app.db.engine import Connection
 from app.db.ingestion import POINT_COLUMNS
-from services.formats.hilbert import hilbert_order
+from services.formats.block.hilbert import hilbert_order
 from services.geodesy import metres_per_degree
 from services.types import Array
 

@@ -8,12 +8,12 @@ import rasterio
 from rasterio.windows import Window as RasterWindow
 
 from benchmarks._simulated import lay_points
-from services.formats.block_document import BlockMetadata, BlockSpecification, Provenance
-from services.formats.block_writing import write_block
-from services.formats.raster import gdal_rpc
+from services.formats.block.document import BlockMetadata, BlockSpecification, Provenance
+from services.formats.block.writer import write_block
+from services.formats.images.raster import gdal_rpc
 from services.geodesy import metres_per_degree
-from services.imagery import ImageSource, Window
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import ImageSource, Window
 from services.sensors.rpc import RpcModel
 from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView

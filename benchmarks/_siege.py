@@ -17,7 +17,7 @@ from types import TracebackType
 import httpx
 import psycopg
 
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.db.engine import connect
 from app.usecases.tokens import create_token
 from tests.serving import free_port

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from services.imagery import ImageSource, ReducedImage, reduce_image, render_chip
-from services.intersection import intersect
-from services.matching.chips import chip_inside, chip_saliency, refine_on_chips, stored_chip
-from services.scene import Scene, scene_gsd_m, view_direction
+from services.adjustment.intersection import intersect
+from services.imagery.scene import Scene, scene_gsd_m, view_direction
+from services.imagery.source import ImageSource, ReducedImage, reduce_image, render_chip
+from services.matching.multi_image import chip_inside, chip_saliency, refine_on_chips, stored_chip
 from services.simulation.world import World
 from services.types import Array, ChipArray, ControlPoints, Views
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._simulated import lay_points
-from services.imagery import render_chip
-from services.matching.chips import stored_chip
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import render_chip
+from services.matching.multi_image import stored_chip
 from services.simulation.render import STEEPEST
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry

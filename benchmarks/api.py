@@ -27,9 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 from app.db import engine
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks import _servers
 from benchmarks._filled import Ground, fill
 from benchmarks._measuring import keep

@@ -29,13 +29,13 @@ from rich.table import Table
 
 from benchmarks._measuring import cpu_medians_s, keep
 from benchmarks._simulated import lay_points
+from services.adjustment.intersection import move_metres
 from services.conventions import CHIP_SIZE
-from services.formats.raster import open_raster, write_raster
-from services.imagery import ImageSource, render_chip
-from services.intersection import move_metres
+from services.formats.images.raster import open_raster, write_raster
+from services.imagery.scene import Scene
+from services.imagery.source import ImageSource, render_chip
+from services.matching.control_points import MatchingOptions, chip_pixels, match_points
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
-from services.matching.points import MatchingOptions, chip_pixels, match_points
-from services.scene import Scene
 from services.simulation.view import SimulatedView, ViewPlan, simulate_view, true_ground
 from services.simulation.world import World, make_world
 from services.types import Array, ChipArray, ControlPoints, FloatImage

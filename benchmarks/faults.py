@@ -27,7 +27,7 @@ from app.config import Settings
 from app.db import engine
 from app.db.engine import Connection
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.worker.sweep import sweep_files
 from benchmarks._measuring import keep
 from benchmarks._siege import LEASE_S, Siege

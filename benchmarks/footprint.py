@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 from app.db import engine
-from app.db.box import Box
-from app.db.collections import Viewer
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection
-from app.usecases.features import find_collection, page
-from app.usecases.questions import Question, understand
+from app.db.features.bbox import Box
+from app.db.features.collection import Viewer
+from app.usecases.features.items import find_collection, page
+from app.usecases.features.query import FeatureQuery, resolve
 from benchmarks._filled import Ground, fill
 from benchmarks._measuring import keep
 
@@ -100,7 +100,7 @@ def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
 def in_database(connection: Connection, box: Box) -> bytes:
     """The way of the service."""
     bbox = f"{box.west!r},{box.south!r},{box.east!r},{box.north!r}"
-    asked = understand(find_collection("points"), Viewer(), Question(10_000, bbox=bbox), SECRET)
+    asked = resolve(find_collection("points"), Viewer(), FeatureQuery(10_000, bbox=bbox), SECRET)
     found = page(connection, asked, "geojson", SECRET)
     rest = f'"numberReturned":{found.returned},"numberMatched":{found.matched.number}'
     return b'{"type":"FeatureCollection","features":[' + found.body + f"],{rest}}}".encode()

@@ -16,11 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from app.db import engine
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.storage import Storage
-from app.usecases.blocks import ingest_block
+from app.usecases.blocks.lifecycle import ingest_block
 from benchmarks._measuring import keep
-from services.formats.block_check import FILES_AT_ONCE
+from services.formats.block.check import FILES_AT_ONCE
 from tests.factories import make_block
 
 IMAGES = 8

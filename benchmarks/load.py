@@ -29,7 +29,7 @@ import numpy as np
 
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token
 from benchmarks._measuring import keep
 from tests.app.flat_world import SIGMA_M, make_flat_world

@@ -33,12 +33,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks._measuring import keep
-from services.formats.dem import read_dem
-from services.formats.ortho_files import gdal_transform
-from services.formats.raster import gdal_rpc, open_raster
+from services.formats.elevation.dem import read_dem
+from services.formats.images.ortho import gdal_transform
+from services.formats.images.raster import gdal_rpc, open_raster
+from services.imagery.scene import Scene
 from services.map_grid import MapGrid
-from services.orthorectify import OrthoOptions, choose_grid, orthorectify
-from services.scene import Scene
+from services.orthorectification.rectify import OrthoOptions, choose_grid, orthorectify
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
 from services.types import Acquisition, FloatImage

@@ -39,12 +39,12 @@ from rich.table import Table
 from benchmarks._beside_arosics import TiePoints, find_tie_points, make_pair, register_pair
 from benchmarks._large_scene import SIGMA_M, make_case
 from benchmarks._measuring import keep, memory_mib
-from services.formats.block import FolderChips, read_block
-from services.formats.scenes import read_scene
+from services.formats.block.reader import FolderChips, read_block
+from services.formats.images.scenes import read_scene
 from services.geodesy import metres_per_degree
-from services.matching.points import MatchingOptions
+from services.matching.control_points import MatchingOptions
 from services.quality.accuracy import accuracy
-from services.registration import Registration, RegistrationOptions, register_scene
+from services.registration.on_points import Registration, RegistrationOptions, register_scene
 from services.sensors.correction import CorrectedModel, ImageCorrection
 from services.types import Array
 

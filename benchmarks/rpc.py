@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks._measuring import cpu_medians_s, keep
-from services.formats.raster import gdal_rpc
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.images.raster import gdal_rpc
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.sensors.rpc import RpcModel
 from services.types import Array
 

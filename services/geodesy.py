@@ -145,3 +145,14 @@ def lon_lat_h_from_east_north_up(enu: Array, origin_lon_lat_h: Array) -> Array:
     origin = ecef_from_lon_lat_h(origin_lon_lat_h[None, :])
     rotation = ecef_from_east_north_up(origin_lon_lat_h)
     return lon_lat_h_from_ecef(origin + enu @ rotation.T)
+
+
+def move_metres(lon_lat_h: Array, enu: Array) -> Array:
+    """Ground points (n, 3) moved by some metres east, north and up (n, 3); exact for small moves."""
+    out = np.empty_like(lon_lat_h)
+    for i in range(len(lon_lat_h)):
+        east, north = metres_per_degree(lon_lat_h[i, 1], lon_lat_h[i, 2])
+        out[i, 0] = lon_lat_h[i, 0] + enu[i, 0] / east
+        out[i, 1] = lon_lat_h[i, 1] + enu[i, 1] / north
+        out[i, 2] = lon_lat_h[i, 2] + enu[i, 2]
+    return out

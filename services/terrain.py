@@ -9,7 +9,7 @@ from numba import njit
 
 from services.errors import CoverageError
 from services.geodesy import metres_per_degree, metres_per_degree_at
-from services.imagery import ArrayImage, ImageSource, Window
+from services.imagery.source import ArrayImage, ImageSource, Window
 from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, FloatImage, IntArray
@@ -157,7 +157,7 @@ class _Part:
         return self.whole.read(Window(line, sample, window.lines, window.samples))
 
 
-def meet(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
+def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
     """Where the lines of sight of image positions meet the ground first, seen from the sensor.
 
     Each line is followed from above the highest ground down, in steps that move it by no more than a

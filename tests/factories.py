@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from services.conventions import CHIP_SIZE
-from services.formats.block_document import (
+from services.formats.block.document import (
     AccuracyFigure,
     BlockMetadata,
     BlockSpecification,
     Provenance,
     rectangle,
 )
-from services.formats.block_writing import write_block
+from services.formats.block.writer import write_block
 from services.sensors.rpc import RpcModel
 from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
 

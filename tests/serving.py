@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 
 patience_s = 90.0
 PORTS = range(20_000, 32_000)

@@ -19,10 +19,10 @@ README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
 TOUR = (
     "app/api/scenes.py",
-    "app/usecases/registration.py",
-    "services/registration.py",
+    "app/usecases/registration/register.py",
+    "services/registration/on_points.py",
     "services/matching/correlate.py",
-    "services/adjustment/scene.py",
+    "services/adjustment/image_correction.py",
     "services/sensors/rpc.py",
 )
 NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}

@@ -20,9 +20,10 @@ from app.auth import Scope, allows
 from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.tokens import Token
-from app.usecases import block_uploads, blocks, jobs
-from app.usecases.block_ingestion import INGEST_BLOCK
-from app.usecases.blocks import Published
+from app.usecases import jobs
+from app.usecases.blocks import lifecycle, uploads
+from app.usecases.blocks.ingestion import INGEST_BLOCK
+from app.usecases.blocks.lifecycle import Published
 from services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"])
@@ -76,7 +77,7 @@ def upload_block(
     """Upload a zip or tar of a block; the reply says how `POST /blocks` names it."""
     length = request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else None
-    upload_id = block_uploads.receive_block(
+    upload_id = uploads.receive_block(
         database, storage, settings, caller, name, body_chunks(request), announced
     )
     return {"upload": str(upload_id)}
@@ -111,7 +112,7 @@ def quality(reference: str, database: DatabaseDep, caller: PointsReader) -> dict
     """
     with database.reading() as connection:
         block = _visible(connection, reference, caller)
-        report = blocks.block_report(connection, block)
+        report = lifecycle.block_report(connection, block)
     return {**quality_document(report.quality), "accuracy": [vars(f) for f in report.accuracy]}
 
 
@@ -119,28 +120,28 @@ def quality(reference: str, database: DatabaseDep, caller: PointsReader) -> dict
 def publish(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block visible, and the version of it that was visible before no longer."""
     with database.transaction() as connection:
-        return _published(blocks.publish_block(connection, reference))
+        return _published(lifecycle.publish_block(connection, reference))
 
 
 @router.post("/blocks/{reference}/restore")
 def restore(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
     with database.transaction() as connection:
-        return _published(blocks.restore_block(connection, reference))
+        return _published(lifecycle.restore_block(connection, reference))
 
 
 @router.patch("/blocks/{reference}")
 def prioritise(reference: str, body: Priority, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Let a block win or lose against other blocks over the same place."""
     with database.transaction() as connection:
-        return {"block": _properties(blocks.prioritise_block(connection, reference, body.priority))}
+        return {"block": _properties(lifecycle.prioritise_block(connection, reference, body.priority))}
 
 
 @router.post("/blocks/{reference}/withdraw")
 def withdraw(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
     """Make a block invisible; it can be published again."""
     with database.transaction() as connection:
-        return {"block": _properties(blocks.withdraw_block(connection, reference))}
+        return {"block": _properties(lifecycle.withdraw_block(connection, reference))}
 
 
 def _published(published: Published) -> dict[str, Any]:
@@ -154,8 +155,8 @@ def _published(published: Published) -> dict[str, Any]:
 def _visible(connection: Connection, reference: str, caller: Token | None) -> Block:
     """The block a caller may see: any for an administrator, the published one for others."""
     if _is_admin(caller):
-        return blocks.find_block(connection, reference)
-    return blocks.find_published(connection, reference)
+        return lifecycle.find_block(connection, reference)
+    return lifecycle.find_published(connection, reference)
 
 
 def _is_admin(caller: Token | None) -> bool:

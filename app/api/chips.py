@@ -11,9 +11,9 @@ from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.negotiation import NPZ, TIFF, refuse_unknown
 from app.errors import InvalidParameter
 from app.storage import StoredChips
-from app.usecases import points
-from app.usecases.points import MOST_POINTS_WITH_CHIPS, StackFormat
-from app.usecases.questions import Question
+from app.usecases.features import points
+from app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
+from app.usecases.features.query import FeatureQuery
 from services.types import ControlPoints
 
 router = APIRouter(tags=["points"])
@@ -100,7 +100,7 @@ def _meant(database: DatabaseDep, asked: ChipsAsked) -> ControlPoints:
     with database.reading() as connection:
         if asked.ids is not None:
             return points.points_of_ids(connection, asked.ids)
-        return points.points_of_question(connection, Question(**by_question))
+        return points.points_of_question(connection, FeatureQuery(**by_question))
 
 
 def _parse_ids(text: str | None) -> list[int] | None:

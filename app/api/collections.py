@@ -7,8 +7,8 @@ from fastapi.responses import JSONResponse
 
 from app.api import stac
 from app.api.deps import DatabaseDep, PointsReader, SettingsDep
-from app.api.documents import document_of, geometry_schema, property_schema
 from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
+from app.api.json_schemas import document_of, geometry_schema, property_schema
 from app.api.negotiation import (
     DOCUMENTS,
     FEATURES,
@@ -20,11 +20,11 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Cell, document_page, drawn
-from app.db.collections import Collection, Viewer
 from app.db.engine import Connection
+from app.db.features.collection import Collection, Viewer
 from app.errors import NotAllowed
-from app.usecases import features
-from app.usecases.tiles import TILED
+from app.usecases.features import items
+from app.usecases.features.tiles import TILED
 
 router = APIRouter(tags=["collections"])
 
@@ -42,7 +42,7 @@ def collections(
     """The collections the caller may see."""
     refuse_unknown(request, {"f"})
     seen = []
-    for collection in features.COLLECTIONS.values():
+    for collection in items.COLLECTIONS.values():
         try:
             seen.append((collection, viewer_of(collection, caller, settings)))
         except NotAllowed:
@@ -145,10 +145,10 @@ def describe(
     request: Request, connection: Connection, collection: Collection, viewer: Viewer
 ) -> dict[str, Any]:
     """A collection as OGC API - Features describes it."""
-    box = features.extent(connection, collection, viewer)
+    box = items.extent(connection, collection, viewer)
     # STAC calls for an extent even where nothing is.
     spatial = {"bbox": [box or WORLD], "crs": _CRS84}
-    period = features.period(connection, collection, viewer)
+    period = items.period(connection, collection, viewer)
     temporal = {"interval": [[None if time is None else time.isoformat() for time in period]]}
     path = f"collections/{collection.id}"
     here = f"{request.base_url}{path}"

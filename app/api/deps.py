@@ -13,7 +13,7 @@ from fastapi import Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import origin
+from app import request_context
 from app.auth import Scope, authenticate, authenticate_identity, require
 from app.config import Settings
 from app.db.engine import Database
@@ -66,7 +66,7 @@ async def _caller(
     if kind.lower() != "bearer" or not secret.strip():
         raise NotAllowed("the Authorization header must read `Bearer TOKEN`", known=False)
     caller = await run_in_threadpool(_known, request.app.state.issuer, database, secret.strip())
-    here = origin.current()
+    here = request_context.current()
     here.actor, here.actor_name = caller.id, caller.name
     return caller
 

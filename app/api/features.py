@@ -14,12 +14,18 @@ from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, re
 from app.api.pages import features_page
 from app.api.streams import Streamed
 from app.auth import Scope, allows, require
-from app.db.collections import Collection, Viewer
 from app.db.engine import Database
-from app.usecases import features
-from app.usecases.features import Answer
-from app.usecases.questions import DEFAULT_LIMIT, FILTER_LANGUAGES, Asked, Question, understand
-from services.formats.feature_files import (
+from app.db.features.collection import Collection, Viewer
+from app.usecases.features import items as features
+from app.usecases.features.items import Answer
+from app.usecases.features.query import (
+    DEFAULT_LIMIT,
+    FILTER_LANGUAGES,
+    FeatureQuery,
+    ResolvedQuery,
+    resolve,
+)
+from services.formats.vector.feature_files import (
     FeatureTable,
     format_flatgeobuf,
     format_geopackage,
@@ -125,8 +131,8 @@ async def question_of_query(
         str | None, Query(description="Properties by which to sort, - before one for descending.")
     ] = None,
     properties: Annotated[str | None, Query(description="Properties to give, all by default.")] = None,
-) -> Question:
-    return Question(
+) -> FeatureQuery:
+    return FeatureQuery(
         limit=limit,
         token=token,
         bbox=bbox,
@@ -174,7 +180,7 @@ def items(
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[Question, Depends(question_of_query)],
+    question: Annotated[FeatureQuery, Depends(question_of_query)],
     f: Format = None,
 ) -> Response:
     """A page of the features of a collection."""
@@ -185,7 +191,7 @@ def items(
         for name, value in request.query_params.items()
         if name in collection.queryables and name not in PARAMETERS
     )
-    asked = understand(collection, viewer, Question(**{**vars(question), "equal": equal}), secret)
+    asked = resolve(collection, viewer, FeatureQuery(**{**vars(question), "equal": equal}), secret)
     return _answer(request, database, asked, form, secret, _next_of_query(request))
 
 
@@ -201,7 +207,7 @@ def search(
     """The same by POST; the next page is asked for with the `token` of the link `next`."""
     refuse_unknown(request, set())
     said = body.model_dump(exclude={"f"})
-    asked = understand(collection, viewer, Question(**said), secret)
+    asked = resolve(collection, viewer, FeatureQuery(**said), secret)
     form = chosen_format(request, FEATURES, body.f)
 
     def next_link(token: str) -> dict[str, Any]:
@@ -250,7 +256,7 @@ def _next_of_query(request: Request) -> Any:
 
 
 def _answer(
-    request: Request, database: Database, asked: Asked, form: str, secret: bytes, next_link: Any
+    request: Request, database: Database, asked: ResolvedQuery, form: str, secret: bytes, next_link: Any
 ) -> Response:
     """A page in a format; links are in the document where it has a place for them, in the header too."""
     if form == "json" and asked.limit > features.LARGEST_TEXT:
@@ -283,7 +289,7 @@ def _answer(
 
 
 def _streamed(
-    request: Request, database: Database, asked: Asked, secret: bytes, next_link: Any
+    request: Request, database: Database, asked: ResolvedQuery, secret: bytes, next_link: Any
 ) -> Generator[bytes, None, None]:
     with database.reading() as connection:
         opened = b'{"type":"FeatureCollection","features":['
@@ -306,7 +312,7 @@ def _rest(answer: Answer, links: list[dict[str, Any]]) -> bytes:
 
 
 def _links(
-    request: Request, asked: Asked, answer: Answer, next_link: Any, form: str
+    request: Request, asked: ResolvedQuery, answer: Answer, next_link: Any, form: str
 ) -> list[dict[str, Any]]:
     kind = FEATURES[form]
     links = [{"rel": "self", "href": str(request.url), "type": kind}]
@@ -323,7 +329,7 @@ def _links(
 
 
 def _headers(
-    asked: Asked,
+    asked: ResolvedQuery,
     kind: str,
     links: list[dict[str, Any]] | None = None,
     answer: Answer | None = None,

@@ -6,10 +6,10 @@ from uuid import UUID
 from fastapi import APIRouter, Depends, Query, Request
 
 from app.api.deps import DatabaseDep, Reader
-from app.db.jobs import Job, JobFilter, JobState
+from app.db.jobs.jobs import Job, JobFilter, JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs
-from app.usecases.questions import parse_interval
+from app.usecases.features.query import parse_interval
 
 router = APIRouter(tags=["jobs"])
 

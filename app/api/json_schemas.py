@@ -6,7 +6,7 @@ Sources: OGC 17-069r4 (Features), OGC 20-057 (Tiles), OGC 19-072 (Common); RFC 7
 from typing import Any
 
 from app.api.negotiation import HTML, JSON
-from app.db.collections import Collection, Property
+from app.db.features.collection import Collection, Property
 
 Schema = dict[str, Any]
 

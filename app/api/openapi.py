@@ -5,11 +5,11 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from app.api.documents import COMPONENTS, feature_schema, page_schema, property_schema, reference
+from app.api.json_schemas import COMPONENTS, feature_schema, page_schema, property_schema, reference
 from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, PROBLEM_JSON
-from app.db.collections import Collection, Property
-from app.usecases.features import COLLECTIONS
-from app.usecases.tiles import MATRIX_SET, MOST_ZOOM
+from app.db.features.collection import Collection, Property
+from app.usecases.features.items import COLLECTIONS
+from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
 
 REFUSED = {
     "description": "What was wrong, as problem details.",

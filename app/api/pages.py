@@ -8,8 +8,8 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
-from app.db.collections import Collection
-from app.usecases.features import Answer
+from app.db.features.collection import Collection
+from app.usecases.features.items import Answer
 
 TEMPLATES = Environment(loader=PackageLoader("app.api", "templates"), autoescape=True)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; frame-ancestors 'none'"

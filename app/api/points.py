@@ -10,12 +10,12 @@ from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import CrsUri, Format
 from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, refuse_unknown
 from app.api.pages import features_page
-from app.db.collections import Viewer
+from app.db.features.collection import Viewer
 from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
-from app.usecases import points
-from app.usecases.features import find_feature
-from services.formats.chip_images import (
+from app.usecases.features import points
+from app.usecases.features.items import find_feature
+from services.formats.chips.images import (
     format_chip_png,
     format_chip_tiff,
     format_chips_npz,

@@ -10,7 +10,7 @@ from app.api.jobs import job_url, status_info
 from app.errors import InputError
 from app.usecases import jobs
 from app.usecases.processes import Process
-from app.usecases.registration_files import media_type
+from app.usecases.registration.deliverables import media_type
 
 router = APIRouter(tags=["processes"])
 

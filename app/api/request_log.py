@@ -8,7 +8,7 @@ from uuid import uuid4
 from prometheus_client import CollectorRegistry, Histogram
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.origin import Origin, working_for
+from app.request_context import Origin, working_for
 
 HEADER = b"x-request-id"
 ACCEPTED_ID = re.compile(rb"[A-Za-z0-9._\-]{1,64}")

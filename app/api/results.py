@@ -11,15 +11,15 @@ from fastapi.responses import JSONResponse
 
 from app import errors
 from app.api.deps import DatabaseDep, Reader, StorageDep
+from app.api.error_responses import HTTP_STATUS, OGC_EXCEPTIONS, problem
 from app.api.files import file_reply
 from app.api.jobs import JobId, job_url
 from app.api.negotiation import JSON, SCHEMA_JSON
-from app.api.replies import HTTP_STATUS, OGC_EXCEPTIONS, problem
-from app.db.jobs import Job
+from app.db.jobs.jobs import Job
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases import jobs, results
-from app.usecases.registration_files import media_type
+from app.usecases.registration.deliverables import media_type
 from app.usecases.results import ToldFile
 from services import errors as errors_of_science
 from services.reports import document

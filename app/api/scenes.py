@@ -15,8 +15,8 @@ from app.api.files import file_reply
 from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
+from app.usecases.features.stac import scene_media_type
 from app.usecases.scenes import Upload
-from app.usecases.stac import scene_media_type
 
 router = APIRouter(tags=["scenes"])
 

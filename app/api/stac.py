@@ -25,13 +25,13 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.processes import inlined
-from app.db.collections import Viewer
 from app.db.engine import Database
-from app.db.outlines import SCENES
+from app.db.features.collection import Viewer
+from app.db.features.outlines import SCENES
 from app.errors import InvalidParameter
-from app.usecases import features as all_features
-from app.usecases import stac
-from app.usecases.questions import DEFAULT_LIMIT, Question, understand
+from app.usecases.features import items as all_features
+from app.usecases.features import stac
+from app.usecases.features.query import DEFAULT_LIMIT, FeatureQuery, resolve
 
 router = APIRouter(tags=["stac"])
 
@@ -95,9 +95,9 @@ class ItemSearch(BaseModel):
     token: str | None = None
 
     @property
-    def question(self) -> Question:
+    def question(self) -> FeatureQuery:
         """The same as a request for features says it."""
-        return Question(
+        return FeatureQuery(
             limit=self.limit,
             token=self.token,
             bbox=None if self.bbox is None else ",".join(map(repr, self.bbox)),
@@ -132,7 +132,7 @@ def search(
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[Question, Depends(features.question_of_query)],
+    question: Annotated[FeatureQuery, Depends(features.question_of_query)],
     ids: Listed = None,
     collections: Listed = None,
     intersects: Annotated[str | None, Query(description="A GeoJSON geometry.")] = None,
@@ -182,7 +182,7 @@ def items(
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[Question, Depends(features.question_of_query)],
+    question: Annotated[FeatureQuery, Depends(features.question_of_query)],
     ids: Listed = None,
     collections: Listed = None,
     f: Format = None,
@@ -229,13 +229,13 @@ def _page(
     database: Database,
     viewer: Viewer,
     secret: bytes,
-    question: Question,
+    question: FeatureQuery,
     next_link: Callable[[str], dict[str, Any]],
 ) -> Response:
     """Items with the links that a page has."""
     if question.bbox is not None and question.intersects is not None:
         raise InvalidParameter("bbox, intersects: only one of them can be asked for")
-    asked = understand(SCENES, viewer, question, secret)
+    asked = resolve(SCENES, viewer, question, secret)
     base = str(request.base_url)
     with database.reading() as connection:
         answer = all_features.page(connection, asked, "geojson", secret)

@@ -7,8 +7,8 @@ from fastapi.responses import JSONResponse
 
 from app.api import processes, stac
 from app.api.deps import DatabaseDep
-from app.api.documents import document_of
 from app.api.features import Format
+from app.api.json_schemas import document_of
 from app.api.negotiation import DOCUMENTS, HTML, JSON, OPENAPI_JSON, chosen_format, refuse_unknown
 from app.api.pages import Cell, document_page
 

@@ -6,13 +6,13 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from app.api.deps import DatabaseDep
-from app.api.documents import json_of
 from app.api.features import CollectionDep, ViewerDep
+from app.api.json_schemas import json_of
 from app.api.negotiation import JSON, MVT
-from app.db.collections import Collection
+from app.db.features.collection import Collection
 from app.errors import NotFound
-from app.usecases import tiles
-from app.usecases.tiles import MATRIX_SET
+from app.usecases.features import tiles
+from app.usecases.features.tiles import MATRIX_SET
 
 router = APIRouter(tags=["tiles"])
 

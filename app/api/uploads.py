@@ -19,7 +19,7 @@ from app.api.deps import (
     StorageDep,
     UploadTurn,
 )
-from app.api.replies import problem
+from app.api.error_responses import problem
 from app.db.uploads import UploadRow
 from app.errors import InputError
 from app.usecases import uploads

@@ -12,9 +12,9 @@ from app.config import read_settings
 from app.db.blocks import Block
 from app.errors import InputError
 from app.storage import StoredChips, open_storage
-from app.usecases import blocks
-from app.usecases.block_export import ExportBlock, export_block
-from app.usecases.blocks import Published
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.export import ExportBlock, export_block
+from app.usecases.blocks.lifecycle import Published
 from services.quality.block import BlockQuality, Distribution, quality_document
 
 app = typer.Typer(help="Productions of points.", no_args_is_help=True)
@@ -34,10 +34,10 @@ def ingest(
     storage = open_storage(settings)
     with transaction(settings) as connection:
         with shown_progress() as progress:
-            ingested = blocks.ingest_block(connection, storage, path, progress, priority)
+            ingested = lifecycle.ingest_block(connection, storage, path, progress, priority)
         block = ingested.block
         if publish:
-            block = blocks.publish_block(connection, str(block.number)).block
+            block = lifecycle.publish_block(connection, str(block.number)).block
     if as_json:
         print_json({"block": _record(block), "quality": quality_document(ingested.quality)})
         return
@@ -48,7 +48,7 @@ def ingest(
 def list_blocks(as_json: AsJson = False) -> None:
     """List all blocks, the newest first."""
     with transaction() as connection:
-        found = blocks.list_blocks(connection)
+        found = lifecycle.list_blocks(connection)
     show([_record(block) for block in found], as_json=as_json)
 
 
@@ -56,7 +56,7 @@ def list_blocks(as_json: AsJson = False) -> None:
 def show_block(reference: Reference, as_json: AsJson = False) -> None:
     """Show one block."""
     with transaction() as connection:
-        block = blocks.find_block(connection, reference)
+        block = lifecycle.find_block(connection, reference)
     show_one(_record(block), as_json=as_json)
 
 
@@ -64,7 +64,7 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
 def quality(reference: Reference, as_json: AsJson = False) -> None:
     """Show the quality figures of a block; with --json also the density of every cell."""
     with transaction() as connection:
-        report = blocks.block_report(connection, blocks.find_block(connection, reference))
+        report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
     if as_json:
         stated = [vars(figure) for figure in report.accuracy]
         print_json({**quality_document(report.quality), "accuracy": stated})
@@ -80,7 +80,7 @@ def quality(reference: Reference, as_json: AsJson = False) -> None:
 def publish(reference: Reference, as_json: AsJson = False) -> None:
     """Make a block visible, and the version of it that was visible before no longer."""
     with transaction() as connection:
-        published = blocks.publish_block(connection, reference)
+        published = lifecycle.publish_block(connection, reference)
     show_one(_published(published), as_json=as_json)
 
 
@@ -88,7 +88,7 @@ def publish(reference: Reference, as_json: AsJson = False) -> None:
 def restore(reference: Reference, as_json: AsJson = False) -> None:
     """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
     with transaction() as connection:
-        published = blocks.restore_block(connection, reference)
+        published = lifecycle.restore_block(connection, reference)
     show_one(_published(published), as_json=as_json)
 
 
@@ -100,7 +100,7 @@ def prioritise(
 ) -> None:
     """Let a block win or lose against other blocks over the same place."""
     with transaction() as connection:
-        block = blocks.prioritise_block(connection, reference, priority)
+        block = lifecycle.prioritise_block(connection, reference, priority)
     show_one(_record(block), as_json=as_json)
 
 
@@ -133,7 +133,7 @@ def export(
 def withdraw(reference: Reference, as_json: AsJson = False) -> None:
     """Make a block invisible; it can be published again."""
     with transaction() as connection:
-        block = blocks.withdraw_block(connection, reference)
+        block = lifecycle.withdraw_block(connection, reference)
     show_one(_record(block), as_json=as_json)
 
 

@@ -8,7 +8,9 @@ import typer
 
 from app.cli.output import AsJson, show_one
 from app.config import read_settings
-from app.db import archive, embedded, engine
+from app.db import engine
+from app.db.cluster import backup as archive
+from app.db.cluster import embedded
 
 app = typer.Typer(help="The database and its schema.", no_args_is_help=True)
 

@@ -11,8 +11,9 @@ import typer
 
 from app.cli.output import AsJson, print_json, show, show_one
 from app.cli.store import transaction
-from app.usecases import history, points
-from app.usecases.questions import parse_bbox
+from app.usecases import history
+from app.usecases.features import points
+from app.usecases.features.query import parse_bbox
 
 app = typer.Typer(help="Control points of published blocks.", no_args_is_help=True)
 

@@ -15,8 +15,8 @@ from app.usecases.production import (
     run_ortho_production,
     run_production,
 )
-from services.ortho_points import OrthoPointOptions
-from services.production import ProductionOptions
+from services.production.from_images import ProductionOptions
+from services.production.from_ortho import OrthoPointOptions
 
 app = typer.Typer(help="New blocks of points out of images.", no_args_is_help=True)
 

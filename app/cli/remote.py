@@ -11,9 +11,9 @@ from urllib.parse import quote
 import httpx
 
 from app.errors import AmersError, ComputationError, InputError
-from app.usecases.registration import SceneFiles
+from app.usecases.registration.register import SceneFiles
 from services import errors
-from services.formats.scenes import model_files
+from services.formats.images.scenes import model_files
 from services.types import Progress
 
 CHUNK_BYTES = 1 << 20

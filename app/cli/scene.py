@@ -15,18 +15,13 @@ from app.config import read_settings
 from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
-from app.usecases.ground_control import points_of_block, points_of_store
 from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorectification
-from app.usecases.reference import ReferenceFiles, this_reference
 from app.usecases.references import references_of_store
-from app.usecases.registration import (
-    SceneFiles,
-    key_of_file,
-    record,
-    run_registration,
-)
-from services.orthorectify import OrthoOptions
-from services.registration import RegistrationOptions
+from app.usecases.registration.control_sources import points_of_block, points_of_store
+from app.usecases.registration.reference_source import ReferenceFiles, this_reference
+from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
+from services.orthorectification.rectify import OrthoOptions
+from services.registration.on_points import RegistrationOptions
 from services.reports.document import report_document
 from services.types import Progress
 

@@ -14,7 +14,8 @@ import uvicorn
 
 from app import logs
 from app.config import Settings, read_settings
-from app.db import embedded, engine
+from app.db import engine
+from app.db.cluster import embedded
 
 WORKER = """
 import ctypes, os, signal, sys

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from app.config import Settings, read_settings
-from app.db import embedded, engine
+from app.db import engine
+from app.db.cluster import embedded
 from app.db.engine import Connection
 
 

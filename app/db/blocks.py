@@ -8,7 +8,7 @@ from typing import Any, Literal
 import shapely
 
 from app.db.engine import Connection
-from services.formats.block import BlockContents
+from services.formats.block.reader import BlockContents
 from services.quality.block import BlockQuality, parse_quality_document, quality_document
 from services.types import Array, IntArray
 

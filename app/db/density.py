@@ -5,9 +5,9 @@ from them as points are superseded or suspended (revision 0010). A cell of level
 wide.
 """
 
-from app.db.box import Box
-from app.db.collections import Collection, Property
 from app.db.engine import Connection
+from app.db.features.bbox import Box
+from app.db.features.collection import Collection, Property
 
 COARSEST = 6
 CELL_DEG = 0.1

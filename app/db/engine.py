@@ -14,9 +14,9 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import ConnectionPool
 
-from app import origin
+from app import request_context
 from app.config import Settings
-from app.db import embedded
+from app.db.cluster import embedded
 from app.errors import InputError
 
 Connection = psycopg.Connection[DictRow]
@@ -133,7 +133,7 @@ def connect(dsn: str) -> Iterator[Connection]:
 
 def say_origin(connection: Connection) -> None:
     """Tell the transaction who is behind it, for the record of changes."""
-    where = origin.current()
+    where = request_context.current()
     connection.execute(
         """select set_config('amers.actor', %s, true), set_config('amers.actor_name', %s, true),
                   set_config('amers.request_id', %s, true), set_config('amers.job_id', %s, true)""",

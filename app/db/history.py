@@ -13,8 +13,8 @@ from psycopg.rows import class_row
 
 from app.db import binary_copy as binary
 from app.db.blocks import PUBLISHED
-from app.db.collections import Collection, Property
 from app.db.engine import Connection
+from app.db.features.collection import Collection, Property
 from services.types import HEALTH_PRIOR_TRIES, Array, IntArray, Measures, ViewMeasures, health
 
 SAYS_NOTHING = ("not_tried", "no_chip", "nodata", "cloud")

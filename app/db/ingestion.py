@@ -8,8 +8,8 @@ import numpy as np
 from app.db import binary_copy as binary
 from app.db.blocks import ID_BITS
 from app.db.engine import Connection
-from services.formats.block import BlockContents
-from services.formats.block_tables import spread_from_covariance
+from services.formats.block.reader import BlockContents
+from services.formats.block.tables import spread_from_covariance
 from services.types import IntArray, Progress
 
 POINT_COLUMNS = (

@@ -9,14 +9,14 @@ import numpy.typing as npt
 import shapely
 from psycopg import sql
 
-from app.db.antimeridian import on_the_map
 from app.db.binary_copy import parse_copy
 from app.db.blocks import ID_BITS, PUBLISHED
-from app.db.collections import Collection, Property
 from app.db.density import points_in_box
 from app.db.engine import Connection
+from app.db.features.antimeridian import on_the_map
+from app.db.features.collection import Collection, Property
 from app.db.history import point_health, view_health
-from services.formats.block_tables import covariance_from_spread
+from services.formats.block.tables import covariance_from_spread
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
 SERVED = "t.superseded_by is null and t.suspended_at is null"

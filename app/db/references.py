@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from psycopg.rows import class_row
 
-from app.db.antimeridian import TURNS_DEG, on_the_map
 from app.db.engine import Connection
+from app.db.features.antimeridian import TURNS_DEG, on_the_map
 from services.types import Array, BoolArray, IntArray
 
 COLUMNS = """id, name, image, dem, vertical, geoid, sigma_m, gsd_m, created_at,

@@ -44,7 +44,7 @@ def lock_publications(connection: Connection) -> None:
     connection.execute("select pg_advisory_xact_lock(%s)", [PUBLICATION_LOCK])
 
 
-def settle(connection: Connection, number: int) -> None:
+def recompute(connection: Connection, number: int) -> None:
     """Decide anew wherever a block matters whose state or priority has changed.
 
     Args:

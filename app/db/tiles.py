@@ -1,9 +1,9 @@
 """Vector tiles, made by the database: points, density cells, outlines of blocks."""
 
-from app.db.collections import Viewer
 from app.db.density import COARSEST, SERVED
 from app.db.engine import Connection
-from app.db.outlines import BLOCKS
+from app.db.features.collection import Viewer
+from app.db.features.outlines import BLOCKS
 from app.db.points import POINTS
 
 EXTENT = 4096

@@ -6,7 +6,7 @@ Ages are counted by it where more than a moment depends on them: `service_time_s
 from app.db.engine import Connection
 
 
-def go_on(connection: Connection, most_s: float) -> None:
+def advance(connection: Connection, most_s: float) -> None:
     """Let the time of the service go on to now.
 
     Args:

@@ -9,21 +9,16 @@ import numpy as np
 from app.config import Settings
 from app.db import engine
 from app.storage import open_storage
-from app.usecases import blocks
-from app.usecases.ground_control import points_of_store
+from app.usecases.blocks import lifecycle
 from app.usecases.production import BlockIdentity, run_production
-from app.usecases.registration import (
-    SceneFiles,
-    key_of_file,
-    record,
-    run_registration,
-)
-from services.formats.raster import write_raster
+from app.usecases.registration.control_sources import points_of_store
+from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
+from services.adjustment.intersection import intersect
+from services.formats.images.raster import write_raster
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.intersection import intersect
-from services.production import Production, ProductionOptions
+from services.production.from_images import Production, ProductionOptions
 from services.quality.accuracy import Quantile, sample_quantile
-from services.registration import Registration, RegistrationOptions
+from services.registration.on_points import Registration, RegistrationOptions
 from services.simulation.view import (
     SimulatedView,
     ViewPlan,
@@ -131,8 +126,8 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
     with engine.opened(settings) as database:
         progress(0.7, "ingesting the block")
         with database.transaction() as connection:
-            ingested = blocks.ingest_block(connection, storage, folder / "block")
-            blocks.publish_block(connection, str(ingested.block.number))
+            ingested = lifecycle.ingest_block(connection, storage, folder / "block")
+            lifecycle.publish_block(connection, str(ingested.block.number))
         sigma_m = float(np.hypot(*options.scene_error_m))
         registered = run_registration(
             SceneFiles(image, sigma_m=sigma_m),

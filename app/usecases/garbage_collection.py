@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from uuid import UUID
 
-from app.db import attempts, scenes, uploads
+from app.db import scenes, uploads
 from app.db.engine import Connection, Database
+from app.db.jobs import attempts
 from app.storage import Storage
 
 

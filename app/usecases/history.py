@@ -2,11 +2,11 @@
 
 from uuid import UUID
 
-from app.db import history, overlaps, registrations
+from app.db import history, registrations, superseding
 from app.db.engine import Connection
 from app.db.history import PointHistory
 from app.errors import Conflict, InputError, NotFound
-from services.registration import Registration
+from services.registration.on_points import Registration
 
 MOST_HISTORIES = 1000
 LONGEST_REASON = 500
@@ -73,7 +73,7 @@ def suspend_point(connection: Connection, point_id: int, because: str) -> PointH
     before = find_history(connection, point_id)
     if not history.suspend(connection, point_id, because.strip()):
         raise Conflict(f"point {point_id} is suspended already, because: {before.suspended_because}")
-    overlaps.count_unserved(connection)
+    superseding.count_unserved(connection)
     return find_history(connection, point_id)
 
 
@@ -87,5 +87,5 @@ def reinstate_point(connection: Connection, point_id: int) -> PointHistory:
     find_history(connection, point_id)
     if not history.reinstate(connection, point_id):
         raise Conflict(f"point {point_id} is not suspended")
-    overlaps.count_unserved(connection)
+    superseding.count_unserved(connection)
     return find_history(connection, point_id)

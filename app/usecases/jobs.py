@@ -14,20 +14,21 @@ from psycopg import OperationalError
 
 from app.auth import Scope, allows, require
 from app.config import Settings
-from app.db import attempts, job_course, jobs
-from app.db.attempts import LostJob
 from app.db.engine import Connection, Database
-from app.db.job_course import JobMessage
-from app.db.jobs import Job, JobFilter, Response
+from app.db.jobs import attempts, jobs
+from app.db.jobs import progress as job_course
+from app.db.jobs.attempts import LostJob
+from app.db.jobs.jobs import Job, JobFilter, Response
+from app.db.jobs.progress import JobMessage
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
 from app.usecases import quotas
-from app.usecases.block_export import EXPORT_BLOCK
-from app.usecases.block_ingestion import INGEST_BLOCK
+from app.usecases.blocks.export import EXPORT_BLOCK
+from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work
-from app.usecases.registration_job import REGISTER_SCENE
+from app.usecases.registration.job import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
     process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)

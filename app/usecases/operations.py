@@ -4,10 +4,10 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.db import audit, gauges
+from app.db import audit, metrics
 from app.db.audit import Change
 from app.db.engine import Connection
-from app.db.gauges import Gauges
+from app.db.metrics import Gauges
 from app.errors import InputError
 
 MOST_CHANGES = 1000
@@ -27,7 +27,7 @@ def installation_figures(connection: Connection, data_folder: Path) -> Installat
     # The folder is made by the first who writes into it.
     there = next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
     disk = shutil.disk_usage(there)
-    return Installation(gauges.read_gauges(connection), disk.free, disk.total)
+    return Installation(metrics.read_gauges(connection), disk.free, disk.total)
 
 
 def list_changes(

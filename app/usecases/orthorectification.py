@@ -17,12 +17,12 @@ from app.errors import InputError
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
-from services.formats.bands import one_band
-from services.formats.dem import read_dem
-from services.formats.ortho_files import write_cog
-from services.formats.raster import RasterImage
-from services.formats.scenes import read_scene
-from services.orthorectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
+from services.formats.elevation.dem import read_dem
+from services.formats.images.bands import one_band
+from services.formats.images.ortho import write_cog
+from services.formats.images.raster import RasterImage
+from services.formats.images.scenes import read_scene
+from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
 from services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"

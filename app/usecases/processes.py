@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from app.auth import Scope
 from app.config import Settings
 from app.db.engine import Connection, Database
-from app.db.jobs import Job
+from app.db.jobs.jobs import Job
 from app.db.tokens import Token
 from app.errors import InputError
 from app.storage import Storage

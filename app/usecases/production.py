@@ -9,15 +9,15 @@ from pathlib import Path
 
 from app.errors import InputError
 from app.usecases.orthorectification import TerrainFile
-from app.usecases.reference import HEIGHT_SIGMA_POSTINGS
-from services.formats.bands import parse_bands
-from services.formats.block_document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
-from services.formats.block_writing import write_block
-from services.formats.dem import read_dem
-from services.formats.scenes import read_scene
-from services.ortho_points import Heights, OrthoPointOptions, OrthoPoints, ortho_points
-from services.production import Production, ProductionOptions, produce_points
-from services.scene import Scene
+from app.usecases.registration.reference_source import HEIGHT_SIGMA_POSTINGS
+from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
+from services.formats.block.writer import write_block
+from services.formats.elevation.dem import read_dem
+from services.formats.images.bands import parse_bands
+from services.formats.images.scenes import read_scene
+from services.imagery.scene import Scene
+from services.production.from_images import Production, ProductionOptions, produce_points
+from services.production.from_ortho import Heights, OrthoPointOptions, OrthoPoints, ortho_points
 from services.sensors.correction import fold_into_rpc
 from services.sensors.rpc import RpcModel
 from services.types import Progress, no_progress
@@ -50,7 +50,7 @@ class OrthoFiles:
         flat_m: metres above the ellipsoid.
         height_sigma_m: of these heights, one standard deviation; has to be given with a flat one.
         sigma_m: accuracy of the image on the map; by default what is known of its sensor.
-        bands: see `services.formats.bands.parse_bands`.
+        bands: see `services.formats.images.bands.parse_bands`.
         mask: image of the same ground, not zero where no point shall be.
     """
 

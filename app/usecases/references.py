@@ -12,12 +12,17 @@ from app.db.engine import Connection, Database
 from app.db.references import ReferenceRow
 from app.errors import Conflict, InputError, NotFound
 from app.usecases.orthorectification import TerrainFile
-from app.usecases.reference import FindReference, FoundReference, ReferenceFiles, read_reference
+from app.usecases.registration.reference_source import (
+    FindReference,
+    FoundReference,
+    ReferenceFiles,
+    read_reference,
+)
 from app.usecases.server_files import file_below
 from services.geodesy import ecef_from_lon_lat_h
-from services.matching.dense import DenseOptions
-from services.registration import Registration
-from services.scene import Scene, scene_footprint
+from services.imagery.scene import Scene, scene_footprint
+from services.matching.reference_image import DenseOptions
+from services.registration.on_points import Registration
 from services.sensors.ortho import OrthoModel
 from services.types import Acquisition, Array, BoolArray
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from app.db.jobs import Job
+from app.db.jobs.jobs import Job
 from app.errors import NotFound
 from app.storage import Storage
-from app.usecases.registration_files import media_type
+from app.usecases.registration.deliverables import media_type
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20

@@ -19,7 +19,7 @@ from app.storage import Storage, StoredFile
 from app.usecases import quotas
 from app.usecases.server_files import file_below
 from services.errors import FormatError
-from services.formats.raster import DRIVER_OF_SIGNATURE
+from services.formats.images.raster import DRIVER_OF_SIGNATURE
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)

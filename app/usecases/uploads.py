@@ -19,7 +19,7 @@ from app.db.uploads import Purpose, UploadRow
 from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage
 from app.usecases import quotas
-from app.usecases.block_uploads import block_key
+from app.usecases.blocks.uploads import block_key
 from app.usecases.scenes import (
     MODEL_LIMIT_BYTES,
     MODEL_SUFFIXES,

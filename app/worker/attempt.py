@@ -18,12 +18,12 @@ from uuid import UUID
 from psycopg import OperationalError
 
 from app.config import Settings
-from app.db import attempts
-from app.db.attempts import LostJob
 from app.db.engine import Database
-from app.db.jobs import Job
+from app.db.jobs import attempts
+from app.db.jobs.attempts import LostJob
+from app.db.jobs.jobs import Job
 from app.errors import is_no_room
-from app.origin import Origin, working_for
+from app.request_context import Origin, working_for
 from app.storage import Storage
 
 FAILURES_ALLOWED = 3

@@ -15,8 +15,9 @@ import procrastinate
 import psycopg
 
 from app.config import Settings
-from app.db import engine, job_queue
+from app.db import engine
 from app.db.engine import Database
+from app.db.jobs import queue
 from app.storage import open_storage
 from app.worker.attempt import Attempts
 from app.worker.sweep import Sweeper
@@ -91,14 +92,14 @@ class _Worker:
         app = procrastinate.App(connector=procrastinate.PsycopgConnector(conninfo=self.database.dsn))
         attempts = Attempts(self.database, self.settings, self.name, self.stop.is_set)
 
-        @app.task(name=job_queue.TASK, queue=job_queue.QUEUE)
+        @app.task(name=queue.TASK, queue=queue.QUEUE)
         def do_job(job_id: str) -> None:
             attempts.do_job(UUID(job_id))
 
         async with app.open_async():
             log.info("worker %s waits for jobs", self.name)
             await app.run_worker_async(
-                queues=[job_queue.QUEUE],
+                queues=[queue.QUEUE],
                 name=self.name,
                 delete_jobs="always",
                 fetch_job_polling_interval=min(self.settings.lease_seconds, LONGEST_POLL_S),

@@ -19,10 +19,10 @@ import cv2
 
 from app import logs
 from app.config import read_settings
-from app.db.attempts import LostJob
 from app.db.engine import pooled
+from app.db.jobs.attempts import LostJob
 from app.errors import is_no_room
-from app.origin import Origin, working_for
+from app.request_context import Origin, working_for
 from app.usecases.jobs import do_attempt
 from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY
 

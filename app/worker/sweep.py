@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import psycopg
 
 from app.config import Settings
-from app.db import attempts, job_queue, jobs, scenes, service_time
+from app.db import scenes, uptime
 from app.db.engine import Database
-from app.origin import Origin, working_for
+from app.db.jobs import attempts, jobs, queue
+from app.request_context import Origin, working_for
 from app.storage import Storage
-from app.usecases.block_uploads import sweep_blocks
-from app.usecases.blocks import sweep_storage
-from app.usecases.cleaning import remove_unnamed_files
+from app.usecases.blocks.lifecycle import sweep_storage
+from app.usecases.blocks.uploads import sweep_blocks
+from app.usecases.garbage_collection import remove_unnamed_files
 from app.usecases.uploads import PREFIX as UPLOADED
 from app.usecases.uploads import sweep_uploads
 from app.worker.attempt import FAILURES_ALLOWED
@@ -69,13 +70,13 @@ class Sweeper:
 def sweep_jobs(database: Database, lease_s: float) -> None:
     """Take back the jobs of dead workers, and put into the queue what was lost from it."""
     with database.transaction() as connection:
-        if not job_queue.may_sweep(connection):
+        if not queue.may_sweep(connection):
             return
         for job_id in attempts.take_back(connection, FAILURES_ALLOWED):
             log.warning("job %s: taken back from a worker that gave no sign of life", job_id)
-        for job_id in job_queue.enqueue_forgotten(connection, lease_s):
+        for job_id in queue.enqueue_forgotten(connection, lease_s):
             log.warning("job %s: was not in the queue any more", job_id)
-        job_queue.forget_dead_entries(connection, SILENT_WORKER_S)
+        queue.forget_dead_entries(connection, SILENT_WORKER_S)
 
 
 def sweep_results(database: Database, result_days: float | None) -> None:
@@ -94,7 +95,7 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
         psycopg.errors.LockNotAvailable: an ingestion is under way; its files are swept another time.
     """
     with database.transaction() as connection:
-        service_time.go_on(connection, MOST_BETWEEN_S)
+        uptime.advance(connection, MOST_BETWEEN_S)
     removed = sweep_uploads(database, storage)
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)

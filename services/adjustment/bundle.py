@@ -7,9 +7,10 @@ import numpy as np
 from numba import njit
 from scipy.special import gammaincinv
 
+from services.adjustment.intersection import intersect, residuals_and_derivatives
 from services.adjustment.robust import cauchy_weights
 from services.errors import NoConvergence, NotEnoughPoints
-from services.intersection import intersect, move_metres, residuals_and_derivatives
+from services.geodesy import move_metres
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import Array, BoolArray, IntArray, Observations

@@ -41,8 +41,8 @@ class AdjustmentOptions:
         min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
             this fraction.
         folds: of the cross-validation.
-        untested_px: what drift and skew are expected to be at the edge of the image before anything is
-            measured, one standard deviation; the measures may say more, never less.
+        prior_slope_sigma_px: standard deviation of drift and skew at the edge of the image before any
+            measure is made, pixels; the measures may raise it, never lower it.
         slope_px: the same where the order is given; None leaves them to the measures.
     """
 
@@ -53,7 +53,7 @@ class AdjustmentOptions:
     min_spread: float = 0.1
     min_gain: float = 0.03
     folds: int = 5
-    untested_px: float = 1.0
+    prior_slope_sigma_px: float = 1.0
     slope_px: float | None = None
 
 
@@ -148,7 +148,7 @@ def adjust_scene(
 
     order, validation = _choose_order(declared, usable, options)
     start = declared.robust_solution(usable, _FREE[order])
-    problem = declared.as_they_scatter(start, usable, of_points)
+    problem = declared.with_empirical_variance(start, usable, of_points)
     start = problem.robust_solution(usable, _FREE[order])
     scale = max(problem.scale(start, usable), 1e-9)
     agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
@@ -156,7 +156,7 @@ def adjust_scene(
     slope_px = float("inf") if options.slope_px is None else options.slope_px
     if options.order is None:
         free = _FREE["affine"]
-        slope_px = problem.likeliest_slope_px(agreeing, max(scale, 1.0), options.untested_px)
+        slope_px = problem.likeliest_slope_px(agreeing, max(scale, 1.0), options.prior_slope_sigma_px)
 
     def magnitude(active: BoolArray) -> Array:
         parameters, _ = problem.solution(active, free, slope_px)
@@ -165,9 +165,9 @@ def adjust_scene(
 
     active = deactivate(magnitude, agreeing, options.tolerance, options.min_points)
     sigma0 = declared.sigma0(active, free, slope_px)
-    parameters, _ = problem.less_sure(sigma0).solution(active, free, slope_px)
+    parameters, _ = problem.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
     # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
-    _, covariance = declared.less_sure(sigma0).solution(active, free, slope_px)
+    _, covariance = declared.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
     if common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += common_covariance_px2
     return SceneAdjustment(
@@ -197,7 +197,9 @@ class _Problem:
     misfit: Array
     variance: Array
 
-    def as_they_scatter(self, parameters: Array, active: BoolArray, of_points: Array) -> "_Problem":
+    def with_empirical_variance(
+        self, parameters: Array, active: BoolArray, of_points: Array
+    ) -> "_Problem":
         """The same with the variances that residuals much smaller than declared show."""
         if self.scale(parameters, active) >= _MUCH_BETTER:
             return self
@@ -206,7 +208,7 @@ class _Problem:
         variance[active] = likeliest_variance(self.residual(parameters)[active], own, of_points[active])
         return replace(self, variance=variance)
 
-    def less_sure(self, sigma0: float) -> "_Problem":
+    def scaled_by_sigma0(self, sigma0: float) -> "_Problem":
         """The same with variances larger by a standard deviation of unit weight above 1."""
         return replace(self, variance=self.variance * max(sigma0, 1.0) ** 2)
 

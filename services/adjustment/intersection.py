@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.geodesy import lon_lat_h_from_ecef, metres_per_degree
+from services.geodesy import lon_lat_h_from_ecef, move_metres
 from services.sensors.base import SensorModel
 from services.types import Array, IntArray, Observations
 
@@ -81,17 +81,6 @@ def residuals_and_derivatives(
 
 
 @njit(cache=True)
-def move_metres(lon_lat_h: Array, enu: Array) -> Array:
-    """Ground points (n, 3) moved by some metres east, north and up (n, 3); exact for small moves."""
-    out = np.empty_like(lon_lat_h)
-    for i in range(len(lon_lat_h)):
-        east, north = metres_per_degree(lon_lat_h[i, 1], lon_lat_h[i, 2])
-        out[i, 0] = lon_lat_h[i, 0] + enu[i, 0] / east
-        out[i, 1] = lon_lat_h[i, 1] + enu[i, 1] / north
-        out[i, 2] = lon_lat_h[i, 2] + enu[i, 2]
-    return out
-
-
 def _lines_of_sight(models: Sequence[SensorModel], observations: Observations) -> tuple[Array, Array]:
     origin = np.empty((len(observations), 3))
     direction = np.empty((len(observations), 3))

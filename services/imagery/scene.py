@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from services.geodesy import ecef_from_east_north_up
-from services.imagery import ImageSource, image_gsd_m
+from services.imagery.source import ImageSource, image_gsd_m
 from services.sensors.base import SensorModel
 from services.types import Acquisition, Array
 

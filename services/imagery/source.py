@@ -8,7 +8,7 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import lon_lat_h_from_east_north_up
-from services.resampling import extent, resample, spline_coefficients
+from services.imagery.resampling import extent, resample, spline_coefficients
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
 

@@ -33,7 +33,7 @@ class Consensus:
     false_alarms: float
 
 
-def vote(displacement: Array, tolerance: float, search_radius: float) -> Consensus:
+def a_contrario_consensus(displacement: Array, tolerance: float, search_radius: float) -> Consensus:
     """The largest set of displacements within a tolerance of one of them.
 
     How far it can be believed is counted a contrario (Desolneux, Moisan, Morel, 2000): displacements

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from services.conventions import CHIP_CENTRE
-from services.imagery import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
-from services.intersection import move_metres
+from services.geodesy import move_metres
+from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
+from services.matching.chip_extent import middle_of, shown_half_side
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
 from services.matching.least_squares import covariance_of
-from services.matching.middle import middle_of, shown_half_side
-from services.matching.radiometry import clouded, edges, looks_of
+from services.matching.radiometry import clouded, edges, patch_statistics
 from services.matching.shadows import ShadowMove, shadow_move
-from services.matching.shared_error import common_covariance_px2
-from services.matching.views import Likeness, choose_views
+from services.matching.systematic_error import common_covariance_px2
+from services.matching.view_selection import Likeness, choose_views
 from services.sensors.base import SensorModel
 from services.types import (
     Acquisition,
@@ -40,8 +40,8 @@ class MatchingOptions:
     Attributes:
         max_views: how many views of a point are tried.
         agreement_px: views of a point agree when their measures are this near, in chip pixels.
-        min_edge_score: correlation of edges from which on a point is found by them that is not found by
-            its grey values.
+        min_gradient_score: least correlation of gradients for a point that is not found by its grey
+            values.
         likeness: which views are tried first.
         correlation: when a correlation peak is believed. From 0.6 on 215 of 216 peaks of four simulated
             scenes were right; views and the other points have to agree with it all the same.
@@ -49,7 +49,7 @@ class MatchingOptions:
 
     max_views: int = 4
     agreement_px: float = 0.7
-    min_edge_score: float = 0.5
+    min_gradient_score: float = 0.5
     likeness: Likeness = field(default_factory=Likeness)
     correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.6))
 
@@ -141,7 +141,7 @@ def match_points(
         scene_gsd_m[row] = image_gsd_m(model, ground)
         stack = point_chips(points, chips, row)
         ratio = scene_gsd_m[row] / gsd_m
-        looks[row] = looks_of(patch)
+        looks[row] = patch_statistics(patch)
         half = shown_half_side(patch, whole, radius_px)
         patch = middle_of(patch, half + radius_px)
         like_scene = [middle_of(_as_seen(stack[number], ratio, reduction), half) for number in numbers]
@@ -198,7 +198,7 @@ def _search(
     combined = _combined(peaks, options.agreement_px)
     if combined[-1] == "low_score":
         outlines = edges(patch)
-        correlation = replace(options.correlation, min_score=options.min_edge_score)
+        correlation = replace(options.correlation, min_score=options.min_gradient_score)
         by_edges = [find_chip(outlines, edges(chip), correlation) for chip in chips]
         again = _combined(by_edges, options.agreement_px)
         if again[-1] == FOUND:

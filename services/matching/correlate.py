@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from services.matching.least_squares import covariance_of, fit_chip
-from services.matching.shadows import ShadowMove, steady_weights
+from services.matching.shadows import ShadowMove, shadow_weights
 from services.types import Array, FloatImage
 
 FOUND = ""
@@ -118,7 +118,7 @@ def place_chip(
         score: normalised correlation there.
         options: thresholds.
     """
-    weight = None if shadows is None else steady_weights(chip, score, shadows)
+    weight = None if shadows is None else shadow_weights(chip, score, shadows)
     fit = fit_chip(patch, chip, start, weight=weight)
     score = score if fit is None else max(score, fit.score)
     if score < options.min_score:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.resampling import SPLINE_REACH_PX, spline_coefficients, spline_weights
+from services.imagery.resampling import SPLINE_REACH_PX, spline_coefficients, spline_weights
 from services.types import Array, FloatImage
 
 MAX_STEPS = 12

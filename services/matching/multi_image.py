@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from services.conventions import CHIP_CENTRE, CHIP_SIZE
-from services.imagery import image_gsd_m, render_chip
-from services.intersection import move_metres
+from services.geodesy import move_metres
+from services.imagery.scene import Scene
+from services.imagery.source import image_gsd_m, render_chip
 from services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
-from services.scene import Scene
 from services.sensors.base import SensorModel
 from services.types import (
     Array,

@@ -41,7 +41,7 @@ def edges(pixels: FloatImage) -> FloatImage:
     return np.asarray(cv2.sqrt(cv2.magnitude(right, down)))
 
 
-def looks_of(pixels: FloatImage) -> Array:
+def patch_statistics(pixels: FloatImage) -> Array:
     """Brightness and roughness of the squares of a patch: mean, and mean difference of neighbours.
 
     Args:
@@ -62,7 +62,7 @@ def clouded(looks: Sequence[Array], found: BoolArray) -> BoolArray:
     """Which points are hidden by clouds: not found, and much around them is bright and smooth.
 
     Args:
-        looks: (squares, 2) around each of n points, as `looks_of` gives them.
+        looks: (squares, 2) around each of n points, as `patch_statistics` gives them.
         found: (n,) points that were found. With fewer than `ENOUGH_FOUND` nothing is called a cloud.
     """
     hidden = np.zeros(len(found), dtype=bool)

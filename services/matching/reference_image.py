@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from services.errors import InputError
-from services.imagery import (
+from services.imagery.source import (
     ArrayImage,
     ImageSource,
     ReducedImage,
@@ -15,10 +15,10 @@ from services.imagery import (
     mean_pixels,
     sample_image,
 )
+from services.matching.control_points import PointMatches
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.points import PointMatches
 from services.sensors.base import SensorModel
-from services.terrain import Terrain, meet
+from services.terrain import Terrain, intersect_terrain
 from services.types import Array, FloatImage, IntArray, Progress, ViewMeasures, no_progress
 
 _NODE_PX = 4
@@ -181,7 +181,7 @@ def ground_seen(model: SensorModel, line_sample: Array, terrain: Terrain | None)
         InputError: when there is no terrain and heights move what the scene shows.
     """
     if terrain is not None:
-        return meet(model, line_sample, terrain)
+        return intersect_terrain(model, line_sample, terrain)
     middle_m = np.array([sum(model.height_range_m) / 2.0])
     if model.project_derivative(model.locate(line_sample[:1], middle_m))[0, :, 2].any():
         raise InputError("a terrain model is needed: heights move what this scene shows")

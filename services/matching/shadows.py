@@ -47,7 +47,7 @@ def shadow_of(image: Acquisition) -> Array:
     return np.asarray(length * np.array([np.sin(azimuth), np.cos(azimuth)]))
 
 
-def steady_weights(chip: FloatImage, score: float, shadows: ShadowMove) -> FloatImage:
+def shadow_weights(chip: FloatImage, score: float, shadows: ShadowMove) -> FloatImage:
     """How much each pixel of a chip counts for its place: little, where a shadow may have ended.
 
     Where a chip grows brighter away from its sun, a shadow may end. Under another sun that edge lies

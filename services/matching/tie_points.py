@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from services.imagery import ImageSource, Window
-from services.scene import Scene, scene_gsd_m
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import ImageSource, Window
 from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, FloatImage, IntArray, Observations, Progress, no_progress
 

@@ -14,7 +14,7 @@ from numba import njit
 
 from services.errors import ComputationError
 from services.geodesy import metres_per_degree
-from services.imagery import Window
+from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
 from services.terrain import Terrain

@@ -9,10 +9,10 @@ import numpy as np
 from numba import njit
 
 from services.errors import CoverageError, InputError
-from services.imagery import ImageSource, Window, low_pass, mean_pixels
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import ImageSource, Window, low_pass, mean_pixels
 from services.map_grid import MapGrid, utm_of, xy_of_lon_lat
-from services.ortho_mapping import hidden_ground, map_into_image, metres_a_unit
-from services.scene import Scene, scene_gsd_m
+from services.orthorectification.mapping import hidden_ground, map_into_image, metres_a_unit
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
 from services.types import Array, FloatImage, IntArray, Progress, no_progress

@@ -5,22 +5,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.adjustment.block import BlockAdjustment, BlockOptions, adjust_block
+from services.adjustment.bundle import BlockAdjustment, BlockOptions, adjust_block
+from services.adjustment.intersection import Intersection, intersect
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around, continuous, east_north_up
-from services.imagery import render_chip
-from services.intersection import Intersection, intersect
-from services.matching.chips import (
+from services.imagery.scene import Scene, scene_gsd_m, view_direction
+from services.imagery.source import render_chip
+from services.matching.multi_image import (
     RefinementOptions,
     chip_inside,
     chip_saliency,
     refine_on_chips,
     stored_chip,
 )
-from services.matching.features import FeatureOptions, tie_points
 from services.matching.predict import rank_in_group
-from services.scene import Scene, scene_gsd_m, view_direction
+from services.matching.tie_points import FeatureOptions, tie_points
 from services.sensors.base import SensorModel
 from services.types import (
     Array,

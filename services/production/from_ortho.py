@@ -9,9 +9,9 @@ import numpy as np
 
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around
-from services.imagery import Window, mean_pixels, render_chip
-from services.matching.chips import chip_inside, chip_saliency, stored_chip
-from services.scene import Scene, scene_centre, scene_gsd_m
+from services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from services.imagery.source import Window, mean_pixels, render_chip
+from services.matching.multi_image import chip_inside, chip_saliency, stored_chip
 from services.terrain import Terrain
 from services.types import (
     Array,

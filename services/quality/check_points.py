@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.scene import SceneAdjustment
+from services.adjustment.image_correction import SceneAdjustment
 from services.errors import CoverageError
 from services.geodesy import metres_per_degree_at
 from services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error

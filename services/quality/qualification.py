@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.scene import SceneAdjustment
-from services.matching.consensus import vote
+from services.adjustment.image_correction import SceneAdjustment
+from services.matching.consensus import a_contrario_consensus
 from services.quality.accuracy import Statistics, normal_ce90, statistics
 from services.quality.stability import (
     ImageResiduals,
@@ -43,8 +43,8 @@ class QualificationOptions:
             more: points coarser than the pixels still make a model several times better than they are
             (SRP: corners within 0.3 m with points of 3 m).
         good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
-        good_rival_share: largest share, of the active points, of deactivated ones that agree among
-            themselves on another place: two stories told by as many points are not one truth.
+        good_second_consensus_share: largest number of deactivated points that agree on another
+            displacement, as a share of the active points: a scene has one displacement, not two.
         usable_active_points: fewest active points.
         coverage_cells: cells of the coverage along each side of the image.
         grid: nodes of the predicted accuracy along each side of the image.
@@ -61,7 +61,7 @@ class QualificationOptions:
     good_ce90_px: float = 1.0
     good_ce90_of_points: float = 0.25
     good_unit_weight: float = 3.0
-    good_rival_share: float = 0.3
+    good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
@@ -75,7 +75,7 @@ class QualificationOptions:
 
 
 @dataclass(frozen=True)
-class Equipment:
+class PointCounts:
     """How many points a scene was given, and what became of them.
 
     Attributes:
@@ -159,7 +159,7 @@ class Qualification:
 
     verdict: Verdict
     criteria: tuple[Criterion, ...]
-    equipment: Equipment
+    equipment: PointCounts
     image_residuals_px: ImageResiduals
     ground_residuals_m: GroundResiduals
     stability: Stability
@@ -202,7 +202,12 @@ def qualify(
     criteria = compare(equipment, std_px, stability, predicted, points_ce90_px, coverage, options)
     criteria += (
         _at_most("unit_weight", adjustment.sigma0, options.good_unit_weight, "good"),
-        _at_most("rival_share", rival_share(measures), options.good_rival_share, "good"),
+        _at_most(
+            "second_consensus_share",
+            second_consensus_share(measures),
+            options.good_second_consensus_share,
+            "good",
+        ),
     )
     return Qualification(
         verdict=verdict_of(criteria),
@@ -216,11 +221,11 @@ def qualify(
     )
 
 
-def count_equipment(measures: Measures) -> Equipment:
+def count_equipment(measures: Measures) -> PointCounts:
     """Count visible, matched and active points."""
     visible = len(measures.point_id)
     matched, active = int(measures.matched.sum()), int(measures.active.sum())
-    return Equipment(
+    return PointCounts(
         visible=visible,
         unused=int((measures.reason == "not_tried").sum()),
         matched=matched,
@@ -246,7 +251,7 @@ def unexplained_px(residuals: ImageResiduals, point_sigma_px: Array) -> float:
     return float(np.sqrt(left.max()))
 
 
-def rival_share(measures: Measures) -> float:
+def second_consensus_share(measures: Measures) -> float:
     """The largest group of deactivated points that agree on another place, over the active points.
 
     They agree when their residuals are as near each other as those of the active points are to zero.
@@ -256,7 +261,7 @@ def rival_share(measures: Measures) -> float:
         return float("nan")
     apart = measures.residual_px[measures.matched & ~measures.active]
     tolerance_px = 3.0 * float(np.sqrt((active**2).mean())) + 0.5
-    rivals = vote(apart, tolerance_px, float(np.abs(apart).max(initial=tolerance_px)))
+    rivals = a_contrario_consensus(apart, tolerance_px, float(np.abs(apart).max(initial=tolerance_px)))
     return int(rivals.agreeing.sum()) / len(active)
 
 
@@ -275,7 +280,7 @@ def image_coverage(line_sample: Array, shape: tuple[int, int], cells: int) -> Co
 
 
 def compare(
-    equipment: Equipment,
+    equipment: PointCounts,
     std_px: float,
     stability: Stability,
     predicted: PredictedAccuracy,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.scene import SceneAdjustment
+from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
 from services.quality.accuracy import CIRCULAR_CE90, Statistics, normal_ce90, statistics
 from services.types import Array, BoolArray, Measures

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from services.conventions import CHIP_CENTRE
-from services.scene import Scene, scene_gsd_m
+from services.imagery.scene import Scene, scene_gsd_m
 from services.types import Array, BoolArray, ControlPoints
 
 _CHIPS_TO_SCENE = 1.25

@@ -4,23 +4,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions
-from services.chip_choice import chance_of_being_shown, has_chip
+from services.adjustment.image_correction import AdjustmentOptions
 from services.conventions import CHIP_CENTRE
 from services.errors import InputError, NoConsensus
-from services.imagery import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import vote
-from services.matching.points import MatchingOptions, match_points
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import ImageSource, ReducedImage, reduce_image
+from services.matching.consensus import a_contrario_consensus
+from services.matching.control_points import MatchingOptions, match_points
 from services.matching.predict import spread_over_image
-from services.passes import (
-    Pass,
-    adjust_on,
+from services.registration.chip_selection import chance_of_being_shown, has_chip
+from services.registration.search import (
+    SearchStage,
+    adjust_matches,
     model_uncertainty_m,
     reasons_in_words,
     search_radius_px,
     summarised,
 )
-from services.scene import Scene, scene_gsd_m
 from services.sensors.correction import CorrectedModel
 from services.types import Array, ChipSource, ControlPoints, IntArray, Progress
 
@@ -87,7 +87,7 @@ def search_coarsely(
     matching: MatchingOptions,
     adjustment: AdjustmentOptions,
     progress: Progress,
-) -> tuple[CorrectedModel, Array, Pass]:
+) -> tuple[CorrectedModel, Array, SearchStage]:
     """A first correction from few points searched far, accepted only when they agree beyond chance.
 
     Args:
@@ -127,7 +127,7 @@ def search_coarsely(
     )
 
     reach_m = _reach_m(scene, search)
-    consensus = vote(matches.displacement_m, 3.0 * level_m, reach_m)
+    consensus = a_contrario_consensus(matches.displacement_m, 3.0 * level_m, reach_m)
     if consensus.false_alarms > options.max_false_alarms:
         found = int((matches.reason == "").sum())
         raise NoConsensus(
@@ -137,7 +137,7 @@ def search_coarsely(
             "times); " + reasons_in_words(matches.reason)
         )
     enough = replace(adjustment, min_points=min(3, int(consensus.agreeing.sum())))
-    adjusted = adjust_on(scene, few, matches, consensus.agreeing, enough)
+    adjusted = adjust_matches(scene, few, matches, consensus.agreeing, enough)
     corrected = CorrectedModel(scene.model, adjusted.correction)
     after_m = np.hypot(model_uncertainty_m(corrected, points, adjusted), level_m / 2.0)
     return corrected, after_m, summarised("coarse", level_m, radius_px, matches, consensus.agreeing)

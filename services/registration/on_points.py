@@ -5,24 +5,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
-from services.chip_choice import fine_gsd_m
-from services.coarse import CoarseOptions, search_coarsely
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment
 from services.errors import InputError
-from services.imagery import KeptWindows
-from services.matching.points import MatchingOptions, PointMatches, match_points
-from services.measures import measures_of
-from services.passes import (
-    Pass,
-    adjust_on,
-    agreement,
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import KeptWindows
+from services.matching.control_points import MatchingOptions, PointMatches, match_points
+from services.quality.qualification import Qualification, QualificationOptions, qualify
+from services.registration.chip_selection import fine_gsd_m
+from services.registration.coarse import CoarseOptions, search_coarsely
+from services.registration.point_results import point_results
+from services.registration.point_selection import points_to_try, start_uncertainty_m, visible_points
+from services.registration.search import (
+    SearchStage,
+    adjust_matches,
     model_uncertainty_m,
     search_radius_px,
+    select_inliers,
     summarised,
 )
-from services.point_choice import points_to_try, start_uncertainty_m, visible_points
-from services.quality.qualification import Qualification, QualificationOptions, qualify
-from services.scene import Scene, scene_gsd_m
 from services.sensors.correction import CorrectedModel, no_correction
 from services.types import (
     BoolArray,
@@ -80,7 +80,7 @@ class Registration:
     adjustment: SceneAdjustment
     measures: Measures
     views: ViewMeasures
-    passes: tuple[Pass, ...]
+    passes: tuple[SearchStage, ...]
     qualification: Qualification
 
 
@@ -113,7 +113,7 @@ def register_scene(
     model = CorrectedModel(scene.model, no_correction(scene.image.shape))
     uncertainty_m = start_uncertainty_m(scene, shown)
     fine_m = fine_gsd_m(scene, shown, uncertainty_m)
-    passes: list[Pass] = []
+    passes: list[SearchStage] = []
 
     if 3.0 * uncertainty_m.max() / fine_m > options.coarse.max_fine_radius_px:
         model, uncertainty_m, done = search_coarsely(
@@ -145,14 +145,16 @@ def register_scene(
             options.matching,
             part,
         )
-        agreeing = agreement(model, tried, matches, radius_px * fine_m, options.adjustment.min_points)
-        adjustment = adjust_on(scene, tried, matches, agreeing, options.adjustment)
+        agreeing = select_inliers(
+            model, tried, matches, radius_px * fine_m, options.adjustment.min_points
+        )
+        adjustment = adjust_matches(scene, tried, matches, agreeing, options.adjustment)
         passes.append(summarised("fine", fine_m, radius_px, matches, agreeing))
         model = CorrectedModel(scene.model, adjustment.correction)
         uncertainty_m = model_uncertainty_m(model, shown, adjustment)
 
     progress(0.95, "qualifying the result")
-    registration = qualified(
+    registration = build_registration(
         scene,
         points,
         (visible, visible[chosen]),
@@ -166,13 +168,13 @@ def register_scene(
     return registration
 
 
-def qualified(
+def build_registration(
     scene: Scene,
     points: ControlPoints,
     rows: tuple[IntArray, IntArray],
     matches: PointMatches,
     adjustment: SceneAdjustment,
-    passes: tuple[Pass, ...],
+    passes: tuple[SearchStage, ...],
     options: RegistrationOptions,
     frame_sigma_m: float,
 ) -> Registration:
@@ -190,14 +192,14 @@ def qualified(
     """
     visible, chosen = rows
     tried = points.take(chosen)
-    measures = measures_of(scene, points, rows, matches, adjustment)
+    measures = point_results(scene, points, rows, matches, adjustment)
     row_of_tried = np.searchsorted(visible, chosen)
 
     def refit(held: BoolArray) -> SceneAdjustment:
         fixed = options.adjustment
         if fixed.order is None:
             fixed = replace(fixed, order="affine", slope_px=adjustment.slope_px)
-        return adjust_on(scene, tried, matches, held[row_of_tried], fixed)
+        return adjust_matches(scene, tried, matches, held[row_of_tried], fixed)
 
     qualification = qualify(
         measures,

@@ -4,26 +4,26 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions, SceneAdjustment
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment
 from services.errors import ComputationError, CoverageError, InputError, NoConsensus
-from services.homologous import homologous_points
-from services.imagery import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import vote
-from services.matching.dense import DenseOptions, Places, Reference, match_places, places_seen
-from services.matching.points import PointMatches
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import ImageSource, ReducedImage, reduce_image
+from services.matching.consensus import a_contrario_consensus
+from services.matching.control_points import PointMatches
 from services.matching.predict import inside
-from services.passes import (
-    Pass,
-    adjust_on,
-    agreement,
-    model_uncertainty_m,
-    reasons_in_words,
-    summarised,
-)
+from services.matching.reference_image import DenseOptions, Places, Reference, match_places, places_seen
 from services.quality.qualification import QualificationOptions
 from services.quality.stability import image_places
-from services.registration import Registration, RegistrationOptions, qualified
-from services.scene import Scene, scene_gsd_m
+from services.registration.on_points import Registration, RegistrationOptions, build_registration
+from services.registration.reference_points import homologous_points
+from services.registration.search import (
+    SearchStage,
+    adjust_matches,
+    model_uncertainty_m,
+    reasons_in_words,
+    select_inliers,
+    summarised,
+)
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import Array, BoolArray, ControlPoints, Progress, no_progress, part_of
 
@@ -100,7 +100,7 @@ def register_on_reference(
     """
     finest = _finest_factor(scene, reference)
     state = _start(scene, finest, options)
-    passes: list[Pass] = []
+    passes: list[SearchStage] = []
     while not passes or state.factor > finest:
         part = part_of(progress, min(0.1 * len(passes), 0.4), 0.1)
         search = _lead(scene, reference, state, not passes, options, part)
@@ -119,7 +119,7 @@ def register_on_reference(
     ground, matches, adjustment = search.ground, search.matches, search.adjustment
     progress(0.95, "qualifying the result")
     everything = np.arange(len(ground))
-    registration = qualified(
+    registration = build_registration(
         scene,
         ground,
         (everything, everything),
@@ -158,7 +158,7 @@ class _Search:
     matches: PointMatches
     adjustment: SceneAdjustment
     agreeing: int
-    summary: Pass
+    summary: SearchStage
 
 
 def _start(scene: Scene, finest: int, options: ReferenceOptions) -> _State:
@@ -221,8 +221,8 @@ def _search(
         agreeing = _first_consensus(matches, level_m, radius_px, options)
     else:
         least = options.adjustment.min_points
-        agreeing = agreement(model, ground, matches, radius_px * level_m, least)
-    adjustment = adjust_on(scene, ground, matches, agreeing, options.adjustment)
+        agreeing = select_inliers(model, ground, matches, radius_px * level_m, least)
+    adjustment = adjust_matches(scene, ground, matches, agreeing, options.adjustment)
     summary = summarised("dense", level_m, radius_px, matches, agreeing)
     return _Search(ground, matches, adjustment, int(agreeing.sum()), summary)
 
@@ -317,7 +317,7 @@ def _first_consensus(
     matches: PointMatches, level_m: float, radius_px: int, options: ReferenceOptions
 ) -> BoolArray:
     """Places whose displacements agree beyond chance, or an error that says how many there were."""
-    consensus = vote(matches.displacement_m, 3.0 * level_m, radius_px * level_m)
+    consensus = a_contrario_consensus(matches.displacement_m, 3.0 * level_m, radius_px * level_m)
     if consensus.false_alarms > options.max_false_alarms:
         found = int((matches.reason == "").sum())
         raise NoConsensus(

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from services.adjustment.scene import SceneAdjustment
-from services.matching.points import PointMatches
-from services.scene import Scene
+from services.adjustment.image_correction import SceneAdjustment
+from services.imagery.scene import Scene
+from services.matching.control_points import PointMatches
 from services.sensors.correction import CorrectedModel
 from services.types import Array, ControlPoints, IntArray, Measures
 
 
-def measures_of(
+def point_results(
     scene: Scene,
     points: ControlPoints,
     rows_of: tuple[IntArray, IntArray],

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from services.chip_choice import chance_of_being_shown
 from services.errors import CoverageError
-from services.matching.middle import LEAST_SHARE
+from services.imagery.scene import Scene, scene_gsd_m
+from services.matching.chip_extent import LEAST_SHARE
 from services.matching.predict import inside, spread_over_image
-from services.scene import Scene, scene_gsd_m
+from services.registration.chip_selection import chance_of_being_shown
 from services.sensors.base import SensorModel
 from services.types import Array, ControlPoints, IntArray
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.imagery import image_gsd_m, image_gsds_m, render_chip
-from services.matching.dense import Reference
+from services.imagery.source import image_gsd_m, image_gsds_m, render_chip
+from services.matching.reference_image import Reference
 from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
 
 

@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.errors import NoConsensus, NotEnoughPoints
-from services.imagery import image_gsds_m
+from services.imagery.scene import Scene, scene_centre
+from services.imagery.source import image_gsds_m
 from services.matching.consensus import agreeing_points, consensus_tolerance_px
-from services.matching.points import PointMatches
-from services.scene import Scene, scene_centre
+from services.matching.control_points import PointMatches
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import Array, BoolArray, ControlPoints
 
 
 @dataclass(frozen=True)
-class Pass:
+class SearchStage:
     """One search of the points through one model.
 
     Attributes:
@@ -43,7 +43,7 @@ def search_radius_px(uncertainty_m: Array, gsd_m: float, largest: int) -> int:
     return int(np.clip(np.ceil(3.0 * np.percentile(uncertainty_m, 95) / gsd_m) + 2, 4, largest))
 
 
-def adjust_on(
+def adjust_matches(
     scene: Scene,
     points: ControlPoints,
     matches: PointMatches,
@@ -65,7 +65,7 @@ def adjust_on(
     )
 
 
-def agreement(
+def select_inliers(
     model: SensorModel,
     points: ControlPoints,
     matches: PointMatches,
@@ -117,9 +117,9 @@ def model_uncertainty_m(
 
 def summarised(
     name: str, gsd_m: float, radius_px: int, matches: PointMatches, agreeing: BoolArray
-) -> Pass:
+) -> SearchStage:
     move_m = matches.displacement_m[agreeing]
-    return Pass(
+    return SearchStage(
         name=name,
         chip_gsd_m=gsd_m,
         search_radius_m=radius_px * gsd_m,

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from services.adjustment.scene import SceneAdjustment
-from services.passes import Pass
+from services.adjustment.image_correction import SceneAdjustment
 from services.quality.qualification import (
     Coverage,
     Criterion,
-    Equipment,
     GroundResiduals,
+    PointCounts,
     Verdict,
 )
 from services.quality.stability import ImageResiduals, PredictedAccuracy, Stability
+from services.registration.search import SearchStage
 from services.reports.summary import BlockUsed, Check, Method, RegistrationSummary
 from services.types import Acquisition, Array, Measures
 
@@ -145,8 +145,8 @@ class RegistrationReport:
     method: Method
     blocks: tuple[BlockUsed, ...]
     correction: CorrectionRecord
-    passes: tuple[Pass, ...]
-    equipment: Equipment
+    passes: tuple[SearchStage, ...]
+    equipment: PointCounts
     reasons: tuple[ReasonCount, ...]
     image_residuals_px: ImageResiduals
     ground_residuals_m: GroundResiduals

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from services.adjustment.scene import SceneAdjustment
-from services.passes import Pass
+from services.adjustment.image_correction import SceneAdjustment
 from services.quality.accuracy import Accuracy, NormalisedError
 from services.quality.qualification import (
     Qualification,
 )
 from services.quality.stability import ImageResiduals
+from services.registration.search import SearchStage
 from services.types import Acquisition, Array, ChipArray, FloatImage, Measures
 
 Method = Literal["control points", "reference image"]
@@ -121,7 +121,7 @@ class RegistrationSummary:
     footprint: Array
     blocks: tuple[BlockUsed, ...]
     options: Any
-    passes: tuple[Pass, ...]
+    passes: tuple[SearchStage, ...]
     order_reason: str
     measures: Measures
     adjustment: SceneAdjustment

@@ -22,7 +22,7 @@ CRITERION_NAMES = {
     "displacement_px": ("Displacement with fewer points", "px", 2),
     "predicted_ce90_px": ("Predicted CE90, worst place", "px", 2),
     "unit_weight": ("Residuals over what is expected", "", 2),
-    "rival_share": ("Points that tell another story", "", 2),
+    "second_consensus_share": ("Points that tell another story", "", 2),
     "check_points": ("Check points over what is expected", "", 2),
 }
 
@@ -38,8 +38,8 @@ CRITERION_WAYS = {
     "of its normal law, largest of the grid; points coarser than the pixels allow a share of their own",
     "unit_weight": "root of the weighted squares of the active residuals over the degrees of freedom: "
     "one when the stated sigmas are true",
-    "rival_share": "largest group of deactivated points that agree on another place, over the "
-    "active points",
+    "second_consensus_share": "largest group of deactivated points that agree on another place, over "
+    "the active points",
     "check_points": "residuals at independent check points, in units of what the covariances of the "
     "correction, the marks and the points let expect, rms",
 }

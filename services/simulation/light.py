@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from services.imagery import BLUR_PER_RATIO
+from services.imagery.source import BLUR_PER_RATIO
 from services.simulation.land import NO_ROOF
 from services.simulation.world import World, natural_noise
 from services.types import BoolArray, FloatImage

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from services.imagery import Window
+from services.imagery.source import Window
 from services.simulation.conditions import (
     CLEAR,
     Clouds,

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from services.errors import ComputationError
-from services.imagery import ArrayImage
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
 from services.sensors.base import SensorModel
 from services.sensors.correction import (
     CorrectedModel,

@@ -3,7 +3,7 @@
 from base64 import b64encode
 
 from tests.app.bad_requests import HUGE, ITEMS, NO_ID, Bad
-from tests.app.besieged import LIMIT_BYTES
+from tests.app.hostile_installation import LIMIT_BYTES
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PIECE = {**TUS, "Content-Type": "application/offset+octet-stream"}

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from services.formats.rpc_text import parse_rpc_text
-from tests.app.besieged import LIMIT_BYTES
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 from tests.app.flat_world import FlatWorld
+from tests.app.hostile_installation import LIMIT_BYTES
 
 SHORT, LONG, LONG8 = 3, 4, 16
 FORMS = {SHORT: "H", LONG: "I", LONG8: "Q"}

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from tests.app.besieged import BODY_LIMIT_BYTES
+from tests.app.hostile_installation import BODY_LIMIT_BYTES
 
 JSON = {"Content-Type": "application/json"}
 HUGE = "9" * 400

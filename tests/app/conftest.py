@@ -13,7 +13,7 @@ from pydantic import SecretStr
 
 from app.config import Settings
 from app.db import engine
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection, Database
 from app.main import create_app
 from app.storage import Storage

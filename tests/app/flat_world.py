@@ -9,11 +9,11 @@ import rasterio
 
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from services.formats.block_writing import write_block
-from services.formats.raster import gdal_rpc
-from services.formats.rpc_text import format_rpc_text
-from services.imagery import ArrayImage, render_chip
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from services.formats.block.writer import write_block
+from services.formats.images.raster import gdal_rpc
+from services.formats.sensor_models.rpc_text import format_rpc_text
+from services.imagery.source import ArrayImage, render_chip
 from services.sensors.rpc import RpcModel
 from services.types import Array, ChipArray, ControlPoints, FloatImage, Views
 from tests.factories import images, metadata

@@ -13,11 +13,12 @@ import httpx
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import attempts, engine
+from app.db import engine
 from app.db.engine import Database
+from app.db.jobs import attempts
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.jobs import do_attempt
 from app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, FlatWorld

@@ -2,9 +2,9 @@
 
 from uuid import UUID, uuid4
 
-from app.db import attempts, jobs
 from app.db.engine import Connection, Database
-from app.db.jobs import Job
+from app.db.jobs import attempts, jobs
+from app.db.jobs.jobs import Job
 
 LEASE_S = 30.0
 

@@ -7,9 +7,9 @@ import numpy as np
 import rasterio
 from jsonschema import validate
 
-from app.usecases.registration_files import OUTPUTS
-from services.formats.control_point_files import read_control_points
-from services.formats.rpc_files import read_rpc
+from app.usecases.registration.deliverables import OUTPUTS
+from services.formats.gcp.reader import read_control_points
+from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import report_schema
 from services.sensors.base import SensorModel
 from services.sensors.rpc import RpcModel

@@ -12,9 +12,9 @@ import httpx
 
 from app.config import Settings
 from app.db import engine
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.storage import Storage
-from app.usecases import blocks
+from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
 from services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
@@ -46,8 +46,8 @@ def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator
         made = make_block(folder / "block", count=60)
         settings = Settings(database_url=dsn, data_folder=folder / "data")
         with engine.connect(dsn) as connection:
-            blocks.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
-            blocks.publish_block(connection, "calanques")
+            lifecycle.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)
+            lifecycle.publish_block(connection, "calanques")
             secret = create_token(connection, "a client", [scope]).secret
         port = free_port()
         environment = {

@@ -14,20 +14,20 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine
-from app.db.antimeridian import on_the_map
-from app.db.crs import EPSG_3857
+from app.db.features.antimeridian import on_the_map
+from app.db.features.crs import EPSG_3857
 from app.db.points import control_points
 from app.db.scenes import set_footprint
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from app.usecases.ground_control import points_of_store
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.production import BlockIdentity, run_production
-from app.usecases.registration import SceneFiles, run_registration
-from services.formats.block_check import check_block
-from services.formats.raster import write_raster
-from services.production import ProductionOptions
-from services.registration import RegistrationOptions
-from services.scene import scene_footprint
+from app.usecases.registration.control_sources import points_of_store
+from app.usecases.registration.register import SceneFiles, run_registration
+from services.formats.block.check import check_block
+from services.formats.images.raster import write_raster
+from services.imagery.scene import scene_footprint
+from services.production.from_images import ProductionOptions
+from services.registration.on_points import RegistrationOptions
 from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from services.simulation.world import World, make_world
 

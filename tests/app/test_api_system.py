@@ -4,7 +4,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from app.api import replies
+from app.api import error_responses
 from app.api.deps import Admin, DatabaseDep, PointsReader, Reader, Registrar
 from app.db import engine
 from app.errors import AmersError, ComputationError, Conflict, InputError, NotAllowed, NotFound, TooLarge
@@ -68,7 +68,7 @@ def client(app):
 def refused(reply, status: int) -> dict:
     """The problem details of a reply, after a check that they are what RFC 9457 says."""
     assert reply.status_code == status, reply.text
-    assert reply.headers["content-type"] == replies.PROBLEM_JSON
+    assert reply.headers["content-type"] == error_responses.PROBLEM_JSON
     problem = reply.json()
     assert problem["status"] == status
     assert problem["type"] == "about:blank"
@@ -206,7 +206,7 @@ def test_a_request_is_kept_whole_or_not_at_all(client, connection):
 )
 def test_every_error_has_its_status(error, status):
     app = FastAPI()
-    replies.install(app)
+    error_responses.install(app)
 
     @app.get("/")
     def fail() -> None:

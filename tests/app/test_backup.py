@@ -14,7 +14,7 @@ from pyogrio.raw import read
 
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.workers import wait_until

@@ -16,9 +16,9 @@ import pytest
 
 from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_archive
 from tests.app.bad_requests import QUESTIONS
-from tests.app.besieged import CANARY, LEFT_BY_JOBS, Besieged, besieged, told
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import FlatWorld, make_flat_world
+from tests.app.hostile_installation import CANARY, LEFT_BY_JOBS, Besieged, besieged, told
 from tests.factories import make_block
 
 TUS = {"Tus-Resumable": "1.0.0"}

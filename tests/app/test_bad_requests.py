@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.app.bad_deliveries import DELIVERIES
 from tests.app.bad_requests import JSON, QUESTIONS, Bad
-from tests.app.besieged import CANARY, Besieged, besieged, told
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import make_flat_world
+from tests.app.hostile_installation import CANARY, Besieged, besieged, told
 
 CASES = [*QUESTIONS, *DELIVERIES]
 

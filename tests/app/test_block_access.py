@@ -12,10 +12,11 @@ from numpy.testing import assert_allclose
 from typer.testing import CliRunner
 
 from app.cli.main import app as commands
-from app.db import attempts, engine
+from app.db import engine
+from app.db.jobs import attempts
 from app.errors import InputError
 from app.main import create_app
-from app.usecases import blocks
+from app.usecases.blocks import lifecycle
 from app.usecases.jobs import do_attempt
 from tests.factories import BOX, make_block
 
@@ -159,9 +160,9 @@ def test_only_folders_below_the_allowed_one_are_ingested_by_request(tmp_path, pa
     (allowed / "good").mkdir(parents=True)
     (tmp_path / "outside").mkdir()
     (allowed / "link").symlink_to(tmp_path / "outside")
-    assert blocks.folder_to_ingest(allowed, "good") == allowed / "good"
+    assert lifecycle.folder_to_ingest(allowed, "good") == allowed / "good"
     with pytest.raises(InputError, match="path"):
-        blocks.folder_to_ingest(allowed, path)
+        lifecycle.folder_to_ingest(allowed, path)
 
 
 def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client, settings, bearer):

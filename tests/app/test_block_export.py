@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from app.db import attempts, engine
+from app.db import engine
 from app.db import points as point_store
+from app.db.jobs import attempts
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
-from app.usecases import blocks
-from app.usecases.block_export import ExportBlock, export_block
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.export import ExportBlock, export_block
 from app.usecases.jobs import do_attempt
-from services.formats.block_check import check_block
-from services.formats.block_document import rectangle
+from services.formats.block.check import check_block
+from services.formats.block.document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
 
@@ -47,15 +48,15 @@ def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same
     connection, storage, chips, tmp_path
 ):
     made = make_block(tmp_path / "block")
-    first = blocks.ingest_block(connection, storage, made.folder).block
-    blocks.publish_block(connection, "calanques")
+    first = lifecycle.ingest_block(connection, storage, made.folder).block
+    lifecycle.publish_block(connection, "calanques")
     written = export_block(connection, chips, ExportBlock(BOX, id="copy"), tmp_path / "copy")
     assert written == 40
-    second = blocks.ingest_block(connection, storage, tmp_path / "copy").block
+    second = lifecycle.ingest_block(connection, storage, tmp_path / "copy").block
 
     assert rows(connection, second.number) == rows(connection, first.number)
     assert (np.load(tmp_path / "copy/chips/0000.npy") == np.load(made.folder / "chips/0000.npy")).all()
-    report = blocks.block_report(connection, second)
+    report = lifecycle.block_report(connection, second)
     assert report.accuracy == made.metadata.accuracy
     assert report.quality.points == 40
 
@@ -64,8 +65,8 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
     half = (BOX[0], BOX[1], (BOX[0] + BOX[2]) / 2, BOX[3])
     for name, kind, seed in (("a", np.uint8, 1), ("b", np.uint16, 2)):
         folder = make_block(tmp_path / name, 30, seed, name, n_images=3, dtype=kind).folder
-        blocks.ingest_block(connection, storage, folder)
-        blocks.publish_block(connection, name)
+        lifecycle.ingest_block(connection, storage, folder)
+        lifecycle.publish_block(connection, name)
     expected = point_store.control_points(connection, rectangle(*half))
 
     written = export_block(connection, chips, ExportBlock(half), tmp_path / "out")
@@ -103,16 +104,16 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
 def test_an_export_that_cannot_be_is_refused_and_writes_nothing(
     connection, storage, chips, tmp_path, said, error, named
 ):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
     with pytest.raises(error, match=named):
         export_block(connection, chips, ExportBlock(**said), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp_path):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
     with pytest.raises(InputError, match="more than 4 points"):
         export_block(connection, chips, ExportBlock(BOX), tmp_path / "out", most=4)
 
@@ -120,8 +121,8 @@ def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp
 def test_a_block_is_exported_by_a_job_as_an_archive(
     client, settings, connection, storage, bearer, tmp_path
 ):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
     connection.commit()
     reader = bearer("read")
     asked = client.post(

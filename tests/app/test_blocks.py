@@ -9,8 +9,8 @@ from shapely import Polygon
 from app.db import points as point_store
 from app.errors import Conflict, NotFound
 from app.storage import StoredChips
-from app.usecases import blocks
-from services.formats.block_document import rectangle
+from app.usecases.blocks import lifecycle
+from services.formats.block.document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
 
@@ -21,7 +21,7 @@ float32_rounding = 1e-6
 def ingested(connection, storage, tmp_path):
     """A staged block of 40 points, committed."""
     made = make_block(tmp_path / "block")
-    result = blocks.ingest_block(connection, storage, made.folder)
+    result = lifecycle.ingest_block(connection, storage, made.folder)
     connection.commit()
     return made, result
 
@@ -36,43 +36,43 @@ def test_an_ingested_block_is_staged_and_invisible(connection, ingested):
     assert result.block.state == "staged"
     assert (result.block.n_points, result.block.n_views) == (40, 240)
     assert visible(connection) == 0
-    assert blocks.find_block(connection, "calanques").number == result.block.number
+    assert lifecycle.find_block(connection, "calanques").number == result.block.number
 
 
 def test_publishing_and_withdrawing_flip_all_points_at_once(connection, ingested):
-    assert blocks.publish_block(connection, "calanques").block.state == "published"
+    assert lifecycle.publish_block(connection, "calanques").block.state == "published"
     assert visible(connection) == 40
-    assert blocks.withdraw_block(connection, "calanques").state == "withdrawn"
+    assert lifecycle.withdraw_block(connection, "calanques").state == "withdrawn"
     assert visible(connection) == 0
-    blocks.publish_block(connection, "calanques@1")
+    lifecycle.publish_block(connection, "calanques@1")
     assert visible(connection) == 40
 
 
 def test_wrong_steps_are_conflicts_that_say_the_state(connection, ingested):
     with pytest.raises(Conflict, match="is staged: it cannot become withdrawn"):
-        blocks.withdraw_block(connection, "calanques")
-    blocks.publish_block(connection, "calanques")
+        lifecycle.withdraw_block(connection, "calanques")
+    lifecycle.publish_block(connection, "calanques")
     with pytest.raises(Conflict, match="is published: it cannot become published"):
-        blocks.publish_block(connection, "calanques")
+        lifecycle.publish_block(connection, "calanques")
 
 
 def test_the_same_version_twice_is_a_conflict_and_changes_nothing(connection, storage, ingested):
     made, result = ingested
     with pytest.raises(Conflict, match="calanques version 1 is in the store already"):
-        blocks.ingest_block(connection, storage, made.folder)
+        lifecycle.ingest_block(connection, storage, made.folder)
     connection.rollback()
-    assert [block.number for block in blocks.list_blocks(connection)] == [result.block.number]
+    assert [block.number for block in lifecycle.list_blocks(connection)] == [result.block.number]
 
 
 def test_publishing_a_new_version_withdraws_the_old_one_in_the_same_step(
     connection, storage, tmp_path, ingested
 ):
-    blocks.publish_block(connection, "calanques")
+    lifecycle.publish_block(connection, "calanques")
     newer = make_block(tmp_path / "newer", count=25, seed=2, version="2")
-    blocks.ingest_block(connection, storage, newer.folder)
+    lifecycle.ingest_block(connection, storage, newer.folder)
     assert visible(connection) == 40
 
-    published = blocks.publish_block(connection, "calanques@2")
+    published = lifecycle.publish_block(connection, "calanques@2")
 
     assert published.superseded is not None
     assert (published.superseded.version, published.superseded.state) == ("1", "withdrawn")
@@ -80,18 +80,18 @@ def test_publishing_a_new_version_withdraws_the_old_one_in_the_same_step(
 
 
 def test_an_id_of_several_versions_must_be_made_precise(connection, storage, tmp_path, ingested):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "two", seed=2, version="2").folder)
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "two", seed=2, version="2").folder)
     with pytest.raises(Conflict, match="calanques@1, calanques@2"):
-        blocks.find_block(connection, "calanques")
-    assert blocks.find_block(connection, "calanques@2").version == "2"
-    assert blocks.find_block(connection, "1").version == "1"
+        lifecycle.find_block(connection, "calanques")
+    assert lifecycle.find_block(connection, "calanques@2").version == "2"
+    assert lifecycle.find_block(connection, "1").version == "1"
     with pytest.raises(NotFound):
-        blocks.find_block(connection, "calanques@3")
+        lifecycle.find_block(connection, "calanques@3")
 
 
 def test_the_store_gives_back_the_points_of_the_block(connection, storage, ingested):
     made, result = ingested
-    blocks.publish_block(connection, "calanques")
+    lifecycle.publish_block(connection, "calanques")
 
     stored = point_store.control_points(connection, made.metadata.extent)
 
@@ -122,8 +122,8 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
         ),
     ]
     for block in made:
-        blocks.ingest_block(connection, storage, block.folder)
-        blocks.publish_block(connection, block.metadata.id)
+        lifecycle.ingest_block(connection, storage, block.folder)
+        lifecycle.publish_block(connection, block.metadata.id)
 
     points = point_store.control_points(connection, made[0].metadata.extent).points
 
@@ -142,8 +142,8 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
 
 def test_points_are_asked_for_by_an_outline_and_thinned_evenly(connection, storage, tmp_path):
     made = make_block(tmp_path / "many", count=600)
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
     triangle = np.array([[BOX[0], BOX[1]], [BOX[2], BOX[1]], [BOX[0], BOX[3]]])
     inside = (made.points.lon_lat_h[:, :2] - [BOX[0], BOX[1]]).sum(axis=1) < 0.1
 
@@ -169,8 +169,8 @@ def test_no_published_points_is_an_empty_answer(connection, ingested):
 
 def test_an_outline_across_the_antimeridian_finds_both_sides(connection, storage, tmp_path):
     made = make_block(tmp_path / "far", count=30, box=(179.9, -17.0, -179.9, -16.9))
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
     east = point_store.control_points(connection, made.metadata.extent)
     west = point_store.control_points(connection, made.metadata.extent - [360.0, 0.0])
     assert len(east.points) == len(west.points) == 30
@@ -178,7 +178,7 @@ def test_an_outline_across_the_antimeridian_finds_both_sides(connection, storage
 
 def test_quality_figures_are_those_of_the_points(connection, ingested):
     made, result = ingested
-    quality = blocks.find_quality(connection, "calanques")
+    quality = lifecycle.find_quality(connection, "calanques")
     variance = np.diagonal(made.points.covariance_m2, axis1=1, axis2=2)
     assert quality.points == 40
     assert quality.points_per_km2 == pytest.approx(40 / quality.area_km2)
@@ -196,6 +196,6 @@ def test_quality_figures_are_those_of_the_points(connection, ingested):
 def test_files_no_row_names_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
     orphan = make_block(tmp_path / "orphan", count=3, seed=9).folder / "chips/0000.npy"
     key = storage.put_chips(orphan).key
-    assert blocks.sweep_storage(connection, storage) == [key]
+    assert lifecycle.sweep_storage(connection, storage) == [key]
     assert not storage.exists(key)
     assert len(storage.keys("chips")) == 1

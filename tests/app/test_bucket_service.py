@@ -11,8 +11,8 @@ from app.config import Settings
 from app.db import engine
 from app.main import create_app
 from app.storage import open_storage
-from app.usecases.blocks import ingest_block, publish_block
-from services.formats.rpc_files import read_rpc
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from services.formats.sensor_models.rpc_files import read_rpc
 from tests.app.buckets import running_bucket
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 from tests.app.registered import A_TENTH_OF_A_PIXEL, largest_error_px

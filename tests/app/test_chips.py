@@ -7,8 +7,9 @@ import pytest
 import rasterio
 from numpy.testing import assert_allclose, assert_array_equal
 
-from app.usecases import blocks, points
-from services.formats import chip_stacks
+from app.usecases.blocks import lifecycle
+from app.usecases.features import points
+from services.formats.chips import stacks
 from tests.factories import make_block
 
 CHIPS = "/collections/points/chips"
@@ -20,8 +21,8 @@ in_single_precision = 1e-7
 def made(connection, storage, tmp_path):
     """A published block of 40 points with 6 chips each, of 16 bits."""
     made = make_block(tmp_path / "block", count=40)
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
     connection.commit()
     return made
 
@@ -95,8 +96,8 @@ def test_chips_of_8_and_16_bits_come_together_with_their_values(
     small = make_block(
         tmp_path / "small", count=5, seed=3, name="small", box=(6.2, 43.2, 6.3, 43.3), dtype=np.uint8
     )
-    blocks.ingest_block(connection, storage, small.folder)
-    blocks.publish_block(connection, "small")
+    lifecycle.ingest_block(connection, storage, small.folder)
+    lifecycle.publish_block(connection, "small")
     connection.commit()
     found = arrays(get(CHIPS, ids=f"{FIRST},{2 * FIRST}"))
     assert found["chips"].dtype == np.uint16
@@ -107,7 +108,7 @@ def test_chips_of_8_and_16_bits_come_together_with_their_values(
 
 def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monkeypatch):
     whole = get(CHIPS, bbox="5,43,6,44").content
-    monkeypatch.setattr(chip_stacks, "CHIPS_AT_ONCE", 12)
+    monkeypatch.setattr(stacks, "CHIPS_AT_ONCE", 12)
     in_pieces = arrays(get(CHIPS, bbox="5,43,6,44"))
     with np.load(io.BytesIO(whole)) as expected:
         for name, column in expected.items():

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 from owslib.ogcapi.features import Features
 from pyproj import CRS
 
-from tests.app.served import Served, service_with_a_block
+from tests.app.running_service import Served, service_with_a_block
 
 BOX = (5.22, 43.21, 5.27, 43.26)
 WHERE = "saliency > 0.5 AND n_views = 3"

@@ -15,10 +15,11 @@ from starlette.requests import ClientDisconnect
 
 from app.api import deps, streams
 from app.config import Settings
-from app.db import engine, features
+from app.db import engine
+from app.db.features import pages as features
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from tests.factories import make_block
 
 POINTS = 60

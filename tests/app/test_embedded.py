@@ -13,9 +13,9 @@ from uuid import uuid4
 import psycopg
 import pytest
 
-from app.db import binaries
-from app.db.binaries import find_binaries, server_user
-from app.db.embedded import LONGEST_SOCKET_PATH, Cluster
+from app.db.cluster import binaries
+from app.db.cluster.binaries import find_binaries, server_user
+from app.db.cluster.embedded import LONGEST_SOCKET_PATH, Cluster
 from app.errors import InputError
 
 pytestmark = pytest.mark.long

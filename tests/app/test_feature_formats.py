@@ -9,8 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 from pyogrio.raw import read as read_features
 
-from app.db import overlaps
-from app.usecases import blocks, features
+from app.db import superseding
+from app.usecases.blocks import lifecycle
+from app.usecases.features import items
 from tests.factories import make_block
 
 ITEMS = "/collections/points/items"
@@ -22,8 +23,8 @@ a_tenth_of_a_millimetre_deg = 1e-9
 def made(connection, storage, tmp_path):
     """A published block of 60 points."""
     made = make_block(tmp_path / "block", count=60)
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
     connection.commit()
     return made
 
@@ -103,8 +104,8 @@ def test_a_format_is_chosen_by_the_header_accept(client, bearer, made):
 
 def test_a_large_page_is_streamed_and_says_the_same(get, monkeypatch):
     whole = get(ITEMS, limit=50).json()
-    monkeypatch.setattr(features, "LARGEST_TEXT", 10)
-    monkeypatch.setattr("app.db.features.ROWS_AT_ONCE", 7)
+    monkeypatch.setattr(items, "LARGEST_TEXT", 10)
+    monkeypatch.setattr("app.db.features.pages.ROWS_AT_ONCE", 7)
     streamed = get(ITEMS, limit=50).json()
     assert streamed["features"] == whole["features"]
     for member in ("numberMatched", "numberReturned", "links"):
@@ -120,7 +121,7 @@ def test_density_is_what_is_published_and_goes_when_it_is_withdrawn(get, connect
     cell = cells[0]["properties"]
     assert cell["points_per_km2"] == pytest.approx(cell["n_points"] / cell["area_km2"])
     assert cell["area_km2"] == pytest.approx(90.2, abs=0.1)
-    blocks.withdraw_block(connection, "calanques")
+    lifecycle.withdraw_block(connection, "calanques")
     connection.commit()
     assert get("/collections/density/items").json()["features"] == []
     levels = connection.execute("select count(*) as n from density_cell").fetchone()
@@ -139,13 +140,13 @@ def test_density_counts_points_that_are_served(get, connection):
     connection.execute(
         "update point set suspended_at = now(), suspended_because = 'gone' where id < %s", [2**26 + 7]
     )
-    overlaps.count_unserved(connection)
+    superseding.count_unserved(connection)
     connection.commit()
     fewer = counted()
     assert (whole[0], fewer[0]) == (60, 53)
     assert fewer[1] != whole[1]
     connection.execute("update point set suspended_at = null, suspended_because = null")
-    overlaps.count_unserved(connection)
+    superseding.count_unserved(connection)
     connection.commit()
     assert counted()[0] == 60
 
@@ -182,7 +183,7 @@ def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, con
     first = client.get(path, headers=headers)
     again = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
-    blocks.withdraw_block(connection, "calanques")
+    lifecycle.withdraw_block(connection, "calanques")
     connection.commit()
     after = client.get(path, headers={**headers, "If-None-Match": first.headers["etag"]})
     assert (after.status_code, after.content) == (200, b"")

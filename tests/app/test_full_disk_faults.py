@@ -13,11 +13,11 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from app.errors import is_no_room
 from app.storage import Storage
-from app.usecases import blocks
-from app.usecases.blocks import sweep_storage
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.lifecycle import sweep_storage
 from tests.app.workers import ended, running_worker
 from tests.factories import make_block
 
@@ -138,7 +138,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
         assert "disk" in str(failed["message"])
         assert "full" in str(failed["message"])
         with engine.connect(dsn) as connection:
-            assert blocks.list_blocks(connection) == []
+            assert lifecycle.list_blocks(connection) == []
             sweep_storage(connection, storage)
         assert files(storage) == []
 
@@ -146,7 +146,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
         assert ingested()["status"] == "successful"
         assert worker.poll() is None
     with engine.connect(dsn) as connection:
-        (block,) = blocks.list_blocks(connection)
+        (block,) = lifecycle.list_blocks(connection)
         assert block.n_points == len(made.points)
         assert sweep_storage(connection, storage) == []
 
@@ -172,15 +172,15 @@ def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is
                 pytest.raises(psycopg.OperationalError) as refused,
                 engine.connect(dsn) as connection,
             ):
-                blocks.ingest_block(connection, storage, made.folder)
+                lifecycle.ingest_block(connection, storage, made.folder)
             assert is_no_room(refused.value), refused.value
             ballast.unlink()
             # It stops where even its log has no room, and is started again as `amers serve` does.
             cluster.revive()
             with engine.connect(dsn) as connection:
-                assert blocks.list_blocks(connection) == []
-                blocks.ingest_block(connection, storage, made.folder)
+                assert lifecycle.list_blocks(connection) == []
+                lifecycle.ingest_block(connection, storage, made.folder)
             with engine.connect(dsn) as connection:
-                assert [block.n_points for block in blocks.list_blocks(connection)] == [2_000]
+                assert [block.n_points for block in lifecycle.list_blocks(connection)] == [2_000]
     finally:
         disk.remove()

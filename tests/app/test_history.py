@@ -14,20 +14,17 @@ from typer.testing import CliRunner
 
 from app.cli.main import app as amers
 from app.config import Settings
-from app.db import attempts, engine, history, jobs, registrations
-from app.db.attempts import LostJob
+from app.db import engine, history, registrations
 from app.db.engine import Connection, Database
+from app.db.jobs import attempts, jobs
+from app.db.jobs.attempts import LostJob
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
-from app.usecases.ground_control import points_of_block, points_of_store
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.history import remember
-from app.usecases.registration import (
-    RegisteredScene,
-    SceneFiles,
-    run_registration,
-)
-from services.formats.block_check import check_block
-from services.registration import Registration, RegistrationOptions
+from app.usecases.registration.control_sources import points_of_block, points_of_store
+from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
+from services.formats.block.check import check_block
+from services.registration.on_points import Registration, RegistrationOptions
 from services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 

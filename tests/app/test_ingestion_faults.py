@@ -16,10 +16,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from app.db import binary_copy, engine
-from app.db.embedded import Cluster
-from app.db.gauges import read_gauges
+from app.db.cluster.embedded import Cluster
+from app.db.metrics import read_gauges
 from app.storage import Storage
-from app.usecases import blocks
+from app.usecases.blocks import lifecycle
 from services.errors import FormatError
 from tests.factories import make_block
 
@@ -124,13 +124,13 @@ def test_a_broken_block_is_refused_by_name_changes_nothing_and_works_once_mended
     broken = make_block(tmp_path / "broken")
     spoil(broken.folder)
     with pytest.raises(FormatError, match=named):
-        blocks.ingest_block(connection, storage, broken.folder)
+        lifecycle.ingest_block(connection, storage, broken.folder)
     connection.commit()
     assert rows(connection) == dict.fromkeys(TABLES, 0)
     assert not (storage.folder / "chips").exists()
 
     mended = make_block(tmp_path / "mended")
-    blocks.ingest_block(connection, storage, mended.folder)
+    lifecycle.ingest_block(connection, storage, mended.folder)
     connection.commit()
     assert rows(connection) == {"block": 1, "image": 3, "chip_file": 1, "point": 40, "view": 240}
 
@@ -143,7 +143,7 @@ def test_a_block_that_changes_while_it_is_ingested_is_refused(connection, storag
             changed_chip(made.folder)
 
     with pytest.raises(FormatError, match=r"chips/0000\.npy: sha256"):
-        blocks.ingest_block(connection, storage, made.folder, change)
+        lifecycle.ingest_block(connection, storage, made.folder, change)
     connection.rollback()
     assert rows(connection) == dict.fromkeys(TABLES, 0)
     assert not (storage.folder / "chips").exists()
@@ -223,16 +223,16 @@ def test_postgresql_killed_in_the_middle_of_an_ingestion_leaves_nothing(
 
         halfway = {"point": 0.68, "view": 0.88}
         with pytest.raises(psycopg.OperationalError), engine.connect(dsn) as connection:
-            blocks.ingest_block(connection, storage, made.folder, kill_halfway)
+            lifecycle.ingest_block(connection, storage, made.folder, kill_halfway)
         assert killed
 
     with own.lease() as dsn:
         with engine.connect(dsn) as connection:
             assert rows(connection) == dict.fromkeys(TABLES, 0)
-            assert blocks.list_blocks(connection) == []
+            assert lifecycle.list_blocks(connection) == []
         with engine.connect(dsn) as connection:
-            blocks.ingest_block(connection, storage, made.folder)
-            blocks.publish_block(connection, "calanques")
+            lifecycle.ingest_block(connection, storage, made.folder)
+            lifecycle.publish_block(connection, "calanques")
         with engine.connect(dsn) as connection:
             assert rows(connection) == {
                 "block": 1,
@@ -242,7 +242,7 @@ def test_postgresql_killed_in_the_middle_of_an_ingestion_leaves_nothing(
                 "view": 4000,
             }
             assert read_gauges(connection).points == 2000
-            assert blocks.sweep_storage(connection, storage) == []
+            assert lifecycle.sweep_storage(connection, storage) == []
 
 
 def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
@@ -251,7 +251,7 @@ def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
 
     def ingest_and_kill(dsn: str) -> None:
         with engine.connect(dsn) as connection:
-            blocks.ingest_block(connection, storage, made.folder)
+            lifecycle.ingest_block(connection, storage, made.folder)
             kill(own)
 
     with own.lease() as dsn:
@@ -262,4 +262,4 @@ def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
     with own.lease() as dsn, engine.connect(dsn) as connection:
         assert rows(connection) == dict.fromkeys(TABLES, 0)
         assert len(storage.keys("chips")) == 1
-        assert len(blocks.sweep_storage(connection, storage)) == 1
+        assert len(lifecycle.sweep_storage(connection, storage)) == 1

@@ -7,14 +7,15 @@ from uuid import UUID
 import pytest
 from psycopg.errors import UniqueViolation
 
-from app.db import attempts, jobs, registrations, scenes
-from app.db.attempts import LostJob
+from app.db import registrations, scenes
 from app.db.engine import Connection, Database
-from app.db.jobs import Job
+from app.db.jobs import attempts, jobs
+from app.db.jobs.attempts import LostJob
+from app.db.jobs.jobs import Job
 from app.storage import Storage
 from app.worker.attempt import FAILURES_ALLOWED
 from app.worker.sweep import sweep_files, sweep_jobs
-from tests.app.queued import LEASE_S, claimed, let_lease_lapse, new_job, queue_entries, state_of
+from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, queue_entries, state_of
 
 
 def test_a_job_is_claimed_by_one_worker_only(database: Database):

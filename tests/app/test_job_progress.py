@@ -6,10 +6,10 @@ from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
 
-from app.db import attempts, job_course, jobs
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
-from app.db.jobs import Job, JobFilter
+from app.db.jobs import attempts, jobs, progress
+from app.db.jobs.jobs import Job, JobFilter
 from app.storage import Storage
 from app.worker.sweep import sweep_files, sweep_results
 
@@ -45,7 +45,7 @@ def done_in(connection: Connection, seconds: float, kind: str = "register-scene"
 
 def wait_of(connection: Connection, job: Job) -> timedelta:
     """From now to the expected end of a job."""
-    end = job_course.expected_end(connection, job)
+    end = progress.expected_end(connection, job)
     now = connection.execute("select clock_timestamp() as now").fetchone()
     assert end is not None
     assert now is not None
@@ -62,7 +62,7 @@ def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
     attempts.try_again(connection, job.id, 1, 0.0)
     attempts.claim(connection, job.id, "w", LEASE_S)
     attempts.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
-    said = job_course.read_messages(connection, job.id, 100)
+    said = progress.read_messages(connection, job.id, 100)
     assert [(entry.attempt, entry.progress, entry.message) for entry in said] == [
         (0, 0, "waiting for a worker"),
         (1, 0, "started"),
@@ -72,12 +72,12 @@ def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
         (2, 0, "3 found"),
     ]
     assert [entry.at for entry in said] == sorted(entry.at for entry in said)
-    assert job_course.read_messages(connection, job.id, 2) == said[-2:]
+    assert progress.read_messages(connection, job.id, 2) == said[-2:]
 
 
 def test_the_expected_end_is_the_median_of_past_jobs_of_its_process(connection: Connection):
     running = begun(connection)
-    assert job_course.expected_end(connection, running) is None, "nothing like it was ever done"
+    assert progress.expected_end(connection, running) is None, "nothing like it was ever done"
     for seconds in (10, 100, 1000):
         done_in(connection, seconds)
     done_in(connection, 5, kind="ingest-block")
@@ -105,7 +105,7 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     assert abs(wait_of(connection, waiting) - timedelta(seconds=(100 + 20) / 2 + 100)) < a_slow_machine
     ended = jobs.find(connection, done_in(connection, 1))
     assert ended is not None
-    assert job_course.expected_end(connection, ended) is None
+    assert progress.expected_end(connection, ended) is None
 
 
 def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Connection):
@@ -114,10 +114,10 @@ def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Conn
         "select args ->> 'job_id' as job from procrastinate_jobs order by id"
     ).fetchall()
     assert [row["job"] for row in queued] == [str(job.id) for job in made]
-    assert [job_course.position(connection, job) for job in made] == [1, 2, 3, 4, 5, 6]
+    assert [progress.position(connection, job) for job in made] == [1, 2, 3, 4, 5, 6]
     connection.execute("update job set created_at = %s", [made[0].created_at])
     alike = [replace(job, created_at=made[0].created_at) for job in made]
-    assert sorted(job_course.position(connection, job) for job in alike) == [1, 2, 3, 4, 5, 6]
+    assert sorted(progress.position(connection, job) for job in alike) == [1, 2, 3, 4, 5, 6]
     pages = [jobs.newest(connection, None, JobFilter(), 2)]
     while len(pages[-1]) == 2:
         pages.append(jobs.newest(connection, None, JobFilter(), 2, after=pages[-1][-1].id))

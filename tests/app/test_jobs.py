@@ -9,10 +9,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import attempts, engine, jobs
+from app.db import engine
 from app.db.engine import Database
+from app.db.jobs import attempts, jobs
 from app.main import create_app
-from tests.app.queued import LEASE_S, claimed, queue_entries
+from tests.app.job_queue import LEASE_S, claimed, queue_entries
 
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"

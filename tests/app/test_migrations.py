@@ -14,7 +14,8 @@ from alembic.script import ScriptDirectory
 from pydantic import SecretStr
 
 from app.config import Settings
-from app.db import archive, engine
+from app.db import engine
+from app.db.cluster import backup
 from app.db.engine import SchemaStatus
 from app.errors import Conflict, InputError
 from app.usecases.tokens import create_token, list_tokens
@@ -164,8 +165,8 @@ def test_a_point_lies_in_the_range_of_its_block(connection):
 def test_a_backup_restores_into_an_empty_database(dsn, empty_dsn, tmp_path):
     with engine.connect(dsn) as connection:
         create_token(connection, "kept", ["read"])
-    archive.dump(dsn, tmp_path / "amers.dump")
-    archive.restore(empty_dsn, tmp_path / "amers.dump")
+    backup.dump(dsn, tmp_path / "amers.dump")
+    backup.restore(empty_dsn, tmp_path / "amers.dump")
     assert engine.status(empty_dsn).current
     with engine.connect(empty_dsn) as connection:
         assert [token.name for token in list_tokens(connection)] == ["kept"]
@@ -173,15 +174,15 @@ def test_a_backup_restores_into_an_empty_database(dsn, empty_dsn, tmp_path):
 
 def test_a_backup_overwrites_nothing_and_a_restore_neither(dsn, tmp_path):
     file = tmp_path / "amers.dump"
-    archive.dump(dsn, file)
+    backup.dump(dsn, file)
     with pytest.raises(Conflict, match="exists"):
-        archive.dump(dsn, file)
+        backup.dump(dsn, file)
     with pytest.raises(Conflict, match="has tables already"):
-        archive.restore(dsn, file)
+        backup.restore(dsn, file)
 
 
 def test_a_file_that_is_no_backup_restores_nothing(empty_dsn, tmp_path):
     (tmp_path / "noise").write_bytes(b"\x00noise" * 100)
     with pytest.raises(InputError, match="pg_restore"):
-        archive.restore(empty_dsn, tmp_path / "noise")
+        backup.restore(empty_dsn, tmp_path / "noise")
     assert tables(empty_dsn) <= {"spatial_ref_sys"}

@@ -19,7 +19,7 @@ from schemathesis.specs.openapi.checks import (
 
 from app.config import Settings
 from app.main import create_app
-from tests.app.served import Served, service_with_a_block
+from tests.app.running_service import Served, service_with_a_block
 
 pytestmark = pytest.mark.long
 

@@ -10,12 +10,14 @@ from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
 from app import logs
-from app.db import attempts, engine, jobs, scenes
+from app.db import engine, scenes
 from app.db.audit import list_changes
+from app.db.jobs import attempts, jobs
 from app.errors import TooLarge, TooMany
 from app.main import create_app
-from app.origin import Origin, working_for
-from app.usecases import blocks, quotas
+from app.request_context import Origin, working_for
+from app.usecases import quotas
+from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
 from tests.factories import make_block
 
@@ -29,9 +31,9 @@ def changes(connection, **chosen) -> list:
 def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
     connection, storage, tmp_path
 ):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
-    blocks.publish_block(connection, "calanques")
-    blocks.withdraw_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
+    lifecycle.withdraw_block(connection, "calanques")
     found = changes(connection, kind="block", subject="calanques@1")
     assert [change.action for change in found] == ["created", "changed", "changed"]
     assert found[0].before is None
@@ -154,8 +156,8 @@ def families(text: str) -> dict:
 
 
 def test_metrics_tell_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
-    blocks.ingest_block(connection, storage, make_block(tmp_path / "block", 7).folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 7).folder)
+    lifecycle.publish_block(connection, "calanques")
     jobs.create(connection, "register-scene", {})
     connection.commit()
     client.get("/healthz")

@@ -18,12 +18,13 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from app.config import Settings
-from app.db import attempts, engine, jobs, registrations
+from app.db import engine, registrations
+from app.db.jobs import attempts, jobs
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases.jobs import do_attempt
-from services.formats.raster import write_raster
-from services.formats.rpc_text import format_rpc_text, parse_rpc_text
+from services.formats.images.raster import write_raster
+from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from services.sensors.rpc import RpcModel
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())

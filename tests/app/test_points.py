@@ -13,15 +13,17 @@ from rasterio.io import MemoryFile
 from typer.testing import CliRunner
 
 from app.cli.main import app as commands
-from app.db import feature_counts, features
-from app.db.collections import Viewer
-from app.db.feature_counts import Count
+from app.db.features import counts
+from app.db.features import pages as features
+from app.db.features.collection import Viewer
+from app.db.features.counts import Count
+from app.db.features.query import Selection
 from app.db.points import POINTS
-from app.db.selection import Selection
 from app.errors import InputError
-from app.usecases import blocks, points
-from app.usecases.features import everything_in
-from app.usecases.questions import Question, condition_of
+from app.usecases.blocks import lifecycle
+from app.usecases.features import points
+from app.usecases.features.items import everything_in
+from app.usecases.features.query import FeatureQuery, condition_of
 from services.geodesy import east_north_up
 from tests.factories import make_block
 
@@ -35,9 +37,9 @@ a_step_of_the_planner = 0.02
 def made(connection, storage, tmp_path):
     """A published block of 60 points; a staged one of 10 lies in the same place."""
     made = make_block(tmp_path / "block", count=60)
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
-    blocks.ingest_block(
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
+    lifecycle.ingest_block(
         connection, storage, make_block(tmp_path / "b", count=10, seed=5, name="staged").folder
     )
     connection.commit()
@@ -131,8 +133,8 @@ def test_a_box_across_the_antimeridian_holds_both_sides_and_nothing_between(
     made = make_block(tmp_path / "far", count=50, box=(179.9, -17.0, -179.9, -16.9))
     near = make_block(tmp_path / "near", count=9, name="near")
     for block in (made, near):
-        blocks.ingest_block(connection, storage, block.folder)
-        blocks.publish_block(connection, block.metadata.id)
+        lifecycle.ingest_block(connection, storage, block.folder)
+        lifecycle.publish_block(connection, block.metadata.id)
     connection.commit()
     page = get(f"{ITEMS}?bbox=179.95,-17,-179.95,-16.9").json()
     lon = made.points.lon_lat_h[:, 0]
@@ -173,17 +175,17 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
         gsds_m=(2.0,),
         dtype=np.uint8,
     )
-    blocks.ingest_block(connection, storage, many.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, many.folder)
+    lifecycle.publish_block(connection, "calanques")
     hidden = make_block(tmp_path / "hidden", count=3_000, n_images=2, gsds_m=(2.0,), name="hidden")
-    blocks.ingest_block(connection, storage, hidden.folder)
+    lifecycle.ingest_block(connection, storage, hidden.folder)
     connection.execute("analyze point")
     lon = many.points.lon_lat_h[:, 0]
     ordered = np.sort(lon)
     middle = (ordered[9_999] + ordered[10_000]) / 2
 
     def count(bbox):
-        return feature_counts.count(connection, everything_in(POINTS, bbox))
+        return counts.count(connection, everything_in(POINTS, bbox))
 
     assert count(f"4,42,{middle},44") == Count(10_000, exact=True)
     assert count(None) == Count(12_500, exact=True)
@@ -196,11 +198,9 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     assert 10_000 < true != estimate.number
     assert abs(estimate.number - true) <= (lon > 5.3).sum()
 
-    question = Question(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
+    question = FeatureQuery(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
     condition = condition_of(POINTS, question)
-    estimate = feature_counts.count(
-        connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition)
-    )
+    estimate = counts.count(connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition))
     true = (many.points.saliency > 0.1).sum()
     assert not estimate.exact
     assert true > 10_000

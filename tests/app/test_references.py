@@ -13,8 +13,9 @@ from fastapi.testclient import TestClient
 from rasterio.transform import Affine
 
 from app.config import Settings
-from app.db import attempts, engine, references
+from app.db import engine, references
 from app.db.engine import Connection, Database
+from app.db.jobs import attempts
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
 from app.storage import open_storage
@@ -26,11 +27,11 @@ from app.usecases.references import (
     references_of_store,
     remove_reference,
 )
-from app.usecases.registration import RegisteredScene, SceneFiles, run_registration
+from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
 from services.errors import CoverageError
-from services.imagery import ArrayImage, sample_image
+from services.imagery.source import ArrayImage, sample_image
 from services.map_grid import MapGrid, xy_of_lon_lat
-from services.registration import RegistrationOptions
+from services.registration.on_points import RegistrationOptions
 from services.types import FloatImage
 from tests.app.buckets import running_bucket
 from tests.app.workers import ended, running_worker

@@ -14,7 +14,7 @@ from jsonschema import validate
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from services.formats.rpc_files import read_rpc
+from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registered import (
@@ -27,7 +27,7 @@ from tests.app.registered import (
     write_check_points,
     write_mask,
 )
-from tests.app.served import running_service
+from tests.app.running_service import running_service
 
 pytestmark = pytest.mark.long
 

@@ -12,10 +12,10 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from app.usecases.ground_control import points_of_block, points_of_store
-from app.usecases.registration import SceneFiles, run_registration
-from services.formats.rpc_files import read_rpc
-from services.registration import RegistrationOptions
+from app.usecases.registration.control_sources import points_of_block, points_of_store
+from app.usecases.registration.register import SceneFiles, run_registration
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.registration.on_points import RegistrationOptions
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world

@@ -11,7 +11,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from app.cli.main import main
-from services.imagery import ArrayImage, sample_image
+from services.imagery.source import ArrayImage, sample_image
 
 SHIFT_PX = np.array([5.3, -3.6])
 SHIFT_ALLOWED_PX = 0.1

@@ -19,7 +19,7 @@ from app.main import create_app
 from app.storage import KEY, Storage
 from app.usecases.scenes import clean_name, folder_of
 from app.worker.sweep import sweep_files
-from tests.app.served import running_service
+from tests.app.running_service import running_service
 from tests.app.workers import wait_until
 
 TIFF = b"II*\0" + bytes(100_000)

@@ -14,7 +14,7 @@ import pytest
 
 from app.db import engine
 from app.storage import Storage
-from app.usecases.blocks import ingest_block, publish_block
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token
 from tests.factories import make_block
 from tests.serving import Service, until, users_of

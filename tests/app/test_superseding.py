@@ -7,12 +7,12 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from app.db import engine, overlaps
-from app.db.overlaps import SAME_PLACE_M
+from app.db import engine, superseding
+from app.db.superseding import SAME_PLACE_M
 from app.errors import Conflict, InputError
-from app.usecases import blocks
-from services.formats.block_document import AccuracyFigure
-from services.formats.block_writing import write_block
+from app.usecases.blocks import lifecycle
+from services.formats.block.document import AccuracyFigure
+from services.formats.block.writer import write_block
 from services.types import Array
 from tests.factories import BOX, control_points, metadata, noise_chips
 
@@ -47,7 +47,7 @@ def ingest(connection, storage, tmp_path):
 
     def ingest(name: str, lon_lat: Array, priority: int = 0, **said):
         folder = made(tmp_path / f"{name}{said.get('version', '')}", name, lon_lat, **said)
-        return blocks.ingest_block(connection, storage, folder, priority=priority).block.number
+        return lifecycle.ingest_block(connection, storage, folder, priority=priority).block.number
 
     return ingest
 
@@ -70,7 +70,7 @@ def test_of_two_blocks_over_one_place_the_one_with_the_better_frame_is_served(
     ingest("good", places[:20], frame_sigma_m=0.5)
     ingest("poor", near, frame_sigma_m=5.0)
     for name in ("poor", "good"):
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"good@1": 20, "poor@1": 10}
     named = connection.execute(
         "select count(*) as n from point l join point w on w.id = l.superseded_by"
@@ -84,7 +84,7 @@ def test_points_further_apart_than_one_place_are_both_served(connection, ingest,
     ingest("b", places + [0.0, 1.1 * SAME_PLACE_M * metre_of_latitude_deg])
     ingest("c", places + [0.0, -0.9 * SAME_PLACE_M * metre_of_latitude_deg])
     for name in ("a", "b", "c"):
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"b@1": 30, "c@1": 30}
 
 
@@ -92,26 +92,26 @@ def test_a_priority_comes_before_every_figure_and_may_change_while_published(con
     ingest("good", places, frame_sigma_m=0.5)
     ingest("poor", places, frame_sigma_m=5.0, priority=1)
     for name in ("good", "poor"):
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"poor@1": 30}
-    assert blocks.prioritise_block(connection, "good", 2).n_superseded == 0
+    assert lifecycle.prioritise_block(connection, "good", 2).n_superseded == 0
     assert served(connection) == {"good@1": 30}
     with pytest.raises(InputError, match="priority: 1001 found"):
-        blocks.prioritise_block(connection, "good", 1001)
+        lifecycle.prioritise_block(connection, "good", 1001)
 
 
 def test_a_withdrawal_gives_the_place_to_the_next_best(connection, ingest, places):
     for priority, name in enumerate(("third", "second", "first")):
         ingest(name, places, priority=priority)
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"first@1": 30}
-    assert blocks.withdraw_block(connection, "first").n_superseded == 0
+    assert lifecycle.withdraw_block(connection, "first").n_superseded == 0
     assert served(connection) == {"second@1": 30}
-    blocks.withdraw_block(connection, "second")
+    lifecycle.withdraw_block(connection, "second")
     assert served(connection) == {"third@1": 30}
-    blocks.restore_block(connection, "first")
+    lifecycle.restore_block(connection, "first")
     assert served(connection) == {"first@1": 30}
-    assert blocks.withdraw_block(connection, "third").n_superseded == 0
+    assert lifecycle.withdraw_block(connection, "third").n_superseded == 0
 
 
 def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, ingest, places):
@@ -123,11 +123,11 @@ def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, 
     found = []
     for order in permutations(names):
         for name in order:
-            blocks.publish_block(connection, name)
+            lifecycle.publish_block(connection, name)
         rows = connection.execute("select id, superseded_by from point order by id").fetchall()
         found.append([tuple(row.values()) for row in rows])
         for name in order[::-1]:
-            blocks.withdraw_block(connection, name)
+            lifecycle.withdraw_block(connection, name)
         left = connection.execute("select count(superseded_by) as n from point").fetchone()
         assert left["n"] == 0
     assert all(one == found[0] for one in found)
@@ -139,9 +139,9 @@ def test_a_new_version_takes_the_places_of_the_old_one(connection, ingest, place
     ingest("good", places, frame_sigma_m=0.5)
     ingest("good", places[:10], frame_sigma_m=0.5, version="2")
     for name in ("poor", "good@1", "good@2"):
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"good@2": 10, "poor@1": 20}
-    restored = blocks.restore_block(connection, "good@1")
+    restored = lifecycle.restore_block(connection, "good@1")
     assert restored.superseded is not None
     assert restored.superseded.version == "2"
     assert served(connection) == {"good@1": 30}
@@ -153,14 +153,14 @@ def test_one_place_is_one_place_across_the_antimeridian(connection, ingest):
     ingest("a", lon_lat, box=box)
     ingest("b", lon_lat, box=box, priority=1)
     for name in ("a", "b"):
-        blocks.publish_block(connection, name)
+        lifecycle.publish_block(connection, name)
     assert served(connection) == {"b@1": 2}
 
 
 def test_only_a_block_that_was_published_is_restored(connection, ingest, places):
     ingest("a", places)
     with pytest.raises(Conflict, match="never published"):
-        blocks.restore_block(connection, "a")
+        lifecycle.restore_block(connection, "a")
 
 
 def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_place(
@@ -174,14 +174,14 @@ def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_pl
 
     def publish(reference: str) -> str | None:
         with engine.connect(dsn) as own:
-            superseded = blocks.publish_block(own, reference).superseded
+            superseded = lifecycle.publish_block(own, reference).superseded
         return None if superseded is None else superseded.version
 
     wanted = ("a@1", "a@2", "a@3", "b", "c")
     with ThreadPoolExecutor(len(wanted)) as administrators:
         list(administrators.map(publish, wanted))
     assert served(connection) == {"c@1": 30}
-    states = [(block.id, block.state) for block in blocks.list_blocks(connection)]
+    states = [(block.id, block.state) for block in lifecycle.list_blocks(connection)]
     assert sorted(states) == [
         ("a", "published"),
         ("a", "withdrawn"),
@@ -199,8 +199,8 @@ def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_pl
 
 def test_publications_wait_for_each_other(dsn):
     with engine.connect(dsn) as one, engine.connect(dsn) as other:
-        overlaps.lock_publications(one)
+        superseding.lock_publications(one)
         other.execute("set local lock_timeout = '100ms'")
         with pytest.raises(Exception, match="lock timeout"):
-            overlaps.lock_publications(other)
+            superseding.lock_publications(other)
         other.rollback()

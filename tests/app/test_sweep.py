@@ -13,7 +13,7 @@ from app.db.engine import Database
 from app.db.uploads import LIFE_HOURS
 from app.storage import Storage
 from app.worker.sweep import MOST_BETWEEN_S, sweep_files
-from tests.app.ageing import jump
+from tests.app.point_history import jump
 
 JOB_S = 3600.0
 A_YEAR_H = 8760

@@ -25,10 +25,10 @@ from app.db import engine
 from app.db.uploads import LIFE_HOURS
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.block_uploads import finished_block
+from app.usecases.blocks.uploads import finished_block
 from app.usecases.uploads import sweep_uploads
 from app.worker.sweep import sweep_files
-from tests.app.ageing import let_pass
+from tests.app.point_history import let_pass
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
 LIMIT_BYTES = 400_000

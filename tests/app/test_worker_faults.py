@@ -11,7 +11,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine, jobs
+from app.db import engine
+from app.db.jobs import jobs
 from app.main import create_app
 from app.storage import Storage
 from tests.app.flat_world import FlatWorld, make_flat_world

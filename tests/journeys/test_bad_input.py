@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from services.formats.block import file_sha256
-from services.formats.rpc_text import format_rpc_text, parse_rpc_text
+from services.formats.block.reader import file_sha256
+from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.serving import Service
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from app.usecases.production import BlockIdentity, run_production
-from services.formats.block import FolderChips
-from services.formats.block_check import check_block
-from services.formats.rpc_text import parse_rpc_text
-from services.formats.scenes import read_scene
-from services.imagery import Window
-from services.production import ProductionOptions
-from services.registration import register_scene
-from services.scene import Scene, scene_gsd_m
+from services.formats.block.check import check_block
+from services.formats.block.reader import FolderChips
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.rpc_text import parse_rpc_text
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import Window
+from services.production.from_images import ProductionOptions
+from services.registration.on_points import register_scene
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
 

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from services.formats.raster import map_grid_of, open_raster
-from services.imagery import ImageSource, Window
-from services.matching.dense import Reference
-from services.reference import register_on_reference
-from services.registration import Registration
-from services.scene import Scene
+from services.formats.images.raster import map_grid_of, open_raster
+from services.imagery.scene import Scene
+from services.imagery.source import ImageSource, Window
+from services.matching.reference_image import Reference
+from services.registration.on_points import Registration
+from services.registration.on_reference import register_on_reference
 from services.sensors.ortho import OrthoModel
 from services.types import Acquisition, Array, FloatImage
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.formats.raster import open_raster, write_raster
-from services.formats.rpc_files import read_rpc
-from services.formats.rpc_text import parse_rpc_text
-from services.imagery import Window
-from services.intersection import intersect
+from services.adjustment.intersection import intersect
+from services.formats.images.raster import open_raster, write_raster
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.formats.sensor_models.rpc_text import parse_rpc_text
+from services.imagery.source import Window
 from services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
 from services.sensors.rpc import RpcModel
 from tests.journeys.ties import independent_tracks

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.scene import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import Array, BoolArray, Measures
 

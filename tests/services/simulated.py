@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from services.production import Production, ProductionOptions, produce_points
+from services.production.from_images import Production, ProductionOptions, produce_points
 from services.simulation.view import (
     SimulatedView,
     ViewGeometry,

@@ -12,8 +12,8 @@ from benchmarks._campaign import Outcome, attempt, prepare
 from benchmarks._trials import Trial, draw_trial, nominal_trial
 from benchmarks._worlds import Block, Place, block_of
 from benchmarks.stress import by_factor, read_outcomes, summary
-from services.imagery import Window
-from services.registration import Registration, RegistrationOptions, register_scene
+from services.imagery.source import Window
+from services.registration.on_points import Registration, RegistrationOptions, register_scene
 
 pytestmark = pytest.mark.long
 

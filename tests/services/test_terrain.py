@@ -8,12 +8,12 @@ from scipy.ndimage import map_coordinates
 
 from services import terrain as terrain_module
 from services.errors import CoverageError
-from services.imagery import ArrayImage, FloatImage, Window
+from services.imagery.source import ArrayImage, FloatImage, Window
 from services.map_grid import MapGrid
 from services.sensors.ortho import OrthoModel
 from services.sensors.pushbroom import PushbroomModel
 from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain, meet
+from services.terrain import Terrain, intersect_terrain
 from services.types import Array
 
 a_tenth_of_a_millimetre = 1e-4
@@ -113,7 +113,7 @@ def test_the_slope_is_the_rise_per_metre() -> None:
 @pytest.mark.parametrize("incidence_deg", [0.0, 12.0, 35.0])
 def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
     model, ground = view(incidence_deg), terrain(60.0)
-    met = meet(model, pixels_of(), ground)
+    met = intersect_terrain(model, pixels_of(), ground)
     np.testing.assert_allclose(met[:, 2], ground.height_m(met[:, :2]), atol=a_millimetre)
     np.testing.assert_allclose(model.project(met), pixels_of(), atol=a_thousandth_of_a_pixel)
 
@@ -121,7 +121,7 @@ def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
 def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
     """Slopes steeper than the line of sight: several places of the ground lie on one line."""
     model, ground = view(40.0), terrain(400.0)
-    met = meet(model, pixels_of(), ground)
+    met = intersect_terrain(model, pixels_of(), ground)
     hidden_by_m = np.zeros(len(met))
     twice = np.zeros(len(met), dtype=bool)
     for above_m in np.arange(2.0, 900.0, 2.0):
@@ -138,15 +138,15 @@ def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
 def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_ends_nowhere() -> None:
     heights = hills(60.0)
     heights[:, :140] = np.nan
-    met = meet(view(12.0), pixels_of(), replace(terrain(60.0), heights=ArrayImage(heights)))
+    met = intersect_terrain(view(12.0), pixels_of(), replace(terrain(60.0), heights=ArrayImage(heights)))
     known = np.isfinite(met[:, 2])
     assert 0.3 < known.mean() < 0.7
     far = replace(GRID, origin_xy=GRID.origin_xy + 1e5)
     with pytest.raises(CoverageError, match="does not reach"):
-        meet(view(12.0), pixels_of(), replace(terrain(), grid=far))
+        intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
 
 
 def test_the_verticals_of_an_ortho_image_end_straight_below() -> None:
     model, ground = OrthoModel(GRID), terrain()
-    met = meet(model, places(), ground)
+    met = intersect_terrain(model, places(), ground)
     np.testing.assert_allclose(met[:, 2], ground.height_m(GRID.lon_lat(places())), atol=a_millimetre)

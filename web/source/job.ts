@@ -156,7 +156,7 @@ const CRITERIA: Record<string, [words: string, unit?: string]> = {
   displacement_px: ["Displacement with fewer points", "px"],
   predicted_ce90_px: ["Predicted CE90, worst place", "px"],
   unit_weight: ["Residuals over what is expected"],
-  rival_share: ["Points that tell another story"],
+  second_consensus_share: ["Points that tell another story"],
   check_points: ["Check points over what is expected"],
 };
 

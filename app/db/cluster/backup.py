@@ -7,7 +7,7 @@ from pathlib import Path
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from app.db.binaries import find_binaries
+from app.db.cluster.binaries import find_binaries
 from app.errors import Conflict, InputError
 
 

@@ -24,7 +24,7 @@ from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
 from app.config import Settings
-from app.db.binaries import ServerUser, find_binaries, run_as, server_user
+from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from app.errors import InputError
 
 ROLE = "amers"

@@ -1,4 +1,4 @@
-"""What a collection of features is: declared once for each, asked for by `app.db.features`.
+"""What a collection of features is: declared once for each, asked for by `app.db.features.pages`.
 
 SQL in a declaration calls the row `t`, and may use `%(admin)s` and `%(viewer)s`: whether the caller is
 an administrator, and the id of the caller's token.
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Literal
 from uuid import UUID
 
-from app.db.box import Box
-from app.db.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
 from app.db.engine import Connection
+from app.db.features.bbox import Box
+from app.db.features.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
 
 SqlType = Literal["bigint", "real", "double precision", "text", "date", "timestamptz", "boolean"]
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import psycopg
 
-from app.db.box import WORLD
-from app.db.collections import Collection, Viewer
-from app.db.conditions import ANYTHING
 from app.db.engine import Connection
-from app.db.selection import Selection, from_where, viewer_parameters
+from app.db.features.bbox import WORLD
+from app.db.features.collection import Collection, Viewer
+from app.db.features.predicates import ANYTHING
+from app.db.features.query import Selection, from_where, viewer_parameters
 
 EXACT_COUNT = 10_000
 COUNTING_MS = 1_000

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.db.collections import Collection, Property
-from app.db.conditions import Condition
-from app.db.cql2_reading import MOST_NODES, parse_geometry, parse_instant
-from app.db.crs import CRS84, Crs
+from app.db.features.collection import Collection, Property
+from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_instant
+from app.db.features.crs import CRS84, Crs
+from app.db.features.predicates import Condition
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")

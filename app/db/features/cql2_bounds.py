@@ -12,8 +12,8 @@ from typing import Any
 import cql2
 import shapely
 
-from app.db.antimeridian import on_the_map
-from app.db.crs import Crs, lon_lat_from_mercator
+from app.db.features.antimeridian import on_the_map
+from app.db.features.crs import Crs, lon_lat_from_mercator
 from app.errors import InvalidParameter
 
 LONGEST_TEXT = 4_000

@@ -1,6 +1,6 @@
 """Blocks and scenes as collections of their outlines."""
 
-from app.db.collections import Collection, Property
+from app.db.features.collection import Collection, Property
 
 STATES = ("staged", "published", "withdrawn")
 

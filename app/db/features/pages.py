@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 from psycopg.rows import tuple_row
 
-from app.db.collections import Property
-from app.db.crs import from_storage
 from app.db.engine import Connection
-from app.db.feature_text import csv_text, feature_text, plain_value
-from app.db.selection import Key, Selection, chosen_rows, sortable, viewer_parameters
+from app.db.features.collection import Property
+from app.db.features.crs import from_storage
+from app.db.features.query import Key, Selection, chosen_rows, sortable, viewer_parameters
+from app.db.features.serialization import csv_text, feature_text, plain_value
 
 ROWS_AT_ONCE = 2_000
 
@@ -86,7 +86,7 @@ def stream_geojson(
 
 
 def copy_csv(connection: Connection, selection: Selection, after: Key | None, limit: int) -> BytesIO:
-    """A page and one row more, as CSV that `services.formats.feature_files` makes into columns.
+    """A page and one row more, as CSV that `services.formats.vector.feature_files` makes into columns.
 
     Columns are the values that order features (a JSON text); longitude or east, latitude or north, and
     height of points, else the geometry as hexadecimal WKB; the key and the properties.

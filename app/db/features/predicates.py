@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
-from app.db.box import Box
-from app.db.collections import Collection
+from app.db.features.bbox import Box
+from app.db.features.collection import Collection
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.db.collections import Collection, Property, Viewer
-from app.db.conditions import ANYTHING, Condition
-from app.db.crs import Crs
+from app.db.features.collection import Collection, Property, Viewer
+from app.db.features.crs import Crs
+from app.db.features.predicates import ANYTHING, Condition
 
 Key = tuple[Any, ...]
 """The values that order features, of one of them."""

@@ -2,9 +2,9 @@
 
 import json
 
-from app.db.collections import Property
-from app.db.crs import from_storage, in_own_order
-from app.db.selection import Selection
+from app.db.features.collection import Property
+from app.db.features.crs import from_storage, in_own_order
+from app.db.features.query import Selection
 
 DEGREE_DIGITS = 9
 """Decimals of a degree in replies: a tenth of a millimetre."""

@@ -12,8 +12,8 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from app.db.engine import Connection
-from app.db.job_queue import enqueue
-from app.db.jobs import COLUMNS, Job
+from app.db.jobs.jobs import COLUMNS, Job
+from app.db.jobs.queue import enqueue
 
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 

@@ -9,7 +9,7 @@ from psycopg.rows import class_row, scalar_row
 from psycopg.types.json import Jsonb
 
 from app.db.engine import Connection
-from app.db.job_queue import enqueue
+from app.db.jobs.queue import enqueue
 
 JobState = Literal["accepted", "running", "successful", "failed", "dismissed"]
 Response = Literal["document", "raw"]

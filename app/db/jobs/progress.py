@@ -7,7 +7,7 @@ from uuid import UUID
 from psycopg.rows import class_row, scalar_row
 
 from app.db.engine import Connection
-from app.db.jobs import Job
+from app.db.jobs.jobs import Job
 
 PAST_JOBS = 20
 """The last successes of a process whose median duration is expected of the next."""

@@ -18,7 +18,7 @@ from app.db.tokens import Token
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.processes import Commit, Process, Work
-from services.formats.block_document import (
+from services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
     BlockDocument,
@@ -27,8 +27,8 @@ from services.formats.block_document import (
     Provenance,
     rectangle,
 )
-from services.formats.block_json import parse_block_json
-from services.formats.block_writing import write_block
+from services.formats.block.document_json import parse_block_json
+from services.formats.block.writer import write_block
 from services.types import (
     Array,
     ChipArray,

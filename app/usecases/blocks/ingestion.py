@@ -11,12 +11,12 @@ from app.db import uploads
 from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError, NotFound
-from app.usecases import blocks
-from app.usecases.block_uploads import finished_block
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.uploads import finished_block
 from app.usecases.processes import Commit, Process, Work
 from services.errors import FormatError
 from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
-from services.formats.block_json import BLOCK_JSON
+from services.formats.block.document_json import BLOCK_JSON
 from services.quality.block import quality_document
 
 UNPACKED_TIMES = 4
@@ -54,19 +54,19 @@ def _run(work: Work) -> Commit:
     # Lives as long as the transaction may need it; goes with the attempt's process at the latest.
     scratch = tempfile.TemporaryDirectory(prefix="amers-block-")
     folder = (
-        blocks.folder_to_ingest(work.settings.ingest_folder, inputs.path)
+        lifecycle.folder_to_ingest(work.settings.ingest_folder, inputs.path)
         if inputs.path is not None
         else _unpacked(work, inputs.upload, Path(scratch.name))
     )
 
     def commit(connection: Connection) -> dict[str, Any]:
         with scratch:
-            ingested = blocks.ingest_block(
+            ingested = lifecycle.ingest_block(
                 connection, work.storage, folder, work.progress, inputs.priority
             )
         block = ingested.block
         if inputs.publish:
-            block = blocks.publish_block(connection, str(block.number)).block
+            block = lifecycle.publish_block(connection, str(block.number)).block
         figures = quality_document(ingested.quality)
         return {
             "number": block.number,

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from app.db import blocks, overlaps
+from app.db import blocks, superseding
 from app.db.blocks import Block, BlockState
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
 from app.errors import Conflict, InputError, NotFound
 from app.storage import Storage, StoredFile
 from services.errors import FormatError
-from services.formats.block import BlockContents, block_member
-from services.formats.block_check import check_block, check_checksums
-from services.formats.block_document import AccuracyFigure
-from services.formats.block_json import BLOCK_JSON, parse_block_json
-from services.formats.chip_files import ChipFile, read_chip_file
+from services.formats.block.check import check_block, check_checksums
+from services.formats.block.document import AccuracyFigure
+from services.formats.block.document_json import BLOCK_JSON, parse_block_json
+from services.formats.block.reader import BlockContents, block_member
+from services.formats.chips.npy_files import ChipFile, read_chip_file
 from services.quality.block import BlockQuality, block_quality
 from services.types import Progress, no_progress, part_of
 
@@ -111,7 +111,8 @@ def ingest_block(
 def publish_block(connection: Connection, reference: str) -> Published:
     """Make a block visible, and the version of it that was visible before no longer, in one step.
 
-    Of points of several blocks over one place those of the better block are served: `app.db.overlaps`.
+    Where several blocks have a point at one place, the point of the better block is served: see
+    `app.db.superseding`.
 
     Raises:
         NotFound: there is no such block.
@@ -122,8 +123,8 @@ def publish_block(connection: Connection, reference: str) -> Published:
     _change(connection, block, "published")
     if before is not None:
         _change(connection, before, "withdrawn")
-        overlaps.settle(connection, before.number)
-    overlaps.settle(connection, block.number)
+        superseding.recompute(connection, before.number)
+    superseding.recompute(connection, block.number)
     return Published(
         blocks.read_block_row(connection, block.number),
         None if before is None else blocks.read_block_row(connection, before.number),
@@ -139,7 +140,7 @@ def withdraw_block(connection: Connection, reference: str) -> Block:
     """
     block, _ = _to_change(connection, reference)
     _change(connection, block, "withdrawn")
-    overlaps.settle(connection, block.number)
+    superseding.recompute(connection, block.number)
     return blocks.read_block_row(connection, block.number)
 
 
@@ -170,7 +171,7 @@ def prioritise_block(connection: Connection, reference: str, priority: int) -> B
     block, _ = _to_change(connection, reference)
     blocks.set_priority(connection, block.number, priority)
     if block.state == "published":
-        overlaps.settle(connection, block.number)
+        superseding.recompute(connection, block.number)
     return blocks.read_block_row(connection, block.number)
 
 
@@ -273,7 +274,7 @@ def sweep_storage(connection: Connection, storage: Storage) -> list[str]:
 
 def _to_change(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
     """A block as it stands once nobody else is changing it, and all versions of it."""
-    overlaps.lock_publications(connection)
+    superseding.lock_publications(connection)
     number = find_block(connection, reference).number
     versions = blocks.lock_versions(connection, blocks.read_block_row(connection, number).id)
     return next(version for version in versions if version.number == number), versions

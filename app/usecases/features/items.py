@@ -7,21 +7,21 @@ from datetime import datetime
 
 import psycopg
 
-from app.db import feature_counts, feature_text, features
-from app.db.collections import Collection, Viewer
-from app.db.crs import Crs
 from app.db.density import DENSITY
 from app.db.engine import Connection
-from app.db.feature_counts import Count
-from app.db.features import Reading
+from app.db.features import counts, pages, serialization
+from app.db.features.collection import Collection, Viewer
+from app.db.features.counts import Count
+from app.db.features.crs import Crs
+from app.db.features.outlines import BLOCKS, SCENES
+from app.db.features.pages import Reading
+from app.db.features.query import Key, Selection
 from app.db.history import HISTORY
-from app.db.outlines import BLOCKS, SCENES
 from app.db.points import POINTS
-from app.db.selection import Key, Selection
 from app.errors import InvalidParameter, NotFound
-from app.usecases.page_tokens import format_token
-from app.usecases.questions import Asked, Question, condition_of, crs_of
-from services.formats.feature_files import Column, FeatureTable, read_feature_csv
+from app.usecases.features.page_tokens import format_token
+from app.usecases.features.query import FeatureQuery, ResolvedQuery, condition_of, crs_of
+from services.formats.vector.feature_files import Column, FeatureTable, read_feature_csv
 
 COLLECTIONS: Mapping[str, Collection] = {
     collection.id: collection for collection in (POINTS, BLOCKS, DENSITY, HISTORY, SCENES)
@@ -59,25 +59,25 @@ def find_collection(name: str) -> Collection:
     return found
 
 
-def page(connection: Connection, asked: Asked, kind: features.Text, secret: bytes) -> Answer:
+def page(connection: Connection, asked: ResolvedQuery, kind: pages.Text, secret: bytes) -> Answer:
     """A page in a format that the database makes.
 
     Raises:
         InvalidParameter: a value of the filter cannot be calculated with.
     """
     try:
-        found = features.page(connection, asked.selection, kind, asked.after, asked.limit)
+        found = pages.page(connection, asked.selection, kind, asked.after, asked.limit)
         matched = _matched(connection, asked, found.last, found.returned)
     except psycopg.DataError as error:
         raise _unusable(error) from error
     return Answer(found.body, found.returned, matched, _next(asked, found.last, matched, secret))
 
 
-def table(connection: Connection, asked: Asked, secret: bytes) -> tuple[FeatureTable, Answer]:
+def table(connection: Connection, asked: ResolvedQuery, secret: bytes) -> tuple[FeatureTable, Answer]:
     """A page as columns, for the formats that hold columns."""
     selection = asked.selection
     try:
-        text = features.copy_csv(connection, selection, asked.after, asked.limit)
+        text = pages.copy_csv(connection, selection, asked.after, asked.limit)
     except psycopg.DataError as error:
         raise _unusable(error) from error
     columns = [
@@ -92,10 +92,10 @@ def table(connection: Connection, asked: Asked, secret: bytes) -> tuple[FeatureT
     return read, Answer(b"", len(read), matched, _next(asked, last, matched, secret))
 
 
-def stream(connection: Connection, asked: Asked, secret: bytes) -> Iterator[bytes | Answer]:
+def stream(connection: Connection, asked: ResolvedQuery, secret: bytes) -> Iterator[bytes | Answer]:
     """The features of a large page as GeoJSON, in pieces; the last thing is the answer about them."""
     reading = Reading()
-    yield from features.stream_geojson(connection, asked.selection, asked.after, asked.limit, reading)
+    yield from pages.stream_geojson(connection, asked.selection, asked.after, asked.limit, reading)
     matched = _matched(connection, asked, reading.last, reading.returned)
     yield Answer(b"", reading.returned, matched, _next(asked, reading.last, matched, secret))
 
@@ -110,7 +110,7 @@ def find_feature(
     """
     chosen = crs_of("crs", crs, collection) if crs else collection.storage_crs
     selection = Selection(collection, viewer, chosen, collection.properties)
-    found = None if "\0" in reference else features.find(connection, selection, reference)
+    found = None if "\0" in reference else pages.find(connection, selection, reference)
     if found is None:
         raise NotFound(f"no feature {reference:.100} in {collection.id}")
     return found, chosen
@@ -120,7 +120,7 @@ def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tu
     """West, south, east, north of what the viewer may see of a collection, None without any."""
     # Points lie in the outlines of their blocks, which are fewer; so do cells, to a tenth of a degree.
     whose = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
-    return feature_counts.extent(connection, whose, viewer if whose is collection else Viewer())
+    return counts.extent(connection, whose, viewer if whose is collection else Viewer())
 
 
 def period(
@@ -129,7 +129,7 @@ def period(
     """The first and the last time of what the viewer may see of scenes; unknown for the others."""
     if collection is not SCENES:
         return None, None
-    return feature_counts.period(connection, collection, viewer)
+    return counts.period(connection, collection, viewer)
 
 
 def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
@@ -138,20 +138,20 @@ def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
     Raises:
         InvalidParameter: the box cannot be used.
     """
-    condition = condition_of(collection, Question(bbox=bbox))
+    condition = condition_of(collection, FeatureQuery(bbox=bbox))
     return Selection(collection, Viewer(), collection.storage_crs, collection.properties, condition)
 
 
-def _matched(connection: Connection, asked: Asked, last: Key | None, returned: int) -> Count:
+def _matched(connection: Connection, asked: ResolvedQuery, last: Key | None, returned: int) -> Count:
     """How many match; a first page that holds them all has counted them already."""
     if asked.matched is not None:
         return asked.matched
     if last is None and asked.after is None:
         return Count(returned, exact=True)
-    return feature_counts.count(connection, asked.selection)
+    return counts.count(connection, asked.selection)
 
 
-def _next(asked: Asked, last: Key | None, matched: Count, secret: bytes) -> str | None:
+def _next(asked: ResolvedQuery, last: Key | None, matched: Count, secret: bytes) -> str | None:
     return None if last is None else format_token(last, matched, asked.fingerprint, secret)
 
 
@@ -162,9 +162,9 @@ def _unusable(error: psycopg.DataError) -> InvalidParameter:
 
 def page_secret(connection: Connection) -> bytes:
     """What the installation signs the links to further pages with."""
-    return features.page_secret(connection)
+    return pages.page_secret(connection)
 
 
 def csv_header(selection: Selection) -> str:
     """The names of the columns of CSV."""
-    return feature_text.csv_header(selection)
+    return serialization.csv_header(selection)

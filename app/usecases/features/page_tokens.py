@@ -4,8 +4,8 @@ import base64
 import hmac
 import json
 
-from app.db.feature_counts import Count
-from app.db.selection import Key
+from app.db.features.counts import Count
+from app.db.features.query import Key
 from app.errors import InvalidParameter
 
 

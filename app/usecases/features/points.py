@@ -6,21 +6,22 @@ from typing import Literal
 
 import numpy as np
 
-from app.db import feature_counts, features, point_detail, points
-from app.db.collections import Viewer
+from app.db import point_detail, points
 from app.db.engine import Connection
-from app.db.feature_counts import Count
-from app.db.feature_text import csv_header
-from app.db.features import Reading
+from app.db.features import counts, pages
+from app.db.features.collection import Viewer
+from app.db.features.counts import Count
+from app.db.features.pages import Reading
+from app.db.features.query import Selection
+from app.db.features.serialization import csv_header
 from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
-from app.db.selection import Selection
 from app.errors import InvalidParameter, NotFound
-from app.usecases.features import everything_in
-from app.usecases.questions import MOST_FEATURES, Question, condition_of
-from services.formats.chip_images import LabelledChips
-from services.formats.chip_pages import stream_chips_tiff
-from services.formats.chip_stacks import stream_chips_npz
+from app.usecases.features.items import everything_in
+from app.usecases.features.query import MOST_FEATURES, FeatureQuery, condition_of
+from services.formats.chips.images import LabelledChips
+from services.formats.chips.stacks import stream_chips_npz
+from services.formats.chips.tiff_pages import stream_chips_tiff
 from services.types import Acquisition, ChipSource, ControlPoints
 
 StackFormat = Literal["npz", "tif"]
@@ -31,13 +32,13 @@ MOST_POINTS_WITH_CHIPS = 1_000
 
 def count_points(connection: Connection, bbox: str) -> Count:
     """How many published points a box holds: exact up to 10,000, an estimate beyond."""
-    return feature_counts.count(connection, everything_in(POINTS, bbox))
+    return counts.count(connection, everything_in(POINTS, bbox))
 
 
 def geojson(connection: Connection, bbox: str) -> Iterator[bytes]:
     """All published points of a box as one FeatureCollection, in pieces."""
     yield b'{"type":"FeatureCollection","features":[\n'
-    yield from features.stream_geojson(connection, everything_in(POINTS, bbox), None, ALL, Reading())
+    yield from pages.stream_geojson(connection, everything_in(POINTS, bbox), None, ALL, Reading())
     yield b"\n]}\n"
 
 
@@ -46,7 +47,7 @@ def csv(connection: Connection, bbox: str) -> Iterator[bytes]:
     selection, after = everything_in(POINTS, bbox), None
     yield csv_header(selection).encode() + b"\r\n"
     while True:
-        page = features.page(connection, selection, "csv", after, MOST_FEATURES)
+        page = pages.page(connection, selection, "csv", after, MOST_FEATURES)
         if page.body:
             yield page.body + b"\r\n"
         if page.last is None:
@@ -71,7 +72,7 @@ def points_of_ids(connection: Connection, ids: Sequence[int]) -> ControlPoints:
     return found
 
 
-def points_of_question(connection: Connection, question: Question) -> ControlPoints:
+def points_of_question(connection: Connection, question: FeatureQuery) -> ControlPoints:
     """The published points that a question leaves, with their views.
 
     Raises:
@@ -79,7 +80,7 @@ def points_of_question(connection: Connection, question: Question) -> ControlPoi
     """
     condition = condition_of(POINTS, question)
     selection = Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition)
-    ids = features.keys(connection, selection, MOST_POINTS_WITH_CHIPS)
+    ids = pages.keys(connection, selection, MOST_POINTS_WITH_CHIPS)
     if len(ids) > MOST_POINTS_WITH_CHIPS:
         raise InvalidParameter(
             f"bbox, filter: more than {MOST_POINTS_WITH_CHIPS} points are meant; ask for a smaller place"

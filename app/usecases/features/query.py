@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
-from app.db.box import Box
-from app.db.collections import Collection, Property, Viewer
-from app.db.conditions import ANYTHING, Condition, in_box, in_time
-from app.db.cql2 import geometry_condition, translate
-from app.db.cql2_reading import check_size, parse_instant, parse_json, parse_text
-from app.db.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
-from app.db.feature_counts import Count
-from app.db.selection import Key, Order, Selection
+from app.db.features.bbox import Box
+from app.db.features.collection import Collection, Property, Viewer
+from app.db.features.counts import Count
+from app.db.features.cql2 import geometry_condition, translate
+from app.db.features.cql2_bounds import check_size, parse_instant, parse_json, parse_text
+from app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
+from app.db.features.predicates import ANYTHING, Condition, in_box, in_time
+from app.db.features.query import Key, Order, Selection
 from app.errors import InvalidParameter
-from app.usecases.page_tokens import parse_token
+from app.usecases.features.page_tokens import parse_token
 
 DEFAULT_LIMIT = 100
 MOST_FEATURES = 10_000
@@ -25,7 +25,7 @@ FILTER_LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
 
 
 @dataclass(frozen=True)
-class Question:
+class FeatureQuery:
     """What a request says, as it says it; None where it says nothing.
 
     Attributes:
@@ -54,7 +54,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Asked:
+class ResolvedQuery:
     """A question that can be answered.
 
     Attributes:
@@ -72,7 +72,9 @@ class Asked:
     fingerprint: str
 
 
-def understand(collection: Collection, viewer: Viewer, question: Question, secret: bytes) -> Asked:
+def resolve(
+    collection: Collection, viewer: Viewer, question: FeatureQuery, secret: bytes
+) -> ResolvedQuery:
     """What a question means.
 
     Args:
@@ -100,10 +102,10 @@ def understand(collection: Collection, viewer: Viewer, question: Question, secre
         after, matched = parse_token(question.token, fingerprint, secret)
         if len(after) != len(selection.orders):
             raise InvalidParameter("token: not of this query; follow the link `next`")
-    return Asked(selection, min(question.limit, MOST_FEATURES), after, matched, fingerprint)
+    return ResolvedQuery(selection, min(question.limit, MOST_FEATURES), after, matched, fingerprint)
 
 
-def condition_of(collection: Collection, question: Question) -> Condition:
+def condition_of(collection: Collection, question: FeatureQuery) -> Condition:
     parts = []
     if question.bbox is not None:
         crs = crs_of("bbox-crs", question.bbox_crs, None) if question.bbox_crs else CRS84
@@ -129,7 +131,7 @@ def condition_of(collection: Collection, question: Question) -> Condition:
     return condition
 
 
-def _filter(question: Question) -> Any:
+def _filter(question: FeatureQuery) -> Any:
     language = question.filter_lang or ("cql2-text" if isinstance(question.filter, str) else "cql2-json")
     if language not in FILTER_LANGUAGES:
         raise InvalidParameter(

@@ -10,7 +10,7 @@ from uuid import UUID
 
 from app.db.engine import Connection
 from app.db.scene_files import SceneFiles, read_scene_files
-from app.usecases.registration_files import OUTPUTS, media_type
+from app.usecases.registration.deliverables import OUTPUTS, media_type
 
 VERSION = "1.1.0"
 COLLECTION = "scenes"

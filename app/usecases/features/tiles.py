@@ -1,8 +1,8 @@
 """Vector tiles of the collections that are looked at on a map."""
 
 from app.db import tiles
-from app.db.collections import Viewer
 from app.db.engine import Connection
+from app.db.features.collection import Viewer
 from app.errors import NotFound
 
 TILED = ("points", "density", "blocks")

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from app.errors import InputError
-from services.formats.control_point_files import read_control_points
-from services.formats.control_points import MarkedPoints
-from services.quality.checks import CheckPoints
-from services.scene import Scene
+from services.formats.gcp.marked_points import MarkedPoints
+from services.formats.gcp.reader import read_control_points
+from services.imagery.scene import Scene
+from services.quality.check_points import CheckPoints
 from services.sensors.ortho import OrthoModel
 
 

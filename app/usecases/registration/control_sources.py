@@ -8,14 +8,14 @@ from pathlib import Path
 from app.db.engine import Database
 from app.db.points import control_points
 from app.storage import Storage, StoredChips
-from services.formats.block import FolderChips
-from services.formats.block_check import check_block
+from services.formats.block.check import check_block
+from services.formats.block.reader import FolderChips
 from services.reports.summary import BlockUsed
 from services.types import Array, ChipSource, ControlPoints
 
 
 @dataclass(frozen=True)
-class FoundPoints:
+class ControlSet:
     """Control points of a piece of ground.
 
     Attributes:
@@ -31,7 +31,7 @@ class FoundPoints:
     frame_sigma_m: float
 
 
-FindPoints = Callable[[Array], FoundPoints]
+FindPoints = Callable[[Array], ControlSet]
 """Points inside an outline (n, 2) of lon, lat."""
 
 
@@ -41,9 +41,9 @@ def points_of_block(folder: Path) -> FindPoints:
     metadata = contents.document.metadata
     said = next((figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m"), None)
 
-    def find(outline: Array) -> FoundPoints:
+    def find(outline: Array) -> ControlSet:
         block = BlockUsed(metadata.id, metadata.version)
-        return FoundPoints(contents.points, FolderChips(folder), (block,), _frame_sigma_m([said]))
+        return ControlSet(contents.points, FolderChips(folder), (block,), _frame_sigma_m([said]))
 
     return find
 
@@ -51,12 +51,12 @@ def points_of_block(folder: Path) -> FindPoints:
 def points_of_store(database: Database, storage: Storage) -> FindPoints:
     """Points of the published blocks of the store."""
 
-    def find(outline: Array) -> FoundPoints:
+    def find(outline: Array) -> ControlSet:
         with database.transaction() as connection:
             found = control_points(connection, outline)
         blocks = tuple(BlockUsed(block.id, block.version) for block in found.blocks)
         frame_sigma_m = _frame_sigma_m([block.frame_sigma_m for block in found.blocks])
-        return FoundPoints(found.points, StoredChips(storage), blocks, frame_sigma_m)
+        return ControlSet(found.points, StoredChips(storage), blocks, frame_sigma_m)
 
     return find
 

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from services.formats.control_points import marked_points
-from services.formats.control_points_json import format_measures, format_opf, measure_status
-from services.formats.control_points_odm import format_gcp_list
-from services.formats.control_points_pci import format_pci_text
-from services.formats.control_points_text import format_asp_gcp, format_envi_pts, format_qgis_points
-from services.formats.refined import write_refined
-from services.formats.residual_layers import exaggeration_for, write_residual_layers
-from services.imagery import reduce_image, render_chip
-from services.registration import Registration, RegistrationOptions
+from services.formats.gcp.json_formats import format_measures, format_opf, measure_status
+from services.formats.gcp.marked_points import marked_points
+from services.formats.gcp.odm import format_gcp_list
+from services.formats.gcp.pci import format_pci_text
+from services.formats.gcp.text_formats import format_asp_gcp, format_envi_pts, format_qgis_points
+from services.formats.sensor_models.refined_model import write_refined
+from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
+from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
+from services.imagery.source import reduce_image, render_chip
+from services.registration.on_points import Registration, RegistrationOptions
 from services.reports.document import format_report
 from services.reports.html import format_html
 from services.reports.report import RegistrationReport, build_report
 from services.reports.summary import BlockUsed, Check, ChipPair, Method, Quicklook, RegistrationSummary
-from services.scene import Scene, scene_footprint, scene_gsd_m
 from services.sensors.ortho import OrthoModel
 from services.types import Array, ChipSource, ControlPoints, Measures, point_chips
 

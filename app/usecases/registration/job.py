@@ -10,17 +10,17 @@ from app.auth import Scope
 from app.db import scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
-from app.usecases.ground_control import points_of_store
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.references import references_of_store
-from app.usecases.registration import Method, SceneFiles, record, run_registration
-from app.usecases.registration_files import OUTPUTS
+from app.usecases.registration.control_sources import points_of_store
+from app.usecases.registration.deliverables import OUTPUTS
+from app.usecases.registration.register import Method, SceneFiles, record, run_registration
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
-from services.formats.bands import parse_bands
-from services.registration import RegistrationOptions
+from services.formats.images.bands import parse_bands
+from services.imagery.scene import scene_gsd_m
+from services.registration.on_points import RegistrationOptions
 from services.reports.summary import Method as ReportedMethod
-from services.scene import scene_gsd_m
 
 
 @dataclass(frozen=True)

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from app.errors import InputError
-from app.usecases.ground_control import FoundPoints
 from app.usecases.orthorectification import TerrainFile
-from services.formats.dem import read_dem
-from services.formats.raster import map_grid_of, open_raster
-from services.homologous import ReferenceChips, homologous_points
-from services.matching.dense import Reference
-from services.reference import ReferenceOptions, register_on_reference
-from services.registration import Registration, RegistrationOptions
+from app.usecases.registration.control_sources import ControlSet
+from services.formats.elevation.dem import read_dem
+from services.formats.images.raster import map_grid_of, open_raster
+from services.imagery.scene import Scene
+from services.matching.reference_image import Reference
+from services.registration.on_points import Registration, RegistrationOptions
+from services.registration.on_reference import ReferenceOptions, register_on_reference
+from services.registration.reference_points import ReferenceChips, homologous_points
 from services.reports.summary import BlockUsed
-from services.scene import Scene
 from services.sensors.ortho import OrthoModel
 from services.types import Array, Progress
 
@@ -75,7 +75,7 @@ def this_reference(files: ReferenceFiles) -> FindReference:
 
 def register_on(
     found: FoundReference, scene: Scene, options: RegistrationOptions, progress: Progress
-) -> tuple[Registration, FoundPoints]:
+) -> tuple[Registration, ControlSet]:
     """Register a scene on a reference.
 
     Returns:
@@ -89,7 +89,7 @@ def register_on(
     lon_lat_h = registration.measures.lon_lat_h
     points, chips = homologous_points(lon_lat_h, held), ReferenceChips(held, lon_lat_h)
     used = BlockUsed(found.name, "reference image")
-    return registration, FoundPoints(points, chips, (used,), held.frame_sigma_m)
+    return registration, ControlSet(points, chips, (used,), held.frame_sigma_m)
 
 
 def read_reference(files: ReferenceFiles) -> Reference:

@@ -13,20 +13,20 @@ import shapely
 from app.db import registrations
 from app.db.engine import Connection
 from app.usecases import history
-from app.usecases.check_points import read_check_points
-from app.usecases.ground_control import FindPoints, FoundPoints
-from app.usecases.reference import FindReference, FoundReference, register_on
 from app.usecases.references import keep_places
-from app.usecases.registration_files import write_outputs
+from app.usecases.registration.check_points import read_check_points
+from app.usecases.registration.control_sources import ControlSet, FindPoints
+from app.usecases.registration.deliverables import write_outputs
+from app.usecases.registration.reference_source import FindReference, FoundReference, register_on
 from services.errors import CoverageError
-from services.formats.bands import parse_bands
-from services.formats.scenes import read_scene
-from services.quality.checks import CheckPoints, check_model, qualified_by
-from services.registration import Registration, RegistrationOptions, register_scene
+from services.formats.images.bands import parse_bands
+from services.formats.images.scenes import read_scene
+from services.imagery.scene import Scene, scene_footprint
+from services.quality.check_points import CheckPoints, check_model, qualified_by
+from services.registration.on_points import Registration, RegistrationOptions, register_scene
 from services.reports.document import report_document
 from services.reports.report import RegistrationReport
 from services.reports.summary import Check
-from services.scene import Scene, scene_footprint
 from services.types import Array, Progress, no_progress
 
 Method = Literal["auto", "points", "reference"]
@@ -45,7 +45,7 @@ class SceneFiles:
         image: the image; what lies beside it is looked at for a model.
         model: file of the model, if it is not found by itself.
         sigma_m: accuracy of the model, metres; by default what the producer or the sensor says.
-        bands: what is looked at; see `services.formats.bands.parse_bands`.
+        bands: what is looked at; see `services.formats.images.bands.parse_bands`.
         mask: image of the same ground, not zero where pixels shall not be used.
         check_points: points held out of the registration.
         check_heights: what their heights are above, where their format cannot say.
@@ -151,7 +151,7 @@ def _registered(
     find_reference: FindReference | None,
     options: RegistrationOptions,
     progress: Progress,
-) -> tuple[Registration, FoundPoints, FoundReference | None]:
+) -> tuple[Registration, ControlSet, FoundReference | None]:
     """A registration and what it was made on: control points, or else places of a reference."""
     missing = CoverageError("no reference image shows the ground of the scene")
     if find_points is not None:
@@ -173,7 +173,7 @@ def _registered(
 def _checked(
     registration: Registration,
     points: CheckPoints,
-    found: FoundPoints,
+    found: ControlSet,
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:

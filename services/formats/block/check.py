@@ -7,19 +7,25 @@ from pathlib import Path
 import numpy.typing as npt
 
 from services.errors import FormatError
-from services.formats.block import BlockContents, assemble, block_member, file_sha256, read_document
-from services.formats.block_document import BlockDocument
-from services.formats.block_json import BLOCK_JSON
-from services.formats.block_problems import ProblemReport
-from services.formats.block_rows import check_order, check_points, check_views
-from services.formats.block_tables import (
+from services.formats.block.document import BlockDocument
+from services.formats.block.document_json import BLOCK_JSON
+from services.formats.block.problems import ProblemReport
+from services.formats.block.reader import (
+    BlockContents,
+    assemble,
+    block_member,
+    file_sha256,
+    read_document,
+)
+from services.formats.block.row_checks import check_order, check_points, check_views
+from services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     PointRows,
     read_points,
     read_views,
 )
-from services.formats.chip_files import ChipFile, read_chip_file
+from services.formats.chips.npy_files import ChipFile, read_chip_file
 from services.types import Progress, no_progress
 
 FILES_AT_ONCE = 4

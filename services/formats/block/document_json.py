@@ -11,7 +11,7 @@ import numpy as np
 
 from services.conventions import CHIP_SIZE
 from services.errors import FormatError
-from services.formats.block_document import (
+from services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
     BlockCounts,

@@ -9,9 +9,9 @@ from types import TracebackType
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.block_document import BlockDocument
-from services.formats.block_json import BLOCK_JSON, parse_block_json
-from services.formats.block_tables import (
+from services.formats.block.document import BlockDocument
+from services.formats.block.document_json import BLOCK_JSON, parse_block_json
+from services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     Dates,
@@ -22,7 +22,7 @@ from services.formats.block_tables import (
     read_points,
     read_views,
 )
-from services.formats.chip_files import ChipFile, read_chip_file, read_chips
+from services.formats.chips.npy_files import ChipFile, read_chip_file, read_chips
 from services.types import ChipArray, ControlPoints, IntArray, Views
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import shapely
 
-from services.formats.block_document import BlockDocument
-from services.formats.block_json import BLOCK_JSON
-from services.formats.block_problems import ProblemReport
-from services.formats.block_tables import POINTS_PARQUET, VIEWS_PARQUET, PointRows, ViewRows
+from services.formats.block.document import BlockDocument
+from services.formats.block.document_json import BLOCK_JSON
+from services.formats.block.problems import ProblemReport
+from services.formats.block.tables import POINTS_PARQUET, VIEWS_PARQUET, PointRows, ViewRows
 from services.types import Array, BoolArray, IntArray
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0

@@ -15,10 +15,11 @@ import numpy as np
 
 from services.conventions import CHIP_SIZE
 from services.errors import FormatError, InputError
-from services.formats.block import file_sha256
-from services.formats.block_document import NAME_PATTERN, BlockCounts, BlockDocument, BlockMetadata
-from services.formats.block_json import BLOCK_JSON, format_block_json
-from services.formats.block_tables import (
+from services.formats.block.document import NAME_PATTERN, BlockCounts, BlockDocument, BlockMetadata
+from services.formats.block.document_json import BLOCK_JSON, format_block_json
+from services.formats.block.hilbert import hilbert_order
+from services.formats.block.reader import file_sha256
+from services.formats.block.tables import (
     POINTS_PARQUET,
     VIEWS_PARQUET,
     Dates,
@@ -29,9 +30,8 @@ from services.formats.block_tables import (
     write_points,
     write_views,
 )
-from services.formats.chip_files import CHIP_DTYPES, chip_file_header
-from services.formats.hilbert import hilbert_order
-from services.formats.rpc_text import format_rpc_text
+from services.formats.chips.npy_files import CHIP_DTYPES, chip_file_header
+from services.formats.sensor_models.rpc_text import format_rpc_text
 from services.sensors.rpc import RpcModel
 from services.types import Acquisition, ChipArray, ControlPoints, IntArray, Progress, no_progress
 

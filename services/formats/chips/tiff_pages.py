@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from services.conventions import CHIP_CENTRE
-from services.formats.chip_stacks import chip_runs, chip_table, read_runs
+from services.formats.chips.stacks import chip_runs, chip_table, read_runs
 from services.geodesy import metres_per_degree
 from services.types import ChipArray, ChipSource, ControlPoints
 

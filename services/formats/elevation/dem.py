@@ -8,9 +8,9 @@ import numpy as np
 from pyproj import CRS
 
 from services.errors import CoverageError, FormatError, VerticalDatumError
-from services.formats.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
-from services.formats.raster import RasterImage, map_grid_of, open_raster
-from services.imagery import ImageSource, Window
+from services.formats.elevation.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
+from services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from services.imagery.source import ImageSource, Window
 from services.terrain import Geoid, Terrain
 from services.types import FloatImage
 

@@ -9,7 +9,7 @@ import numpy as np
 from pyproj import CRS
 
 from services.errors import FormatError, InputError, VerticalDatumError
-from services.formats.control_points import (
+from services.formats.gcp.marked_points import (
     MarkedPoints,
     crs_from,
     ground_from,

@@ -11,8 +11,14 @@ import numpy as np
 from pyproj import CRS
 
 from services.errors import FormatError
-from services.formats.control_point_lines import coordinate_array, format_mark, lines_of, numbers_of
-from services.formats.control_points import ELLIPSOID, MarkedPoints, crs_from, ground_from, marked_points
+from services.formats.gcp.marked_points import (
+    ELLIPSOID,
+    MarkedPoints,
+    crs_from,
+    ground_from,
+    marked_points,
+)
+from services.formats.gcp.text_lines import coordinate_array, format_mark, lines_of, numbers_of
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS]?)", re.IGNORECASE)
 _NAMES = ["geo_x", "geo_y", "geo_z", "im_x", "im_y"]

@@ -13,7 +13,14 @@ import re
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.control_point_lines import (
+from services.formats.gcp.marked_points import (
+    ELLIPSOID,
+    MarkedPoints,
+    crs_from,
+    ground_from,
+    marked_points,
+)
+from services.formats.gcp.text_lines import (
     coordinate_array,
     counted_ids,
     format_deg,
@@ -22,7 +29,6 @@ from services.formats.control_point_lines import (
     lines_of,
     numbers_of,
 )
-from services.formats.control_points import ELLIPSOID, MarkedPoints, crs_from, ground_from, marked_points
 
 PCI_CORNER_PX = 0.5
 """PCI counts from the corner of the first pixel."""

@@ -4,19 +4,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 from services.errors import FormatError
-from services.formats.control_points import MarkedPoints
-from services.formats.control_points_json import parse_geojson_points, parse_opf
-from services.formats.control_points_odm import parse_gcp_list
-from services.formats.control_points_pci import is_pci_text, parse_pci_text
-from services.formats.control_points_text import parse_asp_gcp, parse_envi_pts, parse_qgis_points
-from services.formats.rpc_files import read_text
+from services.formats.gcp.json_formats import parse_geojson_points, parse_opf
+from services.formats.gcp.marked_points import MarkedPoints
+from services.formats.gcp.odm import parse_gcp_list
+from services.formats.gcp.pci import is_pci_text, parse_pci_text
+from services.formats.gcp.text_formats import parse_asp_gcp, parse_envi_pts, parse_qgis_points
+from services.formats.sensor_models.rpc_files import read_text
 
 Parser = Callable[[str, str | None, str], MarkedPoints]
 """From the text, what its heights are above where the format cannot say, and the name of the file."""
 
 
 def read_control_points(path: Path, heights: str | None = None) -> MarkedPoints:
-    """Read ground points marked in images, in any format of `services.formats.control_points`.
+    """Read ground points marked in images, in any format of `services.formats.gcp.marked_points`.
 
     Args:
         path: `.gcp`, `.points`, `.pts`, `.txt` for ODM and PCI, `.geojson` and `.json` for GeoJSON, OPF.

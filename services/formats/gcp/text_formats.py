@@ -8,7 +8,15 @@ import numpy as np
 from pyproj import CRS
 
 from services.errors import FormatError, InputError
-from services.formats.control_point_lines import (
+from services.formats.gcp.marked_points import (
+    ELLIPSOID,
+    WGS84_3D,
+    MarkedPoints,
+    crs_from,
+    ground_from,
+    marked_points,
+)
+from services.formats.gcp.text_lines import (
     coordinate_array,
     counted_ids,
     format_deg,
@@ -17,14 +25,6 @@ from services.formats.control_point_lines import (
     format_px,
     lines_of,
     numbers_of,
-)
-from services.formats.control_points import (
-    ELLIPSOID,
-    WGS84_3D,
-    MarkedPoints,
-    crs_from,
-    ground_from,
-    marked_points,
 )
 
 QGIS_CORNER_PX = 0.5

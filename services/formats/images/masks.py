@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.raster import RasterImage, open_raster
-from services.imagery import Window
+from services.formats.images.raster import RasterImage, open_raster
+from services.imagery.source import Window
 from services.types import FloatImage
 
 _SAME_SHAPE = 0.01

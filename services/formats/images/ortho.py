@@ -13,7 +13,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
-from services.formats.raster import (
+from services.formats.images.raster import (
     GDAL_FIRST_PIXEL,
     OPTIONS,
     as_format_error,
@@ -21,7 +21,7 @@ from services.formats.raster import (
     open_raster,
 )
 from services.map_grid import MapGrid
-from services.orthorectify import OrthoWindow
+from services.orthorectification.rectify import OrthoWindow
 from services.types import FloatImage
 
 

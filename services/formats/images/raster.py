@@ -19,8 +19,8 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
-from services.formats.bands import BandMix, default_mix, one_band
-from services.imagery import Window
+from services.formats.images.bands import BandMix, default_mix, one_band
+from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
 from services.types import FloatImage

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.bands import BandMix
-from services.formats.dimap import parse_dimap_acquisition, parse_imaging_time
-from services.formats.masks import masked
-from services.formats.raster import RasterImage, map_grid_of, open_raster
-from services.formats.rpc_files import DeliveredModel, has_rpc, model_of_image, read_text
-from services.formats.rpc_text import rpb_satellite
-from services.imagery import ImageSource
-from services.scene import Scene, view_direction
+from services.formats.images.bands import BandMix
+from services.formats.images.masks import masked
+from services.formats.images.raster import RasterImage, map_grid_of, open_raster
+from services.formats.sensor_models.dimap import parse_dimap_acquisition, parse_imaging_time
+from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image, read_text
+from services.formats.sensor_models.rpc_text import rpb_satellite
+from services.imagery.scene import Scene, view_direction
+from services.imagery.source import ImageSource
 from services.sensors.ortho import OrthoModel
 from services.sensors.rpc import RpcModel
 from services.types import Acquisition, Array

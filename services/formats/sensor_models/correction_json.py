@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.control_points import load_json
+from services.formats.gcp.marked_points import load_json
 from services.sensors.correction import ImageCorrection
 from services.types import Array
 

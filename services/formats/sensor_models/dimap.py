@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.rpc_text import parse_number, rpc_from_numbers
+from services.formats.sensor_models.rpc_text import parse_number, rpc_from_numbers
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_to_ground
 from services.types import Acquisition, Array

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.adjustment.scene import SceneAdjustment
-from services.formats.correction_json import format_correction
-from services.formats.ortho_files import write_refined_ortho
-from services.formats.raster import open_raster
-from services.formats.rpc_files import DeliveredModel, read_rpc, write_model
+from services.adjustment.image_correction import SceneAdjustment
+from services.formats.images.ortho import write_refined_ortho
+from services.formats.images.raster import open_raster
+from services.formats.sensor_models.correction_json import format_correction
+from services.formats.sensor_models.rpc_files import DeliveredModel, read_rpc, write_model
 from services.map_grid import MapGrid
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel, fold_into_ortho

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.raster import RasterImage, copy_with_rpc, open_raster
-from services.formats.rpc_text import (
+from services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
+from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from services.formats.sensor_models.rpc_text import (
     format_rpb,
     format_rpc_text,
     parse_number,

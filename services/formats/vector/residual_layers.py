@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.formats.control_points_json import measure_status, measured_numbers
+from services.formats.gcp.json_formats import measure_status, measured_numbers
 from services.geodesy import metres_per_degree_at
 from services.types import Measures
 

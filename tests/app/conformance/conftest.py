@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from app.usecases import blocks
+from app.usecases.blocks import lifecycle
 from tests.factories import make_block
 
 
@@ -13,11 +13,11 @@ from tests.factories import make_block
 def made(connection, storage, tmp_path):
     """A published block of 60 points, 3 of them tried; one of 10, staged, lies in the same place."""
     made = make_block(tmp_path / "block", count=60)
-    blocks.ingest_block(connection, storage, made.folder)
-    blocks.publish_block(connection, "calanques")
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
     connection.execute("insert into point_history (point_id) select id from point limit 3")
     staged = make_block(tmp_path / "staged", count=10, seed=5, name="staged")
-    blocks.ingest_block(connection, storage, staged.folder)
+    lifecycle.ingest_block(connection, storage, staged.folder)
     connection.commit()
     return made
 

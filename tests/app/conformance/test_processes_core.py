@@ -11,8 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 from jsonschema import Draft202012Validator, validate
 
-from app.db import attempts, engine
-from app.db.jobs import Job
+from app.db import engine
+from app.db.jobs import attempts
+from app.db.jobs.jobs import Job
 from app.storage import Storage
 from app.usecases import results
 from app.usecases.jobs import PROCESSES, error_details

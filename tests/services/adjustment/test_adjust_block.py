@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.block import BlockAdjustment, BlockOptions, adjust_block
+from services.adjustment.bundle import BlockAdjustment, BlockOptions, adjust_block
+from services.adjustment.intersection import intersect
 from services.errors import NoConvergence, NotEnoughPoints
-from services.intersection import intersect
 from services.simulation.view import ViewGeometry
 from services.types import Array, Observations
 from tests.services.simulated import ring_of_geometries

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.scene import AdjustmentOptions, Order, SceneAdjustment, adjust_scene
+from services.adjustment.image_correction import AdjustmentOptions, Order, SceneAdjustment, adjust_scene
 from services.errors import NotEnoughPoints
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
@@ -282,7 +282,7 @@ def test_what_could_not_be_tested_is_not_taken_for_known():
     seen_at = (points.line_sample[near] - found.correction.centre) / found.correction.half_size
     plane = np.column_stack([np.ones(len(seen_at)), seen_at])
     far = np.array([1.0, 1.0, 1.0])
-    expected = np.diag([0.0, 1.0, 1.0]) / DEFAULTS.untested_px**2
+    expected = np.diag([0.0, 1.0, 1.0]) / DEFAULTS.prior_slope_sigma_px**2
     told = far @ np.linalg.inv(plane.T @ plane / NOISE_PX**2 + expected) @ far
     assert std[1].min() > 0.99 * np.sqrt(told)
     assert std[0].max() < 0.5 * std[1].min()
@@ -294,7 +294,7 @@ def test_a_drift_too_small_to_be_seen_is_in_the_stated_accuracy():
     corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]) * (np.array(SHAPE) - 1.0)
     squares, orders = [], []
     for _ in range(TRIALS):
-        slopes = rng.normal(0.0, DEFAULTS.untested_px, (2, 2))
+        slopes = rng.normal(0.0, DEFAULTS.prior_slope_sigma_px, (2, 2))
         points = seen(np.column_stack([[3.0, -2.0], slopes]), rng, 80, noise_px=4.0)
         found = points.adjust()
         error = found.correction.apply(corners) - points.truth.apply(corners)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.intersection import intersect, move_metres, residuals_and_derivatives
+from services.adjustment.intersection import intersect, residuals_and_derivatives
+from services.geodesy import move_metres
 from services.simulation.view import ViewGeometry
 from services.types import Observations
 from tests.services.simulated import ring_of_geometries

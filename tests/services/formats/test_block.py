@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from services.errors import FormatError, InputError
-from services.formats import block_writing
-from services.formats.block import FolderChips, read_block
-from services.formats.block_check import check_block
-from services.formats.block_json import format_block_json, parse_block_json
-from services.formats.block_writing import write_block
-from services.formats.hilbert import hilbert_order
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.block import writer
+from services.formats.block.check import check_block
+from services.formats.block.document_json import format_block_json, parse_block_json
+from services.formats.block.hilbert import hilbert_order
+from services.formats.block.reader import FolderChips, read_block
+from services.formats.block.writer import write_block
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.types import ControlPoints, point_chips
 from tests.factories import MadeBlock, affine_model, control_points, make_block, metadata, noise_chips
 
@@ -72,7 +72,7 @@ def test_chips_that_fill_a_file_go_on_in_the_next_without_splitting_a_point(
     tmp_path, monkeypatch, dtype
 ):
     chip_bytes = 101 * 101 * np.dtype(dtype).itemsize
-    monkeypatch.setattr(block_writing, "CHIP_FILE_BYTES", 14 * chip_bytes)
+    monkeypatch.setattr(writer, "CHIP_FILE_BYTES", 14 * chip_bytes)
 
     block = make_block(tmp_path / "block", count=7, dtype=dtype)
 

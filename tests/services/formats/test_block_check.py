@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.errors import FormatError
-from services.formats.block import FolderChips
-from services.formats.block_check import check_block
-from services.formats.block_problems import BlockProblems
+from services.formats.block.check import check_block
+from services.formats.block.problems import BlockProblems
+from services.formats.block.reader import FolderChips
 from tests.factories import MadeBlock, make_block
 
 

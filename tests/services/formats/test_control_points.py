@@ -15,17 +15,12 @@ from rasterio.control import GroundControlPoint
 from rasterio.transform import RPCTransformer, from_gcps
 
 from services.errors import AmersError, FormatError, InputError, VerticalDatumError
-from services.formats.control_point_files import read_control_points
-from services.formats.control_points import MarkedPoints, marked_points
-from services.formats.control_points_json import (
-    format_opf,
-    opf_camera_id,
-    parse_geojson_points,
-    parse_opf,
-)
-from services.formats.control_points_odm import format_gcp_list, parse_gcp_list
-from services.formats.control_points_pci import format_pci_text, parse_pci_text
-from services.formats.control_points_text import (
+from services.formats.gcp.json_formats import format_opf, opf_camera_id, parse_geojson_points, parse_opf
+from services.formats.gcp.marked_points import MarkedPoints, marked_points
+from services.formats.gcp.odm import format_gcp_list, parse_gcp_list
+from services.formats.gcp.pci import format_pci_text, parse_pci_text
+from services.formats.gcp.reader import read_control_points
+from services.formats.gcp.text_formats import (
     format_asp_gcp,
     format_envi_pts,
     format_qgis_points,
@@ -33,8 +28,8 @@ from services.formats.control_points_text import (
     parse_envi_pts,
     parse_qgis_points,
 )
-from services.formats.raster import gdal_rpc
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.images.raster import gdal_rpc
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
 from services.errors import CoverageError, FormatError, VerticalDatumError
-from services.formats.dem import FilledVoids, read_dem
-from services.formats.geoid import geoid_of_grid
-from services.imagery import ArrayImage, Window
+from services.formats.elevation.dem import FilledVoids, read_dem
+from services.formats.elevation.geoid import geoid_of_grid
+from services.imagery.source import ArrayImage, Window
 from services.terrain import Terrain
 
 a_millimetre = 1e-3

@@ -17,11 +17,11 @@ from pyproj import CRS
 from rasterio.transform import Affine, RPCTransformer
 from rasterio.warp import transform
 
-from services.formats.correction_json import format_correction, parse_correction
-from services.formats.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.ortho_files import write_refined_ortho
-from services.formats.residual_layers import write_residual_layers
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.images.ortho import write_refined_ortho
+from services.formats.sensor_models.correction_json import format_correction, parse_correction
+from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from services.formats.sensor_models.rpc_text import parse_rpc_text
+from services.formats.vector.residual_layers import write_residual_layers
 from services.map_grid import MapGrid
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel

@@ -9,9 +9,9 @@ import rasterio
 from rasterio.transform import RPCTransformer
 
 from services.errors import FormatError
-from services.formats.raster import open_raster
-from services.formats.rpc_files import read_rpc
-from services.imagery import Window
+from services.formats.images.raster import open_raster
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.imagery.source import Window
 from services.sensors.rpc import RpcModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

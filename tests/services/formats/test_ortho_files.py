@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from services.errors import FormatError
-from services.formats.bands import default_mix, parse_bands
-from services.formats.ortho_files import write_refined_ortho
-from services.formats.raster import map_grid_of, open_raster
-from services.formats.scenes import CE90_TO_SIGMA, model_files, read_scene
-from services.imagery import Window
+from services.formats.images.bands import default_mix, parse_bands
+from services.formats.images.ortho import write_refined_ortho
+from services.formats.images.raster import map_grid_of, open_raster
+from services.formats.images.scenes import CE90_TO_SIGMA, model_files, read_scene
+from services.imagery.source import Window
 from services.sensors.correction import CorrectedModel, ImageCorrection
 from services.sensors.ortho import OrthoModel, fold_into_ortho
 

@@ -11,12 +11,12 @@ import rpcfast
 from rasterio.warp import transform
 
 from services.errors import FormatError
-from services.formats.dimap import format_dimap_rpc, parse_dimap_rpc
-from services.formats.rpc_files import read_rpc
-from services.formats.rpc_text import format_rpc_text, parse_rpc_text
-from services.formats.scenes import read_scene
-from services.imagery import Window, render_chip
-from services.scene import Scene, scene_centre, scene_gsd_m
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from services.imagery.source import Window, render_chip
 from services.sensors.correction import fold_into_rpc, no_correction
 from services.sensors.rpc import RpcModel, check_rpc
 from services.types import Array

@@ -12,10 +12,10 @@ import shapely
 from rasterio.transform import Affine
 
 from services.errors import FormatError
-from services.formats.correction_json import format_correction, parse_correction
-from services.formats.refined import write_refined
-from services.formats.residual_layers import exaggeration_for, write_residual_layers
-from services.formats.scenes import read_scene
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.correction_json import format_correction, parse_correction
+from services.formats.sensor_models.refined_model import write_refined
+from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from services.geodesy import metres_per_degree_at
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc

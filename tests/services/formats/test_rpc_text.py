@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from services.errors import FormatError
-from services.formats.rpc_text import (
+from services.formats.sensor_models.rpc_text import (
     format_rpb,
     format_rpc_text,
     parse_rpb,

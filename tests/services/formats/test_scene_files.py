@@ -12,13 +12,13 @@ import rasterio
 from rasterio.transform import Affine
 
 from services.errors import FormatError
-from services.formats.dimap import format_dimap_rpc
-from services.formats.raster import gdal_rpc
-from services.formats.rpc_files import read_rpc, write_model
-from services.formats.rpc_text import format_rpb, format_rpc_text, parse_rpc_text
-from services.formats.scenes import prior_sigma_m, read_scene
-from services.imagery import Window
-from services.scene import scene_centre, scene_gsd_m
+from services.formats.images.raster import gdal_rpc
+from services.formats.images.scenes import prior_sigma_m, read_scene
+from services.formats.sensor_models.dimap import format_dimap_rpc
+from services.formats.sensor_models.rpc_files import read_rpc, write_model
+from services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text, parse_rpc_text
+from services.imagery.scene import scene_centre, scene_gsd_m
+from services.imagery.source import Window
 from services.sensors.correction import fold_into_rpc, no_correction
 from services.sensors.rpc import RpcModel
 from services.types import Array

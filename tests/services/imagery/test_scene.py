@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPoint, Polygon
 
-from services.imagery import ArrayImage
-from services.scene import Scene, scene_centre, scene_footprint, scene_gsd_m, view_direction
+from services.imagery.scene import Scene, scene_centre, scene_footprint, scene_gsd_m, view_direction
+from services.imagery.source import ArrayImage
 from services.simulation.view import ViewGeometry, plan_geometry
 from services.simulation.world import World, make_world
 from services.types import Array

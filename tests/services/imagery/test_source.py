@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
-from services.imagery import (
+from services.imagery.source import (
     ArrayImage,
     KeptWindows,
     Window,

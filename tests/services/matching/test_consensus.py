@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from services.matching.consensus import Consensus, affine_consensus, agreeing_points, vote
+from services.matching.consensus import (
+    Consensus,
+    a_contrario_consensus,
+    affine_consensus,
+    agreeing_points,
+)
 from services.types import Array
 
 REACH_M = 60.0
@@ -21,7 +26,10 @@ def everywhere(rng: np.random.Generator, count: int) -> Array:
 def chance(count: int, seed: int = 0) -> Array:
     """False alarms stated for many sets of displacements that mean nothing."""
     rng = np.random.default_rng(seed)
-    trials = (vote(everywhere(rng, count), TOLERANCE_M, REACH_M) for _ in range(CALIBRATION_TRIALS))
+    trials = (
+        a_contrario_consensus(everywhere(rng, count), TOLERANCE_M, REACH_M)
+        for _ in range(CALIBRATION_TRIALS)
+    )
     return np.array([trial.false_alarms for trial in trials])
 
 
@@ -31,7 +39,7 @@ def test_the_vote_finds_the_right_two_fifths(seed: int) -> None:
     truth = rng.uniform(-40.0, 40.0, 2)
     displacement = everywhere(rng, 40)
     displacement[:16] = truth + rng.normal(0.0, NOISE_M, (16, 2))
-    found = vote(displacement, TOLERANCE_M, REACH_M)
+    found = a_contrario_consensus(displacement, TOLERANCE_M, REACH_M)
     assert found.agreeing[:16].sum() >= 15
     assert found.agreeing[16:].sum() <= 2
     assert np.hypot(*(found.displacement - truth)) < a_metre
@@ -41,7 +49,7 @@ def test_the_vote_finds_the_right_two_fifths(seed: int) -> None:
 def test_displacements_that_mean_nothing_are_not_believed() -> None:
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        assert vote(everywhere(rng, 60), TOLERANCE_M, REACH_M).false_alarms > 1e-4
+        assert a_contrario_consensus(everywhere(rng, 60), TOLERANCE_M, REACH_M).false_alarms > 1e-4
 
 
 @pytest.mark.parametrize("count", [5, 10, 20, 40, 60])
@@ -58,7 +66,7 @@ def test_more_voters_that_agree_are_believed_more() -> None:
     for right in (0, 4, 8, 16):
         displacement = noise.copy()
         displacement[:right] = [10.0, -20.0] + rng.normal(0.0, NOISE_M, (right, 2))
-        stated.append(vote(displacement, TOLERANCE_M, REACH_M).false_alarms)
+        stated.append(a_contrario_consensus(displacement, TOLERANCE_M, REACH_M).false_alarms)
     assert stated[0] > 0.1
     assert np.all(np.diff(stated) < 0.0)
 
@@ -68,7 +76,10 @@ def test_what_was_not_found_does_not_vote() -> None:
     displacement = everywhere(rng, 30)
     displacement[:12] = [10.0, -20.0] + rng.normal(0.0, NOISE_M, (12, 2))
     padded = np.concatenate([np.full((25, 2), np.nan), displacement])
-    alone, among = vote(displacement, TOLERANCE_M, REACH_M), vote(padded, TOLERANCE_M, REACH_M)
+    alone, among = (
+        a_contrario_consensus(displacement, TOLERANCE_M, REACH_M),
+        a_contrario_consensus(padded, TOLERANCE_M, REACH_M),
+    )
     assert among.false_alarms == alone.false_alarms
     np.testing.assert_array_equal(among.agreeing[25:], alone.agreeing)
     assert not among.agreeing[:25].any()
@@ -76,9 +87,9 @@ def test_what_was_not_found_does_not_vote() -> None:
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_nobody_and_one_alone_do_not_agree(count: int) -> None:
-    found: Consensus = vote(np.full((3, 2), np.nan), TOLERANCE_M, REACH_M)
+    found: Consensus = a_contrario_consensus(np.full((3, 2), np.nan), TOLERANCE_M, REACH_M)
     if count:
-        found = vote(np.array([[1.0, 2.0], [np.nan, np.nan]]), TOLERANCE_M, REACH_M)
+        found = a_contrario_consensus(np.array([[1.0, 2.0], [np.nan, np.nan]]), TOLERANCE_M, REACH_M)
     assert found.agreeing.sum() == count
     assert found.false_alarms >= 1.0
 

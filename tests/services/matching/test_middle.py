@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from services.matching.chip_extent import middle_of, shown_half_side
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.middle import middle_of, shown_half_side
 from services.types import FloatImage
 from tests.services.textures import as_pixels, moved, texture
 

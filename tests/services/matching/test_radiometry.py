@@ -3,7 +3,7 @@
 import numpy as np
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import clouded, edges, looks_of
+from services.matching.radiometry import clouded, edges, patch_statistics
 from services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
@@ -75,7 +75,7 @@ def test_nothing_is_called_a_cloud_where_no_ground_was_found() -> None:
 def test_squares_not_seen_whole_have_no_looks() -> None:
     pixels = np.tile(np.array([[1.0, 3.0]], dtype=np.float32), (20, 13))
     pixels[15, 15] = np.nan
-    looks = looks_of(pixels)
+    looks = patch_statistics(pixels)
     assert looks.shape == (4, 2)
     np.testing.assert_allclose(looks[:3], [[2.0, 2.0]] * 3)
     assert np.isnan(looks[3]).all()

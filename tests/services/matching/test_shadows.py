@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.shadows import CASTER_M, shadow_move, shadow_of, steady_weights
+from services.matching.shadows import CASTER_M, shadow_move, shadow_of, shadow_weights
 from services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
 
@@ -74,13 +74,13 @@ def test_so_does_a_higher_one() -> None:
 def test_edges_that_no_sun_moves_keep_their_weight() -> None:
     chip = village(0, JUNE)
     away_from_a_southern_sun = chip[2:, 1:-1] < chip[:-2, 1:-1]
-    weights = steady_weights(chip, 0.9, shadow_move(JUNE, OCTOBER, GSD_M))
+    weights = shadow_weights(chip, 0.9, shadow_move(JUNE, OCTOBER, GSD_M))
     assert (weights[~away_from_a_southern_sun] == 1.0).all()
     assert weights[away_from_a_southern_sun].min() < 0.1
 
 
 def test_under_the_same_sun_all_pixels_count_alike() -> None:
-    assert (steady_weights(village(0, JUNE), 0.9, shadow_move(JUNE, JUNE, GSD_M)) == 1.0).all()
+    assert (shadow_weights(village(0, JUNE), 0.9, shadow_move(JUNE, JUNE, GSD_M)) == 1.0).all()
 
 
 def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.matching.shared_error import (
+from services.matching.systematic_error import (
     COMMON_SIGMA_PX,
     LEAN_SIGMA_PX,
     SHADOW_SIGMA_PX,

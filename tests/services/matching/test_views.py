@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.matching.views import choose_views, distances
+from services.matching.view_selection import choose_views, distances
 from services.types import Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(

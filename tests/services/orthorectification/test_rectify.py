@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import rasterio
 
-from services import orthorectify as module
 from services.errors import CoverageError
-from services.formats.ortho_files import write_cog
-from services.imagery import ArrayImage
+from services.formats.images.ortho import write_cog
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
 from services.map_grid import MapGrid
-from services.ortho_mapping import hidden_ground, map_into_image
-from services.orthorectify import OrthoOptions, Window, choose_grid, orthorectify
-from services.scene import Scene
+from services.orthorectification import rectify as module
+from services.orthorectification.mapping import hidden_ground, map_into_image
+from services.orthorectification.rectify import OrthoOptions, Window, choose_grid, orthorectify
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain, meet
+from services.terrain import Terrain, intersect_terrain
 from services.types import Acquisition, FloatImage
 
 the_tolerance_px = 0.1
@@ -108,7 +108,7 @@ def test_the_map_holds_all_the_ground_of_the_scene_and_little_more() -> None:
     grid = choose_grid(scene(), ground)
     assert grid.crs == "EPSG:32631"
     pixels = np.random.default_rng(1).uniform(-0.5, np.array(SHAPE) - 0.5, (500, 2))
-    met = meet(scene().model, pixels, ground)
+    met = intersect_terrain(scene().model, pixels, ground)
     assert grid.contains(grid.line_sample(met[:, :2])).all()
     assert grid.shape[0] * grid.shape[1] < 2.2 * SHAPE[0] * SHAPE[1]
     coarse = choose_grid(scene(), ground, gsd_m=7.0)
@@ -171,7 +171,7 @@ def test_hidden_ground_is_that_which_no_line_of_sight_meets() -> None:
     mapping = map_into_image(scene().model, ground, grid, window, the_tolerance_px)
     assert mapping is not None
     hidden = hidden_ground(scene().model, ground, grid, window, mapping.height_m)
-    met = meet(scene().model, mapping.line_sample.reshape(-1, 2), ground)
+    met = intersect_terrain(scene().model, mapping.line_sample.reshape(-1, 2), ground)
     above_m = met[:, 2].reshape(hidden.shape) - mapping.height_m
     inside = np.isfinite(above_m)
     truly = above_m > 3.0

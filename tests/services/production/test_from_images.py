@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from services.adjustment.intersection import Intersection, intersect
 from services.conventions import CHIP_CENTRE, CHIP_SIZE
 from services.errors import ComputationError, InputError, NotEnoughPoints
-from services.imagery import ArrayImage, render_chip
-from services.intersection import Intersection, intersect
-from services.matching.chips import stored_chip
-from services.production import Production, ProductionOptions, produce_points
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage, render_chip
+from services.matching.multi_image import stored_chip
+from services.production.from_images import Production, ProductionOptions, produce_points
 from services.simulation.view import plan_geometry
 from services.types import Array, Observations
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, SHAPE, block_views, plan, production, world

@@ -8,12 +8,12 @@ import pytest
 
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
-from services.imagery import ArrayImage, render_chip
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage, render_chip
 from services.map_grid import MapGrid
-from services.matching.chips import chip_inside
-from services.ortho_points import Heights, OrthoPointOptions, OrthoPoints, ortho_points
-from services.registration import register_scene
-from services.scene import Scene
+from services.matching.multi_image import chip_inside
+from services.production.from_ortho import Heights, OrthoPointOptions, OrthoPoints, ortho_points
+from services.registration.on_points import register_scene
 from services.sensors.ortho import OrthoModel
 from services.terrain import Terrain
 from services.types import Acquisition, Array

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError
-from services.quality.checks import MARKING_SIGMA_PX, CheckPoints, check_model, qualified_by
+from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, qualified_by
 from services.quality.qualification import QualificationOptions, qualify
 from services.sensors.correction import CorrectedModel
 from tests.services.conftest import GSD_M, SHAPE, FlatModel, Registered

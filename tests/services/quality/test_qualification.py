@@ -12,7 +12,7 @@ from services.quality.qualification import (
     count_equipment,
     image_coverage,
     qualify,
-    rival_share,
+    second_consensus_share,
     verdict_of,
 )
 from services.quality.stability import predict_accuracy
@@ -188,7 +188,7 @@ def test_coverage_is_the_share_of_cells_with_an_active_point():
         ("good_displacement_px", 0.0001, ("displacement_px", "good")),
         ("good_ce90_px", 0.001, ("predicted_ce90_px", "good")),
         ("good_unit_weight", 0.1, ("unit_weight", "good")),
-        ("good_rival_share", -0.1, ("rival_share", "good")),
+        ("good_second_consensus_share", -0.1, ("second_consensus_share", "good")),
         ("usable_active_points", 1000, ("active_points", "usable")),
         ("usable_residual_std_px", 0.01, ("residual_std_px", "usable")),
         ("usable_displacement_px", 0.0001, ("displacement_px", "usable")),
@@ -219,10 +219,10 @@ def test_two_stories_told_by_many_points_are_not_good(registered):
     residual_px[:25] += [8.0, -3.0]
     active[:25] = False
     told = replace(scene.measures, residual_px=residual_px, active=active)
-    assert rival_share(told) == pytest.approx(25 / active.sum())
-    assert ("rival_share", "good") in failed(qualified(replace(scene, measures=told)))
+    assert second_consensus_share(told) == pytest.approx(25 / active.sum())
+    assert ("second_consensus_share", "good") in failed(qualified(replace(scene, measures=told)))
     residual_px[:25] += np.random.default_rng(1).uniform(-60.0, 60.0, (25, 2))
-    assert rival_share(replace(told, residual_px=residual_px)) < 0.2
+    assert second_consensus_share(replace(told, residual_px=residual_px)) < 0.2
 
 
 def test_nineteen_active_points_are_never_good(registered):

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.chip_choice import chance_of_being_shown, fine_gsd_m, has_chip
-from services.coarse import CoarseOptions
 from services.conventions import CHIP_CENTRE
 from services.errors import InputError, NoConsensus
-from services.imagery import ArrayImage
-from services.registration import Registration, RegistrationOptions, register_scene
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.registration.chip_selection import chance_of_being_shown, fine_gsd_m, has_chip
+from services.registration.coarse import CoarseOptions
+from services.registration.on_points import Registration, RegistrationOptions, register_scene
 from services.simulation.view import SimulatedView, plan_geometry
 from services.types import Array, ControlPoints
 from tests.services.simulated import block, plan, spoiled_view, world

@@ -6,13 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from services.adjustment.intersection import intersect
 from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
 from services.geodesy import metres_per_degree
-from services.imagery import ArrayImage
-from services.intersection import intersect
-from services.matching.points import MatchingOptions
-from services.registration import Registration, register_scene
-from services.scene import Scene
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.matching.control_points import MatchingOptions
+from services.registration.on_points import Registration, register_scene
 from services.simulation.view import SimulatedView, simulate_view
 from services.types import Array, Observations
 from tests.services.simulated import block, block_views, plan, production, spoiled_view, world
@@ -141,7 +141,7 @@ def test_every_view_that_was_tried_is_told(name: str) -> None:
     assert (views.reason[views.agreed] == "").all()
     options = MatchingOptions()
     by_gradient = measures.by_gradient[views.point]
-    least = np.where(by_gradient, options.min_edge_score, options.correlation.min_score)
+    least = np.where(by_gradient, options.min_gradient_score, options.correlation.min_score)
     assert (views.score >= least)[views.agreed].all()
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError, InputError, NoConsensus
-from services.imagery import ArrayImage, Window, sample_image
+from services.imagery.source import ArrayImage, Window, sample_image
 from services.map_grid import MapGrid, utm_of
-from services.matching.dense import DenseOptions, Reference
-from services.reference import ReferenceOptions, register_on_reference
-from services.registration import Registration
+from services.matching.reference_image import DenseOptions, Reference
+from services.registration.on_points import Registration
+from services.registration.on_reference import ReferenceOptions, register_on_reference
 from services.sensors.ortho import OrthoModel
 from services.simulation.view import true_ground
 from services.terrain import Terrain

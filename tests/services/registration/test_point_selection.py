@@ -7,11 +7,11 @@ import pytest
 
 from services.conventions import CHIP_CENTRE
 from services.errors import CoverageError
-from services.imagery import ArrayImage
-from services.intersection import move_metres
-from services.matching.middle import LEAST_SHARE
-from services.point_choice import points_to_try, start_uncertainty_m, visible_points
-from services.scene import Scene
+from services.geodesy import move_metres
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.matching.chip_extent import LEAST_SHARE
+from services.registration.point_selection import points_to_try, start_uncertainty_m, visible_points
 from services.sensors.base import SensorModel
 from services.simulation.view import plan_geometry
 from services.types import Array, BoolArray, ControlPoints

@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.passes import Pass
 from services.quality.accuracy import accuracy
 from services.quality.qualification import QualificationOptions, qualify
+from services.registration.search import SearchStage
 from services.reports.report import RegistrationReport, build_report
 from services.reports.summary import BlockUsed, Check, ChipPair, Quicklook, RegistrationSummary
 from services.types import Acquisition, FloatImage
@@ -70,8 +70,8 @@ def summarised(registered) -> Callable[..., RegistrationSummary]:
             blocks=(BlockUsed("calanques", "1"),),
             options=Options(),
             passes=(
-                Pass("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
-                Pass("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
+                SearchStage("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
+                SearchStage("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
             ),
             order_reason="drift: lowest cross-validated residual",
             measures=scene.measures,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
 
 MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from services.adjustment.scene import AdjustmentOptions, adjust_scene
+from services.adjustment.image_correction import AdjustmentOptions, adjust_scene
+from services.imagery.scene import view_direction
 from services.map_grid import MapGrid
-from services.scene import view_direction
 from services.sensors.correction import CorrectedModel, ImageCorrection
 from services.sensors.ortho import OrthoModel, fold_into_ortho
 

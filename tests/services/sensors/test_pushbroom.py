@@ -8,8 +8,8 @@ from services.geodesy import (
     lon_lat_h_from_east_north_up,
     lon_lat_h_from_ecef,
 )
-from services.imagery import image_gsd_m
-from services.scene import view_direction
+from services.imagery.scene import view_direction
+from services.imagery.source import image_gsd_m
 from services.sensors.pushbroom import PushbroomModel
 from services.simulation.orbit import pushbroom_over
 

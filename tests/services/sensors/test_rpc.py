@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rasterio.transform import RPCTransformer
 
 from services.errors import FormatError
-from services.formats.raster import gdal_rpc
-from services.formats.rpc_text import parse_rpc_text
+from services.formats.images.raster import gdal_rpc
+from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.geodesy import ecef_from_lon_lat_h, lon_lat_h_from_east_north_up
 from services.sensors.rpc import RpcModel, check_rpc
 from services.types import Array

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import InputError
-from services.imagery import Window
+from services.imagery.source import Window
 from services.simulation.conditions import CLEAR, CLOUD_LIGHT, Conditions, clouds_over
 from services.simulation.light import day_of, radiance
 from services.simulation.tiles import TiledView

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.imagery import Window
+from services.imagery.source import Window
 from services.simulation.conditions import Conditions
 from services.simulation.render import Radiometry
 from services.simulation.tiles import TILE_PX, TiledView

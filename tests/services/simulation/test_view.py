@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import InputError
-from services.imagery import render_chip
+from services.imagery.source import render_chip
 from services.sensors.correction import CorrectedModel
 from services.simulation.land import NO_ROOF
 from services.simulation.light import radiance_of_day
