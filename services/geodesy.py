@@ -147,6 +147,7 @@ def lon_lat_h_from_east_north_up(enu: Array, origin_lon_lat_h: Array) -> Array:
     return lon_lat_h_from_ecef(origin + enu @ rotation.T)
 
 
+@njit(cache=True)
 def move_metres(lon_lat_h: Array, enu: Array) -> Array:
     """Ground points (n, 3) moved by some metres east, north and up (n, 3); exact for small moves."""
     out = np.empty_like(lon_lat_h)

@@ -80,7 +80,6 @@ def residuals_and_derivatives(
     return residual, derivative
 
 
-@njit(cache=True)
 def _lines_of_sight(models: Sequence[SensorModel], observations: Observations) -> tuple[Array, Array]:
     origin = np.empty((len(observations), 3))
     direction = np.empty((len(observations), 3))
