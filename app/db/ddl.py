@@ -1,0 +1,50 @@
+"""The script that creates the store: functions, tables, indexes, triggers and first rows.
+
+`python -m app.db.ddl` prints it. A release keeps the script in a migration, which no later change of the
+schema touches; `tests/app/test_schema.py` compares a migrated database with the schema.
+"""
+
+from collections.abc import Iterator
+from importlib import resources
+
+from sqlalchemy.dialects.postgresql.psycopg import PGDialect_psycopg
+from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
+
+from app.db.schema import metadata
+
+EXTENSION = "create extension if not exists postgis;\n"
+
+
+def sql_file(name: str) -> str:
+    """The text of a file of `app/db/sql`."""
+    return resources.files("app.db").joinpath("sql", name).read_text()
+
+
+def table_statements() -> Iterator[str]:
+    """The statements that create the tables and indexes; a table comes before those that refer to it."""
+    for table in metadata.sorted_tables:
+        yield _ddl(CreateTable(table))
+        for index in sorted(table.indexes, key=lambda index: index.name or ""):
+            yield _ddl(CreateIndex(index))
+
+
+def store_script() -> str:
+    """The whole script, to run in one transaction on an empty database."""
+    tables = "\n".join(f"{statement};" for statement in table_statements())
+    parts = (
+        EXTENSION,
+        sql_file("functions.sql"),
+        f"{tables}\n",
+        sql_file("triggers.sql"),
+        sql_file("first_rows.sql"),
+    )
+    return "\n".join(parts)
+
+
+def _ddl(element: DDLElement) -> str:
+    lines = str(element.compile(dialect=PGDialect_psycopg())).strip().splitlines()
+    return "\n".join(line.replace("\t", "    ").rstrip() for line in lines)
+
+
+if __name__ == "__main__":
+    print(store_script(), end="")

@@ -1,0 +1,52 @@
+"""The tables of the store: every column, constraint and index, named and typed here and nowhere else.
+
+Statements name columns through these tables, and the column list of a row comes from its table
+(`app/db/rows.py`). Functions, triggers and the first rows are SQL: `app/db/sql/functions.sql`,
+`triggers.sql` and `first_rows.sql`. `python -m app.db.ddl` prints the whole store as one script.
+
+The tables of the queue belong to procrastinate and are not described here.
+"""
+
+from app.db.schema.access import audit, installation, token, uptime
+from app.db.schema.base import BlockState, JobResponse, JobState, SceneState, UploadPurpose, metadata
+from app.db.schema.jobs import job, job_message, scene, upload
+from app.db.schema.points import block, chip_file, density_cell, image, point, view
+from app.db.schema.registrations import (
+    measure,
+    point_history,
+    reference_image,
+    reference_point,
+    registration,
+    view_history,
+    view_measure,
+)
+
+__all__ = [
+    "BlockState",
+    "JobResponse",
+    "JobState",
+    "SceneState",
+    "UploadPurpose",
+    "audit",
+    "block",
+    "chip_file",
+    "density_cell",
+    "image",
+    "installation",
+    "job",
+    "job_message",
+    "measure",
+    "metadata",
+    "point",
+    "point_history",
+    "reference_image",
+    "reference_point",
+    "registration",
+    "scene",
+    "token",
+    "upload",
+    "uptime",
+    "view",
+    "view_history",
+    "view_measure",
+]

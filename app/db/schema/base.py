@@ -1,0 +1,49 @@
+"""What the tables share: the metadata with its names of constraints, types, defaults and choices."""
+
+from typing import Any, Literal, get_args
+
+from geoalchemy2 import Geometry
+from sqlalchemy import CheckConstraint, Computed, DateTime, MetaData, func
+from sqlalchemy import column as column_named
+from sqlalchemy.dialects.postgresql import DOUBLE_PRECISION, JSONB, REAL
+
+BlockState = Literal["staged", "published", "withdrawn"]
+SceneState = Literal["uploading", "uploaded", "removed"]
+JobState = Literal["accepted", "running", "successful", "failed", "dismissed"]
+JobResponse = Literal["document", "raw"]
+UploadPurpose = Literal["image", "model", "block"]
+
+# Names that PostgreSQL gives to constraints without a name; a check adds what it checks.
+NAMING_CONVENTION = {
+    "pk": "%(table_name)s_pkey",
+    "uq": "%(table_name)s_%(column_0_N_name)s_key",
+    "fk": "%(table_name)s_%(column_0_name)s_fkey",
+    "ck": "%(table_name)s_%(constraint_name)s_check",
+}
+
+metadata = MetaData(naming_convention=NAMING_CONVENTION)
+
+Timestamp = DateTime(timezone=True)
+Real = REAL()
+Double = DOUBLE_PRECISION()
+# None is SQL's null, never the JSON value null.
+Json = JSONB(none_as_null=True)
+Polygon = Geometry("POLYGON", srid=4326, spatial_index=False)
+MapOutline = Geometry("GEOMETRY", srid=4326, spatial_index=False)
+PointZ = Geometry("POINTZ", srid=4979, dimension=3, spatial_index=False)
+
+now = func.now()
+# Rows written in one transaction differ in this one.
+clock = func.clock_timestamp()
+uptime_s = func.uptime_s()
+
+
+def one_of(column: str, choices: Any) -> CheckConstraint:
+    """A check that a column has one of the values of a `Literal`."""
+    return CheckConstraint(column_named(column).in_(get_args(choices)), name=column)
+
+
+def on_map(outline: str) -> Computed:
+    """An outline cut at 180 degrees, as RFC 7946 asks; the outline itself stays in one piece."""
+    wrapped = func.st_wrapx(func.st_wrapx(column_named(outline), 180, -360), -180, 360)
+    return Computed(func.st_forcepolygonccw(wrapped), persisted=True)
