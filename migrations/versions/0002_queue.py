@@ -1,7 +1,7 @@
 """The tables of the queue (procrastinate), so that one command makes the whole store.
 
-The SQL is procrastinate's own, of the installed version; raising that version past a change of its
-schema needs a revision that applies the statements of its release.
+The script is procrastinate's own, of the installed version. An upgrade of procrastinate that changes its
+schema needs a revision with the statements of that release.
 """
 
 from alembic import op
@@ -42,7 +42,7 @@ def downgrade() -> None:
 
 
 def _run(script: str) -> None:
-    """Several statements, sent to the driver as they are: percent signs and colons mean nothing."""
+    """Run several statements as they are: percent signs and colons have no meaning to the driver."""
     connection = op.get_bind().connection.driver_connection
     assert connection is not None
     connection.execute(script)

@@ -1,0 +1,17 @@
+-- Let the reading role read all tables, those of later migrations too.
+-- Roles belong to the cluster and not to the database: this is no migration, and a restore runs it again.
+-- Where the owner of the database may not create roles, requests are read as the owner, still read-only.
+do $$ begin
+    begin
+        create role amers_reader nologin;
+    exception when duplicate_object or unique_violation then null;
+    end;
+    if not pg_has_role('amers_reader', 'member') then
+        execute format('grant amers_reader to %I', current_user);
+    end if;
+    grant usage on schema public to amers_reader;
+    grant select on all tables in schema public to amers_reader;
+    alter default privileges in schema public grant select on tables to amers_reader;
+exception when insufficient_privilege then
+    raise notice 'no role amers_reader: %', sqlerrm;
+end $$;
