@@ -170,7 +170,7 @@ def looked_over(dsn: str, siege: Siege, caller: Caller) -> dict[str, Any]:
             connection.execute(
                 "update scene set created_at = created_at - interval '2 days' where state = 'uploading'"
             )
-            connection.execute("update service_time set ran_s = ran_s + 2 * 86400")
+            connection.execute("update uptime set elapsed_s = elapsed_s + 2 * 86400")
         sweep_files(database, storage, settings.job_seconds)
         storage.sweep_unfinished(0.0, spare="upload-")
         with database.transaction() as connection:

@@ -153,7 +153,7 @@ def _record(block: Block) -> Row:
         "state": block.state,
         "priority": block.priority,
         "points": block.n_points,
-        "points superseded": block.n_superseded,
+        "points superseded": block.n_unserved,
         "views": block.n_views,
         "title": block.title,
         "created_at": block.created_at,

@@ -23,7 +23,7 @@ INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
 
 COLUMNS = (
-    "number, id, version, title, state, priority, n_points, n_superseded, n_views, checksum, "
+    "number, id, version, title, state, priority, n_points, n_unserved, n_views, checksum, "
     "created_at, state_changed_at, st_asbinary(extent) as outline"
 )
 
@@ -36,7 +36,7 @@ class Block:
         number: of this version in this database.
         id, version: as its producer names it.
         priority: of blocks over one place, the points of the greater one are served.
-        n_superseded: how many of its points are not served: a better block has them, or they are
+        n_unserved: how many of its points are not served: a better block has them, or they are
             suspended.
         outline: (m, 2) lon, lat, not closed.
         checksum: sha256 of its block.json.
@@ -49,7 +49,7 @@ class Block:
     state: BlockState
     priority: int
     n_points: int
-    n_superseded: int
+    n_unserved: int
     n_views: int
     checksum: str
     created_at: datetime

@@ -5,19 +5,13 @@ schema touches; `tests/app/test_schema.py` compares a migrated database with the
 """
 
 from collections.abc import Iterator
-from importlib import resources
 
-from sqlalchemy.dialects.postgresql.psycopg import PGDialect_psycopg
 from sqlalchemy.schema import CreateIndex, CreateTable, DDLElement
 
 from app.db.schema import metadata
+from app.db.statements import DIALECT, sql_file
 
 EXTENSION = "create extension if not exists postgis;\n"
-
-
-def sql_file(name: str) -> str:
-    """The text of a file of `app/db/sql`."""
-    return resources.files("app.db").joinpath("sql", name).read_text()
 
 
 def table_statements() -> Iterator[str]:
@@ -42,7 +36,7 @@ def store_script() -> str:
 
 
 def _ddl(element: DDLElement) -> str:
-    lines = str(element.compile(dialect=PGDialect_psycopg())).strip().splitlines()
+    lines = str(element.compile(dialect=DIALECT)).strip().splitlines()
     return "\n".join(line.replace("\t", "    ").rstrip() for line in lines)
 
 

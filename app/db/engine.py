@@ -209,28 +209,11 @@ def newest_revision() -> str:
 
 
 def _grant_reading(dsn: str) -> None:
-    """Let the reading role read all tables, those of later migrations too.
+    """Let the reading role read all tables, those of later migrations too."""
+    from app.db.statements import sql_file
 
-    Roles belong to the cluster, not to the database: this is no migration, and a restore does it again.
-    Where the owner of the database may not make roles, reading goes on as the owner, still read-only.
-    """
     with _reachable(dsn) as connection:
-        connection.execute(
-            f"""do $$ begin
-                begin
-                    create role {READER} nologin;
-                exception when duplicate_object or unique_violation then null;
-                end;
-                if not pg_has_role('{READER}', 'member') then
-                    execute format('grant {READER} to %I', current_user);
-                end if;
-                grant usage on schema public to {READER};
-                grant select on all tables in schema public to {READER};
-                alter default privileges in schema public grant select on tables to {READER};
-            exception when insufficient_privilege then
-                raise notice 'no role {READER}: %', sqlerrm;
-            end $$"""
-        )
+        connection.execute(sql_file("grants.sql").encode())
 
 
 def _may_read_as_reader(dsn: str) -> bool:

@@ -59,7 +59,7 @@ POINTS = Collection(
     interval=("first_view", "last_view"),
     everything=EVERYTHING,
     total=(
-        "select coalesce(sum(n_points - n_superseded), 0)::bigint as n from block"
+        "select coalesce(sum(n_points - n_unserved), 0)::bigint as n from block"
         " where state = 'published'"
     ),
     in_box=points_in_box,

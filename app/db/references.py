@@ -120,10 +120,10 @@ def places_inside(
     """
     area = on_the_map(shapely.Polygon(outline))
     rows = connection.execute(
-        """select id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h from homologous_place
+        """select id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h from reference_point
            where reference_id = %s and st_intersects(geom, st_setsrid(st_geomfromwkb(%s), 4979))
-               and not (%s and tried >= %s and 2 * found < tried)
-           order by found::real / tried desc, found desc, id""",
+               and not (%s and attempts >= %s and 2 * successes < attempts)
+           order by successes::real / attempts desc, successes desc, id""",
         [reference_id, shapely.to_wkb(area), worthwhile, FEW_TRIES],
     ).fetchall()
     return HomologousPlaces(
@@ -135,8 +135,8 @@ def places_inside(
 def count_places(connection: Connection, ids: IntArray, found: BoolArray) -> None:
     """Note of places (n,) that a scene was looked for there, and whether it was found."""
     connection.execute(
-        """update homologous_place p set tried = tried + 1, found = p.found + new.found::int,
-               last_found_at = case when new.found then now() else last_found_at end
+        """update reference_point p set attempts = attempts + 1, successes = successes + new.found::int,
+               last_success_at = case when new.found then now() else last_success_at end
            from (select * from unnest(%s::bigint[], %s::bool[]) as n(id, found) order by id) new
            where p.id = new.id""",
         [ids.tolist(), found.tolist()],
@@ -147,7 +147,7 @@ def insert_places(connection: Connection, reference_id: int, lon_lat_h: Array) -
     """Keep new places (n, 3) that a scene was found by."""
     with connection.cursor() as cursor:
         cursor.executemany(
-            """insert into homologous_place (reference_id, geom, tried, found, last_found_at)
+            """insert into reference_point (reference_id, geom, attempts, successes, last_success_at)
                values (%s, st_setsrid(st_makepoint(%s, %s, %s), 4979), 1, 1, now())""",
             [(reference_id, *place) for place in lon_lat_h.tolist()],
         )

@@ -122,7 +122,7 @@ def give_up_old_uploads(connection: Connection) -> None:
     connection.execute(
         "delete from scene where state = 'uploading'"
         " and created_at < now() - make_interval(hours => %(hours)s)"
-        " and begun_at_s < service_time_s() - 3600 * %(hours)s"
+        " and created_at_uptime_s < uptime_s() - 3600 * %(hours)s"
         " and not exists (select from upload where scene_id = scene.id and finished_at is null)",
         {"hours": LONGEST_UPLOAD_HOURS},
     )

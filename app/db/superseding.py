@@ -131,11 +131,11 @@ def _release(connection: Connection, ranked: list[Ranked], number: int) -> None:
 def count_unserved(connection: Connection) -> None:
     """Keep how many points of each block and cell are not served: superseded, or suspended."""
     connection.execute(
-        f"""update block set n_superseded = coalesce(found.n, 0)
+        f"""update block set n_unserved = coalesce(found.n, 0)
             from block b left join (select (id >> {ID_BITS})::int as number, count(*) as n from point
                                     where superseded_by is not null or suspended_at is not null
                                     group by 1) found using (number)
-            where block.number = b.number and block.n_superseded <> coalesce(found.n, 0)"""
+            where block.number = b.number and block.n_unserved <> coalesce(found.n, 0)"""
     )
     count_unserved_cells(connection)
 

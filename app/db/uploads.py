@@ -13,7 +13,7 @@ Purpose = Literal["image", "model", "block"]
 
 LIFE_HOURS = 24
 """An upload is given up so long after its last piece."""
-IDLE = f"(expires_at < now() and idle_since_s < service_time_s() - {3600 * LIFE_HOURS})"
+IDLE = f"(expires_at < now() and active_at_uptime_s < uptime_s() - {3600 * LIFE_HOURS})"
 """Nobody went on with it, by the clock and by the time that the service has run."""
 COLUMNS = f"""id, owner, purpose, scene_id, name, file_name, size_bytes, sha256, metadata, file_key,
     created_at, expires_at, finished_at, {IDLE} and finished_at is null as expired"""
@@ -84,7 +84,7 @@ def prolong(connection: Connection, upload_id: UUID) -> UploadRow | None:
     with connection.cursor(row_factory=class_row(UploadRow)) as cursor:
         return cursor.execute(
             f"""update upload set expires_at = now() + make_interval(hours => %s),
-                    idle_since_s = service_time_s()
+                    active_at_uptime_s = uptime_s()
                 where id = %s returning {COLUMNS}""",
             [LIFE_HOURS, upload_id],
         ).fetchone()

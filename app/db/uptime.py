@@ -1,20 +1,21 @@
-"""The table `service_time`: how long the service has run, whatever its clocks were put to.
+"""The table `uptime`: how long the service has run, independent of changes of the clock.
 
-Ages are counted by it where more than a moment depends on them: `service_time_s()` in SQL.
+Ages that decide over files are counted in it: `uptime_s()` in SQL.
 """
 
 from app.db.engine import Connection
 
 
 def advance(connection: Connection, most_s: float) -> None:
-    """Let the time of the service go on to now.
+    """Advance the time that the service has run to now.
 
     Args:
-        most_s: believed of the database's clock; what it says beyond that is a jump, or a rest.
+        most_s: the longest step; beyond it the clock of the database has jumped, or the service did not
+            run.
     """
     connection.execute(
-        """update service_time set read_at = clock_timestamp(),
-               ran_s = ran_s
-                   + least(greatest(extract(epoch from clock_timestamp() - read_at), 0.0), %s)""",
+        """update uptime set advanced_at = clock_timestamp(),
+               elapsed_s = elapsed_s
+                   + least(greatest(extract(epoch from clock_timestamp() - advanced_at), 0.0), %s)""",
         [most_s],
     )

@@ -5,7 +5,7 @@ from app.db.engine import Connection
 MOVED = (
     "update upload set expires_at = expires_at - make_interval(hours => %s)",
     "update scene set created_at = created_at - make_interval(hours => %s) where state = 'uploading'",
-    "update service_time set read_at = read_at - make_interval(hours => %s)",
+    "update uptime set advanced_at = advanced_at - make_interval(hours => %s)",
 )
 
 
@@ -19,5 +19,5 @@ def let_pass(connection: Connection, hours: int) -> None:
     """So many hours go by in which the service runs."""
     jump(connection, hours)
     connection.execute(
-        "update service_time set ran_s = ran_s + 3600 * %s, read_at = clock_timestamp()", [hours]
+        "update uptime set elapsed_s = elapsed_s + 3600 * %s, advanced_at = clock_timestamp()", [hours]
     )

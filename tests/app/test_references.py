@@ -105,8 +105,8 @@ def registered(database: Database, settings: Settings, image: Path, output: Path
 
 def places(connection: Connection) -> list[tuple[int, int]]:
     """How often each place was looked for and found."""
-    rows = connection.execute("select tried, found from homologous_place order by id").fetchall()
-    return [(row["tried"], row["found"]) for row in rows]
+    rows = connection.execute("select attempts, successes from reference_point order by id").fetchall()
+    return [(row["attempts"], row["successes"]) for row in rows]
 
 
 def test_only_files_of_the_folder_that_lie_on_a_map_become_references(

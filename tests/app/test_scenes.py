@@ -240,7 +240,7 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
         arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", None)
         cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", None)
         connection.execute(
-            "update scene set created_at = now() - interval '2 days', begun_at_s = -2 * 86400"
+            "update scene set created_at = now() - interval '2 days', created_at_uptime_s = -2 * 86400"
             " where id = %s",
             [cut_off],
         )

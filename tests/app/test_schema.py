@@ -7,9 +7,10 @@ import pytest
 from sqlalchemy import create_engine
 from sqlalchemy.pool import NullPool
 
-from app.db import ddl
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
+from app.db.ddl import EXTENSION
 from app.db.schema import metadata
+from app.db.statements import sql_file
 from tests.app.conftest import TEMPLATE, fresh_database
 
 # Everything that the catalogues record of the store: (what, name, definition). Objects of extensions, of
@@ -179,10 +180,10 @@ def from_schema(cluster: Cluster) -> Iterator[Catalogue]:
         with engine.begin() as connection:
             driver = connection.connection.driver_connection
             assert driver is not None
-            driver.execute(ddl.EXTENSION + ddl.sql_file("functions.sql"))
+            driver.execute(EXTENSION + sql_file("functions.sql"))
             metadata.create_all(connection)
             for name in ("triggers.sql", "first_rows.sql", "grants.sql"):
-                driver.execute(ddl.sql_file(name))
+                driver.execute(sql_file(name))
         with psycopg.connect(dsn) as connection:
             yield catalogue(connection)
 

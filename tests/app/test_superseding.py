@@ -55,7 +55,7 @@ def ingest(connection, storage, tmp_path):
 def served(connection) -> dict[str, int]:
     """How many points of each block are served."""
     rows = connection.execute(
-        """select b.id || '@' || b.version as name, count(*) as n, b.n_points - b.n_superseded as told
+        """select b.id || '@' || b.version as name, count(*) as n, b.n_points - b.n_unserved as told
            from point p join block b on b.number = p.block_number
            where b.state = 'published' and p.superseded_by is null group by b.number order by 1"""
     ).fetchall()
@@ -94,7 +94,7 @@ def test_a_priority_comes_before_every_figure_and_may_change_while_published(con
     for name in ("good", "poor"):
         lifecycle.publish_block(connection, name)
     assert served(connection) == {"poor@1": 30}
-    assert lifecycle.prioritise_block(connection, "good", 2).n_superseded == 0
+    assert lifecycle.prioritise_block(connection, "good", 2).n_unserved == 0
     assert served(connection) == {"good@1": 30}
     with pytest.raises(InputError, match="priority: 1001 found"):
         lifecycle.prioritise_block(connection, "good", 1001)
@@ -105,13 +105,13 @@ def test_a_withdrawal_gives_the_place_to_the_next_best(connection, ingest, place
         ingest(name, places, priority=priority)
         lifecycle.publish_block(connection, name)
     assert served(connection) == {"first@1": 30}
-    assert lifecycle.withdraw_block(connection, "first").n_superseded == 0
+    assert lifecycle.withdraw_block(connection, "first").n_unserved == 0
     assert served(connection) == {"second@1": 30}
     lifecycle.withdraw_block(connection, "second")
     assert served(connection) == {"third@1": 30}
     lifecycle.restore_block(connection, "first")
     assert served(connection) == {"first@1": 30}
-    assert lifecycle.withdraw_block(connection, "third").n_superseded == 0
+    assert lifecycle.withdraw_block(connection, "third").n_unserved == 0
 
 
 def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, ingest, places):

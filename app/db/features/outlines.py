@@ -17,7 +17,9 @@ BLOCKS = Collection(
         Property("state", "text", "State", choices=STATES),
         Property("priority", "bigint", "Which block comes first over one place"),
         Property("n_points", "bigint", "Points"),
-        Property("n_superseded", "bigint", "Points that another block has better"),
+        Property(
+            "n_unserved", "bigint", "Points not served: superseded by a better block, or suspended"
+        ),
         Property("n_views", "bigint", "Views"),
         Property("created_at", "timestamptz", "When it was ingested"),
         Property("state_changed_at", "timestamptz", "When its state changed last"),

@@ -24,8 +24,8 @@ NAMING_CONVENTION = {
 metadata = MetaData(naming_convention=NAMING_CONVENTION)
 
 Timestamp = DateTime(timezone=True)
-Real = REAL()
-Double = DOUBLE_PRECISION()
+Real: REAL[float] = REAL()
+Double: DOUBLE_PRECISION[float] = DOUBLE_PRECISION()
 # None is SQL's null, never the JSON value null.
 Json = JSONB(none_as_null=True)
 Polygon = Geometry("POLYGON", srid=4326, spatial_index=False)
