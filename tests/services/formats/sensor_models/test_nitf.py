@@ -16,7 +16,7 @@ from services.sensors.rpc import RpcModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
-GOLDEN = Path(__file__).parents[2] / "golden"
+GOLDEN = Path(__file__).parents[3] / "golden"
 PLACES = json.loads((GOLDEN / "invented_nitf_places.json").read_text())
 GROUND, LINE_SAMPLE = np.array(PLACES["lon_lat_h"]), np.array(PLACES["line_sample"])
 

@@ -21,7 +21,7 @@ from services.sensors.correction import ImageCorrection, fold_into_rpc, no_corre
 from services.sensors.rpc import RpcModel, cubic_terms
 from services.types import Array
 
-GOLDEN = Path(__file__).parents[2] / "golden"
+GOLDEN = Path(__file__).parents[3] / "golden"
 V2 = (GOLDEN / "RPC_invented_v2.XML").read_text()
 V3 = (GOLDEN / "RPC_invented_v3.XML").read_text()
 MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())

@@ -13,7 +13,7 @@ from services.formats.images.raster import copy_with_rpc, open_raster, write_ras
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.imagery.source import ArrayImage, Window
 
-MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
+MODEL = parse_rpc_text((Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text())
 PIXELS = np.random.default_rng(5).integers(1, 4000, (90, 120)).astype(np.uint16)
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -127,7 +127,7 @@ def test_sidecars_are_not_looked_at(tmp_path: Path) -> None:
         '<PAMDataset><PAMRasterBand band="1"><NoDataValue>0</NoDataValue></PAMRasterBand></PAMDataset>'
     )
     (tmp_path / "a_RPC.TXT").write_text(
-        (Path(__file__).parents[2] / "golden/invented_RPC.TXT").read_text()
+        (Path(__file__).parents[3] / "golden/invented_RPC.TXT").read_text()
     )
     image = open_raster(path)
     assert image.dataset.nodata is None

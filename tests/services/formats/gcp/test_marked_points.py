@@ -31,7 +31,7 @@ from services.formats.gcp.text_formats import (
 from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 
-GOLDEN = Path(__file__).parents[2] / "golden"
+GOLDEN = Path(__file__).parents[3] / "golden"
 MODEL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())
 FILES = [
     "invented.gcp",

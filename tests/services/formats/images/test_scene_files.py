@@ -23,7 +23,7 @@ from services.sensors.correction import fold_into_rpc, no_correction
 from services.sensors.rpc import RpcModel
 from services.types import Array
 
-GOLDEN = Path(__file__).parents[2] / "golden"
+GOLDEN = Path(__file__).parents[3] / "golden"
 FULL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())
 V2 = (GOLDEN / "RPC_invented_v2.XML").read_text()
 ORIGIN = (9000.0, 15000.0)

@@ -20,8 +20,8 @@ from services.formats.sensor_models.rpc_text import (
 )
 from services.sensors.rpc import RpcModel
 
-TEXT = (Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text()
-RPB = (Path(__file__).parents[2] / "golden" / "invented.RPB").read_text()
+TEXT = (Path(__file__).parents[3] / "golden" / "invented_RPC.TXT").read_text()
+RPB = (Path(__file__).parents[3] / "golden" / "invented.RPB").read_text()
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 errors = st.one_of(st.just(math.nan), st.floats(1e-300, 1e300))

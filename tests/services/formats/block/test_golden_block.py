@@ -15,7 +15,7 @@ from services.formats.sensor_models.rpc_files import read_text
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.types import point_chips
 
-FOLDER = Path(__file__).parents[2] / "golden" / "invented_block"
+FOLDER = Path(__file__).parents[3] / "golden" / "invented_block"
 MODEL = "models/left_RPC.TXT"
 
 rounding = 1e-15
