@@ -34,7 +34,7 @@ from services.conventions import CHIP_SIZE
 from services.formats.images.raster import open_raster, write_raster
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource, render_chip
-from services.matching.control_points import MatchingOptions, chip_pixels, match_points
+from services.matching.control_points import ChipSearch, MatchingOptions, chip_pixels, match_points
 from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip
 from services.simulation.view import SimulatedView, ViewPlan, simulate_view, true_ground
 from services.simulation.world import World, make_world
@@ -293,10 +293,9 @@ def measure_points(world: World, repeats: int) -> list[PointOutcome]:
 def matched(image: ImageSource, scene: SimulatedView, points: ControlPoints, chips: MemoryChips) -> None:
     """Search all points in an image."""
     options = MatchingOptions()
-    found = match_points(
-        image, scene.geometry.rpc, points, chips, GSD_M, RADIUS_PX, scene.geometry.acquisition, options
-    )
-    assert (found.reason == "").sum() > len(points) / 2
+    search = ChipSearch(image, scene.geometry.rpc, scene.geometry.acquisition, GSD_M, RADIUS_PX)
+    matches = match_points(search, points, chips, options)
+    assert (matches.reason == "").sum() > len(points) / 2
 
 
 def show(outcomes: list[Outcome]) -> None:

@@ -139,7 +139,9 @@ def besiege(
                     name = f"besieged-{number}"
                     box = (5.2 + number, 43.2, 5.3 + number, 43.3)
                     into = siege.ingest_folder / name
-                    make_block(into, POINTS, number, name, "1", box, IMAGES, (2.0,))
+                    make_block(
+                        into, POINTS, seed=number, name=name, box=box, n_images=IMAGES, gsds_m=(2.0,)
+                    )
                     caller.ingest(name, f"task {number}")
                 caller.wait(OPEN_AT_ONCE - 1)
                 told = ", ".join(f"{kind} {count}" for kind, count in siege.killed.items())

@@ -82,7 +82,15 @@ def run(folder: Path, clients: int, seconds: float, seed: int) -> dict[str, Any]
 
 def _fill(service: Service, folder: Path) -> tuple[str, int]:
     """Publish a block to be asked for; a token, and the id of the first point."""
-    made = make_block(folder / "served", POINTS, 1, "served", "1", BOX, IMAGES, (2.0,), np.uint8)
+    made = make_block(
+        folder / "served",
+        POINTS,
+        name="served",
+        box=BOX,
+        n_images=IMAGES,
+        gsds_m=(2.0,),
+        dtype=np.uint8,
+    )
     with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
         block = ingest_block(connection, Storage(service.folder / "storage"), made.folder).block
         publish_block(connection, str(block.number))
@@ -227,7 +235,14 @@ class _Jobs:
                 name, west = f"ingested-{number}", 10.0 + number
                 box = (west, 43.2, west + 0.1, 43.3)
                 make_block(
-                    self.folder / name, INGESTED_POINTS, number, name, "1", box, IMAGES, (2.0,), np.uint8
+                    self.folder / name,
+                    INGESTED_POINTS,
+                    seed=number,
+                    name=name,
+                    box=box,
+                    n_images=IMAGES,
+                    gsds_m=(2.0,),
+                    dtype=np.uint8,
                 )
                 self._end(client, self._block(client, name, True), "ingestion", ended)
                 body = {"inputs": {"scene": scene}}

@@ -158,6 +158,7 @@ def metadata(
 def make_block(
     folder: Path,
     count: int = 40,
+    *,
     seed: int = 1,
     name: str = "calanques",
     version: str = "1",

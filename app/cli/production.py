@@ -65,7 +65,7 @@ def run(
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
         made = run_production(images, output, identity, options, sigma_m, progress)
-    relative = made.relative
+    relative = made.relative_accuracy
     show_one(
         {
             "block": output,

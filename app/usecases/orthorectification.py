@@ -159,7 +159,7 @@ def run_orthorectification(
     if nodata is None:
         nodata = float("nan") if dtype == "float32" else 0.0
     seen = _Counted()
-    windows = seen.counted(orthorectify(bands, scene.model, ground, grid, options, progress))
+    windows = seen.counted(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     error_px = write_cog(output, grid, windows, len(bands), dtype, float(nodata))
     share = seen.pixels / (grid.shape[0] * grid.shape[1] * len(bands))
     gsd_m = float(abs(np.linalg.det(grid.step_xy))) ** 0.5

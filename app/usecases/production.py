@@ -17,7 +17,12 @@ from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.imagery.scene import Scene
 from services.production.from_images import Production, ProductionOptions, produce_points
-from services.production.from_ortho import Heights, OrthoPointOptions, OrthoPoints, ortho_points
+from services.production.from_ortho import (
+    GroundHeights,
+    OrthoPointOptions,
+    OrthoPoints,
+    produce_ortho_points,
+)
 from services.sensors.correction import fold_into_rpc
 from services.sensors.rpc import RpcModel
 from services.types import Progress, no_progress
@@ -128,7 +133,7 @@ def run_ortho_production(
     with ExitStack() as stack:
         scene = read_scene(files.image, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
         stack.callback(scene.image.close)  # type: ignore[attr-defined]
-        made = ortho_points(scene, heights, options, lambda f, m: progress(0.7 * f, m))
+        made = produce_ortho_points(scene, heights, options, lambda f, m: progress(0.7 * f, m))
         write_block(
             folder,
             _ortho_metadata(identity, scene, made, options),
@@ -140,17 +145,17 @@ def run_ortho_production(
     return made
 
 
-def _heights(files: OrthoFiles) -> Heights:
+def _heights(files: OrthoFiles) -> GroundHeights:
     if (files.terrain is None) == (files.flat_m is None):
         raise InputError("heights of the ground: expected either a terrain or one flat height")
     if files.terrain is not None:
         asked = files.terrain
         terrain = read_dem(asked.dem, asked.vertical, asked.geoid, asked.fill_px)
         sigma_m = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
-        return Heights(terrain, 0.0, sigma_m)
+        return GroundHeights(terrain, 0.0, sigma_m)
     if files.flat_m is None or files.height_sigma_m is None:
         raise InputError("one flat height: expected its standard deviation beside it, in metres")
-    return Heights(None, files.flat_m, files.height_sigma_m)
+    return GroundHeights(None, files.flat_m, files.height_sigma_m)
 
 
 def _refuse_existing(folder: Path) -> None:
@@ -170,7 +175,7 @@ def _models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcMod
 def _metadata(
     identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
 ) -> BlockMetadata:
-    relative, n_points = production.relative, len(production.points)
+    relative, n_points = production.relative_accuracy, len(production.points)
     days = [s.acquisition.acquired_at for s in scenes if s.acquisition.acquired_at is not None]
     spacing_km = None if options.spacing_m is None else options.spacing_m / 1000.0
     return BlockMetadata(

@@ -21,7 +21,7 @@ from app.usecases.registration.reference_source import (
 from app.usecases.server_files import file_below
 from services.geodesy import ecef_from_lon_lat_h
 from services.imagery.scene import Scene, scene_footprint
-from services.matching.reference_image import DenseOptions
+from services.matching.reference_image import ReferenceMatchingOptions
 from services.registration.on_points import Registration
 from services.sensors.ortho import OrthoModel
 from services.types import Acquisition, Array, BoolArray
@@ -130,7 +130,7 @@ def keep_places(
     measures = registration.measures
     tried = np.isfinite(measures.lon_lat_h).all(axis=1) & (measures.reason != "nodata")
     kept = references.places_inside(connection, found.id, outline, worthwhile=False)
-    apart_m = DenseOptions().window_px / 2.0 * found.gsd_m
+    apart_m = ReferenceMatchingOptions().window_px / 2.0 * found.gsd_m
     place = ecef_from_lon_lat_h(measures.lon_lat_h[tried])
     active = measures.active[tried]
     same = np.full(len(place), len(kept.id))

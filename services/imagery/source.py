@@ -94,7 +94,7 @@ class ReducedImage:
     factor: int
 
 
-class KeptWindows:
+class CachedImage:
     """An image whose windows are read once, as far as memory is allowed for them.
 
     A registration looks at the same places pass after pass; what `sample_image` has made of a window
@@ -102,15 +102,15 @@ class KeptWindows:
 
     Attributes:
         source: the image.
-        most_bytes: what may be kept; windows read after that are not.
-        kept_bytes: what is kept.
+        max_bytes: what may be kept; windows read after that are not.
+        cached_bytes: what is kept.
     """
 
-    def __init__(self, source: ImageSource, most_bytes: int = 96_000_000) -> None:
+    def __init__(self, source: ImageSource, max_bytes: int = 96_000_000) -> None:
         """Keep nothing yet."""
         self.source = source
-        self.most_bytes = most_bytes
-        self.kept_bytes = 0
+        self.max_bytes = max_bytes
+        self.cached_bytes = 0
         self._kept: list[tuple[int, Window, FloatImage]] = []
 
     @property
@@ -131,17 +131,17 @@ class KeptWindows:
                 top, left = line // factor, sample // factor
                 bottom, right = top + window.lines // factor, left + window.samples // factor
                 return means[top:bottom, left:right]
-        means = mean_pixels(self.source.read(window), factor)
-        if self.kept_bytes + means.nbytes <= self.most_bytes:
-            self.kept_bytes += means.nbytes
+        means = block_means(self.source.read(window), factor)
+        if self.cached_bytes + means.nbytes <= self.max_bytes:
+            self.cached_bytes += means.nbytes
             self._kept.append((factor, window, means))
         return means
 
 
 def _means(image: ImageSource, window: Window, factor: int) -> FloatImage:
-    if isinstance(image, KeptWindows):
+    if isinstance(image, CachedImage):
         return image.means(window, factor)
-    return mean_pixels(image.read(window), factor)
+    return block_means(image.read(window), factor)
 
 
 def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_000) -> ReducedImage:
@@ -158,11 +158,11 @@ def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_00
     for line in range(0, lines, step):
         count = min(step, lines - line)
         strip = source.read(Window(line * factor, 0, count * factor, samples * factor))
-        pixels[line : line + count] = mean_pixels(strip, factor)
+        pixels[line : line + count] = block_means(strip, factor)
     return ReducedImage(pixels, factor)
 
 
-def mean_pixels(pixels: FloatImage, factor: int) -> FloatImage:
+def block_means(pixels: FloatImage, factor: int) -> FloatImage:
     """Means over squares of `factor` pixels; what does not fill a square at the end is left out."""
     if factor == 1:
         return pixels

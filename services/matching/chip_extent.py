@@ -4,12 +4,12 @@ import numpy as np
 
 from services.types import FloatImage
 
-LEAST_SHARE = 0.5
+MIN_VISIBLE_SIDE = 0.5
 """Of the half side of a chip: less of it is not searched. What is searched stays round the point, so
 that slopes lean to all sides alike."""
 
 
-def shown_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
+def visible_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
     """Half the side of the part of a chip, round its point, that a patch shows at all places searched.
 
     Args:
@@ -18,7 +18,7 @@ def shown_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
         radius_px: how far the point may be from the middle.
 
     Returns:
-        `half_side` where the whole chip is shown, or less than `LEAST_SHARE` of it everywhere.
+        `half_side` where the whole chip is shown, or less than `MIN_VISIBLE_SIDE` of it everywhere.
     """
     row, col = np.nonzero(~np.isfinite(patch))
     if len(row) == 0:
@@ -26,10 +26,10 @@ def shown_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
     centre = patch.shape[0] // 2
     nearest = int(np.maximum(np.abs(row - centre), np.abs(col - centre)).min())
     shown = min(nearest - 1 - radius_px, half_side)
-    return shown if shown >= LEAST_SHARE * half_side else half_side
+    return shown if shown >= MIN_VISIBLE_SIDE * half_side else half_side
 
 
-def middle_of(pixels: FloatImage, half_side: int) -> FloatImage:
+def central_square(pixels: FloatImage, half_side: int) -> FloatImage:
     """The (2 h + 1, 2 h + 1) pixels in the middle of a square."""
     first = pixels.shape[0] // 2 - half_side
     return np.ascontiguousarray(

@@ -23,12 +23,12 @@ class Consensus:
     """A set of displacements that agree.
 
     Attributes:
-        agreeing: (n,) members of the set.
+        inliers: (n,) members of the set.
         displacement: (2,) their mean.
         false_alarms: how many such sets chance alone would give; far below one when it can be believed.
     """
 
-    agreeing: BoolArray
+    inliers: BoolArray
     displacement: Array
     false_alarms: float
 
@@ -66,7 +66,7 @@ def consensus_tolerance_px(sigma_px: float) -> float:
     return 3.0 * sigma_px + 0.5
 
 
-def agreeing_points(
+def robust_affine_inliers(
     position: Array, displacement: Array, candidates: BoolArray, sigma_px: float
 ) -> tuple[BoolArray, float]:
     """Measures that agree on one affine displacement, as far as they turn out to scatter.
@@ -85,7 +85,7 @@ def agreeing_points(
     scale, agreeing = 1.0, candidates
     for _ in range(MAX_WIDENINGS):
         tolerance_px = consensus_tolerance_px(scale * sigma_px)
-        agreeing = affine_consensus(position, displacement, candidates, tolerance_px)
+        agreeing = affine_inliers(position, displacement, candidates, tolerance_px)
         if agreeing.sum() < LEAST_FOR_SCATTER:
             break
         seen = _scatter_px(position, displacement, candidates, agreeing, 4.0 * tolerance_px)
@@ -105,7 +105,7 @@ def _scatter_px(
     return float(np.median(distance[distance <= reach_px]) / MEDIAN_DISTANCE)
 
 
-def affine_consensus(
+def affine_inliers(
     position: Array, displacement: Array, candidates: BoolArray, tolerance: float
 ) -> BoolArray:
     """Measures that agree on one affine displacement field, by MAGSAC.

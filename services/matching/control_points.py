@@ -8,13 +8,13 @@ import numpy as np
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
 from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
-from services.matching.chip_extent import middle_of, shown_half_side
-from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_of
-from services.matching.least_squares import covariance_of
-from services.matching.radiometry import clouded, edges, patch_statistics
-from services.matching.shadows import ShadowMove, shadow_move
+from services.matching.chip_extent import central_square, visible_half_side
+from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_per_coordinate
+from services.matching.least_squares import covariance_from_influence
+from services.matching.radiometry import cloud_mask, edges, patch_statistics
+from services.matching.shadows import ShadowShift, shadow_shift
 from services.matching.systematic_error import common_covariance_px2
-from services.matching.view_selection import Likeness, choose_views
+from services.matching.view_selection import ViewDistanceScales, select_views
 from services.sensors.base import SensorModel
 from services.types import (
     Acquisition,
@@ -50,7 +50,7 @@ class MatchingOptions:
     max_views: int = 4
     agreement_px: float = 0.7
     min_gradient_score: float = 0.5
-    likeness: Likeness = field(default_factory=Likeness)
+    likeness: ViewDistanceScales = field(default_factory=ViewDistanceScales)
     correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.6))
 
 
@@ -68,7 +68,7 @@ class PointMatches:
         by_gradient: (n,) found by the edges of the chips only.
         common_covariance_m2: (2, 2) east, north, of what all the measures have in common: see
             `shared_error`.
-        tried: what became of every view that was tried; its rows are those of the points.
+        view_measures: what became of every view that was tried; its rows are those of the points.
     """
 
     line_sample: Array
@@ -79,20 +79,36 @@ class PointMatches:
     reason: np.ndarray
     by_gradient: BoolArray
     common_covariance_m2: Array
-    tried: ViewMeasures
+    view_measures: ViewMeasures
+
+
+@dataclass(frozen=True)
+class ChipSearch:
+    """The scene that chips are searched in, which chips, and how far.
+
+    Attributes:
+        image: the scene, or a reduction of it.
+        model: of the scene.
+        acquisition: how the scene was taken.
+        gsd_m: ground sampling of the chips to use, metres, as they are stored.
+        radius_px: search radius, pixels of the chips after their reduction.
+        reduction: factor by which the chips are reduced before the search.
+    """
+
+    image: ImageSource | ReducedImage
+    model: SensorModel
+    acquisition: Acquisition
+    gsd_m: float
+    radius_px: int
+    reduction: int = 1
 
 
 def match_points(
-    image: ImageSource | ReducedImage,
-    model: SensorModel,
+    search: ChipSearch,
     points: ControlPoints,
     chips: ChipSource,
-    gsd_m: float,
-    radius_px: int,
-    scene: Acquisition,
     options: MatchingOptions,
     progress: Progress = no_progress,
-    reduction: int = 1,
 ) -> PointMatches:
     """Search every point around where a model expects it.
 
@@ -112,6 +128,8 @@ def match_points(
         reduction: chips are degraded to so many times their ground sampling before they are searched.
     """
     n = len(points)
+    image, model, scene = search.image, search.model, search.acquisition
+    gsd_m, radius_px, reduction = search.gsd_m, search.radius_px, search.reduction
     level_m, whole = gsd_m * reduction, CHIP_CENTRE // reduction
     displacement_m = np.full((n, 2), np.nan)
     sigma_m = np.full(n, np.nan)
@@ -121,8 +139,8 @@ def match_points(
     by_gradient = np.zeros(n, dtype=bool)
     looks = [np.empty((0, 2))] * n
     scene_gsd_m = np.full(n, np.nan)
-    chosen = choose_views(points, gsd_m, scene, options.max_views, options.likeness)
-    shadows = [shadow_move(image, scene, level_m) for image in points.views.images]
+    chosen = select_views(points, gsd_m, scene, options.max_views, options.likeness)
+    shadows = [shadow_shift(image, scene, level_m) for image in points.views.images]
     offsets: list[Array] = []
     seen: list[tuple[int, int, Peak, bool]] = []
     for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
@@ -142,9 +160,11 @@ def match_points(
         stack = point_chips(points, chips, row)
         ratio = scene_gsd_m[row] / gsd_m
         looks[row] = patch_statistics(patch)
-        half = shown_half_side(patch, whole, radius_px)
-        patch = middle_of(patch, half + radius_px)
-        like_scene = [middle_of(_as_seen(stack[number], ratio, reduction), half) for number in numbers]
+        half = visible_half_side(patch, whole, radius_px)
+        patch = central_square(patch, half + radius_px)
+        like_scene = [
+            central_square(_as_seen(stack[number], ratio, reduction), half) for number in numbers
+        ]
         moves = [shadows[image] for image in points.views.image[rows]]
         peaks, combined, by_gradient[row] = _search(patch, like_scene, moves, options)
         row_col, sigma, agreeing, reason[row] = combined
@@ -156,7 +176,7 @@ def match_points(
         displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
         sigma_m[row] = sigma * level_m
     # Where the scene ends it is not a cloud that hides a point.
-    reason[clouded(looks, reason == FOUND) & (reason != "nodata")] = "cloud"
+    reason[cloud_mask(looks, reason == FOUND) & (reason != "nodata")] = "cloud"
     moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     found_views = np.array([np.isfinite(offset).all() for offset in offsets], dtype=bool)
     view_row = np.array([points.views.start[row] + number for row, number, *_ in seen], dtype=np.int64)
@@ -187,7 +207,7 @@ Combined = tuple[Array, float, BoolArray, str]
 def _search(
     patch: FloatImage,
     chips: list[FloatImage],
-    shadows: list[ShadowMove | None],
+    shadows: list[ShadowShift | None],
     options: MatchingOptions,
 ) -> tuple[list[Peak], Combined, bool]:
     """The views of a point in a patch: by grey values, else by their edges alone."""
@@ -254,11 +274,11 @@ def _combined(peaks: list[Peak], agreement_px: float) -> Combined:
         return nothing, np.nan, none, "views_disagree"
     agreeing = none.copy()
     agreeing[np.flatnonzero([p.reason == FOUND for p in peaks])[near]] = True
-    mean, sigma = mean_of([p for p, agreed in zip(peaks, agreeing, strict=True) if agreed])
+    mean, sigma = weighted_mean([p for p, agreed in zip(peaks, agreeing, strict=True) if agreed])
     return mean, sigma, agreeing, FOUND
 
 
-def mean_of(peaks: list[Peak]) -> tuple[Array, float]:
+def weighted_mean(peaks: list[Peak]) -> tuple[Array, float]:
     """The weighted mean (2,) of places of one point, and its sigma.
 
     Views of one scene share its noise and its shadows: their influences are averaged square by square,
@@ -270,7 +290,9 @@ def mean_of(peaks: list[Peak]) -> tuple[Array, float]:
     mean = weight @ places
     influences = np.stack([peak.influence for peak in peaks])
     common = np.tensordot(weight, influences, axes=1)
-    own = sum(np.trace(covariance_of(each - common)) for each in influences)
+    own = sum(np.trace(covariance_from_influence(each - common)) for each in influences)
     scatter = float(((places - mean) ** 2).sum())
     beyond = max(0.0, scatter - own) / (2.0 * len(peaks) ** 2)
-    return mean, float(np.hypot(sigma_of(covariance_of(common)), np.sqrt(beyond)))
+    return mean, float(
+        np.hypot(sigma_per_coordinate(covariance_from_influence(common)), np.sqrt(beyond))
+    )

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from services.matching.least_squares import covariance_of, fit_chip
-from services.matching.shadows import ShadowMove, shadow_weights
+from services.matching.least_squares import covariance_from_influence, fit_chip
+from services.matching.shadows import ShadowShift, shadow_weights
 from services.types import Array, FloatImage
 
 FOUND = ""
@@ -69,7 +69,7 @@ def find_chip(
     patch: FloatImage,
     chip: FloatImage,
     options: CorrelationOptions,
-    shadows: ShadowMove | None = None,
+    shadows: ShadowShift | None = None,
 ) -> Peak:
     """Find a chip in a larger patch of the same geometry.
 
@@ -99,16 +99,16 @@ def find_chip(
         return _rejected("border_peak", score)
     if _second_peak(scores, row, col, options.second_distance_px) > options.max_second * score:
         return _rejected("ambiguous" if score >= options.min_score else "low_score", score)
-    return place_chip(patch, chip, np.array([row, col], dtype=np.float64), score, options, shadows)
+    return refine_peak(patch, chip, np.array([row, col], dtype=np.float64), score, options, shadows)
 
 
-def place_chip(
+def refine_peak(
     patch: FloatImage,
     chip: FloatImage,
     start: Array,
     score: float,
     options: CorrelationOptions,
-    shadows: ShadowMove | None = None,
+    shadows: ShadowShift | None = None,
 ) -> Peak:
     """The place of a chip whose pixel is known.
 
@@ -125,14 +125,14 @@ def place_chip(
         return _rejected("low_score", score)
     if fit is None:
         return _rejected("ambiguous", score)
-    covariance = covariance_of(fit.influence)
+    covariance = covariance_from_influence(fit.influence)
     if not math.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)) <= options.max_sigma_px:
         return _rejected("ambiguous", score)
     centre = (np.array(patch.shape) - chip.shape[0]) / 2.0
-    return Peak(fit.row_col - centre, score, sigma_of(covariance), fit.influence, FOUND)
+    return Peak(fit.row_col - centre, score, sigma_per_coordinate(covariance), fit.influence, FOUND)
 
 
-def sigma_of(covariance: Array) -> float:
+def sigma_per_coordinate(covariance: Array) -> float:
     """One standard deviation a coordinate (root mean square over both), pixels."""
     return math.hypot(math.sqrt(np.trace(covariance) / 2.0), INTERPOLATION_SIGMA_PX)
 

@@ -79,7 +79,7 @@ def fit_chip(
     return Fit(first + np.array([row, col]), score, influence)
 
 
-def covariance_of(influence: Array) -> Array:
+def covariance_from_influence(influence: Array) -> Array:
     """Covariance (2, 2) of a place from the influences of the squares of its chip.
 
     What chip and patch do not share is rarely white: it is as smooth as the land, and sits where

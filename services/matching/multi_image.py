@@ -49,6 +49,7 @@ def refine_on_chips(
     lon_lat_h: Array,
     gsd_m: float,
     options: RefinementOptions = RefinementOptions(),
+    *,
     progress: Progress = no_progress,
 ) -> Observations:
     """Measure points again, in every image that shows their chip whole.

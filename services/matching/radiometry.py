@@ -58,7 +58,7 @@ def patch_statistics(pixels: FloatImage) -> Array:
     return np.column_stack([cells.mean(axis=(1, 2)), rough])
 
 
-def clouded(looks: Sequence[Array], found: BoolArray) -> BoolArray:
+def cloud_mask(looks: Sequence[Array], found: BoolArray) -> BoolArray:
     """Which points are hidden by clouds: not found, and much around them is bright and smooth.
 
     Args:

@@ -10,9 +10,9 @@ from services.imagery.source import (
     ImageSource,
     ReducedImage,
     Window,
+    block_means,
     image_gsds_m,
     low_pass,
-    mean_pixels,
     sample_image,
 )
 from services.matching.control_points import PointMatches
@@ -51,7 +51,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class DenseOptions:
+class ReferenceMatchingOptions:
     """How places are searched.
 
     Attributes:
@@ -73,6 +73,8 @@ class Places:
     """Places of a level of a scene, and the ground a model sees there.
 
     Attributes:
+        model: of the scene.
+        reference: what the scene is matched against.
         cell: (n, 2) pixels of the level; pixel c covers `factor` pixels of the scene from c * factor on.
         factor: pixels of the scene to one of the level.
         line_sample: (n, 2) their centres, pixels of the scene.
@@ -80,6 +82,8 @@ class Places:
         nodes: (n, k, k, 2) where the ground around is in the reference.
     """
 
+    model: SensorModel
+    reference: Reference
     cell: IntArray
     factor: int
     line_sample: Array
@@ -87,7 +91,7 @@ class Places:
     nodes: Array
 
 
-def places_seen(
+def visible_places(
     model: SensorModel, reference: Reference, line_sample: Array, factor: int, window_px: int
 ) -> Places:
     """The places nearest to image positions (n, 2) whose surroundings lie on the reference's terrain.
@@ -107,21 +111,21 @@ def places_seen(
     half = -(-(window_px // 2) // _NODE_PX)
     offset = np.arange(-half, half + 1) * float(_NODE_PX * factor)
     around = centre[:, None, None, :] + np.stack(np.meshgrid(offset, offset, indexing="ij"), axis=-1)
-    ground = ground_seen(model, around.reshape(-1, 2), reference.terrain)
+    ground = locate_on_terrain(model, around.reshape(-1, 2), reference.terrain)
     nodes = np.asarray(reference.model.project(ground).reshape(around.shape), dtype=np.float64)
     inside = np.isfinite(nodes).all(axis=(1, 2, 3))
     inside &= ((nodes >= 0.0) & (nodes <= np.array(reference.image.shape) - 1.0)).all(axis=(1, 2, 3))
     lon_lat_h = ground.reshape(*around.shape[:3], 3)[:, half, half]
-    return Places(cell[inside], factor, centre[inside], lon_lat_h[inside], nodes[inside])
+    return Places(
+        model, reference, cell[inside], factor, centre[inside], lon_lat_h[inside], nodes[inside]
+    )
 
 
 def match_places(
     image: ImageSource | ReducedImage,
-    model: SensorModel,
-    reference: Reference,
     places: Places,
     radius_px: int,
-    options: DenseOptions,
+    options: ReferenceMatchingOptions,
     progress: Progress = no_progress,
 ) -> PointMatches:
     """Search the ground that a model sees at some places of a scene around them.
@@ -139,6 +143,7 @@ def match_places(
         progress: told the fraction of the places done.
     """
     n, factor = len(places.cell), places.factor
+    model, reference = places.model, places.reference
     line_sample = np.full((n, 2), np.nan)
     sigma_px = np.full(n, np.nan)
     score = np.full(n, np.nan)
@@ -170,11 +175,11 @@ def match_places(
         reason=reason,
         by_gradient=np.zeros(n, dtype=bool),
         common_covariance_m2=reference.common_sigma_m**2 * np.eye(2),
-        tried=ViewMeasures(np.arange(n), np.zeros(n, dtype=np.int64), score, found, reason),
+        view_measures=ViewMeasures(np.arange(n), np.zeros(n, dtype=np.int64), score, found, reason),
     )
 
 
-def ground_seen(model: SensorModel, line_sample: Array, terrain: Terrain | None) -> Array:
+def locate_on_terrain(model: SensorModel, line_sample: Array, terrain: Terrain | None) -> Array:
     """The ground (n, 3) lon, lat, height that a model sees at image positions (n, 2).
 
     Raises:
@@ -206,4 +211,4 @@ def _level_patch(
     if isinstance(image, ReducedImage):
         return ArrayImage(image.pixels).read(Window(line, sample, size, size))
     window = Window(line * factor, sample * factor, size * factor, size * factor)
-    return mean_pixels(image.read(window), factor)
+    return block_means(image.read(window), factor)

@@ -14,7 +14,7 @@ CASTER_M = 6.0
 
 
 @dataclass(frozen=True)
-class ShadowMove:
+class ShadowShift:
     """How the shadows of a chip lie in the image it is searched in.
 
     Attributes:
@@ -26,7 +26,7 @@ class ShadowMove:
     move_px: Array
 
 
-def shadow_move(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowMove | None:
+def shadow_shift(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowShift | None:
     """How shadows have moved from a chip to a scene; None where one of the suns is not known.
 
     Args:
@@ -34,20 +34,20 @@ def shadow_move(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowMo
         scene: how the scene was taken.
         gsd_m: of the chip as it is searched.
     """
-    before, after = shadow_of(chip), shadow_of(scene)
+    before, after = shadow_vector(chip), shadow_vector(scene)
     if not np.isfinite(before + after).all():
         return None
-    return ShadowMove(_rows_cols(before), _rows_cols(after - before) * (CASTER_M / gsd_m))
+    return ShadowShift(_rows_cols(before), _rows_cols(after - before) * (CASTER_M / gsd_m))
 
 
-def shadow_of(image: Acquisition) -> Array:
+def shadow_vector(image: Acquisition) -> Array:
     """East and north (2,) by which a metre of height throws its shadow; NaN when unknown."""
     azimuth = np.radians(image.sun_azimuth_deg + 180.0)
     length = np.tan(np.radians(90.0 - image.sun_elevation_deg))
     return np.asarray(length * np.array([np.sin(azimuth), np.cos(azimuth)]))
 
 
-def shadow_weights(chip: FloatImage, score: float, shadows: ShadowMove) -> FloatImage:
+def shadow_weights(chip: FloatImage, score: float, shadows: ShadowShift) -> FloatImage:
     """How much each pixel of a chip counts for its place: little, where a shadow may have ended.
 
     Where a chip grows brighter away from its sun, a shadow may end. Under another sun that edge lies

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.matching.shadows import shadow_of
+from services.matching.shadows import shadow_vector
 from services.types import Acquisition, Array, BoolArray, IntArray, Views
 
 COMMON_SIGMA_PX = 0.05
@@ -57,7 +57,7 @@ def common_covariance_px2(
         covariance += scatter / (len(means) * (len(means) - 1)) * np.eye(2)
     image = views.image[row[used]]
     leans = _lean(scene.incidence_deg, scene.azimuth_deg) - _leans(views, row[used])
-    shadows = shadow_of(scene) - np.array([shadow_of(each) for each in views.images])[image]
+    shadows = shadow_vector(scene) - np.array([shadow_vector(each) for each in views.images])[image]
     for apart, sigma_px, unknown_px in (
         (leans, LEAN_SIGMA_PX, LEAN_SIGMA_PX),
         (shadows, SHADOW_SIGMA_PX, UNKNOWN_SHADOW_SIGMA_PX),

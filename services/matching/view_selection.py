@@ -11,7 +11,7 @@ DAYS_OF_A_YEAR = 365.25
 
 
 @dataclass(frozen=True)
-class Likeness:
+class ViewDistanceScales:
     """Differences between a view and a scene that count as much as each other.
 
     A view's distance from a scene is the sum of the squares of its differences in these units. What is
@@ -35,7 +35,7 @@ class Likeness:
 
 
 @dataclass(frozen=True)
-class ChosenViews:
+class SelectedViews:
     """Views of n points; those of point i are `row[start[i]:start[i + 1]]`, most alike first.
 
     Attributes:
@@ -47,13 +47,13 @@ class ChosenViews:
     start: IntArray
 
 
-def choose_views(
+def select_views(
     points: ControlPoints,
     gsd_m: float,
     scene: Acquisition,
     count: int,
-    likeness: Likeness = Likeness(),
-) -> ChosenViews:
+    likeness: ViewDistanceScales = ViewDistanceScales(),
+) -> SelectedViews:
     """The views of every point, at one ground sampling, that look most like a scene.
 
     Args:
@@ -71,10 +71,12 @@ def choose_views(
     rows, distance = rows[kept], distance[kept]
     rows = rows[np.lexsort((distance, owner[rows]))]
     start = np.searchsorted(owner[rows], np.arange(len(points) + 1))
-    return ChosenViews(rows, start.astype(np.int64))
+    return SelectedViews(rows, start.astype(np.int64))
 
 
-def distances(views: Views, scene: Acquisition, likeness: Likeness = Likeness()) -> Array:
+def distances(
+    views: Views, scene: Acquisition, likeness: ViewDistanceScales = ViewDistanceScales()
+) -> Array:
     """How far views (m,) are from looking like a scene; 0 for one taken in the same way."""
     direction = _unit(views.incidence_deg, views.azimuth_deg) @ _unit(
         np.array([scene.incidence_deg]), np.array([scene.azimuth_deg])
@@ -85,7 +87,7 @@ def distances(views: Views, scene: Acquisition, likeness: Likeness = Likeness())
     return np.asarray(_square(angle / likeness.direction_deg) + health**2 + of_images[views.image])
 
 
-def _of_image(image: Acquisition, scene: Acquisition, likeness: Likeness) -> float:
+def _of_image(image: Acquisition, scene: Acquisition, likeness: ViewDistanceScales) -> float:
     """The part of the distance that all the views cut from one image share."""
     season = _day(image) - _day(scene)
     turn = image.sun_azimuth_deg - scene.sun_azimuth_deg

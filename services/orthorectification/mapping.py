@@ -102,7 +102,7 @@ def map_into_image(
     return Mapping(line_sample, height_m, 0.0 if math.isnan(error_px) else error_px)
 
 
-def hidden_ground(
+def occluded_ground(
     model: SensorModel, terrain: Terrain, grid: MapGrid, window: Window, height_m: FloatImage
 ) -> BoolArray:
     """Which ground (lines, samples) of a window other ground hides from the sensor.

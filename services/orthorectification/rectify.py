@@ -10,9 +10,9 @@ from numba import njit
 
 from services.errors import CoverageError, InputError
 from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import ImageSource, Window, low_pass, mean_pixels
+from services.imagery.source import ImageSource, Window, block_means, low_pass
 from services.map_grid import MapGrid, utm_of, xy_of_lon_lat
-from services.orthorectification.mapping import hidden_ground, map_into_image, metres_a_unit
+from services.orthorectification.mapping import map_into_image, metres_a_unit, occluded_ground
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
 from services.types import Array, FloatImage, IntArray, Progress, no_progress
@@ -112,6 +112,7 @@ def orthorectify(
     terrain: Terrain,
     grid: MapGrid,
     options: OrthoOptions = OrthoOptions(),
+    *,
     progress: Progress = no_progress,
 ) -> Iterator[OrthoWindow]:
     """The windows of an ortho-image, row after row; memory does not grow with image, terrain or map.
@@ -160,7 +161,7 @@ def _rectified(
     if math.prod(size.tolist()) > MAX_READ_PIXELS and min(shape) > _SMALLEST_WINDOW:
         return _divided(images, model, terrain, grid, window, options)
     if options.hide:
-        line_sample[hidden_ground(model, terrain, grid, window, mapping.height_m)] = np.nan
+        line_sample[occluded_ground(model, terrain, grid, window, mapping.height_m)] = np.nan
     ratio = _ratio(line_sample)
     pixels = np.stack(
         [_sampled(image, line_sample, first, size, ratio, options.kernel) for image in images]
@@ -217,7 +218,7 @@ def _sampled(
     whole = np.where(whole == 0, high - low, whole) if factor > 1 else high - low
     pixels = image.read(Window(int(low[0]), int(low[1]), int(whole[0]), int(whole[1])))
     factor = factor if min(pixels.shape) >= factor else 1
-    pixels = np.ascontiguousarray(low_pass(mean_pixels(pixels, factor), ratio / factor))
+    pixels = np.ascontiguousarray(low_pass(block_means(pixels, factor), ratio / factor))
     return _resampled(pixels, line_sample, float(low[0]), float(low[1]), factor, kernel == "cubic")
 
 

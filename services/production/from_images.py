@@ -95,14 +95,14 @@ class Production:
             followed each other in one file.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
         adjustment: of the images; its models are those the points refer to.
-        relative: how well the images agree.
+        relative_accuracy: how well the images agree.
         outline: (m, 2) lon, lat of a rectangle that holds the points, counter-clockwise, not closed.
     """
 
     points: ControlPoints
     chips: Callable[[int], ChipArray]
     adjustment: BlockAdjustment
-    relative: RelativeAccuracy
+    relative_accuracy: RelativeAccuracy
     outline: Array
 
 
@@ -143,7 +143,7 @@ def produce_points(
         candidates,
         options.fine_gsd_m,
         options.refinement,
-        part_of(progress, 0.5, 0.4),
+        progress=part_of(progress, 0.5, 0.4),
     )
     progress(0.9, "adjusting the block on its chips")
     final = _adjusted(scenes, [s.model for s in scenes], measured, options)

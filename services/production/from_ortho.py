@@ -10,7 +10,7 @@ import numpy as np
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import Window, mean_pixels, render_chip
+from services.imagery.source import Window, block_means, render_chip
 from services.matching.multi_image import chip_inside, chip_saliency, stored_chip
 from services.terrain import Terrain
 from services.types import (
@@ -54,7 +54,7 @@ class OrthoPointOptions:
 
 
 @dataclass(frozen=True)
-class Heights:
+class GroundHeights:
     """How high the ground lies.
 
     Attributes:
@@ -91,9 +91,9 @@ class OrthoPoints:
     outline: Array
 
 
-def ortho_points(
+def produce_ortho_points(
     scene: Scene,
-    heights: Heights,
+    heights: GroundHeights,
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
 ) -> OrthoPoints:
@@ -155,11 +155,11 @@ def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Win
 
 
 def _best_of(
-    scene: Scene, heights: Heights, square: Window, fine_m: float, options: OrthoPointOptions
+    scene: Scene, heights: GroundHeights, square: Window, fine_m: float, options: OrthoPointOptions
 ) -> tuple[Array, float] | None:
     """The most salient corner (lon, lat, height) of a square with its saliency."""
     factor = max(1, int(fine_m / scene_gsd_m(scene)))
-    corners = _corners(mean_pixels(scene.image.read(square), factor), options.candidates)
+    corners = _corners(block_means(scene.image.read(square), factor), options.candidates)
     line_sample = corners * factor + (factor - 1) / 2.0 + [square.line, square.sample]
     lon_lat = scene.model.locate(line_sample, np.zeros(len(corners)))[:, :2]
     lon_lat_h = np.column_stack([lon_lat, heights.at(lon_lat)])
@@ -187,7 +187,7 @@ def _corners(pixels: FloatImage, count: int) -> Array:
 
 def _finished(
     scene: Scene,
-    heights: Heights,
+    heights: GroundHeights,
     found: list[tuple[Array, float]],
     gsds_m: tuple[float, float],
     sigma_m: float,

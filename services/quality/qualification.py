@@ -262,7 +262,7 @@ def second_consensus_share(measures: Measures) -> float:
     apart = measures.residual_px[measures.matched & ~measures.active]
     tolerance_px = 3.0 * float(np.sqrt((active**2).mean())) + 0.5
     rivals = a_contrario_consensus(apart, tolerance_px, float(np.abs(apart).max(initial=tolerance_px)))
-    return int(rivals.agreeing.sum()) / len(active)
+    return int(rivals.inliers.sum()) / len(active)
 
 
 def _residuals_on_ground(residual_m: Array) -> GroundResiduals:

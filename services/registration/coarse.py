@@ -10,7 +10,7 @@ from services.errors import InputError, NoConsensus
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import a_contrario_consensus
-from services.matching.control_points import MatchingOptions, match_points
+from services.matching.control_points import ChipSearch, MatchingOptions, match_points
 from services.matching.predict import spread_over_image
 from services.registration.chip_selection import chance_of_being_shown, has_chip
 from services.registration.search import (
@@ -113,18 +113,10 @@ def search_coarsely(
     matching = replace(matching, correlation=correlation)
     progress(0.0, "coarse search")
     image = _image_for(scene, level_m, len(few), radius_px)
-    matches = match_points(
-        image,
-        model,
-        few,
-        chips,
-        search.gsd_m,
-        radius_px,
-        scene.acquisition,
-        matching,
-        progress,
-        search.reduction,
+    chip_search = ChipSearch(
+        image, model, scene.acquisition, search.gsd_m, radius_px, reduction=search.reduction
     )
+    matches = match_points(chip_search, few, chips, matching, progress)
 
     reach_m = _reach_m(scene, search)
     consensus = a_contrario_consensus(matches.displacement_m, 3.0 * level_m, reach_m)
@@ -132,15 +124,15 @@ def search_coarsely(
         found = int((matches.reason == "").sum())
         raise NoConsensus(
             f"the coarse search does not agree on one correction: {len(few)} points tried within "
-            f"{radius_px * level_m:.0f} m, {found} found, {int(consensus.agreeing.sum())} of them "
+            f"{radius_px * level_m:.0f} m, {found} found, {int(consensus.inliers.sum())} of them "
             f"within {3.0 * level_m:g} m of each other (chance alone: {consensus.false_alarms:.2g} "
             "times); " + reasons_in_words(matches.reason)
         )
-    enough = replace(adjustment, min_points=min(3, int(consensus.agreeing.sum())))
-    adjusted = adjust_matches(scene, few, matches, consensus.agreeing, enough)
+    enough = replace(adjustment, min_points=min(3, int(consensus.inliers.sum())))
+    adjusted = adjust_matches(scene, few, matches, consensus.inliers, enough)
     corrected = CorrectedModel(scene.model, adjusted.correction)
     after_m = np.hypot(model_uncertainty_m(corrected, points, adjusted), level_m / 2.0)
-    return corrected, after_m, summarised("coarse", level_m, radius_px, matches, consensus.agreeing)
+    return corrected, after_m, summarised("coarse", level_m, radius_px, matches, consensus.inliers)
 
 
 def _planned(

@@ -8,8 +8,8 @@ import numpy as np
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment
 from services.errors import InputError
 from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import KeptWindows
-from services.matching.control_points import MatchingOptions, PointMatches, match_points
+from services.imagery.source import CachedImage
+from services.matching.control_points import ChipSearch, MatchingOptions, PointMatches, match_points
 from services.quality.qualification import Qualification, QualificationOptions, qualify
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import CoarseOptions, search_coarsely
@@ -128,23 +128,14 @@ def register_scene(
             part_of(progress, 0.0, 0.3),
         )
         passes.append(done)
-    image = KeptWindows(scene.image)
+    image = CachedImage(scene.image)
     for number in range(options.fine_passes):
         chosen = points_to_try(scene, model, shown, uncertainty_m, options.max_points)
         tried = shown.take(chosen)
         radius_px = search_radius_px(uncertainty_m[chosen], fine_m, options.coarse.max_search_px)
         part = part_of(progress, 0.3 + 0.6 * number / options.fine_passes, 0.6 / options.fine_passes)
-        matches = match_points(
-            image,
-            model,
-            tried,
-            chips,
-            fine_m,
-            radius_px,
-            scene.acquisition,
-            options.matching,
-            part,
-        )
+        search = ChipSearch(image, model, scene.acquisition, fine_m, radius_px)
+        matches = match_points(search, tried, chips, options.matching, part)
         agreeing = select_inliers(
             model, tried, matches, radius_px * fine_m, options.adjustment.min_points
         )
@@ -212,5 +203,5 @@ def build_registration(
         frame_sigma_m,
     )
     model = CorrectedModel(scene.model, adjustment.correction)
-    views = replace(matches.tried, point=row_of_tried[matches.tried.point])
+    views = replace(matches.view_measures, point=row_of_tried[matches.view_measures.point])
     return Registration(model, adjustment, measures, views, passes, qualification)

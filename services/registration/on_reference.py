@@ -1,4 +1,4 @@
-"""SCENE AND REFERENCE IMAGE IN -> REGISTERED MODEL OUT: the dense method, which needs no points."""
+"""SCENE AND REFERENCE IMAGE IN -> REGISTERED MODEL OUT, without control points."""
 
 from dataclasses import dataclass, field
 
@@ -10,8 +10,14 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import a_contrario_consensus
 from services.matching.control_points import PointMatches
-from services.matching.predict import inside
-from services.matching.reference_image import DenseOptions, Places, Reference, match_places, places_seen
+from services.matching.predict import in_image
+from services.matching.reference_image import (
+    Places,
+    Reference,
+    ReferenceMatchingOptions,
+    match_places,
+    visible_places,
+)
 from services.quality.qualification import QualificationOptions
 from services.quality.stability import image_places
 from services.registration.on_points import Registration, RegistrationOptions, build_registration
@@ -45,7 +51,7 @@ class ReferenceOptions:
         enough: a level on which the scene has fewer whole windows than this is left out.
         max_false_alarms: a first consensus that chance would give more often than this is refused.
         seed: of the random draws of the stability test.
-        dense, adjustment, qualification: of the stages.
+        matching, adjustment, qualification: of the stages.
     """
 
     places: int = 900
@@ -56,7 +62,7 @@ class ReferenceOptions:
     enough: int = 12
     max_false_alarms: float = 1e-4
     seed: int = 0
-    dense: DenseOptions = field(default_factory=DenseOptions)
+    matching: ReferenceMatchingOptions = field(default_factory=ReferenceMatchingOptions)
     adjustment: AdjustmentOptions = field(default_factory=lambda: AdjustmentOptions(min_points=6))
     qualification: QualificationOptions = field(default_factory=QualificationOptions)
 
@@ -213,8 +219,8 @@ def _search(
     """Search places of a level, and adjust on those that agree."""
     model, factor, radius_px = state.model, state.factor, state.radius_px
     places = _places(scene, model, reference, factor, count, options, known)
-    image = _image_at(scene, factor, len(places.cell), radius_px, options.dense.window_px)
-    matches = match_places(image, model, reference, places, radius_px, options.dense, progress)
+    image = _image_at(scene, factor, len(places.cell), radius_px, options.matching.window_px)
+    matches = match_places(image, places, radius_px, options.matching, progress)
     ground = homologous_points(places.lon_lat_h, reference)
     level_m = factor * scene_gsd_m(scene)
     if first:
@@ -223,7 +229,7 @@ def _search(
         least = options.adjustment.min_points
         agreeing = select_inliers(model, ground, matches, radius_px * level_m, least)
     adjustment = adjust_matches(scene, ground, matches, agreeing, options.adjustment)
-    summary = summarised("dense", level_m, radius_px, matches, agreeing)
+    summary = summarised("reference", level_m, radius_px, matches, agreeing)
     return _Search(ground, matches, adjustment, int(agreeing.sum()), summary)
 
 
@@ -252,7 +258,7 @@ def _factor(reach_px: float, scene: Scene, finest: int, options: ReferenceOption
     searched further.
     """
     wanted = int(np.ceil(reach_px / options.first_radius_px))
-    per_side = np.sqrt(options.enough) * options.dense.window_px / 2.0
+    per_side = np.sqrt(options.enough) * options.matching.window_px / 2.0
     largest = int(min(scene.image.shape) / per_side)
     return max(finest, min(wanted, largest))
 
@@ -272,7 +278,7 @@ def _places(
     known: Array | None,
 ) -> Places:
     """Places evenly over the part of a scene where whole windows lie, the known ones first."""
-    margin = options.dense.window_px // 2 * factor
+    margin = options.matching.window_px // 2 * factor
     size = np.array(scene.image.shape, dtype=np.float64)
     room = np.maximum(size - 2.0 * margin, 1.0)
     side = max(np.sqrt(room[0] * room[1] / count), 2.0 * factor)
@@ -281,7 +287,7 @@ def _places(
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     if known is not None and len(known):
         grid = _with_known(grid, model.project(known), room / counts, size, margin)
-    places = places_seen(model, reference, grid, factor, options.dense.window_px)
+    places = visible_places(model, reference, grid, factor, options.matching.window_px)
     if len(places.cell) < options.adjustment.min_points:
         raise CoverageError(
             f"the reference shows {len(places.cell)} of {len(grid)} places of the scene, "
@@ -292,7 +298,7 @@ def _places(
 
 def _with_known(grid: Array, known: Array, side: Array, size: Array, margin: float) -> Array:
     """The places of a grid, each replaced by a known one of its cell where there is one."""
-    known = known[inside(known, (int(size[0]), int(size[1])), -float(margin))]
+    known = known[in_image(known, (int(size[0]), int(size[1])), -float(margin))]
     if not len(known):
         return grid
     cell = np.floor((grid - margin) / side).astype(np.int64)
@@ -323,7 +329,7 @@ def _first_consensus(
         raise NoConsensus(
             f"the reference does not agree with the scene on one correction: {len(matches.reason)} "
             f"places tried within {radius_px * level_m:.0f} m, {found} found, "
-            f"{int(consensus.agreeing.sum())} of them within {3.0 * level_m:g} m of each other (chance "
+            f"{int(consensus.inliers.sum())} of them within {3.0 * level_m:g} m of each other (chance "
             f"alone: {consensus.false_alarms:.2g} times); {reasons_in_words(matches.reason)}"
         )
-    return consensus.agreeing
+    return consensus.inliers

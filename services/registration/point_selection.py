@@ -4,8 +4,8 @@ import numpy as np
 
 from services.errors import CoverageError
 from services.imagery.scene import Scene, scene_gsd_m
-from services.matching.chip_extent import LEAST_SHARE
-from services.matching.predict import inside, spread_over_image
+from services.matching.chip_extent import MIN_VISIBLE_SIDE
+from services.matching.predict import in_image, spread_over_image
 from services.registration.chip_selection import chance_of_being_shown
 from services.sensors.base import SensorModel
 from services.types import Array, ControlPoints, IntArray
@@ -25,7 +25,7 @@ def visible_points(scene: Scene, points: ControlPoints) -> IntArray:
         raise CoverageError("no control point lies in the footprint of the scene")
     margin_px = 3.0 * scene.sigma_m / scene_gsd_m(scene)
     predicted = scene.model.project(points.lon_lat_h)
-    visible = np.flatnonzero(inside(predicted, scene.image.shape, margin_px))
+    visible = np.flatnonzero(in_image(predicted, scene.image.shape, margin_px))
     if len(visible) == 0:
         raise CoverageError(
             f"none of the {len(points)} control points lies in the scene, "
@@ -56,7 +56,7 @@ def points_to_try(
         return np.arange(len(points))
     predicted = model.project(points.lon_lat_h)
     finest_m = float(points.views.gsd_m.min())
-    chance = chance_of_being_shown(scene, points, predicted, finest_m, uncertainty_m, LEAST_SHARE)
+    chance = chance_of_being_shown(scene, points, predicted, finest_m, uncertainty_m, MIN_VISIBLE_SIDE)
     likely = np.flatnonzero(chance >= WORTH_TRYING * chance.max())
     spread_m2 = np.trace(points.covariance_m2, axis1=1, axis2=2)
     preference = points.saliency * points.health

@@ -10,7 +10,7 @@ from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustm
 from services.errors import NoConsensus, NotEnoughPoints
 from services.imagery.scene import Scene, scene_centre
 from services.imagery.source import image_gsds_m
-from services.matching.consensus import agreeing_points, consensus_tolerance_px
+from services.matching.consensus import consensus_tolerance_px, robust_affine_inliers
 from services.matching.control_points import PointMatches
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
@@ -82,7 +82,7 @@ def select_inliers(
             f"{len(points)} tried within {radius_m:.1f} m, {reasons_in_words(matches.reason)}",
         )
     sigma_px = float(np.median(_point_sigma_px(model, points, matches)[found]))
-    agreeing, scale = agreeing_points(predicted, matches.line_sample - predicted, found, sigma_px)
+    agreeing, scale = robust_affine_inliers(predicted, matches.line_sample - predicted, found, sigma_px)
     tolerance_px = consensus_tolerance_px(scale * sigma_px)
     if agreeing.sum() < min_points:
         raise NoConsensus(

@@ -64,7 +64,7 @@ def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same
 def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, storage, chips, tmp_path):
     half = (BOX[0], BOX[1], (BOX[0] + BOX[2]) / 2, BOX[3])
     for name, kind, seed in (("a", np.uint8, 1), ("b", np.uint16, 2)):
-        folder = make_block(tmp_path / name, 30, seed, name, n_images=3, dtype=kind).folder
+        folder = make_block(tmp_path / name, 30, seed=seed, name=name, n_images=3, dtype=kind).folder
         lifecycle.ingest_block(connection, storage, folder)
         lifecycle.publish_block(connection, name)
     expected = point_store.control_points(connection, rectangle(*half))

@@ -8,12 +8,12 @@ import pytest
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.imagery.source import (
     ArrayImage,
-    KeptWindows,
+    CachedImage,
     Window,
+    block_means,
     chip_ground,
     image_gsd_m,
     low_pass,
-    mean_pixels,
     reduce_image,
     render_chip,
 )
@@ -250,7 +250,7 @@ def test_a_block_with_a_missing_pixel_has_no_mean() -> None:
     pixels[3, 1] = np.nan
     expected = np.ones((3, 3))
     expected[1, 0] = np.nan
-    np.testing.assert_array_equal(mean_pixels(pixels, 2), expected)
+    np.testing.assert_array_equal(block_means(pixels, 2), expected)
 
 
 @pytest.mark.parametrize(("gsd_m", "factor"), [(8.0, 2), (8.0, 3), (8.0, 4), (5.0, 2)])
@@ -283,7 +283,7 @@ def test_a_window_inside_one_that_was_read_is_not_read_again() -> None:
 
     for gsd_m in (1.0, 4.5):
         read.clear()
-        kept = KeptWindows(Counted(image.pixels))
+        kept = CachedImage(Counted(image.pixels))
         render_chip(kept, model, point_at(0.0, 0.0), gsd_m, 141)
         again = render_chip(kept, model, point_at(7.3, -4.1), gsd_m, 113)
         assert len(read) == 1
@@ -294,10 +294,10 @@ def test_a_window_inside_one_that_was_read_is_not_read_again() -> None:
 
 def test_windows_beyond_the_memory_they_may_take_are_read_again() -> None:
     image, model = noise_image(), PlaneModel(1.0)
-    kept = KeptWindows(image, most_bytes=200_000)
+    kept = CachedImage(image, max_bytes=200_000)
     wanted = render_chip(image, model, point_at(90.0, 0.0), 1.0)
     for _ in range(2):
         for east_m in (0.0, 30.0, 60.0, 90.0):
             chip = render_chip(kept, model, point_at(east_m, 0.0), 1.0)
     np.testing.assert_array_equal(chip, wanted)
-    assert 0 < kept.kept_bytes <= 200_000
+    assert 0 < kept.cached_bytes <= 200_000

@@ -6,8 +6,8 @@ import pytest
 from services.matching.consensus import (
     Consensus,
     a_contrario_consensus,
-    affine_consensus,
-    agreeing_points,
+    affine_inliers,
+    robust_affine_inliers,
 )
 from services.types import Array
 
@@ -40,8 +40,8 @@ def test_the_vote_finds_the_right_two_fifths(seed: int) -> None:
     displacement = everywhere(rng, 40)
     displacement[:16] = truth + rng.normal(0.0, NOISE_M, (16, 2))
     found = a_contrario_consensus(displacement, TOLERANCE_M, REACH_M)
-    assert found.agreeing[:16].sum() >= 15
-    assert found.agreeing[16:].sum() <= 2
+    assert found.inliers[:16].sum() >= 15
+    assert found.inliers[16:].sum() <= 2
     assert np.hypot(*(found.displacement - truth)) < a_metre
     assert found.false_alarms < 1e-12
 
@@ -81,8 +81,8 @@ def test_what_was_not_found_does_not_vote() -> None:
         a_contrario_consensus(padded, TOLERANCE_M, REACH_M),
     )
     assert among.false_alarms == alone.false_alarms
-    np.testing.assert_array_equal(among.agreeing[25:], alone.agreeing)
-    assert not among.agreeing[:25].any()
+    np.testing.assert_array_equal(among.inliers[25:], alone.inliers)
+    assert not among.inliers[:25].any()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -90,7 +90,7 @@ def test_nobody_and_one_alone_do_not_agree(count: int) -> None:
     found: Consensus = a_contrario_consensus(np.full((3, 2), np.nan), TOLERANCE_M, REACH_M)
     if count:
         found = a_contrario_consensus(np.array([[1.0, 2.0], [np.nan, np.nan]]), TOLERANCE_M, REACH_M)
-    assert found.agreeing.sum() == count
+    assert found.inliers.sum() == count
     assert found.false_alarms >= 1.0
 
 
@@ -106,7 +106,7 @@ def field(rng: np.random.Generator, count: int, right: int) -> tuple[Array, Arra
 @pytest.mark.parametrize("seed", range(20))
 def test_magsac_finds_the_right_two_fifths_of_an_affine_field(seed: int) -> None:
     position, measured, right = field(np.random.default_rng(seed), 60, 24)
-    agreeing = affine_consensus(position, measured, np.ones(60, dtype=bool), tolerance=1.0)
+    agreeing = affine_inliers(position, measured, np.ones(60, dtype=bool), tolerance=1.0)
     assert (agreeing & right).sum() >= 0.9 * right.sum()
     assert (agreeing & ~right).sum() <= 3
 
@@ -119,7 +119,7 @@ def test_points_worse_than_declared_are_kept_and_told() -> None:
         position = rng.uniform(0.0, 700.0, (80, 2))
         measured = rng.normal(0.0, 3.0 * declared_px, (80, 2)) + position @ [[0.0, 0.004], [-0.003, 0.0]]
         measured[:16] += rng.uniform(50.0, 200.0, (16, 2))
-        agreeing, scale = agreeing_points(position, measured, np.ones(80, dtype=bool), declared_px)
+        agreeing, scale = robust_affine_inliers(position, measured, np.ones(80, dtype=bool), declared_px)
         assert not agreeing[:16].any()
         shares.append(agreeing[16:].mean())
         scales.append(scale)
@@ -132,7 +132,7 @@ def test_points_as_good_as_declared_leave_the_scale_at_one() -> None:
     position = rng.uniform(0.0, 700.0, (80, 2))
     for _ in range(20):
         measured = rng.normal(0.0, 1.0, (80, 2))
-        _, scale = agreeing_points(position, measured, np.ones(80, dtype=bool), 1.0)
+        _, scale = robust_affine_inliers(position, measured, np.ones(80, dtype=bool), 1.0)
         assert scale == pytest.approx(1.0, abs=0.3)
 
 
@@ -140,7 +140,7 @@ def test_only_candidates_agree() -> None:
     position, measured, _ = field(np.random.default_rng(0), 60, 60)
     candidates = np.arange(60) % 2 == 0
     measured[~candidates] = np.nan
-    agreeing = affine_consensus(position, measured, candidates, tolerance=1.0)
+    agreeing = affine_inliers(position, measured, candidates, tolerance=1.0)
     assert agreeing.sum() >= 28
     assert not (agreeing & ~candidates).any()
 
@@ -148,4 +148,4 @@ def test_only_candidates_agree() -> None:
 def test_five_are_too_few_to_choose_among() -> None:
     position, measured, _ = field(np.random.default_rng(0), 10, 0)
     candidates = np.arange(10) < 5
-    np.testing.assert_array_equal(affine_consensus(position, measured, candidates, 1.0), candidates)
+    np.testing.assert_array_equal(affine_inliers(position, measured, candidates, 1.0), candidates)

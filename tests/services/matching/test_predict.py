@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from services.matching.predict import inside, spread_over_image
+from services.matching.predict import in_image, spread_over_image
 
 SHAPE = (1000, 2000)
 
 
 def test_an_image_ends_half_a_pixel_beyond_the_centres_of_its_pixels() -> None:
     at = np.array([[-0.5, -0.5], [999.5, 1999.5], [-0.6, 0.0], [0.0, 1999.6], [np.nan, 3.0]])
-    np.testing.assert_array_equal(inside(at, SHAPE), [True, True, False, False, False])
-    np.testing.assert_array_equal(inside(at, SHAPE, 1.0), [True, True, True, True, False])
+    np.testing.assert_array_equal(in_image(at, SHAPE), [True, True, False, False, False])
+    np.testing.assert_array_equal(in_image(at, SHAPE, 1.0), [True, True, True, True, False])
 
 
 @pytest.mark.parametrize("count", [8, 40, 200])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import clouded, edges, patch_statistics
+from services.matching.radiometry import cloud_mask, edges, patch_statistics
 from services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
@@ -63,13 +63,13 @@ def ground_and_clouds(rng: np.random.Generator) -> tuple[list[Array], dict[str, 
 
 def test_a_cloud_is_bright_and_smooth_and_hides_a_point() -> None:
     looks, kinds = ground_and_clouds(np.random.default_rng(0))
-    hidden = clouded(looks, np.arange(40) < 20)
+    hidden = cloud_mask(looks, np.arange(40) < 20)
     assert list(np.flatnonzero(hidden)) == [kinds["cloud"], kinds["part of a cloud"]]
 
 
 def test_nothing_is_called_a_cloud_where_no_ground_was_found() -> None:
     looks, _ = ground_and_clouds(np.random.default_rng(0))
-    assert not clouded(looks, np.arange(40) < 4).any()
+    assert not cloud_mask(looks, np.arange(40) < 4).any()
 
 
 def test_squares_not_seen_whole_have_no_looks() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.shadows import CASTER_M, shadow_move, shadow_of, shadow_weights
+from services.matching.shadows import CASTER_M, shadow_shift, shadow_vector, shadow_weights
 from services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
 
@@ -28,7 +28,7 @@ def village(seed: int, image: Acquisition) -> FloatImage:
     rng = np.random.default_rng(seed)
     cells = (SIDE + 2 * RADIUS_PX) * FINER
     land = 0.5 + 0.08 * texture(rng, cells, 12.0)
-    east, north = shadow_of(image) * FINER / GSD_M
+    east, north = shadow_vector(image) * FINER / GSD_M
     lit = np.ones((cells, cells))
     houses = []
     for row, column in rng.integers(30, cells - 60, (60, 2)):
@@ -47,7 +47,7 @@ def village(seed: int, image: Acquisition) -> FloatImage:
 
 def bias_px(chip_of: Acquisition, patch_of: Acquisition, known: bool) -> Array:
     """Mean place (2,) of chips whose true place is zero."""
-    move = shadow_move(chip_of, patch_of, GSD_M) if known else None
+    move = shadow_shift(chip_of, patch_of, GSD_M) if known else None
     inner = slice(RADIUS_PX, RADIUS_PX + SIDE)
     places = []
     for seed in range(12):
@@ -74,17 +74,17 @@ def test_so_does_a_higher_one() -> None:
 def test_edges_that_no_sun_moves_keep_their_weight() -> None:
     chip = village(0, JUNE)
     away_from_a_southern_sun = chip[2:, 1:-1] < chip[:-2, 1:-1]
-    weights = shadow_weights(chip, 0.9, shadow_move(JUNE, OCTOBER, GSD_M))
+    weights = shadow_weights(chip, 0.9, shadow_shift(JUNE, OCTOBER, GSD_M))
     assert (weights[~away_from_a_southern_sun] == 1.0).all()
     assert weights[away_from_a_southern_sun].min() < 0.1
 
 
 def test_under_the_same_sun_all_pixels_count_alike() -> None:
-    assert (shadow_weights(village(0, JUNE), 0.9, shadow_move(JUNE, JUNE, GSD_M)) == 1.0).all()
+    assert (shadow_weights(village(0, JUNE), 0.9, shadow_shift(JUNE, JUNE, GSD_M)) == 1.0).all()
 
 
 def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
-    move = shadow_move(JUNE, EVENING, GSD_M)
+    move = shadow_shift(JUNE, EVENING, GSD_M)
     assert move is not None
     north = CASTER_M / tan(radians(63.0)) / GSD_M
     east = CASTER_M / tan(radians(38.0)) / GSD_M
@@ -94,5 +94,5 @@ def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
 
 def test_where_a_sun_is_not_known_nothing_is_said_of_shadows() -> None:
     unknown = replace(JUNE, sun_elevation_deg=float("nan"))
-    assert shadow_move(unknown, OCTOBER, GSD_M) is None
-    assert shadow_move(JUNE, unknown, GSD_M) is None
+    assert shadow_shift(unknown, OCTOBER, GSD_M) is None
+    assert shadow_shift(JUNE, unknown, GSD_M) is None

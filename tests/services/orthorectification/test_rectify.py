@@ -14,7 +14,7 @@ from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
 from services.map_grid import MapGrid
 from services.orthorectification import rectify as module
-from services.orthorectification.mapping import hidden_ground, map_into_image
+from services.orthorectification.mapping import map_into_image, occluded_ground
 from services.orthorectification.rectify import OrthoOptions, Window, choose_grid, orthorectify
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
@@ -170,7 +170,7 @@ def test_hidden_ground_is_that_which_no_line_of_sight_meets() -> None:
     window = Window(150, 150, 200, 200)
     mapping = map_into_image(scene().model, ground, grid, window, the_tolerance_px)
     assert mapping is not None
-    hidden = hidden_ground(scene().model, ground, grid, window, mapping.height_m)
+    hidden = occluded_ground(scene().model, ground, grid, window, mapping.height_m)
     met = intersect_terrain(scene().model, mapping.line_sample.reshape(-1, 2), ground)
     above_m = met[:, 2].reshape(hidden.shape) - mapping.height_m
     inside = np.isfinite(above_m)
@@ -185,7 +185,7 @@ def test_flat_ground_hides_nothing() -> None:
     grid = choose_grid(scene(), ground)
     window = Window(50, 50, 100, 100)
     height_m = np.full((100, 100), 700.0, np.float32)
-    assert not hidden_ground(scene().model, ground, grid, window, height_m).any()
+    assert not occluded_ground(scene().model, ground, grid, window, height_m).any()
 
 
 def test_terrain_of_elsewhere_is_refused() -> None:

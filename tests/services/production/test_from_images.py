@@ -75,10 +75,10 @@ def test_the_translation_is_within_what_the_models_promised(
 
 
 def test_images_agree_on_the_points_they_show(made: Production) -> None:
-    assert made.relative.refined_px < refined_limit_px
-    assert made.relative.after_px < refined_limit_px
-    assert made.relative.before_px > 3.0 * made.relative.after_px
-    assert made.relative.tie_points > 500
+    assert made.relative_accuracy.refined_px < refined_limit_px
+    assert made.relative_accuracy.after_px < refined_limit_px
+    assert made.relative_accuracy.before_px > 3.0 * made.relative_accuracy.after_px
+    assert made.relative_accuracy.tie_points > 500
 
 
 def test_chips_of_a_point_show_the_same_at_its_middle(made: Production) -> None:

@@ -12,7 +12,12 @@ from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage, render_chip
 from services.map_grid import MapGrid
 from services.matching.multi_image import chip_inside
-from services.production.from_ortho import Heights, OrthoPointOptions, OrthoPoints, ortho_points
+from services.production.from_ortho import (
+    GroundHeights,
+    OrthoPointOptions,
+    OrthoPoints,
+    produce_ortho_points,
+)
 from services.registration.on_points import register_scene
 from services.sensors.ortho import OrthoModel
 from services.terrain import Terrain
@@ -22,7 +27,7 @@ from tests.services.textures import as_pixels, moved, texture
 
 GSD_M = 10.0
 SIDE = 768
-FLAT = Heights(None, 120.0, 15.0)
+FLAT = GroundHeights(None, 120.0, 15.0)
 OPTIONS = OrthoPointOptions(points=60)
 LOWER_LEFT_XY = (400_000.0, 5_800_000.0)
 AT_180_DEGREES_XY = (162_300.0, 100_000.0)
@@ -46,7 +51,7 @@ def ortho(pixels: Array, zone: int = 33, corner_xy: tuple[float, float] = LOWER_
 
 @cache
 def made() -> OrthoPoints:
-    return ortho_points(ortho(land()), FLAT, OPTIONS)
+    return produce_ortho_points(ortho(land()), FLAT, OPTIONS)
 
 
 def chips_of(found: OrthoPoints) -> MemoryChips:
@@ -99,8 +104,8 @@ def test_missing_pixels_and_unknown_heights_get_no_point() -> None:
     heights = np.full((SIDE, SIDE), 40.0, dtype=np.float32)
     heights[: SIDE // 2] = np.nan
     grid = scene.model.grid  # type: ignore[attr-defined]
-    known = Heights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
-    points = ortho_points(scene, known, replace(OPTIONS, points=100)).points
+    known = GroundHeights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
+    points = produce_ortho_points(scene, known, replace(OPTIONS, points=100)).points
     seen = scene.model.project(points.lon_lat_h)
     assert seen[:, 1].min() > SIDE / 2 + CHIP_SIZE / 2 - 1
     assert seen[:, 0].min() > SIDE / 2 - 1
@@ -109,7 +114,7 @@ def test_missing_pixels_and_unknown_heights_get_no_point() -> None:
 
 def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
     scene = ortho(land(), 1, AT_180_DEGREES_XY)
-    found = ortho_points(scene, FLAT, OPTIONS)
+    found = produce_ortho_points(scene, FLAT, OPTIONS)
     lon = found.points.lon_lat_h[:, 0]
     assert (lon < -179.9).any()
     assert (lon > 179.9).any()
@@ -122,15 +127,15 @@ def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
 
 def test_an_image_without_detail_makes_no_points() -> None:
     with pytest.raises(NotEnoughPoints, match="salient places of known height in"):
-        ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
+        produce_ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
 
 
 def test_an_image_that_is_not_rectified_is_refused() -> None:
     with pytest.raises(InputError, match="an ortho-image is needed: heights move"):
-        ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
+        produce_ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
 
 
 def test_ground_samplings_the_wrong_way_round_are_refused() -> None:
     options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
     with pytest.raises(InputError, match="20 and 10 m: the finer is expected first"):
-        ortho_points(ortho(land()), FLAT, options)
+        produce_ortho_points(ortho(land()), FLAT, options)

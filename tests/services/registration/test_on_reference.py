@@ -9,7 +9,7 @@ import pytest
 from services.errors import CoverageError, InputError, NoConsensus
 from services.imagery.source import ArrayImage, Window, sample_image
 from services.map_grid import MapGrid, utm_of
-from services.matching.reference_image import DenseOptions, Reference
+from services.matching.reference_image import Reference, ReferenceMatchingOptions
 from services.registration.on_points import Registration
 from services.registration.on_reference import ReferenceOptions, register_on_reference
 from services.sensors.ortho import OrthoModel
@@ -91,7 +91,7 @@ def test_the_stated_accuracy_covers_the_error() -> None:
 
 def test_levels_go_down_to_full_resolution_and_their_searches_shrink() -> None:
     passes = registered().passes
-    assert {one.name for one in passes} == {"dense"}
+    assert {one.name for one in passes} == {"reference"}
     gsd_m = [one.chip_gsd_m for one in passes]
     assert gsd_m == sorted(gsd_m, reverse=True)
     assert gsd_m[0] > 1.5 * gsd_m[-1]
@@ -174,4 +174,4 @@ def test_a_reference_that_shows_something_else_is_not_believed() -> None:
 
 def test_windows_without_a_centre_are_refused() -> None:
     with pytest.raises(InputError, match="window_px: 40 given"):
-        DenseOptions(window_px=40)
+        ReferenceMatchingOptions(window_px=40)

@@ -10,7 +10,7 @@ from services.errors import CoverageError
 from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
-from services.matching.chip_extent import LEAST_SHARE
+from services.matching.chip_extent import MIN_VISIBLE_SIDE
 from services.registration.point_selection import points_to_try, start_uncertainty_m, visible_points
 from services.sensors.base import SensorModel
 from services.simulation.view import plan_geometry
@@ -32,7 +32,7 @@ def small_scene() -> Scene:
 
 def enough_shown(scene: Scene, line_sample: Array) -> BoolArray:
     """Whether the scene shows the middle of a chip of a metre, to a few pixels of its turn."""
-    reach_px = LEAST_SHARE * CHIP_CENTRE
+    reach_px = MIN_VISIBLE_SIDE * CHIP_CENTRE
     return np.asarray(((line_sample > reach_px) & (line_sample < SIZE_PX - reach_px)).all(axis=1))
 
 

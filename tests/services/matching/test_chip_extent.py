@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.matching.chip_extent import middle_of, shown_half_side
+from services.matching.chip_extent import central_square, visible_half_side
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.types import FloatImage
 from tests.services.textures import as_pixels, moved, texture
@@ -20,23 +20,23 @@ def patch_without(columns: int) -> FloatImage:
 
 
 def test_a_patch_without_gaps_shows_the_whole_chip() -> None:
-    assert shown_half_side(patch_without(0), HALF, RADIUS_PX) == HALF
+    assert visible_half_side(patch_without(0), HALF, RADIUS_PX) == HALF
 
 
 @pytest.mark.parametrize("missing", [1, 10, 25])
 def test_what_is_missing_at_one_side_is_left_out_at_all(missing: int) -> None:
-    assert shown_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF - missing
+    assert visible_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF - missing
 
 
 @pytest.mark.parametrize("missing", [26, 56, SIDE])
 def test_less_than_half_of_a_chip_is_not_searched(missing: int) -> None:
-    assert shown_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF
+    assert visible_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF
 
 
 def test_one_missing_pixel_decides_wherever_it_lies() -> None:
     patch = patch_without(0)
     patch[SIDE // 2 + 40, SIDE // 2 - 3] = np.nan
-    assert shown_half_side(patch, HALF, RADIUS_PX) == 39 - RADIUS_PX
+    assert visible_half_side(patch, HALF, RADIUS_PX) == 39 - RADIUS_PX
 
 
 def test_the_middle_of_a_chip_is_found_where_the_whole_one_is() -> None:
@@ -45,8 +45,10 @@ def test_the_middle_of_a_chip_is_found_where_the_whole_one_is() -> None:
     chip = as_pixels(ground[RADIUS_PX : RADIUS_PX + 2 * HALF + 1, RADIUS_PX : RADIUS_PX + 2 * HALF + 1])
     patch = as_pixels(moved(ground, *shift)[:SIDE, :SIDE])
     patch[:, :17] = np.nan
-    half = shown_half_side(patch, HALF, RADIUS_PX)
-    peak = find_chip(middle_of(patch, half + RADIUS_PX), middle_of(chip, half), CorrelationOptions())
+    half = visible_half_side(patch, HALF, RADIUS_PX)
+    peak = find_chip(
+        central_square(patch, half + RADIUS_PX), central_square(chip, half), CorrelationOptions()
+    )
     assert peak.reason == FOUND
     np.testing.assert_allclose(peak.row_col, shift, atol=a_twentieth_of_a_pixel)
     assert find_chip(patch, chip, CorrelationOptions()).reason == "nodata"

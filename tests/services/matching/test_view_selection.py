@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.matching.view_selection import choose_views, distances
+from services.matching.view_selection import distances, select_views
 from services.types import Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(
@@ -52,7 +52,7 @@ def point_with_views(
 
 def numbers(points: ControlPoints, gsd_m: float, scene: Acquisition, count: int) -> IntArray:
     """Views of the second point, numbered within it."""
-    chosen = choose_views(points, gsd_m, scene, count)
+    chosen = select_views(points, gsd_m, scene, count)
     return chosen.row[chosen.start[1] : chosen.start[2]] - points.views.start[1]
 
 
@@ -109,6 +109,6 @@ def test_a_view_that_often_failed_stands_back() -> None:
 
 def test_nothing_is_chosen_of_no_points() -> None:
     points = point_with_views([1.0], [0.0], [0.0]).take(np.array([], dtype=np.int64))
-    chosen = choose_views(points, 1.0, SCENE, 2)
+    chosen = select_views(points, 1.0, SCENE, 2)
     assert len(chosen.row) == 0
     np.testing.assert_array_equal(chosen.start, [0])
