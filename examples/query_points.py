@@ -1,0 +1,62 @@
+"""Query points of a running service into geopandas and draw them on a map.
+
+    amers serve                                                      # in another shell
+    python examples/query_points.py WEST,SOUTH,EAST,NORTH PICTURE [URL]
+
+The token is read from the environment variable AMERS_TOKEN; a service with public points needs none.
+"""
+
+import os
+import sys
+from io import BytesIO
+
+import geopandas
+import httpx
+import matplotlib.pyplot as plt
+
+
+def query_points(bbox: str, url: str, token: str | None) -> geopandas.GeoDataFrame:
+    """The published points of a box whose chips are easy to locate, as a table.
+
+    Args:
+        bbox: west, south, east, north in degrees, separated by commas.
+        url: of the service.
+        token: secret with the scope `read`; None for a service with public points.
+    """
+    response = httpx.get(
+        f"{url}/collections/points/items",
+        params={
+            "bbox": bbox,
+            "filter": "saliency > 0.1",  # any property of /collections/points/queryables, in CQL2
+            "limit": 10_000,
+            "f": "parquet",  # GeoParquet; GeoJSON, FlatGeobuf, GeoPackage and CSV are there too
+        },
+        headers={"Authorization": f"Bearer {token}"} if token else {},
+        timeout=60.0,
+    )
+    response.raise_for_status()
+    return geopandas.read_parquet(BytesIO(response.content))
+
+
+def draw(points: geopandas.GeoDataFrame, picture: str) -> None:
+    """Draw the points in metres, coloured by height, the larger the more salient."""
+    heights_m = points.geometry.get_coordinates(include_z=True)["z"]
+    on_map = points.to_crs(points.estimate_utm_crs())
+    axes = on_map.plot(
+        column=heights_m.to_numpy(),
+        markersize=60.0 * points["saliency"],
+        legend=True,
+        legend_kwds={"label": "height above the ellipsoid, m"},
+        figsize=(7.0, 6.0),
+    )
+    axes.set(xlabel="east, m", ylabel="north, m", title=f"{len(points)} control points")
+    axes.figure.savefig(picture, dpi=120, bbox_inches="tight")
+    plt.close(axes.figure)
+
+
+if __name__ == "__main__":
+    box, output = sys.argv[1], sys.argv[2]
+    service = sys.argv[3] if len(sys.argv) > 3 else "http://127.0.0.1:8000"
+    table = query_points(box, service, os.environ.get("AMERS_TOKEN"))
+    print(table[["saliency"]].describe())
+    draw(table, output)

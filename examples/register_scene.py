@@ -1,0 +1,54 @@
+"""Register a scene on the control points of a block.
+
+    python examples/register_scene.py BLOCK FOLDER [SCENE]
+
+BLOCK is the folder of a block, for instance the one that make_block.py writes. Without a scene of your own, the
+example simulates one whose model is 50 m wrong. It writes the refined model into FOLDER.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import simulated_images
+
+from services.formats.block import FolderChips, read_block
+from services.formats.refined import write_refined
+from services.formats.scenes import read_scene
+from services.registration import register_scene
+
+
+def register(image: Path, block_folder: Path, folder: Path) -> None:
+    """Refine the model of a scene, print how good it is, and write it beside nothing that exists."""
+    # A scene is an image that is read by windows, its sensor model, and how wrong that model may be.
+    scene = read_scene(image, sigma_m=50.0)
+
+    # A block is a table of points and the files of their chips, which are read when they are needed.
+    points = read_block(block_folder).points
+    chips = FolderChips(block_folder)
+
+    # Predict where the points are in the scene, find their chips there, adjust the model, qualify the result.
+    registration = register_scene(scene, points, chips)
+
+    measures, quality = registration.measures, registration.qualification
+    print(f"{len(measures.point_id)} points lie in the scene, {measures.matched.sum()} were found")
+    print(f"{measures.active.sum()} of them take part in the final adjustment")
+    print(f"verdict: {quality.verdict}")
+    for criterion in quality.criteria:
+        print(f"  {criterion.name}: {criterion.value:.2f}")
+
+    # A registered model projects ground positions into the image like the model that was delivered.
+    ground = points.lon_lat_h
+    moved_px = registration.model.project(ground) - scene.model.project(ground)
+    print(f"the model moved by {np.nanmedian(np.hypot(*moved_px.T)):.1f} px (median over the points)")
+
+    refined = write_refined(
+        image, None, registration.model, registration.adjustment, scene.image.shape, folder
+    )
+    print(f"{refined.note}: {', '.join(path.name for path in refined.files)}")
+
+
+if __name__ == "__main__":
+    block, output = Path(sys.argv[1]), Path(sys.argv[2])
+    scene_image = Path(sys.argv[3]) if len(sys.argv) > 3 else simulated_images.write_scene(output)
+    register(scene_image, block, output)

@@ -1,0 +1,41 @@
+"""Images of a simulated piece of ground, which stand in for your own in the examples."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from services.formats.raster import write_raster
+from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
+from services.simulation.world import World, make_world
+
+SHAPE = (700, 700)
+GSD_M = 1.0
+
+
+def write_block_images(folder: Path) -> list[Path]:
+    """Write three overlapping images, each with a model that is about 3 m wrong, and return their paths."""
+    rng = np.random.default_rng(2)
+    return [_write(view, folder) for view in simulate_block(_world(), rng, 3, SHAPE, GSD_M, 3.0, 20.0)]
+
+
+def write_scene(folder: Path) -> Path:
+    """Write another image of the same ground, with a model that is 50 m wrong, and return its path."""
+    world = _world()
+    lon, lat = (float(degrees) for degrees in world.centre_lon_lat)
+    day = datetime(2024, 7, 3, 10, 30, tzinfo=UTC)
+    plan = ViewPlan("scene", (lon, lat), SHAPE, GSD_M, incidence_deg=11.0, azimuth_deg=200.0, acquired_at=day)
+    return _write(simulate_view(world, plan, np.random.default_rng(3), ground_error_m=(40.0, -30.0)), folder)
+
+
+def _world() -> World:
+    """A square kilometre of fields, woods and villages; the same at every call."""
+    return make_world(np.random.default_rng(1), size_m=1000.0, posting_m=1.0)
+
+
+def _write(view: SimulatedView, folder: Path) -> Path:
+    """Write an image as a GeoTIFF that has its RPC in its tags, as a producer delivers it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{view.geometry.plan.image_id}.tif"
+    write_raster(path, view.pixels, view.geometry.delivered)
+    return path
