@@ -8,7 +8,7 @@ READY := .venv/ready
 PAGE := app/web/built/index.html
 LONG := faults load stress
 
-.PHONY: demo test check serve bench bench-registration bench-load bench-faults postgis page chromium
+.PHONY: demo test test-fast check docs serve bench bench-registration bench-load bench-faults postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
@@ -17,6 +17,13 @@ test: check postgis page chromium
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --ignore tests/app/test_openapi.py
 	# All its operations have one name, of which files handed out as a whole run only the first.
 	$(BIN)/python -m pytest -n auto --dist load tests/app/test_openapi.py
+
+# Under two minutes on two cores: no database, no journeys, nothing long. It reports what it leaves out.
+test-fast: $(READY)
+	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 check: $(READY)
 	$(BIN)/ruff format --check .

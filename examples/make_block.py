@@ -2,8 +2,8 @@
 
     python examples/make_block.py FOLDER [IMAGE IMAGE ...]
 
-Without images of your own, the example simulates three. It writes the block into FOLDER/block and draws the
-chips of some of its points into FOLDER/chips.png.
+Without images of your own, the example simulates three. It writes the block into FOLDER/block and draws
+the chips of some of its points into FOLDER/chips.png.
 """
 
 import sys
@@ -13,8 +13,8 @@ import matplotlib.pyplot as plt
 import simulated_images
 
 from app.usecases.production import BlockIdentity, run_production
-from services.formats.block import FolderChips, read_block
-from services.production import ProductionOptions
+from services.formats.block.reader import FolderChips, read_block
+from services.production.from_images import ProductionOptions
 from services.types import point_chips
 
 
@@ -29,8 +29,8 @@ def make_block(images: list[Path], folder: Path) -> None:
 
     accuracy = production.relative
     print(f"{len(production.points)} points in {folder}")
-    print(f"median distance between rays and tie points, models as delivered: {accuracy.before_px:.2f} px")
-    print(f"the same with the adjusted models: {accuracy.after_px:.2f} px")
+    print(f"median distance between rays and tie points: {accuracy.before_px:.2f} px as delivered,")
+    print(f"{accuracy.after_px:.2f} px after the adjustment of the images")
     print(f"frame of the block on the Earth: {accuracy.frame_sigma_m:.1f} m (one sigma)")
 
 
@@ -52,7 +52,6 @@ def draw_chips(block_folder: Path, picture: Path, count: int = 5) -> None:
 
 
 if __name__ == "__main__":
-    output = Path(sys.argv[1])
-    inputs = [Path(name) for name in sys.argv[2:]] or simulated_images.write_block_images(output / "images")
-    make_block(inputs, output / "block")
+    output, *names = map(Path, sys.argv[1:])
+    make_block(names or simulated_images.write_block_images(output / "images"), output / "block")
     draw_chips(output / "block", output / "chips.png")

@@ -58,5 +58,5 @@ if __name__ == "__main__":
     box, output = sys.argv[1], sys.argv[2]
     service = sys.argv[3] if len(sys.argv) > 3 else "http://127.0.0.1:8000"
     table = query_points(box, service, os.environ.get("AMERS_TOKEN"))
-    print(table[["saliency"]].describe())
+    print(f"{len(table)} control points, columns: {', '.join(table.columns)}")
     draw(table, output)

@@ -2,8 +2,8 @@
 
     python examples/register_scene.py BLOCK FOLDER [SCENE]
 
-BLOCK is the folder of a block, for instance the one that make_block.py writes. Without a scene of your own, the
-example simulates one whose model is 50 m wrong. It writes the refined model into FOLDER.
+BLOCK is the folder of a block, for instance the one that make_block.py writes. Without a scene of your
+own, the example simulates one whose model is 50 m wrong. It writes the refined model into FOLDER.
 """
 
 import sys
@@ -12,22 +12,22 @@ from pathlib import Path
 import numpy as np
 import simulated_images
 
-from services.formats.block import FolderChips, read_block
-from services.formats.refined import write_refined
-from services.formats.scenes import read_scene
-from services.registration import register_scene
+from services.formats.block.reader import FolderChips, read_block
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.refined_model import write_refined
+from services.registration.on_points import register_scene
 
 
 def register(image: Path, block_folder: Path, folder: Path) -> None:
-    """Refine the model of a scene, print how good it is, and write it beside nothing that exists."""
+    """Refine the model of a scene, print how good the result is, and write it into a folder."""
     # A scene is an image that is read by windows, its sensor model, and how wrong that model may be.
     scene = read_scene(image, sigma_m=50.0)
 
-    # A block is a table of points and the files of their chips, which are read when they are needed.
+    # A block holds a table of points and the files of their chips, which are read when they are needed.
     points = read_block(block_folder).points
     chips = FolderChips(block_folder)
 
-    # Predict where the points are in the scene, find their chips there, adjust the model, qualify the result.
+    # Predict where the scene shows the points, find their chips there, adjust the model, qualify it.
     registration = register_scene(scene, points, chips)
 
     measures, quality = registration.measures, registration.qualification
@@ -35,7 +35,8 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
     print(f"{measures.active.sum()} of them take part in the final adjustment")
     print(f"verdict: {quality.verdict}")
     for criterion in quality.criteria:
-        print(f"  {criterion.name}: {criterion.value:.2f}")
+        limit = f"{criterion.comparison} {criterion.limit:g} to be {criterion.needed_for}"
+        print(f"  {criterion.name}: {criterion.value:.2f}, {limit}")
 
     # A registered model projects ground positions into the image like the model that was delivered.
     ground = points.lon_lat_h
@@ -49,6 +50,5 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    block, output = Path(sys.argv[1]), Path(sys.argv[2])
-    scene_image = Path(sys.argv[3]) if len(sys.argv) > 3 else simulated_images.write_scene(output)
-    register(scene_image, block, output)
+    block, output, *images = map(Path, sys.argv[1:])
+    register(images[0] if images else simulated_images.write_scene(output), block, output)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.formats.raster import write_raster
+from services.formats.images.raster import write_raster
 from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from services.simulation.world import World, make_world
 
@@ -14,7 +14,7 @@ GSD_M = 1.0
 
 
 def write_block_images(folder: Path) -> list[Path]:
-    """Write three overlapping images, each with a model that is about 3 m wrong, and return their paths."""
+    """Write three overlapping images, each with a model that is 3 m wrong, and return their paths."""
     rng = np.random.default_rng(2)
     return [_write(view, folder) for view in simulate_block(_world(), rng, 3, SHAPE, GSD_M, 3.0, 20.0)]
 
@@ -24,8 +24,12 @@ def write_scene(folder: Path) -> Path:
     world = _world()
     lon, lat = (float(degrees) for degrees in world.centre_lon_lat)
     day = datetime(2024, 7, 3, 10, 30, tzinfo=UTC)
-    plan = ViewPlan("scene", (lon, lat), SHAPE, GSD_M, incidence_deg=11.0, azimuth_deg=200.0, acquired_at=day)
-    return _write(simulate_view(world, plan, np.random.default_rng(3), ground_error_m=(40.0, -30.0)), folder)
+    plan = ViewPlan(
+        "scene", (lon, lat), SHAPE, GSD_M, incidence_deg=11.0, azimuth_deg=200.0, acquired_at=day
+    )
+    return _write(
+        simulate_view(world, plan, np.random.default_rng(3), ground_error_m=(40.0, -30.0)), folder
+    )
 
 
 def _world() -> World:

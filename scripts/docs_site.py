@@ -1,8 +1,9 @@
-"""Hooks of mkdocs: pages from outside docs/, the library's reference, links into the code, formulas as MathML.
+"""Hooks of mkdocs: pages from outside docs/, the reference of the library, links, formulas as MathML.
 
-The documents link to source files by their path in the repository, so that the links work on the page of a
-repository. The site has no source files: a link to a module of `services` leads to its reference here, a link to
-a page that the site has under another name leads there, and what else lies outside docs/ becomes its path as code.
+The documents link to source files by their path in the repository, so that the links work on the page of
+a repository. The site has no source files. A link to a module of `services` leads to its reference; a link
+to a page that the site has under another name leads to that page; a link to any other file outside docs/
+becomes the path of the file, set as code.
 """
 
 import html
@@ -54,7 +55,7 @@ def one_for_each(match: re.Match[str]) -> str:
 
 
 def library() -> dict[str, list[str]]:
-    """Pages of the library's reference and the modules on each: one page for each package of `services`."""
+    """Pages of the reference and the modules on each: one page for each package of `services`."""
     pages: dict[str, list[str]] = {"services": []}
     for path in sorted((ROOT / "services").rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
@@ -75,7 +76,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the entries of the navigation that stand for all pages of a folder."""
     filled = {
         "library/": [f"library/{page}.md" for page in library()],
-        "decisions/": sorted(f"decisions/{path.name}" for path in (ROOT / "docs/decisions").glob("*.md")),
+        "decisions/": sorted(
+            f"decisions/{path.name}" for path in (ROOT / "docs/decisions").glob("*.md")
+        ),
     }
     for section in config.nav or []:
         for title, entry in section.items():

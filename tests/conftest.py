@@ -1,8 +1,10 @@
-"""What every test may ask for."""
+"""What every test may ask for, and which tests a fast run leaves out."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -17,7 +19,60 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+LEFT_OUT = pytest.StashKey[Counter[str]]()
+"""How many tests a fast run leaves out, by reason."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add `--fast`."""
+    parser.addoption(
+        "--fast", action="store_true", help="leave out journeys, long tests, tests that need a database"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put long modules first, and leave out what a fast run does not wait for."""
+    if config.getoption("--fast"):
+        _keep_fast(config, items)
+    _begin_long_ones_first(items)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take over what a worker of pytest-xdist has left out; all workers leave out the same."""
+    node.config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Hand what was left out to the process that reports, when this is a worker of pytest-xdist."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left_out"] = dict(session.config.stash.get(LEFT_OUT, Counter()))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Report what a fast run has left out."""
+    if counts := config.stash.get(LEFT_OUT, None):
+        parts = ", ".join(f"{count} {reason}" for reason, count in counts.items())
+        terminalreporter.write_line(f"left out by --fast: {parts}; `make test` runs all tests")
+
+
+def _keep_fast(config: pytest.Config, items: list[pytest.Item]) -> None:
+    reasons = [_slow_because(item) for item in items]
+    config.hook.pytest_deselected(items=[item for item, why in zip(items, reasons, strict=True) if why])
+    config.stash[LEFT_OUT] = Counter(why for why in reasons if why)
+    items[:] = [item for item, why in zip(items, reasons, strict=True) if not why]
+
+
+def _slow_because(item: pytest.Item) -> str | None:
+    """Why a fast run leaves a test out; None when it does not."""
+    if item.nodeid.startswith("tests/journeys/"):
+        return "journeys"
+    if "open_folder" in getattr(item, "fixturenames", ()) or item.get_closest_marker("database"):
+        return "tests that need a database"
+    return "long tests" if item.get_closest_marker("long") else None
+
+
+def _begin_long_ones_first(items: list[pytest.Item]) -> None:
     """Long modules first: one that is begun last leaves the other cores without work.
 
     Of these, those of the science come before those of services whose workers are killed while they

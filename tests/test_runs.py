@@ -15,7 +15,7 @@ from tests.runs import PREFIX, end_dead_runs, processes_in, run_folder
 RUN = """
 import sys
 from pathlib import Path
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 from tests.runs import run_folder
 with run_folder(Path(sys.argv[1])) as folder, Cluster(folder / "postgres", durable=False).lease():
     print(folder, flush=True)
@@ -42,6 +42,7 @@ def running(place: Path) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
         yield run, Path(run.stdout.readline().strip())
 
 
+@pytest.mark.database
 def test_the_database_of_a_run_that_was_killed_is_ended_by_the_next(place: Path):
     with running(place) as (alive, its_folder), running(place) as (run, folder):
         assert folder.name.startswith(PREFIX)

@@ -1,0 +1,68 @@
+"""The examples, run as their readers run them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+from services.formats.block.reader import read_block
+from services.formats.sensor_models.rpc_files import read_rpc
+from tests.serving import Service, until
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(*arguments: object, **environment: str) -> str:
+    """What a command prints, once it has ended well."""
+    result = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        env={**os.environ, "MPLBACKEND": "agg", **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the example of a block has filled."""
+    folder = tmp_path_factory.mktemp("examples")
+    assert "points in" in run(EXAMPLES / "make_block.py", folder)
+    return folder
+
+
+def test_a_block_is_made_from_images(made):
+    assert len(read_block(made / "block").points) >= 40
+    assert (made / "chips.png").stat().st_size > 10_000
+
+
+def test_a_scene_is_registered_on_the_block(made, tmp_path):
+    printed = run(EXAMPLES / "register_scene.py", made / "block", tmp_path)
+    assert "verdict: good" in printed
+    delivered, refined = (
+        read_rpc(tmp_path / "scene.tif"),
+        read_rpc(tmp_path / "scene.tif", tmp_path / "refined_RPC.TXT"),
+    )
+    moved_px = refined.model.image_offset - delivered.model.image_offset
+    assert 30.0 < float((moved_px**2).sum() ** 0.5) < 70.0
+
+
+def test_points_are_queried_from_a_service_and_drawn(made, open_folder, tmp_path):
+    service = Service(open_folder / uuid4().hex[:8], AMERS_PUBLIC_POINTS="true")
+    try:
+        assert until(service.is_ready), service.log.read_text()
+        run("-m", "app.cli.main", "block", "ingest", made / "block", "--publish", **service.environment)
+        points = read_block(made / "block").points
+        (west, south), (east, north) = (f(points.lon_lat_h[:, :2], axis=0) for f in (np.min, np.max))
+        box = f"{west},{south},{east},{north}"
+        printed = run(EXAMPLES / "query_points.py", box, tmp_path / "map.png", service.url)
+    finally:
+        service.end()
+    assert "control points" in printed
+    assert (tmp_path / "map.png").stat().st_size > 10_000
