@@ -25,6 +25,8 @@ TOUR = (
     "services/adjustment/image_correction.py",
     "services/sensors/rpc.py",
 )
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
+FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web"
 NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}
 LONGEST_FILE = 500
 
@@ -69,9 +71,14 @@ def test_a_stop_of_the_tour_exists_and_the_readme_leads_to_it(path):
     assert f"`{path}`" in README.read_text()
 
 
-def test_every_file_that_the_readme_names_exists():
-    named = re.findall(r"\]\((?!https?:|#)([^)#]+)", README.read_text())
-    assert [path for path in named if not (ROOT / path).exists()] == []
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_file_that_a_document_names_exists(document):
+    text = document.read_text()
+    links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", text)
+    assert [path for path in links if not (document.parent / path).exists()] == []
+    paths = re.findall(rf"`((?:{FOLDERS})/[\w./-]+)`", text)
+    real = [path for path in paths if not re.search("NAME|NNNN|built|results", path)]
+    assert [path for path in real if not (ROOT / path).exists()] == []
 
 
 @pytest.mark.parametrize("name", Settings.model_fields)
