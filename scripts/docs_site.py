@@ -1,9 +1,9 @@
 """Hooks of mkdocs: pages from outside docs/, the reference of the library, links, formulas as MathML.
 
 The documents link to source files by their path in the repository, so that the links work on the page of
-a repository. The site has no source files. A link to a module of `services` leads to its reference; a link
-to a page that the site has under another name leads to that page; a link to any other file outside docs/
-becomes the path of the file, set as code.
+a repository. The site has no source files. A link to a module of `services` leads to its reference. A
+link to a page that the site has under another name leads to that page. A link to any other file outside
+docs/ becomes the path of the file, set as code.
 """
 
 import html
