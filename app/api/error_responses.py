@@ -9,7 +9,6 @@ from fastapi import FastAPI, Request
 from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from psycopg_pool import PoolTimeout
 from starlette.exceptions import HTTPException
 
 from app.errors import (
@@ -60,7 +59,6 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(psycopg.OperationalError, _unavailable)
     app.add_exception_handler(psycopg.DataError, _unusable)
     app.add_exception_handler(OSError, _no_room)
-    app.add_exception_handler(PoolTimeout, _unavailable)
     app.add_exception_handler(StorageOutage, _storage_unavailable)
     app.add_exception_handler(Exception, _unexpected)
 

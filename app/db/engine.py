@@ -1,31 +1,47 @@
-"""Connections, pools and the version of the schema."""
+"""Connections to the database: engines with their pools, and the version of the schema.
+
+A request reads on a connection that can only read, each statement a transaction of its own; whatever
+writes has one transaction. Role, read-only mode and time limit belong to a connection from its start:
+to switch them at each checkout costs more than the whole checkout (decision 13). So there are two
+engines, made by one function.
+
+Errors of the database reach callers as the driver raises them, such as `psycopg.OperationalError`.
+"""
 
 import logging
 import select
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
-from psycopg.rows import DictRow, dict_row
-from psycopg_pool import ConnectionPool
+from sqlalchemy import Engine, ExceptionContext, NullPool, QueuePool, create_engine, event, exc
+from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
 from app import request_context
 from app.config import Settings
 from app.db.cluster import embedded
+from app.db.transition import Connection as Connection
+from app.db.transition import DriverConnection as DriverConnection
+from app.db.transition import driver as driver
 from app.errors import InputError
-
-Connection = psycopg.Connection[DictRow]
-Pool = ConnectionPool[Connection]
 
 READER = "amers_reader"
 """Role of the connections that answer reading requests: it can do nothing but select."""
+POOL_TIMEOUT_S = 10.0
+"""A caller waits so long for a connection when all are in use."""
+POOL_RECYCLE_S = 3600
+"""Older connections are replaced: server processes grow with what they have seen."""
+WARM_CONNECTIONS = 2
+"""Connections of each pool that are opened at the start."""
 SILENT_LINE_S = 15
-"""What was sent over a line and not confirmed for so long shows that the line is cut."""
+"""A TCP connection is cut when data that was sent is not confirmed for so long."""
 NOTICING_CUTS: dict[str, Any] = {
     "tcp_user_timeout": 1000 * SILENT_LINE_S,
     "keepalives_idle": SILENT_LINE_S,
@@ -35,9 +51,14 @@ NOTICING_CUTS: dict[str, Any] = {
 FIRST_SPATIAL_PLAN = """select st_asgeojson(st_transform(st_setsrid(st_makepoint(n, 0, 0), 4326), 3857))
     from generate_series(0, 0) n where n = 0"""
 """Loads PostGIS and PROJ: up to 60 ms that no caller should wait for."""
-
+SET_ORIGIN = b"""select set_config('amers.actor', %s, true), set_config('amers.actor_name', %s, true),
+    set_config('amers.request_id', %s, true), set_config('amers.job_id', %s, true)"""
 
 log = logging.getLogger(__name__)
+
+
+class PoolTimeout(psycopg.OperationalError):
+    """All connections of a pool were in use for longer than a caller waits."""
 
 
 @dataclass(frozen=True)
@@ -46,29 +67,30 @@ class Database:
 
     Attributes:
         dsn: its connection string.
-        reader, writer: pools; connections of the first can only read, and not for long.
+        reader, writer: connections of the first can only read, and not for long.
     """
 
     dsn: str
-    reader: Pool
-    writer: Pool
+    reader: Engine
+    writer: Engine
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection that can only read; every statement has the time limit of the settings.
 
-        Each statement is a transaction: several in one would see what others commit between them all the
-        same, for two exchanges with the database more.
+        Each statement is a transaction of its own. One transaction around all of them would see the same
+        commits of others between statements, and would cost two more round trips.
         """
-        with self.reader.connection() as connection:
+        with _connection(self.reader) as connection:
             yield connection
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
         """One transaction, committed at the end of the context, rolled back by an exception."""
-        with self.writer.connection() as connection:
-            say_origin(connection)
+        with _connection(self.writer) as connection:
+            set_origin(connection)
             yield connection
+            connection.commit()
 
 
 @dataclass(frozen=True)
@@ -97,14 +119,13 @@ def opened(settings: Settings) -> Iterator[Database]:
         # First: the schema grants what the role of the reading connections needs.
         ensure_schema(dsn, upgradable=settings.database_url is None)
         with pooled(dsn, settings) as database:
-            for pool in (database.reader, database.writer):
-                pool.wait()
+            _warm_pools(database, min(WARM_CONNECTIONS, settings.pool_size))
             yield database
 
 
 @contextmanager
 def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
-    """Pools on a database, whatever its schema; a line that is cut is noticed within seconds."""
+    """Engines on a database, whatever its schema; a connection that is cut is noticed within seconds."""
     dsn = make_conninfo(**(NOTICING_CUTS | conninfo_to_dict(dsn)))
     limit_ms = round(1000 * settings.read_timeout_seconds)
     # A parallel worker is a process that loads PostGIS for one query, longer than most queries take.
@@ -116,32 +137,53 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
         reading += f" -c role={READER}"
     else:
         log.warning("reading as the role of the database's owner: there is no usable %s", READER)
-    with (
-        _pool(dsn, settings.pool_size, {"options": reading, "autocommit": True}) as reader,
-        _pool(dsn, settings.pool_size, {}) as writer,
-    ):
+    pool: dict[str, Any] = {
+        "poolclass": QueuePool,
+        "pool_size": settings.pool_size,
+        "max_overflow": 0,
+        "pool_timeout": POOL_TIMEOUT_S,
+        "pool_recycle": POOL_RECYCLE_S,
+        # The connection used last has the plans of its statements at hand.
+        "pool_use_lifo": True,
+    }
+    # A reading connection is never in a transaction: no BEGIN, no ROLLBACK.
+    autocommit: dict[str, Any] = {
+        "isolation_level": "AUTOCOMMIT",
+        "skip_autocommit_rollback": True,
+        "pool_reset_on_return": None,
+    }
+    reader = _engine(make_conninfo(dsn, options=reading), **pool, **autocommit)
+    writer = _engine(dsn, **pool)
+    try:
         yield Database(dsn, reader, writer)
+    finally:
+        reader.dispose()
+        writer.dispose()
 
 
 @contextmanager
 def connect(dsn: str) -> Iterator[Connection]:
     """A connection without a pool: one transaction, committed at the end of the context."""
-    with _reachable(dsn) as connection:
-        say_origin(connection)
+    try:
+        connection: Any = _unpooled(dsn).connect()  # transition
+    except psycopg.OperationalError as error:
+        raise _unreachable(error) from error
+    with connection:
+        set_origin(connection)
         yield connection
+        connection.commit()
 
 
-def say_origin(connection: Connection) -> None:
-    """Tell the transaction who is behind it, for the record of changes."""
-    where = request_context.current()
-    connection.execute(
-        """select set_config('amers.actor', %s, true), set_config('amers.actor_name', %s, true),
-                  set_config('amers.request_id', %s, true), set_config('amers.job_id', %s, true)""",
+def set_origin(connection: Connection) -> None:
+    """Record in the transaction who is behind it, for the audit."""
+    origin = request_context.current()
+    driver(connection).execute(
+        SET_ORIGIN,
         [
-            str(where.actor or ""),
-            where.actor_name,
-            where.request_id or "",
-            str(where.job_id or ""),
+            str(origin.actor or ""),
+            origin.actor_name,
+            origin.request_id or "",
+            str(origin.job_id or ""),
         ],
     )
 
@@ -149,15 +191,10 @@ def say_origin(connection: Connection) -> None:
 def status(dsn: str) -> SchemaStatus:
     """The version of a database's schema beside the one this Amers needs."""
     with _reachable(dsn) as connection:
-        known = connection.execute(
-            "select to_regclass('alembic_version') is not null as known"
-        ).fetchone()
-        row = (
-            connection.execute("select version_num from alembic_version").fetchone()
-            if known and known["known"]
-            else None
-        )
-    return SchemaStatus(found=row["version_num"] if row else None, needed=newest_revision())
+        found = None
+        if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
+            found = connection.execute("select version_num from alembic_version").fetchone()
+    return SchemaStatus(found=found[0] if found else None, needed=newest_revision())
 
 
 def ensure_schema(dsn: str, *, upgradable: bool) -> None:
@@ -227,33 +264,54 @@ def _may_read_as_reader(dsn: str) -> bool:
     return row is not None
 
 
-def _pool(dsn: str, size: int, options: dict[str, Any]) -> Pool:
-    return ConnectionPool(
-        dsn,
-        min_size=min(2, size),
-        max_size=size,
-        open=False,
-        timeout=10.0,
-        connection_class=psycopg.Connection[DictRow],
-        kwargs={"row_factory": dict_row, **options},
-        check=_ask_if_suspect,
-        configure=_warm,
+def _engine(dsn: str, **options: Any) -> Engine:
+    """An engine whose connections are warm, checked before use, and raise the errors of the driver."""
+    engine = create_engine(
+        "postgresql+psycopg://",
+        creator=lambda: psycopg.connect(dsn),
+        use_native_hstore=False,
+        **options,
     )
+    engine._connection_cls = Connection  # transition
+    event.listen(engine, "connect", _warm)
+    event.listen(engine, "checkout", _check)
+    event.listen(engine, "handle_error", _raise_as_driver)
+    return engine
 
 
-def _ask_if_suspect(connection: Connection) -> None:
-    """Ask the database for a sign of life where the line is not silent: it tells of its end unasked.
+@lru_cache(maxsize=8)
+def _unpooled(dsn: str) -> Engine:
+    engine = create_engine(
+        "postgresql+psycopg://",
+        creator=lambda: psycopg.connect(dsn, connect_timeout=10),
+        use_native_hstore=False,
+        poolclass=NullPool,
+    )
+    engine._connection_cls = Connection  # transition
+    event.listen(engine, "handle_error", _raise_as_driver)
+    return engine
 
-    Raises:
-        OperationalError: there is none; the pool takes another connection.
-    """
-    line = select.poll()
-    line.register(connection.fileno(), select.POLLIN)
-    if line.poll(0):
-        ConnectionPool.check_connection(connection)
+
+@contextmanager
+def _connection(engine: Engine) -> Iterator[Connection]:
+    try:
+        connection: Any = engine.connect()  # transition
+    except exc.TimeoutError as error:
+        raise PoolTimeout(f"no connection was free within {POOL_TIMEOUT_S:g} s") from error
+    with connection:
+        yield connection
 
 
-def _warm(connection: Connection) -> None:
+def _warm_pools(database: Database, count: int) -> None:
+    """Open the first connections of both pools, at the same time."""
+    engines = [database.reader, database.writer] * count
+    with ThreadPoolExecutor(len(engines)) as threads:
+        connections = list(threads.map(Engine.connect, engines))
+    for connection in connections:
+        connection.close()
+
+
+def _warm(connection: DriverConnection, entry: ConnectionPoolEntry) -> None:
     """Make a new connection ready for its first query; a database without PostGIS has none to get."""
     without_postgis = (psycopg.errors.UndefinedFunction, psycopg.errors.UndefinedObject)
     with suppress(*without_postgis), connection.transaction():
@@ -262,11 +320,39 @@ def _warm(connection: Connection) -> None:
         connection.execute(FIRST_SPATIAL_PLAN)
 
 
-@contextmanager
-def _reachable(dsn: str) -> Iterator[Connection]:
+def _check(
+    connection: DriverConnection, entry: ConnectionPoolEntry, proxy: PoolProxiedConnection
+) -> None:
+    """Ask the database for a sign of life if there is something to read: it announces its end.
+
+    Raises:
+        InvalidatePoolError: there is none; the pool opens new connections in place of all its old ones.
+    """
     try:
-        connection = psycopg.connect(dsn, row_factory=dict_row, connect_timeout=10)
+        line = select.poll()
+        line.register(connection.fileno(), select.POLLIN)
+        if line.poll(0):
+            connection.execute("")
+            connection.rollback()
     except psycopg.OperationalError as error:
-        raise InputError(f"the database cannot be reached: {str(error).strip()}") from error
+        raise exc.InvalidatePoolError() from error
+
+
+def _raise_as_driver(context: ExceptionContext) -> None:
+    """Let callers see the driver's error: its classes say what happened, and nothing wraps it."""
+    if isinstance(context.original_exception, psycopg.Error):
+        raise context.original_exception
+
+
+@contextmanager
+def _reachable(dsn: str) -> Iterator[DriverConnection]:
+    try:
+        connection = psycopg.connect(dsn, connect_timeout=10)
+    except psycopg.OperationalError as error:
+        raise _unreachable(error) from error
     with connection:
         yield connection
+
+
+def _unreachable(error: psycopg.OperationalError) -> InputError:
+    return InputError(f"the database cannot be reached: {str(error).strip()}")

@@ -122,8 +122,7 @@ def test_a_reader_of_a_page_in_pieces_who_is_gone_gives_the_only_connection_back
             with anyio.fail_after(PATIENCE_S), suppress(ClientDisconnect):
                 await app(scope, receive, send)
             assert taken.is_set()
-            reader = app.state.database.reader.get_stats()
-            assert reader["pool_available"] == CONNECTIONS
+            assert app.state.database.reader.pool.checkedin() == CONNECTIONS
             assert (await client_of(app, token).get(f"{ITEMS}/{FIRST_ID}")).status_code == 200
 
     anyio.run(read_on)

@@ -6,7 +6,7 @@ from uuid import UUID
 import procrastinate
 from psycopg.rows import scalar_row
 
-from app.db.engine import Connection
+from app.db.engine import Connection, driver
 
 QUEUE = "amers"
 TASK = "amers:job"
@@ -23,7 +23,7 @@ def enqueue(connection: Connection, job_id: UUID, delay_s: float = 0.0) -> None:
         TASK,
         queue=QUEUE,
         schedule_in={"milliseconds": int(1000 * delay_s)} if delay_s else None,
-        connection=connection,
+        connection=driver(connection),
     ).defer(job_id=str(job_id))
 
 
