@@ -1,9 +1,10 @@
-"""Who calls, and what he may do: bearer tokens of 256 random bits with scopes."""
+"""Authentication and authorisation: bearer tokens of 256 random bits with scopes."""
 
 import hashlib
 import secrets
 from dataclasses import replace
 from enum import StrEnum
+from uuid import UUID
 
 from app.db.engine import Connection, Database
 from app.db.tokens import Token, find_subject, find_valid_token, keep_subject
@@ -11,6 +12,8 @@ from app.errors import NotAllowed
 from app.oidc import Identity
 
 SECRET_BYTES = 32
+INVALID_TOKEN = "the token is unknown, expired or revoked"
+MISSING_TOKEN = "this request needs a token: send the header `Authorization: Bearer TOKEN`"
 
 
 class Scope(StrEnum):
@@ -31,12 +34,12 @@ INCLUDED = {
 
 
 def new_secret() -> str:
-    """A secret for a new token, 43 characters that need no quoting anywhere."""
+    """A secret for a new token: 43 characters that need no quoting in a shell or a URL."""
     return secrets.token_urlsafe(SECRET_BYTES)
 
 
 def secret_hash(secret: str) -> bytes:
-    """What is stored of a secret; 256 random bits need no salt and no slow hash."""
+    """The SHA-256 under which a secret is stored; 256 random bits need neither salt nor a slow hash."""
     return hashlib.sha256(secret.encode()).digest()
 
 
@@ -44,28 +47,28 @@ def authenticate(connection: Connection, secret: str) -> Token:
     """The token of a secret.
 
     Raises:
-        NotAllowed: unknown, expired and revoked secrets get the same answer.
+        NotAllowed: the secret is unknown, expired or revoked; the message does not tell which.
     """
     token = find_valid_token(connection, secret_hash(secret))
     if token is None:
-        raise NotAllowed("the token is unknown, expired or revoked", known=False)
+        raise NotAllowed(INVALID_TOKEN, known=False)
     return token
 
 
 def authenticate_identity(database: Database, identity: Identity) -> Token:
-    """The row that stands for an identity, with the scopes its issuer gives it now.
+    """The token row of an OpenID Connect identity, with the scopes that its issuer gives it now.
 
     Raises:
-        NotAllowed: an administrator has revoked it here.
+        NotAllowed: an administrator of this installation has revoked it.
     """
     with database.reading() as connection:
-        known = find_subject(connection, identity.subject)
-    if known is None:
+        token = find_subject(connection, identity.subject)
+    if token is None:
         with database.transaction() as connection:
-            known = keep_subject(connection, identity.subject, identity.name, identity.scopes)
-    if known.revoked_at is not None:
-        raise NotAllowed("the token is unknown, expired or revoked", known=False)
-    return replace(known, scopes=identity.scopes)
+            token = keep_subject(connection, identity.subject, identity.name, identity.scopes)
+    if token.revoked_at is not None:
+        raise NotAllowed(INVALID_TOKEN, known=False)
+    return replace(token, scopes=identity.scopes)
 
 
 def allows(token: Token, scope: Scope) -> bool:
@@ -73,16 +76,37 @@ def allows(token: Token, scope: Scope) -> bool:
     return any(scope in INCLUDED[Scope(own)] for own in token.scopes)
 
 
-def require(token: Token | None, scope: Scope) -> Token:
-    """The token, if it allows the scope.
+def is_administrator(caller: Token | None) -> bool:
+    """Whether a caller has the scope `admin`; None is a caller without a token."""
+    return caller is not None and allows(caller, Scope.ADMIN)
+
+
+def may_access(caller: Token, owner: UUID | None) -> bool:
+    """Whether a caller may see and change what belongs to an owner: owners and administrators may."""
+    return owner == caller.id or is_administrator(caller)
+
+
+def require_token(caller: Token | None) -> Token:
+    """The token of a caller.
 
     Raises:
-        NotAllowed: there is no token, or it lacks the scope.
+        NotAllowed: the caller sent none.
     """
-    if token is None:
-        raise NotAllowed("this needs a token: send `Authorization: Bearer …`", known=False)
+    if caller is None:
+        raise NotAllowed(MISSING_TOKEN, known=False)
+    return caller
+
+
+def require(caller: Token | None, scope: Scope) -> Token:
+    """The token of a caller who has a scope.
+
+    Raises:
+        NotAllowed: the caller sent no token, or its token lacks the scope.
+    """
+    token = require_token(caller)
     if not allows(token, scope):
         raise NotAllowed(
-            f"this needs scope {scope}; token {token.name} has {', '.join(token.scopes)}", known=True
+            f"this request needs scope {scope}; token {token.name} has {', '.join(token.scopes)}",
+            known=True,
         )
     return token

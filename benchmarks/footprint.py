@@ -100,7 +100,7 @@ def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
 def in_database(connection: Connection, box: Box) -> bytes:
     """The way of the service."""
     bbox = f"{box.west!r},{box.south!r},{box.east!r},{box.north!r}"
-    asked = resolve(find_collection("points"), Viewer(), FeatureQuery(10_000, bbox=bbox), SECRET)
+    asked = resolve(find_collection("points"), Viewer(), FeatureQuery(limit=10_000, bbox=bbox), SECRET)
     found = page(connection, asked, "geojson", SECRET)
     rest = f'"numberReturned":{found.returned},"numberMatched":{found.matched.number}'
     return b'{"type":"FeatureCollection","features":[' + found.body + f"],{rest}}}".encode()

@@ -16,7 +16,7 @@ from app.api.deps import (
     UploadTurn,
 )
 from app.api.jobs import job_url, status_info
-from app.auth import Scope, allows
+from app.auth import is_administrator
 from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.tokens import Token
@@ -154,13 +154,9 @@ def _published(published: Published) -> dict[str, Any]:
 
 def _visible(connection: Connection, reference: str, caller: Token | None) -> Block:
     """The block a caller may see: any for an administrator, the published one for others."""
-    if _is_admin(caller):
+    if is_administrator(caller):
         return lifecycle.find_block(connection, reference)
     return lifecycle.find_published(connection, reference)
-
-
-def _is_admin(caller: Token | None) -> bool:
-    return caller is not None and allows(caller, Scope.ADMIN)
 
 
 def _properties(block: Block) -> dict[str, Any]:

@@ -5,108 +5,111 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
+from app.api.features import parameter_names
 from app.api.negotiation import NPZ, TIFF, refuse_unknown
 from app.errors import InvalidParameter
 from app.storage import StoredChips
 from app.usecases.features import points
 from app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
-from app.usecases.features.query import FeatureQuery
+from app.usecases.features.query import FeatureFilter
 from services.types import ControlPoints
 
 router = APIRouter(tags=["points"])
 
-PARAMETERS = {"ids", "bbox", "filter", "datetime", "f"}
-TYPES: dict[StackFormat, str] = {"npz": NPZ, "tif": TIFF}
-MEANS = f"Chips of at most {MOST_POINTS_WITH_CHIPS:,} points are given at once."
+MEDIA_TYPES: dict[StackFormat, str] = {"npz": NPZ, "tif": TIFF}
+LIMIT_TEXT = f"A reply has the chips of at most {MOST_POINTS_WITH_CHIPS:,} points."
 ARCHIVE: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "npz: a NumPy archive. `chips` is (n, 101, 101) of raw values, 0 is nodata; all"
         " other arrays have a row for each chip: `point_id`, `view`, `lon_lat_h` of the point, `gsd_m`,"
         " `incidence_deg`, `azimuth_deg`, `image_id`, `sensor`, `acquired_at`, `sun_elevation_deg`,"
-        " `sun_azimuth_deg`. tif: a GeoTIFF with a page for each chip, described by the same in JSON."
-        " Chips of a point follow each other, points are in the order of their ids.",
+        " `sun_azimuth_deg`. tif: a GeoTIFF with a page for each chip and the same values in its JSON"
+        " description. Points are in the order of their ids; the chips of a point are contiguous.",
         "content": {NPZ: {}, TIFF: {}},
     }
 }
 
 
-class ChipsAsked(BaseModel):
-    """Which points: by their ids, or by what `items` is asked with and a polygon."""
+def _parsed_ids(value: Any) -> Any:
+    """Whole numbers of the texts of a query; other values are left to the check of the type."""
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        return value
+    parts = [part.strip() for text in value for part in text.split(",")]
+    if not all(part.isdecimal() and len(part) < 20 for part in parts):
+        text = ",".join(value)
+        raise InvalidParameter(f"ids: {text!r:.60} found, whole numbers separated by commas expected")
+    return [int(part) for part in parts]
+
+
+class ChipsQuery(FeatureFilter):
+    """Which points: by their ids, or by a filter."""
+
+    ids: Annotated[tuple[int, ...] | None, BeforeValidator(_parsed_ids)] = Field(
+        default=None, min_length=1, description="Ids of points, separated by commas in a URL."
+    )
+    f: StackFormat = Field(default="npz", description="npz: a NumPy archive; tif: a GeoTIFF of pages.")
+
+
+class ChipsSearch(ChipsQuery):
+    """Which points, in the body of a POST."""
 
     model_config = ConfigDict(extra="forbid")
-
-    ids: list[int] | None = Field(None, min_length=1)
-    intersects: dict[str, Any] | None = Field(
-        None, description="GeoJSON geometry, longitude and latitude: a footprint."
-    )
-    bbox: str | None = None
-    filter: str | dict[str, Any] | None = None
-    datetime: str | None = None
-    f: StackFormat = "npz"
 
 
 @router.get(
     "/collections/points/chips",
     response_class=StreamingResponse,
     responses=ARCHIVE,
-    description=f"The chips of points named by their ids, or by box, filter and time. {MEANS}",
+    description=f"Return the chips of points, chosen by ids, or by box, filter and time. {LIMIT_TEXT}",
 )
 def chips_of_points(
+    *,
     request: Request,
     database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
-    ids: Annotated[str | None, Query(description="Ids, separated by commas.")] = None,
-    bbox: Annotated[str | None, Query(description="W,S,E,N, as for items.")] = None,
-    filter: Annotated[str | None, Query(description="CQL2 text.")] = None,
-    datetime: Annotated[str | None, Query(description="A time, or FROM/TO.")] = None,
-    f: Annotated[StackFormat, Query(description="tif: a page for each chip.")] = "npz",
+    query: Annotated[ChipsQuery, Query()],
 ) -> StreamingResponse:
-    refuse_unknown(request, PARAMETERS)
-    asked = ChipsAsked(
-        ids=_parse_ids(ids), bbox=bbox, filter=filter, datetime=datetime, intersects=None, f=f
-    )
-    return _archive(database, stored, asked)
+    refuse_unknown(request, parameter_names(ChipsQuery))
+    return _archive_reply(database, stored, query)
 
 
 @router.post(
     "/collections/points/chips",
     response_class=StreamingResponse,
     responses=ARCHIVE,
-    description=f"The same by POST: for many ids, and for a polygon. {MEANS}",
+    description=f"Return the chips of points by POST, for many ids or a long polygon. {LIMIT_TEXT}",
 )
 def search_chips(
-    request: Request, database: DatabaseDep, stored: ChipsDep, caller: PointsReader, body: ChipsAsked
+    *,
+    request: Request,
+    database: DatabaseDep,
+    stored: ChipsDep,
+    caller: PointsReader,
+    body: ChipsSearch,
 ) -> StreamingResponse:
     refuse_unknown(request, set())
-    return _archive(database, stored, body)
+    return _archive_reply(database, stored, body)
 
 
-def _archive(database: DatabaseDep, stored: StoredChips, asked: ChipsAsked) -> StreamingResponse:
-    """The first piece is read before the reply begins, so that chips that are not there are an error."""
-    pieces = points.stream_chips(_meant(database, asked), stored, asked.f)
+def _archive_reply(database: DatabaseDep, stored: StoredChips, query: ChipsQuery) -> StreamingResponse:
+    """The archive; the first piece is read before the reply begins: missing chips are then an error."""
+    pieces = points.stream_chips(_points(database, query), stored, query.f)
     first = next(pieces)
-    disposition = {"Content-Disposition": f'attachment; filename="chips.{asked.f}"'}
-    return StreamingResponse(chain((first,), pieces), media_type=TYPES[asked.f], headers=disposition)
+    disposition = {"Content-Disposition": f'attachment; filename="chips.{query.f}"'}
+    return StreamingResponse(
+        chain((first,), pieces), media_type=MEDIA_TYPES[query.f], headers=disposition
+    )
 
 
-def _meant(database: DatabaseDep, asked: ChipsAsked) -> ControlPoints:
-    by_question = asked.model_dump(exclude={"ids", "f"}, exclude_none=True)
-    if (asked.ids is None) == (not by_question):
+def _points(database: DatabaseDep, query: ChipsQuery) -> ControlPoints:
+    is_filtered = any(getattr(query, name) is not None for name in FeatureFilter.model_fields)
+    if (query.ids is None) != is_filtered:
         raise InvalidParameter("ids: either ids or one of bbox, filter, intersects, datetime expected")
     with database.reading() as connection:
-        if asked.ids is not None:
-            return points.points_of_ids(connection, asked.ids)
-        return points.points_of_question(connection, FeatureQuery(**by_question))
-
-
-def _parse_ids(text: str | None) -> list[int] | None:
-    if text is None:
-        return None
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() and len(part) < 20 for part in parts):
-        raise InvalidParameter(f"ids: {text!r:.60} found, whole numbers separated by commas expected")
-    return [int(part) for part in parts]
+        if query.ids is not None:
+            return points.points_of_ids(connection, query.ids)
+        return points.points_of_filter(connection, query)

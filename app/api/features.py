@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Generator
+from dataclasses import dataclass
 from itertools import islice
 from typing import Annotated, Any
 
@@ -13,18 +14,13 @@ from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import features_page
 from app.api.streams import Streamed
-from app.auth import Scope, allows, require
+from app.auth import Scope, is_administrator, require
 from app.db.engine import Database
 from app.db.features.collection import Collection, Viewer
+from app.db.features.pages import Text
 from app.usecases.features import items as features
 from app.usecases.features.items import Answer
-from app.usecases.features.query import (
-    DEFAULT_LIMIT,
-    FILTER_LANGUAGES,
-    FeatureQuery,
-    ResolvedQuery,
-    resolve,
-)
+from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
 from services.formats.vector.feature_files import (
     FeatureTable,
     format_flatgeobuf,
@@ -33,21 +29,6 @@ from services.formats.vector.feature_files import (
 )
 
 router = APIRouter(tags=["features"])
-
-PARAMETERS = {
-    "f",
-    "limit",
-    "token",
-    "bbox",
-    "bbox-crs",
-    "crs",
-    "datetime",
-    "filter",
-    "filter-lang",
-    "filter-crs",
-    "sortby",
-    "properties",
-}
 
 
 async def _collection(collection: str) -> Collection:
@@ -58,12 +39,18 @@ CollectionDep = Annotated[Collection, Depends(_collection)]
 
 
 def viewer_of(collection: CollectionDep, caller: CallerDep, settings: SettingsDep) -> Viewer:
-    """Who asks: with a token to read where points are not public, to register for closed collections."""
+    """The viewer that a caller is to a collection.
+
+    Open collections need the scope `read` unless points are public; closed ones need `register`.
+
+    Raises:
+        NotAllowed: the caller has no such scope.
+    """
     if not collection.is_open:
         caller = require(caller, Scope.REGISTER)
     elif caller is not None or not settings.public_points:
         caller = require(caller, Scope.READ)
-    return Viewer() if caller is None else Viewer(caller.id, allows(caller, Scope.ADMIN))
+    return Viewer() if caller is None else Viewer(caller.id, is_administrator(caller))
 
 
 async def _viewer(collection: CollectionDep, caller: CallerDep, settings: SettingsDep) -> Viewer:
@@ -74,11 +61,11 @@ ViewerDep = Annotated[Viewer, Depends(_viewer)]
 
 
 async def _secret(request: Request, database: DatabaseDep) -> bytes:
-    """The secret of page links, read once by each process."""
-    known: bytes | None = getattr(request.app.state, "page_secret", None)
-    if known is None:
-        known = request.app.state.page_secret = await run_in_threadpool(_read_secret, database)
-    return known
+    """The key that page tokens are signed with; each process reads it once."""
+    secret: bytes | None = getattr(request.app.state, "page_secret", None)
+    if secret is None:
+        secret = request.app.state.page_secret = await run_in_threadpool(_read_secret, database)
+    return secret
 
 
 def _read_secret(database: Database) -> bytes:
@@ -92,111 +79,70 @@ FILES: dict[str, Callable[[FeatureTable, str], bytes]] = {
     "parquet": format_parquet,
     "gpkg": format_geopackage,
 }
-Format = Annotated[str | None, Query(description=f"Format: {', '.join(FEATURES)}.")]
-CrsUri = Annotated[str | None, Query(description="URI of the reference system of the reply.")]
+FORMAT_TEXT = "Format of the reply; without it the header Accept decides."
+Format = Annotated[str | None, Query(description=FORMAT_TEXT)]
+CrsUri = Annotated[str | None, Query(description="URI of the coordinate reference system of the reply.")]
 
 
-async def question_of_query(
-    limit: Annotated[
-        int,
-        Query(ge=1, description="Most features on the page.", json_schema_extra={"maximum": 10_000}),
-    ] = DEFAULT_LIMIT,
-    token: Annotated[str | None, Query(description="From the link `next` of the page before.")] = None,
-    bbox: Annotated[
-        str | None,
-        Query(
-            description="W,S,E,N, or with heights between; W greater than E crosses the antimeridian."
-        ),
-    ] = None,
-    bbox_crs: Annotated[
-        str | None, Query(alias="bbox-crs", description="URI of the reference system of bbox.")
-    ] = None,
-    crs: CrsUri = None,
-    datetime: Annotated[
-        str | None, Query(description="A time, or FROM/TO with .. for an open end.")
-    ] = None,
-    filter: Annotated[str | None, Query(description="CQL2.")] = None,
-    filter_lang: Annotated[
-        str | None,
-        Query(
-            alias="filter-lang",
-            description="cql2-text unless said.",
-            json_schema_extra={"enum": list(FILTER_LANGUAGES)},
-        ),
-    ] = None,
-    filter_crs: Annotated[
-        str | None, Query(alias="filter-crs", description="URI of the reference system in filter.")
-    ] = None,
-    sortby: Annotated[
-        str | None, Query(description="Properties by which to sort, - before one for descending.")
-    ] = None,
-    properties: Annotated[str | None, Query(description="Properties to give, all by default.")] = None,
-) -> FeatureQuery:
-    return FeatureQuery(
-        limit=limit,
-        token=token,
-        bbox=bbox,
-        bbox_crs=bbox_crs,
-        crs=crs,
-        datetime=datetime,
-        filter=filter,
-        filter_lang=filter_lang,
-        filter_crs=filter_crs,
-        sortby=sortby,
-        properties=properties,
-    )
+class ItemsQuery(FeatureQuery):
+    """The parameters of a page of features."""
+
+    f: str | None = Field(default=None, description=FORMAT_TEXT)
 
 
-class Search(BaseModel):
-    """A question too long for a URL; its members are those of the query of items."""
+class Search(ItemsQuery):
+    """The parameters of a page of features in the body of a POST, where a long polygon has room."""
 
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
-
-    intersects: dict[str, Any] | None = Field(
-        None, description="GeoJSON geometry, longitude and latitude, that features must meet."
-    )
-    filter: str | dict[str, Any] | None = None
-    filter_lang: str | None = Field(None, alias="filter-lang")
-    filter_crs: str | None = Field(None, alias="filter-crs")
-    bbox: str | None = None
-    bbox_crs: str | None = Field(None, alias="bbox-crs")
-    crs: str | None = None
-    datetime: str | None = None
-    sortby: str | None = None
-    properties: str | None = None
-    limit: int = Field(DEFAULT_LIMIT, ge=1)
-    token: str | None = None
-    f: str | None = None
+    model_config = ConfigDict(extra="forbid")
 
 
-CONTENT: dict[str, Any] = {kind: {} for kind in FEATURES.values()}
+def parameter_names(model: type[BaseModel]) -> set[str]:
+    """The names of the parameters that a model declares, as requests write them."""
+    return {field.alias or name for name, field in model.model_fields.items()}
+
+
+ITEMS_PARAMETERS = parameter_names(ItemsQuery)
+CONTENT: dict[str, Any] = {media_type: {} for media_type in FEATURES.values()}
 PAGE: dict[int | str, dict[str, Any]] = {200: {"description": "A page.", "content": CONTENT}}
+
+
+def equal_parameters(request: Request, collection: Collection) -> tuple[tuple[str, str], ...]:
+    """The parameters that are named as a property, each with the value the property must have."""
+    return tuple(
+        (name, value)
+        for name, value in request.query_params.items()
+        if name in collection.queryables and name not in ITEMS_PARAMETERS
+    )
 
 
 @router.get("/collections/{collection}/items", response_class=Response, responses=PAGE)
 def items(
+    *,
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[FeatureQuery, Depends(question_of_query)],
-    f: Format = None,
+    query: Annotated[ItemsQuery, Query()],
 ) -> Response:
-    """A page of the features of a collection."""
-    refuse_unknown(request, PARAMETERS | set(collection.queryables))
-    form = chosen_format(request, FEATURES, f)
-    equal = tuple(
-        (name, value)
-        for name, value in request.query_params.items()
-        if name in collection.queryables and name not in PARAMETERS
+    """Return a page of the features of a collection."""
+    refuse_unknown(request, ITEMS_PARAMETERS | set(collection.queryables))
+    restriction = Restriction(equal=equal_parameters(request, collection))
+    return _page_reply(
+        PageRequest(
+            request=request,
+            database=database,
+            form=chosen_format(request, FEATURES, query.f),
+            query=resolve(collection, viewer, query, secret, restriction),
+            secret=secret,
+            next_link=lambda token: {"href": str(request.url.include_query_params(token=token))},
+        )
     )
-    asked = resolve(collection, viewer, FeatureQuery(**{**vars(question), "equal": equal}), secret)
-    return _answer(request, database, asked, form, secret, _next_of_query(request))
 
 
 @router.post("/collections/{collection}/search", response_class=Response, responses=PAGE)
 def search(
+    *,
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
@@ -204,17 +150,23 @@ def search(
     secret: SecretDep,
     body: Search,
 ) -> Response:
-    """The same by POST; the next page is asked for with the `token` of the link `next`."""
+    """Return a page of features by POST; send the `token` of the link `next` for the next page."""
     refuse_unknown(request, set())
-    said = body.model_dump(exclude={"f"})
-    asked = resolve(collection, viewer, FeatureQuery(**said), secret)
-    form = chosen_format(request, FEATURES, body.f)
 
     def next_link(token: str) -> dict[str, Any]:
-        again = body.model_dump(by_alias=True, exclude_none=True) | {"token": token}
-        return {"href": str(request.url), "method": "POST", "body": again}
+        same = body.model_dump(by_alias=True, exclude_none=True)
+        return {"href": str(request.url), "method": "POST", "body": {**same, "token": token}}
 
-    return _answer(request, database, asked, form, secret, next_link)
+    return _page_reply(
+        PageRequest(
+            request=request,
+            database=database,
+            form=chosen_format(request, FEATURES, body.f),
+            query=resolve(collection, viewer, body, secret),
+            secret=secret,
+            next_link=next_link,
+        )
+    )
 
 
 @router.get(
@@ -223,6 +175,7 @@ def search(
     responses={200: {"description": "A feature.", "content": {GEOJSON: {}, HTML: {}}}},
 )
 def item(
+    *,
     feature_id: str,
     request: Request,
     collection: CollectionDep,
@@ -231,11 +184,11 @@ def item(
     crs: CrsUri = None,
     f: Format = None,
 ) -> Response:
-    """One feature."""
+    """Return one feature."""
     refuse_unknown(request, {"crs", "f"})
     form = chosen_format(request, {"json": GEOJSON, "html": HTML}, f)
     with database.reading() as connection:
-        text, given = features.find_feature(connection, collection, viewer, feature_id, crs)
+        text, reply_crs = features.find_feature(connection, collection, viewer, feature_id, crs)
     here = f"{request.base_url}collections/{collection.id}"
     links = [
         {"rel": "self", "href": f"{here}/items/{feature_id}", "type": GEOJSON},
@@ -248,107 +201,122 @@ def item(
             request, collection, f"{collection.title}: {feature['id']}", [feature], links
         )
     body = f'{text[:-1]},"links":{json.dumps(links)}}}'
-    return Response(body, media_type=GEOJSON, headers={"Content-Crs": f"<{given.uri}>"})
+    return Response(body, media_type=GEOJSON, headers={"Content-Crs": f"<{reply_crs.uri}>"})
 
 
-def _next_of_query(request: Request) -> Any:
-    return lambda token: {"href": str(request.url.include_query_params(token=token))}
+@dataclass(frozen=True)
+class PageRequest:
+    """A request for a page of features.
+
+    Attributes:
+        form: name of the format.
+        secret: key that page tokens are signed with.
+        next_link: makes the members of the link `next` from a page token.
+    """
+
+    request: Request
+    database: Database
+    form: str
+    query: ResolvedQuery
+    secret: bytes
+    next_link: Callable[[str], dict[str, Any]]
+
+    @property
+    def collection(self) -> Collection:
+        """The collection of the features."""
+        return self.query.selection.collection
 
 
-def _answer(
-    request: Request, database: Database, asked: ResolvedQuery, form: str, secret: bytes, next_link: Any
-) -> Response:
-    """A page in a format; links are in the document where it has a place for them, in the header too."""
-    if form == "json" and asked.limit > features.LARGEST_TEXT:
-        pieces = _streamed(request, database, asked, secret, next_link)
-        # Read ahead to know that there is no error; with what follows features, it may be all there is.
-        ahead = list(islice(pieces, 3))
-        headers = _headers(asked, FEATURES["json"])
-        if len(ahead) < 3:
-            return Response(b"".join(ahead), media_type=GEOJSON, headers=headers)
-        return Streamed(ahead, pieces, GEOJSON, headers)
-    with database.reading() as connection:
-        if form in FILES:
-            table, answer = features.table(connection, asked, secret)
-            body = FILES[form](table, asked.selection.collection.id)
+def _page_reply(page: PageRequest) -> Response:
+    """A page in its format; links are in the document where the format has them, and in the header."""
+    if page.form == "json" and page.query.limit > features.LARGEST_TEXT:
+        return _streamed_reply(page)
+    with page.database.reading() as connection:
+        if page.form in FILES:
+            table, answer = features.table(connection, page.query, page.secret)
+            body = FILES[page.form](table, page.collection.id)
         else:
-            answer = features.page(connection, asked, "csv" if form == "csv" else "geojson", secret)
+            kind: Text = "csv" if page.form == "csv" else "geojson"
+            answer = features.page(connection, page.query, kind, page.secret)
             body = answer.body
-    links = _links(request, asked, answer, next_link, form)
-    headers = _headers(asked, FEATURES[form], links, answer)
-    if form == "html":
-        page = json.loads(b'{"features":[' + body + b"]}")["features"]
-        return features_page(
-            request, asked.selection.collection, asked.selection.collection.title, page, links, answer
-        )
-    if form == "json":
-        body = b'{"type":"FeatureCollection","features":[' + body + _rest(answer, links)
-    elif form == "csv":
-        body = features.csv_header(asked.selection).encode() + b"\r\n" + body + b"\r\n" * bool(body)
-    return Response(body, media_type=FEATURES[form], headers=headers)
+    links = _links(page, answer)
+    headers = {**_headers(page), **_answer_headers(answer, links)}
+    if page.form == "html":
+        rows = json.loads(b'{"features":[' + body + b"]}")["features"]
+        return features_page(page.request, page.collection, page.collection.title, rows, links, answer)
+    if page.form == "json":
+        body = b'{"type":"FeatureCollection","features":[' + body + _members(answer, links)
+    elif page.form == "csv":
+        body = features.csv_header(page.query.selection).encode() + b"\r\n" + body + b"\r\n" * bool(body)
+    return Response(body, media_type=FEATURES[page.form], headers=headers)
 
 
-def _streamed(
-    request: Request, database: Database, asked: ResolvedQuery, secret: bytes, next_link: Any
-) -> Generator[bytes, None, None]:
-    with database.reading() as connection:
-        opened = b'{"type":"FeatureCollection","features":['
-        for piece in features.stream(connection, asked, secret):
+def _streamed_reply(page: PageRequest) -> Response:
+    """A large page as GeoJSON in pieces.
+
+    Three pieces are read first: an error then still has its own status, and a small page is whole.
+    """
+    pieces = _pieces(page)
+    first_pieces = list(islice(pieces, 3))
+    if len(first_pieces) < 3:
+        return Response(b"".join(first_pieces), media_type=GEOJSON, headers=_headers(page))
+    return Streamed(first_pieces, pieces, GEOJSON, _headers(page))
+
+
+def _pieces(page: PageRequest) -> Generator[bytes, None, None]:
+    with page.database.reading() as connection:
+        opening = b'{"type":"FeatureCollection","features":['
+        for piece in features.stream(connection, page.query, page.secret):
             if isinstance(piece, Answer):
-                yield opened + _rest(piece, _links(request, asked, piece, next_link, "json"))
+                yield opening + _members(piece, _links(page, piece))
             else:
-                yield opened + piece
-            opened = b""
+                yield opening + piece
+            opening = b""
 
 
-def _rest(answer: Answer, links: list[dict[str, Any]]) -> bytes:
-    rest = {
+def _members(answer: Answer, links: list[dict[str, Any]]) -> bytes:
+    """The end of a FeatureCollection after its features."""
+    members = {
         "numberMatched": answer.matched.number,
         "numberReturned": answer.returned,
         "amers:numberMatchedIsExact": answer.matched.exact,
         "links": links,
     }
-    return b"]," + json.dumps(rest)[1:].encode()
+    return b"]," + json.dumps(members)[1:].encode()
 
 
-def _links(
-    request: Request, asked: ResolvedQuery, answer: Answer, next_link: Any, form: str
-) -> list[dict[str, Any]]:
-    kind = FEATURES[form]
-    links = [{"rel": "self", "href": str(request.url), "type": kind}]
+def _links(page: PageRequest, answer: Answer) -> list[dict[str, Any]]:
+    url, media_type = page.request.url, FEATURES[page.form]
+    links = [{"rel": "self", "href": str(url), "type": media_type}]
     links += [
-        {"rel": "alternate", "href": str(request.url.include_query_params(f=name)), "type": other}
+        {"rel": "alternate", "href": str(url.include_query_params(f=name)), "type": other}
         for name, other in FEATURES.items()
-        if name != form and request.method == "GET"
+        if name != page.form and page.request.method == "GET"
     ]
-    here = f"{request.base_url}collections/{asked.selection.collection.id}"
+    here = f"{page.request.base_url}collections/{page.collection.id}"
     links.append({"rel": "collection", "href": here, "type": JSON})
     if answer.next_token is not None:
-        links.append({"rel": "next", "type": kind, **next_link(answer.next_token)})
+        links.append({"rel": "next", "type": media_type, **page.next_link(answer.next_token)})
     return links
 
 
-def _headers(
-    asked: ResolvedQuery,
-    kind: str,
-    links: list[dict[str, Any]] | None = None,
-    answer: Answer | None = None,
-) -> dict[str, str]:
-    headers = {"Content-Crs": f"<{asked.selection.crs.uri}>"}
-    if answer is not None:
-        headers |= {
-            "OGC-NumberMatched": str(answer.matched.number),
-            "OGC-NumberReturned": str(answer.returned),
-        }
-        if answer.next_token is not None:
-            headers["Amers-Next-Token"] = answer.next_token
-    said = [link for link in links or [] if link["rel"] in ("self", "next") and "method" not in link]
-    if said:
-        headers["Link"] = ", ".join(
-            f'<{link["href"]}>; rel="{link["rel"]}"; type="{link["type"]}"' for link in said
-        )
-    suffix = {name for name, value in FEATURES.items() if value == kind} - {"json", "html"}
-    for name in suffix:
-        file = f"{asked.selection.collection.id}.{name}"
-        headers["Content-Disposition"] = f'attachment; filename="{file}"'
+def _headers(page: PageRequest) -> dict[str, str]:
+    """Headers that are known before the features are read."""
+    headers = {"Content-Crs": f"<{page.query.selection.crs.uri}>"}
+    if page.form not in ("json", "html"):
+        file_name = f"{page.collection.id}.{page.form}"
+        headers["Content-Disposition"] = f'attachment; filename="{file_name}"'
     return headers
+
+
+def _answer_headers(answer: Answer, links: list[dict[str, Any]]) -> dict[str, str]:
+    """Counts, page token and links, for formats that have no place for them."""
+    in_header = [link for link in links if link["rel"] in ("self", "next") and "method" not in link]
+    return {
+        "OGC-NumberMatched": str(answer.matched.number),
+        "OGC-NumberReturned": str(answer.returned),
+        **({} if answer.next_token is None else {"Amers-Next-Token": answer.next_token}),
+        "Link": ", ".join(
+            f'<{link["href"]}>; rel="{link["rel"]}"; type="{link["type"]}"' for link in in_header
+        ),
+    }

@@ -6,7 +6,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from app.api.json_schemas import COMPONENTS, feature_schema, page_schema, property_schema, reference
-from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, PROBLEM_JSON
+from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
 from app.db.features.collection import Collection, Property
 from app.usecases.features.items import COLLECTIONS
 from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
@@ -16,14 +16,7 @@ REFUSED = {
     "content": {PROBLEM_JSON: {"schema": reference("Problem")}},
 }
 
-_BY_COMMAS = {"style": "form", "explode": False}
-LISTS = {
-    "bbox": {
-        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 6},
-        **_BY_COMMAS,
-    },
-    "ids": {"schema": {"type": "array", "items": {"type": "integer"}, "minItems": 1}, **_BY_COMMAS},
-}
+COMMA_SEPARATED = ("bbox", "collections", "ids")
 PLACES: dict[str, dict[str, Any]] = {
     "matrix_set": {"enum": [MATRIX_SET]},
     "z": {"minimum": 0, "maximum": MOST_ZOOM},
@@ -57,32 +50,38 @@ def _finished(document: dict[str, Any]) -> dict[str, Any]:
         for operation in operations.values():
             operation["responses"].pop("422", None)
             operation["responses"]["default"] = REFUSED
-            for parameter in operation.get("parameters", []):
-                _define(parameter, operation)
+            parameters = [_parameter(item, operation) for item in operation.get("parameters", [])]
+            operation["parameters"] = [item for item in parameters if item is not None]
         if "{collection}" in path:
             _spell_out(document["paths"], path)
     return document
 
 
-def _define(parameter: dict[str, Any], operation: dict[str, Any]) -> None:
-    """What the code takes as text and reads by itself, as the standards define it."""
-    parameter["schema"] = _without_null(parameter["schema"])
+def _parameter(parameter: dict[str, Any], operation: dict[str, Any]) -> dict[str, Any] | None:
+    """A parameter as the standards define it, out of what the framework makes of its model.
+
+    None for a parameter without a value: that is one of the model which the operation does not take.
+    """
+    kinds = [kind for kind in _kinds(parameter.pop("schema")) if kind.get("type") != "null"]
+    if not kinds:
+        return None
+    # Objects are sent in bodies; a query has the same as text.
+    schema = kinds[0]
+    name, place = parameter["name"], parameter["in"]
+    if place == "query" and schema.get("type") == "object":
+        return {**parameter, "content": {JSON: {"schema": schema}}}
+    if place == "query" and name in COMMA_SEPARATED:
+        parameter |= {"style": "form", "explode": False}
     content = operation["responses"].get("200", {}).get("content", {})
-    if parameter["name"] in ("bbox", "ids") and parameter["in"] == "query":
-        parameter |= LISTS[parameter["name"]]
-    elif parameter["name"] == "f" and HTML in content:
-        formats = FEATURES if FEATURES["csv"] in content else DOCUMENTS
-        parameter["schema"]["enum"] = list(formats)
-    elif parameter["name"] in PLACES:
-        parameter["schema"] |= PLACES[parameter["name"]]
+    if name == "f" and HTML in content:
+        schema["enum"] = list(FEATURES if FEATURES["csv"] in content else DOCUMENTS)
+    return {**parameter, "schema": schema | PLACES.get(name, {})}
 
 
-def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
-    """A parameter that may be left out: nobody can send null."""
-    kinds = [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]
-    if len(kinds) != 1:
-        return schema
-    return {**{name: value for name, value in schema.items() if name != "anyOf"}, **kinds[0]}
+def _kinds(schema: dict[str, Any]) -> list[dict[str, Any]]:
+    """The schemas that a value may follow, each with what they share."""
+    shared = {name: value for name, value in schema.items() if name not in ("anyOf", "description")}
+    return [{**shared, **kind} for kind in schema.get("anyOf", [{}])]
 
 
 def _spell_out(paths: dict[str, Any], path: str) -> None:

@@ -3,18 +3,25 @@
 Source: STAC API 1.0.0 (core, collections, ogcapi-features, item-search; filter and sort of item-search).
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WithJsonSchema
 
 from app.api import features
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
-from app.api.features import PARAMETERS, CrsUri, Format, SecretDep, viewer_of
+from app.api.features import (
+    CrsUri,
+    Format,
+    ItemsQuery,
+    SecretDep,
+    equal_parameters,
+    parameter_names,
+    viewer_of,
+)
 from app.api.negotiation import (
     FEATURES,
     GEOJSON,
@@ -31,7 +38,7 @@ from app.db.features.outlines import SCENES
 from app.errors import InvalidParameter
 from app.usecases.features import items as all_features
 from app.usecases.features import stac
-from app.usecases.features.query import DEFAULT_LIMIT, FeatureQuery, resolve
+from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
 
 router = APIRouter(tags=["stac"])
 
@@ -55,8 +62,6 @@ SEARCH_LINKS = (
 )
 LANDING_MEMBERS = {"type": "Catalog", "stac_version": stac.VERSION, "id": "amers"}
 COLLECTION_MEMBERS = {"type": "Collection", "stac_version": stac.VERSION, "license": "other"}
-SEARCHED = {"bbox", "collections", "datetime", "ids", "intersects", "limit", "sortby", "token"}
-FILTERED = {"filter", "filter-lang", "filter-crs"}
 ITEMS: dict[int | str, dict[str, Any]] = {200: {"description": "A page.", "content": {GEOJSON: {}}}}
 
 
@@ -68,6 +73,13 @@ def landing_links(base: str) -> list[dict[str, str]]:
     ]
 
 
+def _split(value: Any) -> Any:
+    """The parts of texts with commas in a query; other values are left to the check of the type."""
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        return value
+    return [part for text in value for part in text.split(",") if part]
+
+
 class SortedBy(BaseModel):
     """A property to sort by."""
 
@@ -76,39 +88,64 @@ class SortedBy(BaseModel):
     field: str
     direction: str = Field("asc", pattern="^(asc|desc)$")
 
+    @property
+    def text(self) -> str:
+        """The same as the parameter `sortby` has it."""
+        return ("-" if self.direction == "desc" else "") + self.field.removeprefix("properties.")
 
-class ItemSearch(BaseModel):
-    """The body of a search."""
 
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+def _sort_text(value: Any) -> Any:
+    """The text of `sortby`, out of a text or a list of objects; names may begin with `properties.`."""
+    if isinstance(value, list):
+        return ",".join(SortedBy.model_validate(item).text for item in value) or None
+    return value.replace("properties.", "") if isinstance(value, str) else value
 
-    bbox: list[float] | None = None
-    intersects: dict[str, Any] | None = None
-    datetime: str | None = None
-    ids: list[str] | None = None
-    collections: list[str] | None = None
-    limit: int = Field(DEFAULT_LIMIT, ge=1)
-    filter: str | dict[str, Any] | None = None
-    filter_lang: str | None = Field(None, alias="filter-lang")
-    filter_crs: str | None = Field(None, alias="filter-crs")
-    sortby: list[SortedBy] | None = None
-    token: str | None = None
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_split)]
+SORTED_BY = WithJsonSchema({"type": "array", "items": SortedBy.model_json_schema()})
+
+
+class SceneRestriction(BaseModel):
+    """Scenes by their ids; searches over other collections find none."""
+
+    ids: Names | None = Field(default=None, description="Ids of scenes, separated by commas in a URL.")
+    collections: Names | None = Field(
+        default=None, description="Ids of collections, separated by commas in a URL."
+    )
 
     @property
-    def question(self) -> FeatureQuery:
-        """The same as a request for features says it."""
-        return FeatureQuery(
-            limit=self.limit,
-            token=self.token,
-            bbox=None if self.bbox is None else ",".join(map(repr, self.bbox)),
-            datetime=self.datetime,
-            filter=self.filter,
-            filter_lang=self.filter_lang,
-            filter_crs=self.filter_crs,
-            sortby=None if not self.sortby else ",".join(map(_sorted_by, self.sortby)),
-            intersects=self.intersects,
-            ids=_wanted(self.ids, self.collections),
-        )
+    def restriction(self) -> Restriction:
+        """The ids to look for: none if only other collections are searched."""
+        if self.collections and stac.COLLECTION not in self.collections:
+            return Restriction(ids=())
+        return Restriction(ids=self.ids)
+
+
+class SceneItemsQuery(SceneRestriction, ItemsQuery):
+    """The parameters of a page of scenes."""
+
+
+class SceneSearch(SceneRestriction, FeatureQuery):
+    """The parameters of a search; STAC items have all properties, in longitude and latitude."""
+
+    crs: None = None
+    properties: None = None
+    sortby: Annotated[str | None, BeforeValidator(_sort_text)] = Field(
+        default=None, description="Properties to sort by; `-` before one sorts it descending."
+    )
+
+
+NOT_SEARCHED = {"crs", "properties"}
+
+
+class SceneSearchBody(SceneSearch):
+    """The parameters of a search in the body of a POST."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sortby: Annotated[str | None, BeforeValidator(_sort_text), SORTED_BY] = Field(
+        default=None, description="Properties to sort by."
+    )
 
 
 async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
@@ -117,35 +154,30 @@ async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
 
 def _search_schema() -> dict[str, Any]:
     """The JSON Schema of a search, for the description of the API."""
-    schema = ItemSearch.model_json_schema()
+    schema = SceneSearchBody.model_json_schema()
+    for name in NOT_SEARCHED:
+        del schema["properties"][name]
     described: dict[str, Any] = inlined(schema, schema.pop("$defs", {}))
     return described
 
 
 ViewerDep = Annotated[Viewer, Depends(_scenes_viewer)]
-Listed = Annotated[str | None, Query(description="Separated by commas.")]
+NextLink = Callable[[str], dict[str, Any]]
 
 
 @router.get("/search", response_class=Response, responses=ITEMS)
 def search(
+    *,
     request: Request,
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[FeatureQuery, Depends(features.question_of_query)],
-    ids: Listed = None,
-    collections: Listed = None,
-    intersects: Annotated[str | None, Query(description="A GeoJSON geometry.")] = None,
+    query: Annotated[SceneSearch, Query()],
 ) -> Response:
-    """STAC items that meet what is asked, a page of them."""
-    refuse_unknown(request, SEARCHED | FILTERED)
-    asked = replace(
-        question,
-        ids=_wanted(_listed(ids), _listed(collections)),
-        intersects=None if intersects is None else _geometry(intersects),
-        sortby=question.sortby and question.sortby.replace("properties.", ""),
-    )
-    return _page(request, database, viewer, secret, asked, _next_of_query(request))
+    """Return a page of the scenes that meet the parameters, as STAC items."""
+    refuse_unknown(request, parameter_names(SceneSearch) - NOT_SEARCHED)
+    resolved = _resolved(viewer, query, secret, query.restriction)
+    return _page_reply(request, database, secret, resolved, _next_of_query(request))
 
 
 @router.post(
@@ -160,12 +192,17 @@ def search(
     },
 )
 def search_by_post(
-    request: Request, viewer: ViewerDep, database: DatabaseDep, secret: SecretDep, body: dict[str, Any]
+    *,
+    request: Request,
+    viewer: ViewerDep,
+    database: DatabaseDep,
+    secret: SecretDep,
+    body: dict[str, Any],
 ) -> Response:
-    """The same by POST."""
+    """Return a page of the scenes that meet the parameters in the body, as STAC items."""
     refuse_unknown(request, set())
     try:
-        asked = ItemSearch.model_validate(body)
+        query = SceneSearchBody.model_validate(body)
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
         raise InvalidParameter("; ".join(wrong)) from None
@@ -173,32 +210,34 @@ def search_by_post(
     def next_link(token: str) -> dict[str, Any]:
         return {"href": str(request.url), "method": "POST", "body": {**body, "token": token}}
 
-    return _page(request, database, viewer, secret, asked.question, next_link)
+    resolved = _resolved(viewer, query, secret, query.restriction)
+    return _page_reply(request, database, secret, resolved, next_link)
 
 
 @router.get("/collections/scenes/items", response_class=Response, responses=features.PAGE)
 def items(
+    *,
     request: Request,
     viewer: ViewerDep,
     database: DatabaseDep,
     secret: SecretDep,
-    question: Annotated[FeatureQuery, Depends(features.question_of_query)],
-    ids: Listed = None,
-    collections: Listed = None,
-    f: Format = None,
+    query: Annotated[SceneItemsQuery, Query()],
 ) -> Response:
-    """A page of scenes: STAC items, or features in another format."""
-    plain = question.crs is not None or question.properties is not None
-    if plain or chosen_format(request, FEATURES, f) != "json":
-        return features.items(request, SCENES, viewer, database, secret, question, f)
-    refuse_unknown(request, PARAMETERS | set(SCENES.queryables) | {"ids", "collections"})
-    equal = tuple(
-        (name, value)
-        for name, value in request.query_params.items()
-        if name in SCENES.queryables and name != "datetime"
-    )
-    asked = replace(question, equal=equal, ids=_wanted(_listed(ids), _listed(collections)))
-    return _page(request, database, viewer, secret, asked, _next_of_query(request))
+    """Return a page of scenes: STAC items, or features in another format."""
+    is_plain = query.crs is not None or query.properties is not None
+    if is_plain or chosen_format(request, FEATURES, query.f) != "json":
+        return features.items(
+            request=request,
+            collection=SCENES,
+            viewer=viewer,
+            database=database,
+            secret=secret,
+            query=query,
+        )
+    refuse_unknown(request, parameter_names(SceneItemsQuery) | set(SCENES.queryables))
+    restriction = replace(query.restriction, equal=equal_parameters(request, SCENES))
+    resolved = _resolved(viewer, query, secret, restriction)
+    return _page_reply(request, database, secret, resolved, _next_of_query(request))
 
 
 @router.get(
@@ -207,6 +246,7 @@ def items(
     responses={200: {"description": "An item.", "content": {GEOJSON: {}, HTML: {}}}},
 )
 def item(
+    *,
     item_id: str,
     request: Request,
     viewer: ViewerDep,
@@ -214,32 +254,41 @@ def item(
     crs: CrsUri = None,
     f: Format = None,
 ) -> Response:
-    """A scene: a STAC item, or a feature in another reference system or as a page."""
+    """Return a scene: a STAC item, or a feature in another reference system or as a page."""
     if crs is not None or chosen_format(request, {"json": GEOJSON, "html": HTML}, f) != "json":
-        return features.item(item_id, request, SCENES, viewer, database, crs, f)
+        return features.item(
+            feature_id=item_id,
+            request=request,
+            collection=SCENES,
+            viewer=viewer,
+            database=database,
+            crs=crs,
+            f=f,
+        )
     refuse_unknown(request, {"crs", "f"})
     with database.reading() as connection:
-        text, given = all_features.find_feature(connection, SCENES, viewer, item_id, None)
-        found = stac.stac_items(connection, text.encode(), str(request.base_url))
-    return JSONResponse(found[0], media_type=GEOJSON, headers={"Content-Crs": f"<{given.uri}>"})
+        text, reply_crs = all_features.find_feature(connection, SCENES, viewer, item_id, None)
+        items = stac.stac_items(connection, text.encode(), str(request.base_url))
+    headers = {"Content-Crs": f"<{reply_crs.uri}>"}
+    return JSONResponse(items[0], media_type=GEOJSON, headers=headers)
 
 
-def _page(
-    request: Request,
-    database: Database,
-    viewer: Viewer,
-    secret: bytes,
-    question: FeatureQuery,
-    next_link: Callable[[str], dict[str, Any]],
+def _resolved(
+    viewer: Viewer, query: FeatureQuery, secret: bytes, restriction: Restriction
+) -> ResolvedQuery:
+    if query.bbox is not None and query.intersects is not None:
+        raise InvalidParameter("bbox, intersects: both found, only one of them expected")
+    return resolve(SCENES, viewer, query, secret, restriction)
+
+
+def _page_reply(
+    request: Request, database: Database, secret: bytes, query: ResolvedQuery, next_link: NextLink
 ) -> Response:
-    """Items with the links that a page has."""
-    if question.bbox is not None and question.intersects is not None:
-        raise InvalidParameter("bbox, intersects: only one of them can be asked for")
-    asked = resolve(SCENES, viewer, question, secret)
+    """A page of STAC items with its links."""
     base = str(request.base_url)
     with database.reading() as connection:
-        answer = all_features.page(connection, asked, "geojson", secret)
-        found = stac.stac_items(connection, answer.body, base)
+        answer = all_features.page(connection, query, "geojson", secret)
+        items = stac.stac_items(connection, answer.body, base)
     links = [
         {"rel": "self", "href": str(request.url), "type": GEOJSON},
         {"rel": "root", "href": base, "type": JSON},
@@ -252,7 +301,7 @@ def _page(
         links.append({"rel": "next", "type": GEOJSON, **next_link(answer.next_token)})
     page = {
         "type": "FeatureCollection",
-        "features": found,
+        "features": items,
         "numberMatched": answer.matched.number,
         "numberReturned": answer.returned,
         "links": links,
@@ -261,27 +310,5 @@ def _page(
     return JSONResponse(page, media_type=GEOJSON, headers=headers)
 
 
-def _next_of_query(request: Request) -> Callable[[str], dict[str, Any]]:
+def _next_of_query(request: Request) -> NextLink:
     return lambda token: {"href": str(request.url.include_query_params(token=token)), "method": "GET"}
-
-
-def _listed(text: str | None) -> list[str] | None:
-    return None if text is None else [part for part in text.split(",") if part]
-
-
-def _wanted(ids: list[str] | None, collections: list[str] | None) -> tuple[str, ...] | None:
-    """Ids to look for; none of them when only other collections are asked for."""
-    if collections and stac.COLLECTION not in collections:
-        return ()
-    return None if ids is None else tuple(ids)
-
-
-def _geometry(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        raise InvalidParameter(f"intersects: {text!r:.60} found, GeoJSON expected") from None
-
-
-def _sorted_by(wanted: SortedBy) -> str:
-    return ("-" if wanted.direction == "desc" else "") + wanted.field.removeprefix("properties.")

@@ -8,9 +8,8 @@ from fastapi.encoders import jsonable_encoder
 from pydantic import BaseModel, ConfigDict
 
 from app.api.deps import Admin, CallerDep, DatabaseDep
-from app.auth import Scope
+from app.auth import Scope, require_token
 from app.db.tokens import Token
-from app.errors import NotAllowed
 from app.usecases import tokens
 
 router = APIRouter(prefix="/tokens", tags=["tokens"])
@@ -59,9 +58,7 @@ def list_tokens(database: DatabaseDep, caller: Admin) -> dict[str, Any]:
 @router.get("/self")
 def own_token(caller: CallerDep) -> dict[str, Any]:
     """Whose token this request carries, and what it allows."""
-    if caller is None:
-        raise NotAllowed("this needs a token: send `Authorization: Bearer …`", known=False)
-    return _record(caller)
+    return _record(require_token(caller))
 
 
 @router.delete("/{token_id}")

@@ -12,7 +12,7 @@ from uuid import UUID
 
 from psycopg import OperationalError
 
-from app.auth import Scope, allows, require
+from app.auth import is_administrator, may_access, require
 from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
@@ -113,7 +113,7 @@ def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
         NoSuchJob: there is none, or it is somebody else's: strangers cannot tell which.
     """
     job = jobs.find(connection, job_id)
-    if job is None or not (job.owner == caller.id or allows(caller, Scope.ADMIN)):
+    if job is None or not may_access(caller, job.owner):
         raise NoSuchJob(f"no job {job_id}")
     return job
 
@@ -128,7 +128,7 @@ def list_jobs(
     """
     if after is not None:
         visible_job(connection, caller, after)
-    owner = None if allows(caller, Scope.ADMIN) else caller.id
+    owner = None if is_administrator(caller) else caller.id
     return jobs.newest(connection, owner, wanted, limit, after)
 
 

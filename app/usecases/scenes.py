@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
-from app.auth import Scope, allows
+from app.auth import is_administrator, may_access
 from app.config import Settings
 from app.db import scenes
 from app.db.engine import Connection, Database
@@ -214,7 +214,7 @@ def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> Scen
         NotFound: there is none, or it is somebody else's: strangers cannot tell which.
     """
     scene = scenes.find_scene(connection, scene_id)
-    if scene is None or not (scene.owner == caller.id or allows(caller, Scope.ADMIN)):
+    if scene is None or not may_access(caller, scene.owner):
         raise NotFound(f"no scene {scene_id}")
     return scene
 
@@ -234,7 +234,7 @@ def file_key(connection: Connection, caller: Token, scene_id: UUID, name: str) -
 
 def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
     """The caller's newest scenes; everybody's for an administrator."""
-    return scenes.newest_scenes(connection, None if allows(caller, Scope.ADMIN) else caller.id, limit)
+    return scenes.newest_scenes(connection, None if is_administrator(caller) else caller.id, limit)
 
 
 def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:

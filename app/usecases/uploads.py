@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 from uuid import UUID
 
-from app.auth import Scope, allows, require
+from app.auth import Scope, may_access, require
 from app.config import Settings
 from app.db import scenes, uploads
 from app.db.engine import Connection, Database
@@ -137,8 +137,7 @@ def find(connection: Connection, caller: Token, upload_id: UUID) -> UploadRow:
         NotFound: there is none, it was given up, or it is somebody else's: strangers cannot tell which.
     """
     upload = uploads.find_upload(connection, upload_id)
-    mine = upload is not None and (upload.owner == caller.id or allows(caller, Scope.ADMIN))
-    if upload is None or not mine or upload.expired:
+    if upload is None or not may_access(caller, upload.owner) or upload.expired:
         raise NotFound(f"no upload {upload_id}")
     return upload
 

@@ -198,8 +198,8 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     assert 10_000 < true != estimate.number
     assert abs(estimate.number - true) <= (lon > 5.3).sum()
 
-    question = FeatureQuery(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
-    condition = condition_of(POINTS, question)
+    query = FeatureQuery(bbox="4,42,6,44", filter="saliency > 0.1 and n_views = 2")
+    condition = condition_of(POINTS, query)
     estimate = counts.count(connection, Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition))
     true = (many.points.saliency > 0.1).sum()
     assert not estimate.exact

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from uuid import UUID
 
-from app.auth import Scope, allows
+from app.auth import may_access
 from app.config import Settings
 from app.db import uploads
 from app.db.engine import Connection, Database
@@ -81,8 +81,7 @@ def finished_block(connection: Connection, caller: Token, upload_id: UUID) -> st
         InputError: it is no block.
     """
     upload = uploads.find_upload(connection, upload_id)
-    mine = upload is not None and (upload.owner == caller.id or allows(caller, Scope.ADMIN))
-    if upload is None or not mine or upload.expired:
+    if upload is None or not may_access(caller, upload.owner) or upload.expired:
         raise NotFound(f"no uploaded block {upload_id}")
     if upload.purpose != "block":
         raise InputError(f"upload {upload_id} is not one of a block")

@@ -20,7 +20,7 @@ from app.db.history import HISTORY
 from app.db.points import POINTS
 from app.errors import InvalidParameter, NotFound
 from app.usecases.features.page_tokens import format_token
-from app.usecases.features.query import FeatureQuery, ResolvedQuery, condition_of, crs_of
+from app.usecases.features.query import FeatureFilter, ResolvedQuery, condition_of, crs_of
 from services.formats.vector.feature_files import Column, FeatureTable, read_feature_csv
 
 COLLECTIONS: Mapping[str, Collection] = {
@@ -138,7 +138,7 @@ def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
     Raises:
         InvalidParameter: the box cannot be used.
     """
-    condition = condition_of(collection, FeatureQuery(bbox=bbox))
+    condition = condition_of(collection, FeatureFilter(bbox=bbox))
     return Selection(collection, Viewer(), collection.storage_crs, collection.properties, condition)
 
 

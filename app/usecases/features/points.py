@@ -18,7 +18,7 @@ from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
 from app.errors import InvalidParameter, NotFound
 from app.usecases.features.items import everything_in
-from app.usecases.features.query import MOST_FEATURES, FeatureQuery, condition_of
+from app.usecases.features.query import MOST_FEATURES, FeatureFilter, condition_of
 from services.formats.chips.images import LabelledChips
 from services.formats.chips.stacks import stream_chips_npz
 from services.formats.chips.tiff_pages import stream_chips_tiff
@@ -72,18 +72,18 @@ def points_of_ids(connection: Connection, ids: Sequence[int]) -> ControlPoints:
     return found
 
 
-def points_of_question(connection: Connection, question: FeatureQuery) -> ControlPoints:
-    """The published points that a question leaves, with their views.
+def points_of_filter(connection: Connection, query: FeatureFilter) -> ControlPoints:
+    """The published points that meet a filter, with their views.
 
     Raises:
-        InvalidParameter: the question cannot be understood, or leaves too many.
+        InvalidParameter: a parameter cannot be used, or too many points meet the filter.
     """
-    condition = condition_of(POINTS, question)
+    condition = condition_of(POINTS, query)
     selection = Selection(POINTS, Viewer(), POINTS.storage_crs, (), condition)
     ids = pages.keys(connection, selection, MOST_POINTS_WITH_CHIPS)
     if len(ids) > MOST_POINTS_WITH_CHIPS:
         raise InvalidParameter(
-            f"bbox, filter: more than {MOST_POINTS_WITH_CHIPS} points are meant; ask for a smaller place"
+            f"bbox, filter: more than {MOST_POINTS_WITH_CHIPS} points meet them; ask for a smaller area"
         )
     return points.points_of_ids(connection, ids).points
 

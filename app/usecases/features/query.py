@@ -1,11 +1,18 @@
-"""What a request for features says, and what it means: box, time, filter, order, page."""
+"""The feature query: what a client may ask of a collection, and what that selects.
+
+The parameters are declared once, here. Pages of features, search by POST, chips and STAC search use
+these models; OpenAPI shows their descriptions.
+"""
 
 import hashlib
 import json
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 from app.db.features.bbox import Box
 from app.db.features.collection import Collection, Property, Viewer
@@ -21,48 +28,105 @@ from app.usecases.features.page_tokens import parse_token
 DEFAULT_LIMIT = 100
 MOST_FEATURES = 10_000
 FILTER_LANGUAGES = ("cql2-text", "cql2-json", "cql-text")
-"""The last one is what GDAL calls CQL2 text: the name of the draft."""
+"""`cql-text` is the name of CQL2 text in the draft of the standard; GDAL still sends it."""
 
 
-@dataclass(frozen=True)
-class FeatureQuery:
-    """What a request says, as it says it; None where it says nothing.
+def _joined(value: Any) -> Any:
+    """A list of numbers as text; other values are left to the check of the type."""
+    if isinstance(value, list) and all(type(item) in (int, float) for item in value):
+        return ",".join(map(repr, value))
+    return value
 
-    Attributes:
-        limit: most features on the page; more than 10,000 are never given at once.
-        token: of the link `next` of the page before.
-        equal: texts that properties must have.
-        filter: CQL2, in `filter_lang`.
-        intersects: a GeoJSON geometry that features must meet.
-        ids: of the features, None for any.
-    """
 
-    limit: int = DEFAULT_LIMIT
-    token: str | None = None
-    bbox: str | None = None
-    bbox_crs: str | None = None
-    crs: str | None = None
-    datetime: str | None = None
-    filter: Any = None
-    filter_lang: str | None = None
-    filter_crs: str | None = None
-    sortby: str | None = None
-    properties: str | None = None
-    intersects: Any = None
-    equal: tuple[tuple[str, str], ...] = ()
-    ids: tuple[str, ...] | None = None
+def _parsed_geometry(value: Any) -> Any:
+    """The text of a geometry as an object; other values are left to the check of the type."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError):
+        raise InvalidParameter(f"intersects: {value!r:.60} found, GeoJSON expected") from None
+
+
+BBOX_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 6}
+Bbox = Annotated[str, BeforeValidator(_joined), WithJsonSchema(BBOX_SCHEMA)]
+Geometry = Annotated[dict[str, Any], BeforeValidator(_parsed_geometry)]
+
+
+class FeatureFilter(BaseModel):
+    """Which features of a collection: those that meet all of the conditions given."""
+
+    model_config = ConfigDict(frozen=True, populate_by_name=True)
+
+    bbox: Bbox | None = Field(
+        default=None,
+        description="Box W,S,E,N, or with heights W,S,LOWEST,E,N,HIGHEST; W greater than E crosses the"
+        " antimeridian.",
+    )
+    bbox_crs: str | None = Field(
+        default=None, alias="bbox-crs", description="URI of the coordinate reference system of `bbox`."
+    )
+    datetime: str | None = Field(
+        default=None, description="A time, or an interval FROM/TO with `..` for an open end."
+    )
+    filter: str | dict[str, Any] | None = Field(
+        default=None, description="CQL2: text, or JSON in the body of a POST."
+    )
+    filter_lang: str | None = Field(
+        default=None,
+        alias="filter-lang",
+        description="Language of `filter`: cql2-text by default for text, cql2-json for an object.",
+        json_schema_extra={"enum": list(FILTER_LANGUAGES)},
+    )
+    filter_crs: str | None = Field(
+        default=None,
+        alias="filter-crs",
+        description="URI of the coordinate reference system of geometries in `filter`.",
+    )
+    intersects: Geometry | None = Field(
+        default=None,
+        description="GeoJSON geometry in longitude and latitude; only features that intersect it.",
+    )
+
+
+class FeatureQuery(FeatureFilter):
+    """Which features of a collection, in which order, how many, and how they are given."""
+
+    limit: int = Field(
+        default=DEFAULT_LIMIT,
+        ge=1,
+        description=f"Number of features on a page; larger values give {MOST_FEATURES:,}.",
+        json_schema_extra={"maximum": MOST_FEATURES},
+    )
+    token: str | None = Field(
+        default=None, description="Start of the page, from the link `next` of the page before."
+    )
+    crs: str | None = Field(
+        default=None, description="URI of the coordinate reference system of the reply."
+    )
+    sortby: str | None = Field(
+        default=None,
+        description="Properties to sort by, separated by commas; `-` before one sorts it descending.",
+    )
+    properties: str | None = Field(
+        default=None, description="Properties to return, separated by commas; all by default."
+    )
+
+
+FINGERPRINTED = (*FeatureFilter.model_fields, "sortby")
+"""Parameters that all pages of one reply share."""
 
 
 @dataclass(frozen=True)
 class ResolvedQuery:
-    """A question that can be answered.
+    """A query in the terms of the store.
 
     Attributes:
-        selection: what it selects.
-        limit: most features.
-        after: where the page begins; None for the first.
-        matched: how many there are on all pages, when the link said so.
-        fingerprint: of the question, without its page.
+        selection: features, their order and properties.
+        limit: largest number of features on the page.
+        after: key of the last feature of the page before; None for the first page.
+        matched: number of features on all pages if the page token carries it, else None.
+        fingerprint: digest of the query without its page; page tokens are signed with it.
     """
 
     selection: Selection
@@ -72,77 +136,105 @@ class ResolvedQuery:
     fingerprint: str
 
 
+@dataclass(frozen=True)
+class Restriction:
+    """Conditions beside those of the query parameters.
+
+    Attributes:
+        equal: pairs of a property's name and the value it must have, as text.
+        ids: identifiers of the features; None for any.
+    """
+
+    equal: tuple[tuple[str, str], ...] = ()
+    ids: tuple[str, ...] | None = None
+
+
+NO_RESTRICTION = Restriction()
+
+
 def resolve(
-    collection: Collection, viewer: Viewer, question: FeatureQuery, secret: bytes
+    collection: Collection,
+    viewer: Viewer,
+    query: FeatureQuery,
+    secret: bytes,
+    restriction: Restriction = NO_RESTRICTION,
 ) -> ResolvedQuery:
-    """What a question means.
+    """Translate a query into the terms of the store.
 
     Args:
-        secret: that links to further pages are signed with.
+        secret: key that page tokens are signed with.
 
     Raises:
-        InvalidParameter: naming what cannot be used.
+        InvalidParameter: a parameter cannot be used; the message names it.
     """
-    if question.limit < 1:
-        raise InvalidParameter(f"limit: {question.limit} found, 1 to {MOST_FEATURES} expected")
-    crs = crs_of("crs", question.crs, collection) if question.crs else collection.storage_crs
     selection = Selection(
         collection=collection,
         viewer=viewer,
-        crs=crs,
-        properties=_properties(collection, question.properties),
-        condition=condition_of(collection, question),
-        order=_order(collection, question.sortby),
+        crs=crs_of("crs", query.crs, collection) if query.crs else collection.storage_crs,
+        properties=_properties(collection, query.properties),
+        condition=condition_of(collection, query, restriction),
+        order=_order(collection, query.sortby),
     )
-    page = replace(question, limit=0, token=None, crs=None, properties=None)
-    said = repr((collection.id, viewer, page)).encode()
-    fingerprint = hashlib.sha256(said).hexdigest()
+    shared = tuple(getattr(query, name) for name in FINGERPRINTED)
+    fingerprint = hashlib.sha256(repr((collection.id, viewer, shared, restriction)).encode()).hexdigest()
     after, matched = None, None
-    if question.token is not None:
-        after, matched = parse_token(question.token, fingerprint, secret)
+    if query.token is not None:
+        after, matched = parse_token(query.token, fingerprint, secret)
         if len(after) != len(selection.orders):
             raise InvalidParameter("token: not of this query; follow the link `next`")
-    return ResolvedQuery(selection, min(question.limit, MOST_FEATURES), after, matched, fingerprint)
+    return ResolvedQuery(selection, min(query.limit, MOST_FEATURES), after, matched, fingerprint)
 
 
-def condition_of(collection: Collection, question: FeatureQuery) -> Condition:
-    parts = []
-    if question.bbox is not None:
-        crs = crs_of("bbox-crs", question.bbox_crs, None) if question.bbox_crs else CRS84
-        parts.append(in_box(collection, parse_bbox(question.bbox, crs)))
-    if question.datetime is not None:
-        parts.append(in_time(collection, *parse_interval(question.datetime)))
-    if question.intersects is not None:
-        check_size(question.intersects, "intersects")
-        parts.append(geometry_condition(collection, question.intersects, "intersects"))
-    if question.filter is not None:
-        crs = crs_of("filter-crs", question.filter_crs, None) if question.filter_crs else CRS84
-        parts.append(translate(_filter(question), collection, crs))
-    for rank, (name, value) in enumerate(question.equal):
-        literal = _literal(collection.queryables[name], value)
-        equal = {"op": "=", "args": [{"property": name}, literal]}
-        parts.append(translate(equal, collection, CRS84, prefix=f"e{rank}_"))
-    if question.ids is not None:
-        key = f"{collection.key.expression}::text"
-        parts.append(Condition(f"{key} = any(%(ids)s)", {"ids": list(question.ids)}))
+def condition_of(
+    collection: Collection, query: FeatureFilter, restriction: Restriction = NO_RESTRICTION
+) -> Condition:
+    """The condition on features that a filter and a restriction state.
+
+    Raises:
+        InvalidParameter: a parameter cannot be used; the message names it.
+    """
+    parts = [*_filter_conditions(collection, query), *_restriction_conditions(collection, restriction)]
     condition = ANYTHING
     for part in parts:
         condition = part if condition is ANYTHING else condition & part
     return condition
 
 
-def _filter(question: FeatureQuery) -> Any:
-    language = question.filter_lang or ("cql2-text" if isinstance(question.filter, str) else "cql2-json")
+def _filter_conditions(collection: Collection, query: FeatureFilter) -> Iterator[Condition]:
+    if query.bbox is not None:
+        crs = crs_of("bbox-crs", query.bbox_crs, None) if query.bbox_crs else CRS84
+        yield in_box(collection, parse_bbox(query.bbox, crs))
+    if query.datetime is not None:
+        yield in_time(collection, *parse_interval(query.datetime))
+    if query.intersects is not None:
+        check_size(query.intersects, "intersects")
+        yield geometry_condition(collection, query.intersects, "intersects")
+    if query.filter is not None:
+        crs = crs_of("filter-crs", query.filter_crs, None) if query.filter_crs else CRS84
+        yield translate(_parsed_filter(query), collection, crs)
+
+
+def _restriction_conditions(collection: Collection, restriction: Restriction) -> Iterator[Condition]:
+    for rank, (name, value) in enumerate(restriction.equal):
+        literal = _literal(collection.queryables[name], value)
+        equal = {"op": "=", "args": [{"property": name}, literal]}
+        yield translate(equal, collection, CRS84, prefix=f"e{rank}_")
+    if restriction.ids is not None:
+        key = f"{collection.key.expression}::text"
+        yield Condition(f"{key} = any(%(ids)s)", {"ids": list(restriction.ids)})
+
+
+def _parsed_filter(query: FeatureFilter) -> Any:
+    language = query.filter_lang or ("cql2-text" if isinstance(query.filter, str) else "cql2-json")
     if language not in FILTER_LANGUAGES:
         raise InvalidParameter(
             f"filter-lang: {language!r:.40} found, one of {', '.join(FILTER_LANGUAGES)} expected"
         )
     if language == "cql2-json":
-        text = question.filter if isinstance(question.filter, str) else json.dumps(question.filter)
-        return parse_json(text)
-    if not isinstance(question.filter, str):
-        raise InvalidParameter("filter: cql2-text is a text")
-    return parse_text(question.filter)
+        return parse_json(query.filter if isinstance(query.filter, str) else json.dumps(query.filter))
+    if not isinstance(query.filter, str):
+        raise InvalidParameter(f"filter: an object found, text expected for filter-lang {language}")
+    return parse_text(query.filter)
 
 
 def _literal(item: Property, text: str) -> Any:
@@ -158,13 +250,14 @@ def _literal(item: Property, text: str) -> Any:
 
 
 def parse_bbox(text: str, crs: Crs = CRS84) -> Box:
-    """A box out of `W,S,E,N`, or with heights between; west greater than east crosses the antimeridian.
+    """The box of a text `W,S,E,N`, or of six numbers with heights.
 
     Args:
-        crs: of the numbers, in its own order of axes.
+        text: west greater than east crosses the antimeridian.
+        crs: reference system of the numbers, which follow its order of axes.
 
     Raises:
-        InvalidParameter: naming the value that cannot be used.
+        InvalidParameter: a value cannot be used; the message names it.
     """
     try:
         values = [float(part) for part in text.split(",")]
@@ -203,10 +296,10 @@ def _from_mercator(east_m: float, north_m: float) -> list[float]:
 
 
 def parse_interval(text: str) -> tuple[datetime | None, datetime | None]:
-    """The ends of an interval out of an instant or `from/to`; None for an open end, `..` or nothing.
+    """Start and end of an instant or an interval `FROM/TO`; None for an open end (`..` or no text).
 
     Raises:
-        InvalidParameter: the text is neither.
+        InvalidParameter: the text is neither a time nor an interval.
     """
     ends = text.split("/")
     if len(ends) > 2 or not text or ends == ["", ""]:
@@ -222,24 +315,29 @@ def parse_interval(text: str) -> tuple[datetime | None, datetime | None]:
 
 
 def crs_of(parameter: str, uri: str | None, collection: Collection | None) -> Crs:
-    """A reference system by its name; of those a collection has, if there is one."""
+    """The coordinate reference system of a URI.
+
+    Args:
+        parameter: name of the parameter, for the message.
+        collection: its reference systems are allowed; None allows all that the service knows.
+
+    Raises:
+        InvalidParameter: the reference system is not allowed.
+    """
     allowed = EVERY if collection is None else {crs.uri: crs for crs in collection.crs}
-    found = allowed.get((uri or "").strip("[]"))
-    if found is None:
+    crs = allowed.get((uri or "").strip("[]"))
+    if crs is None:
         raise InvalidParameter(f"{parameter}: {uri!r:.100} found, one of {', '.join(allowed)} expected")
-    return found
+    return crs
 
 
 def _properties(collection: Collection, text: str | None) -> tuple[Property, ...]:
     if text is None:
         return collection.properties
     names = [name for name in text.split(",") if name]
-    known = collection.queryables
     for name in names:
-        if name not in known:
-            raise InvalidParameter(
-                f"properties: no property {name!r:.60} in {collection.id}: there are {', '.join(known)}"
-            )
+        if name not in collection.queryables:
+            raise _unknown_property("properties", name, collection)
     return tuple(item for item in collection.properties if item.name in names)
 
 
@@ -247,13 +345,17 @@ def _order(collection: Collection, text: str | None) -> tuple[Order, ...]:
     orders = []
     for part in [] if text is None else text.split(","):
         name = part.strip().lstrip("+-")
-        found = collection.queryables.get(name)
-        if found is None:
-            known = ", ".join(collection.queryables)
-            raise InvalidParameter(
-                f"sortby: no property {name!r:.60} in {collection.id}: there are {known}"
-            )
-        orders.append(Order(found, part.strip().startswith("-")))
+        item = collection.queryables.get(name)
+        if item is None:
+            raise _unknown_property("sortby", name, collection)
+        orders.append(Order(item, part.strip().startswith("-")))
     if len(orders) > len(collection.queryables):
         raise InvalidParameter("sortby: more properties than there are")
     return tuple(orders)
+
+
+def _unknown_property(parameter: str, name: str, collection: Collection) -> InvalidParameter:
+    names = ", ".join(collection.queryables)
+    return InvalidParameter(
+        f"{parameter}: no property {name!r:.60} in {collection.id}: there are {names}"
+    )
