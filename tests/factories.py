@@ -179,7 +179,7 @@ def make_block(
         points,
         noise_chips(points, dtype),
         {"IMG_00": affine_model(outline.mean(axis=0))},
-        typology,
+        typology=typology,
     )
     written = replace(points.take(order), id=np.arange(count, dtype=np.int64))
     return MadeBlock(folder, said, written, noise_chips(written, dtype))

@@ -9,7 +9,7 @@ from app.db import binary_copy as binary
 from app.db.blocks import ID_BITS
 from app.db.engine import Connection
 from services.formats.block.reader import BlockContents
-from services.formats.block.tables import spread_from_covariance
+from services.formats.block.tables import sigmas_from_covariance
 from services.types import IntArray, Progress
 
 POINT_COLUMNS = (
@@ -65,7 +65,7 @@ def load_contents(
 
 def _point_columns(number: int, contents: BlockContents, file_ids: IntArray) -> list[binary.Column]:
     points = contents.points
-    sigma_m, correlation = spread_from_covariance(points.covariance_m2)
+    sigma_m, correlation = sigmas_from_covariance(points.covariance_m2)
     spread = np.column_stack([sigma_m, correlation])
     return [
         binary.numbers((number << ID_BITS) + points.id, "i8"),

@@ -16,7 +16,7 @@ from app.db.engine import Connection
 from app.db.features.antimeridian import on_the_map
 from app.db.features.collection import Collection, Property
 from app.db.history import point_health, view_health
-from services.formats.block.tables import covariance_from_spread
+from services.formats.block.tables import covariance_from_sigmas
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
 SERVED = "t.superseded_by is null and t.suspended_at is null"
@@ -171,7 +171,7 @@ def _with_views(connection: Connection, points_query: sql.Composed) -> StoredPoi
     points = ControlPoints(
         id=ids,
         lon_lat_h=_columns(point, "lon", "lat", "h"),
-        covariance_m2=covariance_from_spread(
+        covariance_m2=covariance_from_sigmas(
             _columns(point, "sigma_east", "sigma_north", "sigma_up"),
             _columns(point, "corr_east_north", "corr_east_up", "corr_north_up"),
         ),

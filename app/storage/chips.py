@@ -4,26 +4,18 @@ import io
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
-from numpy.lib import format as npy
 
 from app.storage.folder import RangeReader, Storage
-from services.conventions import CHIP_SIZE
-from services.errors import FormatError
+from services.formats.chips.npy_files import MAX_HEADER_BYTES, ChipFile, parse_chip_header
+from services.types import ChipArray
 
 OPEN_CHIP_FILES = 64
-LONGEST_HEADER = 4096
 
 
 @dataclass(frozen=True)
-class _ChipFile:
+class _OpenChipFile:
     reader: RangeReader
-    first_byte: int
-    dtype: np.dtype[Any]
-    n_chips: int
+    layout: ChipFile
 
 
 class StoredChips:
@@ -35,10 +27,10 @@ class StoredChips:
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage
-        self._open: OrderedDict[str, _ChipFile] = OrderedDict()
+        self._open: OrderedDict[str, _OpenChipFile] = OrderedDict()
         self._lock = threading.Lock()
 
-    def read(self, file: str, row: int, count: int) -> npt.NDArray[Any]:
+    def read(self, file: str, row: int, count: int) -> ChipArray:
         """Consecutive chips of one file.
 
         Returns:
@@ -49,16 +41,8 @@ class StoredChips:
         """
         with self._lock:
             chips = self._find(file)
-            size = count * CHIP_SIZE * CHIP_SIZE * chips.dtype.itemsize
-            if not 0 <= row <= row + count <= chips.n_chips:
-                raise FormatError(
-                    f"{file} holds {chips.n_chips} chips; {count} asked for from row {row}"
-                )
-            start = chips.first_byte + size // max(count, 1) * row
-            raw = chips.reader.read(start, size)
-        if len(raw) != size:
-            raise FormatError(f"{file} ends too early: {len(raw)} of {size} bytes from row {row}")
-        return np.frombuffer(raw, chips.dtype).reshape(count, CHIP_SIZE, CHIP_SIZE)
+            data = chips.reader.read(*chips.layout.byte_range(row, count))
+        return chips.layout.decode(data, row, count)
 
     def close(self) -> None:
         """Close all files."""
@@ -66,7 +50,7 @@ class StoredChips:
             while self._open:
                 self._open.popitem()[1].reader.close()
 
-    def _find(self, file: str) -> _ChipFile:
+    def _find(self, file: str) -> _OpenChipFile:
         chips = self._open.pop(file, None) or _open_chips(self._storage.reader(file), file)
         self._open[file] = chips
         if len(self._open) > OPEN_CHIP_FILES:
@@ -74,28 +58,11 @@ class StoredChips:
         return chips
 
 
-def _open_chips(reader: RangeReader, key: str) -> _ChipFile:
-    """The file with its header parsed; it is closed again if it is none of chips."""
+def _open_chips(reader: RangeReader, key: str) -> _OpenChipFile:
+    """The file with its header parsed; the reader is closed when it is not a file of chips."""
     try:
-        return _parsed(reader, key.rsplit("/", 1)[-1])
+        header = io.BytesIO(reader.read(0, MAX_HEADER_BYTES))
+        return _OpenChipFile(reader, parse_chip_header(header, key.rsplit("/", 1)[-1]))
     except BaseException:
         reader.close()
         raise
-
-
-def _parsed(reader: RangeReader, name: str) -> _ChipFile:
-    header = io.BytesIO(reader.read(0, LONGEST_HEADER))
-    try:
-        version = npy.read_magic(header)
-        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
-        shape, fortran, dtype = read_header(header)
-    except (ValueError, KeyError) as error:
-        raise FormatError(f"{name} is not a NumPy file: {error}") from error
-    if (
-        fortran
-        or len(shape) != 3
-        or shape[1:] != (CHIP_SIZE, CHIP_SIZE)
-        or dtype.str not in ("|u1", "<u2")
-    ):
-        raise FormatError(f"{name} is not a file of chips: shape {shape}, {dtype.str}")
-    return _ChipFile(reader, header.tell(), dtype, shape[0])

@@ -1,0 +1,1 @@
+"""Sensor models: the relation between image and ground positions, and its correction."""

@@ -1,0 +1,1 @@
+"""Ground truth that can be photographed: simulated worlds, satellites and images."""

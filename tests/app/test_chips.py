@@ -108,7 +108,7 @@ def test_chips_of_8_and_16_bits_come_together_with_their_values(
 
 def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monkeypatch):
     whole = get(CHIPS, bbox="5,43,6,44").content
-    monkeypatch.setattr(stacks, "CHIPS_AT_ONCE", 12)
+    monkeypatch.setattr(stacks, "CHIPS_PER_PIECE", 12)
     in_pieces = arrays(get(CHIPS, bbox="5,43,6,44"))
     with np.load(io.BytesIO(whole)) as expected:
         for name, column in expected.items():

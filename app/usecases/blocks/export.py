@@ -118,8 +118,8 @@ def export_block(
         chosen,
         _reading(chosen, chips),
         {},
-        typology,
-        part_of(progress, 0.1, 0.9),
+        typology=typology,
+        progress=part_of(progress, 0.1, 0.9),
     )
     return len(chosen)
 

@@ -1,4 +1,4 @@
-"""Everything an Amers block promises, checked before anything of it is used."""
+"""Validation of an Amers block: every requirement of the format, before any of its content is used."""
 
 from collections.abc import Mapping, Set
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +12,7 @@ from services.formats.block.document_json import BLOCK_JSON
 from services.formats.block.problems import ProblemReport
 from services.formats.block.reader import (
     BlockContents,
-    assemble,
+    block_contents,
     block_member,
     file_sha256,
     read_document,
@@ -28,34 +28,34 @@ from services.formats.block.tables import (
 from services.formats.chips.npy_files import ChipFile, read_chip_file
 from services.types import Progress, no_progress
 
-FILES_AT_ONCE = 4
-CHIPS = "chips/"
+CHECKSUM_THREADS = 4
+CHIP_FOLDER = "chips/"
 
 
 def check_block(
     folder: Path, progress: Progress = no_progress, chip_checksums: bool = True
 ) -> BlockContents:
-    """Validate a block folder entirely, and read it.
+    """The content of a block folder, after a complete validation.
 
-    Checked: checksums, missing and unlisted files, paths and links, columns and types, ranges,
-    covariances, duplicates, the order of views, counts, shapes and types of the chip files, that views
-    name existing chips, the specified number of views, and that points lie in the declared outline.
+    Checks: checksums, missing and unlisted files, paths and links, columns and types, ranges,
+    covariances, duplicates, the order of views, counts, shapes and types of the chip files, that each
+    view names an existing chip, the specified number of views, and that points lie in the outline.
 
     Args:
         folder: of the block.
-        progress: told while checksums are taken.
-        chip_checksums: False for who copies the files of chips and takes their checksums on the way:
-            passing over their bytes is most of the work. Everything else is checked.
+        progress: reports the progress of computing checksums.
+        chip_checksums: False skips the checksums of the chip files, which are most of the work, for a
+            caller that computes them while copying the files (see `check_checksums`).
 
     Raises:
         BlockProblems: with up to 20 problems, each with file, field, row, value and what was expected.
-        FormatError: when block.json or a table cannot be read at all.
+        FormatError: `block.json` or a table cannot be read.
     """
     document = read_document(folder)
-    later = set() if chip_checksums else {name for name in document.checksums if name.startswith(CHIPS)}
-    report = _check_files(folder, document, later, progress)
+    deferred = set() if chip_checksums else {n for n in document.checksums if n.startswith(CHIP_FOLDER)}
+    report = _check_files(folder, document, deferred, progress)
     if report.count:
-        _check_later(report, folder, document, later)
+        _check_deferred(report, folder, document, deferred)
     report.raise_if_any()
     progress(1.0, "checking points and views")
     points, views = read_points(folder / POINTS_PARQUET), read_views(folder / VIEWS_PARQUET)
@@ -65,59 +65,64 @@ def check_block(
     report.raise_if_any()
     check_views(report, points, views, document)
     _check_chips(report, folder, points, document)
-    _check_later(report, folder, document, later - set(points.chip_files))
+    _check_deferred(report, folder, document, deferred - set(points.chip_files))
     report.raise_if_any()
     progress(1.0, "block checked")
-    return assemble(document, points, views)
+    return block_contents(document, points, views)
 
 
-def check_checksums(found: Mapping[str, str], document: BlockDocument) -> None:
-    """Compare checksums of files that were taken elsewhere with those that block.json promises.
+def check_checksums(computed: Mapping[str, str], document: BlockDocument) -> None:
+    """Compare checksums that the caller computed with those in `block.json`.
 
     Args:
-        found: checksum by path in the block.
+        computed: SHA-256 by path in the block.
+        document: content of `block.json`.
 
     Raises:
-        BlockProblems: naming the files whose bytes are others.
+        BlockProblems: checksums differ; the message names the files.
     """
     report = ProblemReport()
-    for name, checksum in found.items():
+    for name, checksum in computed.items():
         _check_checksum(report, name, checksum, document.checksums[name])
     report.raise_if_any()
 
 
 def _check_files(
-    folder: Path, document: BlockDocument, later: Set[str], progress: Progress
+    folder: Path, document: BlockDocument, deferred: Set[str], progress: Progress
 ) -> ProblemReport:
-    """Which files there are, and the checksums of all but those that are left for later."""
+    """The problems with the list of files, and with the checksums of all files not deferred."""
     report = ProblemReport()
-    present = _files(folder, report)
+    present = _regular_files(folder, report)
     listed = set(document.checksums)
     named = {POINTS_PARQUET, VIEWS_PARQUET, *(model for model in document.models if model is not None)}
     for name in sorted(named - listed):
-        report.add(BLOCK_JSON, "amers:checksums", f"no checksum of {name!r:.200}", "one of every file")
+        report.add(
+            BLOCK_JSON, "amers:checksums", f"no checksum of {name!r:.200}", "a checksum of every file"
+        )
     for name in sorted(present - listed - {BLOCK_JSON}):
         report.add(name, "", "a file without a checksum", "only files listed in amers:checksums")
-    for name in sorted(later - present):
+    for name in sorted(deferred - present):
         report.add(name, "", "no file", "the file listed in amers:checksums")
-    names = sorted(listed - later)
+    names = sorted(listed - deferred)
     progress(0.0, "checking checksums")
-    with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
-        for i, found in enumerate(pool.map(lambda name: _checksum(folder, name), names)):
+    with ThreadPoolExecutor(CHECKSUM_THREADS) as pool:
+        for i, checksum in enumerate(pool.map(lambda name: _checksum(folder, name), names)):
             progress((i + 1) / len(names), "checking checksums")
-            _check_checksum(report, names[i], found, document.checksums[names[i]])
+            _check_checksum(report, names[i], checksum, document.checksums[names[i]])
     return report
 
 
-def _check_later(report: ProblemReport, folder: Path, document: BlockDocument, names: Set[str]) -> None:
-    """The checksums that were left for later: who is refused hears of all that is wrong."""
+def _check_deferred(
+    report: ProblemReport, folder: Path, document: BlockDocument, names: Set[str]
+) -> None:
+    """Check the deferred checksums of a block that is refused, so that its report is complete."""
     for name in sorted(names):
         if (folder / name).is_file():
             _check_checksum(report, name, _checksum(folder, name), document.checksums[name])
 
 
 def _checksum(folder: Path, name: str) -> str | FormatError | None:
-    """The checksum of a file of the block; None without the file, an error without a right to it."""
+    """SHA-256 of a file of the block; None when it is missing, an error when its path is not allowed."""
     try:
         path = block_member(folder, name)
     except FormatError as error:
@@ -126,17 +131,20 @@ def _checksum(folder: Path, name: str) -> str | FormatError | None:
 
 
 def _check_checksum(
-    report: ProblemReport, name: str, found: str | FormatError | None, expected: str
+    report: ProblemReport, name: str, actual: str | FormatError | None, expected: str
 ) -> None:
-    if isinstance(found, FormatError):
-        report.add(BLOCK_JSON, "amers:checksums", str(found), "a path inside the block")
-    elif found is None:
+    if isinstance(actual, FormatError):
+        report.add(
+            BLOCK_JSON, "amers:checksums", f"{name!r:.200}", "a path inside the block, without links"
+        )
+    elif actual is None:
         report.add(name, "", "no file", "the file listed in amers:checksums")
-    elif found != expected.lower():
-        report.add(name, "", f"sha256 {found}", f"{expected:.80}")
+    elif actual != expected.lower():
+        report.add(name, "", f"sha256 {actual}", f"{expected:.80}")
 
 
-def _files(folder: Path, report: ProblemReport) -> set[str]:
+def _regular_files(folder: Path, report: ProblemReport) -> set[str]:
+    """Paths in the block of all plain files; anything else becomes a problem."""
     present = set()
     for path in Path(folder).rglob("*"):
         name = path.relative_to(folder).as_posix()
@@ -152,19 +160,21 @@ def _check_chips(
 ) -> None:
     dtypes: set[npt.DTypeLike] = set()
     for i, name in enumerate(points.chip_files):
-        layout = _layout(report, folder, name, document)
+        layout = _chip_file(report, folder, name, document)
         if layout is None:
             continue
         dtypes.add(layout.dtype)
         end = points.chip_row + points.chip_count
         beyond = (points.chip_file == i) & ((points.chip_row < 0) | (end > layout.count))
-        expected = f"0 to {layout.count}, the chips of {name}, with chip_count"
+        expected = f"chip_row to chip_row + chip_count within the {layout.count} chips of {name}"
         report.rows((POINTS_PARQUET, "chip_row"), beyond, points.chip_row, expected)
     if len(dtypes) > 1:
-        report.add("chips", "", "uint8 and uint16", "one type of chips in a block")
+        report.add("chips", "", "uint8 and uint16", "the same type for all chips of a block")
 
 
-def _layout(report: ProblemReport, folder: Path, name: str, document: BlockDocument) -> ChipFile | None:
+def _chip_file(
+    report: ProblemReport, folder: Path, name: str, document: BlockDocument
+) -> ChipFile | None:
     if name not in document.checksums:
         report.add(POINTS_PARQUET, "chip_file", f"{name!r:.200}", "a file listed in amers:checksums")
         return None

@@ -1,4 +1,4 @@
-"""What an Amers block says of itself, as typed data: `block.json` without its JSON."""
+"""The metadata of an Amers block as typed data: the content of `block.json`, free of JSON."""
 
 import re
 from collections.abc import Mapping
@@ -11,17 +11,17 @@ import numpy as np
 from services.types import Acquisition, Array
 
 NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,99}")
-"""Names of blocks: they go into file names, URLs and command lines as they are."""
+"""Pattern of block names: names appear unquoted in file names, URLs and command lines."""
 
 
 @dataclass(frozen=True)
 class BlockSpecification:
-    """What every point of a block is promised to have.
+    """The guarantees of a block for each of its points.
 
     Attributes:
-        gsds_m: ground samplings of the chips, finest first.
-        min_views: images at least that see a point.
-        points_per_km2: density aimed at, None when not stated.
+        gsds_m: ground sampling distances of the chips in metres, finest first.
+        min_views: least number of images that see a point.
+        points_per_km2: intended density, None when not stated.
     """
 
     gsds_m: tuple[float, ...]
@@ -31,13 +31,13 @@ class BlockSpecification:
 
 @dataclass(frozen=True)
 class AccuracyFigure:
-    """One figure on the accuracy of a block and what it was measured against.
+    """One accuracy figure of a block, with the reference it was measured against.
 
     Attributes:
         kind: "relative" within the block's own frame, "absolute" on the Earth.
-        name: with its unit, as `ce90_m`.
-        count: number of checks behind it.
-        against: the reference.
+        name: name of the figure with its unit, such as `ce90_m`.
+        count: number of check measurements.
+        against: name of the reference.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class AccuracyFigure:
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a block was made: software and version, source images or bases, options as JSON values."""
+    """The origin of a block: software, version, source images or bases, options as JSON values."""
 
     software: str
     version: str
@@ -59,17 +59,17 @@ class Provenance:
 
 @dataclass(frozen=True)
 class BlockMetadata:
-    """What the producer of a block says about it.
+    """The description of a block by its producer.
 
     Attributes:
-        id: name of the block, a letter then letters, digits, dots, dashes, underscores.
-        version: one block is one version; a change is a new version.
-        extent: (m, 2) lon, lat of the outline all points lie in, not closed, longitudes continuous
-            (beyond 180 degrees where it crosses the antimeridian).
-        created: UTC.
+        id: name of the block, see `NAME_PATTERN`.
+        version: version of the block; a block never changes, a change is a new version.
+        extent: (m, 2) lon, lat in degrees of the outline that contains all points; not closed,
+            longitudes continuous (beyond 180 degrees where it crosses the antimeridian).
+        created: time of production, UTC.
         epoch: decimal year of the coordinates, None when unknown.
-        provenance: how it was made.
-        accuracy: figures with what they were measured against.
+        provenance: software, sources and options of the production.
+        accuracy: accuracy figures with their references.
     """
 
     id: str
@@ -87,7 +87,7 @@ class BlockMetadata:
 
 @dataclass(frozen=True)
 class BlockCounts:
-    """How much a block holds."""
+    """The number of points, views and images of a block."""
 
     points: int
     views: int
@@ -96,12 +96,12 @@ class BlockCounts:
 
 @dataclass(frozen=True)
 class BlockDocument:
-    """All of block.json.
+    """The whole content of `block.json`.
 
     Attributes:
-        images: the images its chips were cut from.
-        models: adjusted model of each image, path in the block, None where not delivered.
-        checksums: sha256 of every file but block.json, by path in the block.
+        images: the images the chips were cut from.
+        models: path in the block of the adjusted model of each image, None where not delivered.
+        checksums: SHA-256 of every file except `block.json`, by path in the block.
     """
 
     metadata: BlockMetadata
@@ -112,6 +112,9 @@ class BlockDocument:
 
 
 def rectangle(west: float, south: float, east: float, north: float) -> Array:
-    """Outline (4, 2) of a box, counter-clockwise; a box with `east` below `west` crosses 180 degrees."""
+    """The outline (4, 2) of a box in degrees, counter-clockwise.
+
+    A box with `east` below `west` crosses the antimeridian.
+    """
     east = east + 360.0 if east < west else east
     return np.array([[west, south], [east, south], [east, north], [west, north]])

@@ -1,4 +1,4 @@
-"""block.json, the STAC Collection that says what an Amers block is, as typed data and back."""
+"""Conversion between `block.json`, a STAC Collection, and the typed `BlockDocument`."""
 
 import json
 import math
@@ -29,7 +29,7 @@ BLOCK_JSON = "block.json"
 
 
 def format_block_json(document: BlockDocument) -> str:
-    """The text of block.json."""
+    """The text of `block.json` for a document."""
     metadata = document.metadata
     west, south = (float(v) for v in metadata.extent.min(axis=0))
     east, north = (float(v) for v in metadata.extent.max(axis=0))
@@ -88,17 +88,17 @@ def format_block_json(document: BlockDocument) -> str:
 
 
 def parse_block_json(text: str) -> BlockDocument:
-    """The document in a block.json.
+    """The typed document of the text of a `block.json`.
 
     Raises:
-        FormatError: naming the first field that is missing or not of its type.
+        FormatError: a field is missing or has another type; the message names the first one.
     """
     try:
         root = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise FormatError(f"{BLOCK_JSON}: not JSON: {error}") from error
+        raise FormatError(f"{BLOCK_JSON}: cannot be parsed as JSON: {error}") from error
     if not isinstance(root, dict):
-        raise FormatError(f"{BLOCK_JSON}: a JSON object was expected")
+        raise FormatError(f"{BLOCK_JSON}: {type(root).__name__} found, a JSON object expected")
     if root.get("amers:format") != BLOCK_FORMAT:
         raise FormatError(
             f"{BLOCK_JSON}: amers:format: {root.get('amers:format')!r} found, {BLOCK_FORMAT!r} expected"
@@ -125,7 +125,7 @@ def parse_block_json(text: str) -> BlockDocument:
 
 @dataclass(frozen=True)
 class _Node:
-    """An object of the document, which knows where it stands."""
+    """An object of the document with its path, which error messages name."""
 
     value: Any
     path: str = ""
@@ -137,8 +137,8 @@ class _Node:
     def _get(self, name: str, kinds: tuple[type, ...], expected: str) -> Any:
         value = self.value.get(name)
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            found = "nothing" if name not in self.value else f"{value!r:.80}"
-            raise FormatError(f"{BLOCK_JSON}: {self._name(name)}: {found} found, {expected} expected")
+            actual = "nothing" if name not in self.value else f"{value!r:.80}"
+            raise FormatError(f"{BLOCK_JSON}: {self._name(name)}: {actual} found, {expected} expected")
         return value
 
     def _name(self, name: str) -> str:
@@ -179,7 +179,7 @@ class _Node:
         if time is None or time.tzinfo is None:
             raise FormatError(
                 f"{BLOCK_JSON}: {self._name(name)}: {text!r} found, "
-                "an ISO 8601 time with its zone expected"
+                "an ISO 8601 time with a time zone expected"
             )
         return time.astimezone(UTC)
 
@@ -188,8 +188,8 @@ def _parse_metadata(root: _Node) -> BlockMetadata:
     name = root.text("id")
     if not NAME_PATTERN.fullmatch(name):
         raise FormatError(
-            f"{BLOCK_JSON}: id: {name!r:.120} found, a letter then letters, digits, dots, dashes or "
-            "underscores expected, 100 characters at most"
+            f"{BLOCK_JSON}: id: {name!r:.120} found, a letter followed by letters, digits, dots, "
+            "dashes or underscores expected, at most 100 characters"
         )
     provenance = root.node("amers:provenance")
     return BlockMetadata(
@@ -216,7 +216,8 @@ def _parse_specification(node: _Node) -> BlockSpecification:
     gsds = node.items("gsds_m")
     if not gsds or not all(isinstance(gsd, int | float) and 0.0 < gsd < math.inf for gsd in gsds):
         raise FormatError(
-            f"{BLOCK_JSON}: {node.path}.gsds_m: {gsds!r:.80} found, metres above 0 expected"
+            f"{BLOCK_JSON}: {node.path}.gsds_m: {gsds!r:.80} found, a list of positive numbers "
+            "of metres expected"
         )
     size = node.integer("chip_size")
     if size != CHIP_SIZE:
@@ -229,7 +230,7 @@ def _parse_specification(node: _Node) -> BlockSpecification:
 
 
 def _parse_outline(root: _Node) -> Array:
-    """The outline, or the box of the STAC extent where a block gives no outline."""
+    """The outline of the block, or the box of its STAC extent where `amers:outline` is missing."""
     if "amers:outline" in root.value:
         field, corners = "amers:outline", root.items("amers:outline")
     else:
@@ -242,11 +243,14 @@ def _parse_outline(root: _Node) -> Array:
         outline = rectangle(*(float(v) for v in outline[0]))
     if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2:
         raise FormatError(
-            f"{BLOCK_JSON}: {field}: {corners!r:.80} found, three lon, lat or more expected"
+            f"{BLOCK_JSON}: {field}: {corners!r:.80} found, at least three pairs of lon, lat expected"
         )
     inside = np.isfinite(outline).all() and (np.abs(outline) <= [540.0, 90.0]).all()
     if not inside:
-        raise FormatError(f"{BLOCK_JSON}: {field}: {corners!r:.80} found, degrees on the Earth expected")
+        raise FormatError(
+            f"{BLOCK_JSON}: {field}: {corners!r:.80} found, longitudes within 540 and latitudes within "
+            "90 degrees expected"
+        )
     return outline
 
 

@@ -1,4 +1,4 @@
-"""The Hilbert curve: an order in which points that are near on the ground are near in a file."""
+"""Hilbert order: points that are near on the ground are near in the file."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ _ORDER = 16
 
 
 def hilbert_order(lon_lat: Array) -> IntArray:
-    """Rows of points (n, 2) in the order a Hilbert curve over their box passes them.
+    """Row numbers (n,) that sort points (n, 2) along a Hilbert curve over their bounding box.
 
-    Source: Warren, Hacker's Delight, 16.2: two bits an iteration, one state for each orientation.
+    Source: Warren, Hacker's Delight, section 16.2; two bits of the index per iteration.
     """
     if len(lon_lat) == 0:
         return np.empty(0, dtype=np.int64)

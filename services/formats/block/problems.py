@@ -1,4 +1,4 @@
-"""What is wrong in a block: the first of its problems by name, all of them in the count."""
+"""The problems of a block: the first ones in full, all of them counted."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,18 +9,21 @@ import numpy.typing as npt
 from services.errors import FormatError
 from services.types import BoolArray
 
-LISTED = 20
-ROWS_OF_ONE_KIND = 3
+MAX_LISTED_PROBLEMS = 20
+MAX_LISTED_ROWS = 3
+"""Rows with the same problem that are listed; the others are only counted."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong in a block.
+    """One value of a block that differs from what the format requires.
 
     Attributes:
         file: path in the block.
         field: column or field, "" for the file itself.
-        row: None when it is not about one row.
+        row: row of the table, None when the problem concerns no single row.
+        found: the value found.
+        expected: the value required.
     """
 
     file: str
@@ -36,11 +39,11 @@ class Problem:
 
 
 class BlockProblems(FormatError):
-    """A block that cannot be used.
+    """The block does not satisfy its format.
 
     Attributes:
-        problems: the first of them.
-        count: how many there are.
+        problems: the first problems.
+        count: number of all problems.
     """
 
     def __init__(self, problems: tuple[Problem, ...], count: int) -> None:
@@ -55,7 +58,7 @@ class BlockProblems(FormatError):
 
 @dataclass
 class ProblemReport:
-    """Gathers the problems of a block; the first of them keep their words."""
+    """Collects the problems of a block; only the first ones are stored in full."""
 
     problems: list[Problem] = field(default_factory=list)
     count: int = 0
@@ -63,30 +66,30 @@ class ProblemReport:
     def add(self, file: str, field: str, found: str, expected: str, row: int | None = None) -> None:
         """Add one problem; see `Problem`."""
         self.count += 1
-        if len(self.problems) < LISTED:
+        if len(self.problems) < MAX_LISTED_PROBLEMS:
             self.problems.append(Problem(file, field, row, found, expected))
 
     def rows(
         self, where: tuple[str, str], bad: BoolArray, values: npt.NDArray[Any], expected: str
     ) -> None:
-        """Add the rows of a column that are bad: the first few by name, all of them in the count.
+        """Add the bad rows of a column: list the first ones, count all of them.
 
         Args:
             where: file and column.
-            bad: (n,) mask of the rows.
-            values: (n, ...) of the column.
-            expected: instead of what is there.
+            bad: (n,) mask of the bad rows.
+            values: (n, ...) values of the column.
+            expected: the value required.
         """
         rows = np.flatnonzero(bad)
-        for row in rows[:ROWS_OF_ONE_KIND]:
+        for row in rows[:MAX_LISTED_ROWS]:
             self.add(*where, str(values[row]), expected, int(row))
-        self.count += max(0, len(rows) - ROWS_OF_ONE_KIND)
+        self.count += max(0, len(rows) - MAX_LISTED_ROWS)
 
     def raise_if_any(self) -> None:
-        """End here when something was wrong.
+        """Raise when a problem was added.
 
         Raises:
-            BlockProblems: with what was gathered.
+            BlockProblems: with the problems collected.
         """
         if self.count:
             raise BlockProblems(tuple(self.problems), self.count)

@@ -1,4 +1,4 @@
-"""An Amers block read: a folder of points, their views, their chips and the models of their images."""
+"""Reading an Amers block: a folder with points, views, chips and the models of the images."""
 
 import hashlib
 import os
@@ -18,22 +18,22 @@ from services.formats.block.tables import (
     PointRows,
     Texts,
     ViewRows,
-    covariance_from_spread,
+    covariance_from_sigmas,
     read_points,
     read_views,
 )
-from services.formats.chips.npy_files import ChipFile, read_chip_file, read_chips
+from services.formats.chips.npy_files import ChipFile, read_chip_file
 from services.types import ChipArray, ControlPoints, IntArray, Views
 
 
 @dataclass(frozen=True)
 class BlockContents:
-    """A block as read, without its chips.
+    """The content of a block, without its chips.
 
     Attributes:
-        document: what block.json says.
+        document: content of `block.json`.
         points: in file order; `chip_files` are paths in the block, `views.images` those of the document.
-        n_views: (n,) int64, images that see the point.
+        n_views: (n,) int64, number of images that see the point.
         typology: (n,) str or None.
         first_view, last_view: (n,) datetime64[D], NaT when unknown.
     """
@@ -47,50 +47,54 @@ class BlockContents:
 
 
 def read_block(folder: Path) -> BlockContents:
-    """Read a block without its chips; only what is needed to make sense of it is checked.
+    """The content of a block, without its chips and without the checks of `check_block`.
 
     Raises:
-        FormatError: a file is missing or unreadable, or points and views do not belong together.
+        FormatError: a file is missing or unreadable, or the views do not match the points.
     """
     document = read_document(folder)
     points, views = read_points(folder / POINTS_PARQUET), read_views(folder / VIEWS_PARQUET)
     expected = np.repeat(points.id, np.maximum(points.chip_count, 0))
     if len(expected) != len(views.point_id) or (expected != views.point_id).any():
-        raise FormatError(f"{VIEWS_PARQUET}: point_id: its rows do not follow those of {POINTS_PARQUET}")
-    return assemble(document, points, views)
+        raise FormatError(
+            f"{VIEWS_PARQUET}: point_id: the order of the rows differs from {POINTS_PARQUET}, "
+            "the same order expected"
+        )
+    return block_contents(document, points, views)
 
 
 def read_document(folder: Path) -> BlockDocument:
-    """Read the block.json of a folder.
+    """The `block.json` of a folder.
 
     Raises:
-        FormatError: it is missing or does not say what it should.
+        FormatError: the file is missing, or a field is missing or wrong.
     """
     try:
         text = (Path(folder) / BLOCK_JSON).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"{folder}: no readable {BLOCK_JSON}: {error}") from error
+        raise FormatError(f"{folder}: {BLOCK_JSON} cannot be read: {error}") from error
     return parse_block_json(text)
 
 
-def assemble(document: BlockDocument, points: PointRows, views: ViewRows) -> BlockContents:
-    """The contents of a block, from its parts.
+def block_contents(document: BlockDocument, points: PointRows, views: ViewRows) -> BlockContents:
+    """The content of a block, from its document and the rows of its tables.
 
     Raises:
-        FormatError: a view is of an image that block.json does not list.
+        FormatError: a view names an image that `block.json` does not list.
     """
-    known = {image.image_id: row for row, image in enumerate(document.images)}
-    unknown = sorted(set(views.image_ids) - set(known))
-    if unknown:
+    row_of_image = {image.image_id: row for row, image in enumerate(document.images)}
+    unlisted = sorted(set(views.image_ids) - set(row_of_image))
+    if unlisted:
         raise FormatError(
-            f"{VIEWS_PARQUET}: image_id: {unknown[0]!r} is not in amers:images of {BLOCK_JSON}"
+            f"{VIEWS_PARQUET}: image_id: {unlisted[0]!r} found, an image of amers:images in "
+            f"{BLOCK_JSON} expected"
         )
-    image_rows = np.array([known[name] for name in views.image_ids], dtype=np.int64)
+    image_rows = np.array([row_of_image[name] for name in views.image_ids], dtype=np.int64)
     start = np.concatenate([[0], np.cumsum(points.chip_count)]).astype(np.int64)
     control_points = ControlPoints(
         id=points.id,
         lon_lat_h=points.lon_lat_h,
-        covariance_m2=covariance_from_spread(points.sigma_m, points.correlation),
+        covariance_m2=covariance_from_sigmas(points.sigma_m, points.correlation),
         saliency=points.saliency,
         health=np.ones(len(points.id)),
         views=Views(
@@ -115,44 +119,47 @@ def block_member(folder: Path, name: str) -> Path:
     """The path of a file of a block.
 
     Raises:
-        FormatError: the name leaves the folder or passes through a link.
+        FormatError: the name leads out of the folder or through a symbolic link.
     """
     parts = name.split("/")
     if not name or name.startswith("/") or "\\" in name or {"", ".", ".."} & set(parts) or "\0" in name:
-        raise FormatError(f"{name!r:.200}: not a path inside the block")
+        raise FormatError(f"{name!r:.200} found, a relative path inside the block expected")
     path = Path(folder)
     for part in parts:
         path = path / part
         if path.is_symlink():
-            raise FormatError(f"{name!r:.200}: passes through a link")
+            raise FormatError(
+                f"{name!r:.200}: leads through a symbolic link; replace the link by the file"
+            )
     return path
 
 
 class FolderChips:
-    """The chips of a block folder, a `ChipSource`; files stay open until `close`."""
+    """The chips of a block folder, as a `ChipSource`; files stay open until `close`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = Path(folder)
         self._open: dict[str, tuple[int, ChipFile]] = {}
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
-        """Consecutive chips of one file, by one `pread`.
+        """Consecutive chips of one file, read by one `pread`.
 
         Returns:
             (count, 101, 101) uint8 or uint16; 0 is nodata.
 
         Raises:
-            FormatError: there is no such file in the block, or it does not hold them.
+            FormatError: the file is missing in the block, or ends before the last of these chips.
         """
         if file not in self._open:
             path = block_member(self._folder, file)
             layout = read_chip_file(path, file)
             self._open[file] = (os.open(path, os.O_RDONLY | os.O_CLOEXEC), layout)
         descriptor, layout = self._open[file]
-        return read_chips(descriptor, layout, file, row, count)
+        start, size = layout.byte_range(row, count)
+        return layout.decode(os.pread(descriptor, size, start), row, count)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close all files."""
         while self._open:
             os.close(self._open.popitem()[1][0])
 
@@ -166,6 +173,6 @@ class FolderChips:
 
 
 def file_sha256(path: Path) -> str:
-    """Checksum of a file, in hexadecimal."""
+    """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""What the rows of points and views of an Amers block promise, checked."""
+"""Checks of the rows of the two tables of an Amers block."""
 
 import numpy as np
 import shapely
@@ -15,7 +15,7 @@ OUTLINE_MARGIN_DEG = 1e-9
 
 
 def check_points(report: ProblemReport, points: PointRows, document: BlockDocument) -> None:
-    """Ids, positions, spreads and figures of the points, each by itself and against block.json."""
+    """Add to a report the problems of the points: ids, positions, covariances, counts and dates."""
     n = len(points.id)
     if n != document.counts.points:
         report.add(
@@ -25,13 +25,13 @@ def check_points(report: ProblemReport, points: PointRows, document: BlockDocume
             f"{n}, rows of {POINTS_PARQUET}",
         )
     if n == 0:
-        report.add(POINTS_PARQUET, "", "no points", "one at least")
+        report.add(POINTS_PARQUET, "", "no points", "at least one")
     ids = (POINTS_PARQUET, "id")
     outside = (points.id < 0) | (points.id >= n)
     report.rows(ids, outside, points.id, f"0 to {n - 1}")
-    report.rows(ids, ~outside & _repeated(points.id), points.id, "an id of one point only")
+    report.rows(ids, ~outside & _repeated(points.id), points.id, "an id that occurs once")
     _check_positions(report, points.lon_lat_h, document.metadata.extent)
-    _check_spread(report, points)
+    _check_covariances(report, points)
     report.rows(
         (POINTS_PARQUET, "saliency"),
         ~((points.saliency >= 0.0) & (points.saliency <= 1.0)),
@@ -46,61 +46,64 @@ def check_points(report: ProblemReport, points: PointRows, document: BlockDocume
         points.n_views,
         f"{least} or more, the specification's min_views",
     )
-    known = ~(np.isnat(points.first_view) | np.isnat(points.last_view))
+    dated = ~(np.isnat(points.first_view) | np.isnat(points.last_view))
     report.rows(
         (POINTS_PARQUET, "first_view"),
-        known & (points.first_view > points.last_view),
+        dated & (points.first_view > points.last_view),
         points.first_view,
-        "not after last_view",
+        "a date not after last_view",
     )
 
 
 def _check_positions(report: ProblemReport, lon_lat_h: Array, outline: Array) -> None:
     limits = (("lon", -180.0, 180.0), ("lat", -90.0, 90.0), ("height", LOWEST_M, HIGHEST_M))
-    good = np.ones(len(lon_lat_h), dtype=np.bool_)
+    on_earth = np.ones(len(lon_lat_h), dtype=np.bool_)
     for column, (name, low, high) in enumerate(limits):
         values = lon_lat_h[:, column]
         inside = (values >= low) & (values <= high)
         report.rows((POINTS_PARQUET, f"geometry {name}"), ~inside, values, f"{low:g} to {high:g}")
-        good &= inside
-    lon, lat = lon_lat_h[good, 0], lon_lat_h[good, 1]
+        on_earth &= inside
+    lon, lat = lon_lat_h[on_earth, 0], lon_lat_h[on_earth, 1]
     declared = shapely.Polygon(outline).buffer(OUTLINE_MARGIN_DEG, join_style="mitre")
     shapely.prepare(declared)
     within = np.zeros(len(lon), dtype=np.bool_)
     for turn in (-360.0, 0.0, 360.0):
         within |= shapely.intersects_xy(declared, lon + turn, lat)
     outside = np.zeros(len(lon_lat_h), dtype=np.bool_)
-    outside[good] = ~within
-    report.rows((POINTS_PARQUET, "geometry"), outside, lon_lat_h, "a position in the block's outline")
+    outside[on_earth] = ~within
+    report.rows(
+        (POINTS_PARQUET, "geometry"), outside, lon_lat_h, "a position inside the outline of the block"
+    )
 
 
-def _check_spread(report: ProblemReport, points: PointRows) -> None:
-    finite = (points.sigma_m >= SMALLEST_SIGMA_M) & (points.sigma_m <= LARGEST_SIGMA_M)
+def _check_covariances(report: ProblemReport, points: PointRows) -> None:
+    in_range = (points.sigma_m >= SMALLEST_SIGMA_M) & (points.sigma_m <= LARGEST_SIGMA_M)
     expected = f"{SMALLEST_SIGMA_M:g} to {LARGEST_SIGMA_M:g} metres"
     for column, name in enumerate(("sigma_east_m", "sigma_north_m", "sigma_up_m")):
         values = points.sigma_m[:, column]
-        report.rows((POINTS_PARQUET, name), ~finite[:, column], values, expected)
-    good = np.abs(points.correlation) <= 1.0
+        report.rows((POINTS_PARQUET, name), ~in_range[:, column], values, expected)
+    possible = np.abs(points.correlation) <= 1.0
     for column, name in enumerate(("corr_east_north", "corr_east_up", "corr_north_up")):
         values = points.correlation[:, column]
-        report.rows((POINTS_PARQUET, name), ~good[:, column], values, "-1 to 1")
+        report.rows((POINTS_PARQUET, name), ~possible[:, column], values, "-1 to 1")
     en, eu, nu = points.correlation.T
     determinant = 1.0 - en**2 - eu**2 - nu**2 + 2.0 * en * eu * nu
     report.rows(
         (POINTS_PARQUET, "corr_*"),
-        good.all(axis=1) & ~(determinant > 0.0),
+        possible.all(axis=1) & ~(determinant > 0.0),
         points.correlation,
         "correlations of a positive definite covariance",
     )
 
 
 def _repeated(values: IntArray) -> BoolArray:
+    """Whether each value (n,) occurs more than once."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     return counts[inverse] > 1
 
 
 def check_order(report: ProblemReport, points: PointRows, views: ViewRows) -> None:
-    """Each point's views follow each other, as many as it has chips, in the order of the points."""
+    """Add to a report the views that are not in the order of the points and of their chips."""
     count = np.maximum(points.chip_count, 0)
     owner = np.repeat(points.id, count)
     if len(owner) != len(views.point_id):
@@ -109,17 +112,23 @@ def check_order(report: ProblemReport, points: PointRows, views: ViewRows) -> No
         )
         return
     report.rows(
-        (VIEWS_PARQUET, "point_id"), owner != views.point_id, views.point_id, "the points in their order"
+        (VIEWS_PARQUET, "point_id"),
+        owner != views.point_id,
+        views.point_id,
+        "the ids of the points in their order",
     )
     first = np.cumsum(count) - count
     within = np.arange(len(owner)) - np.repeat(first, count)
-    report.rows((VIEWS_PARQUET, "view"), within != views.view, views.view, "0, 1, 2 … within a point")
+    report.rows((VIEWS_PARQUET, "view"), within != views.view, views.view, "0, 1, 2 … within each point")
 
 
 def check_views(
     report: ProblemReport, points: PointRows, views: ViewRows, document: BlockDocument
 ) -> None:
-    """Views name their images and chips; their rows are known to follow the points by now."""
+    """Add to a report the problems of the views: images, ground samplings and chips.
+
+    `check_order` must have found no problem.
+    """
     if len(views.view) != document.counts.views:
         report.add(
             BLOCK_JSON,
@@ -133,15 +142,15 @@ def check_views(
             BLOCK_JSON,
             "amers:images",
             f"{len(names)} images",
-            f"{document.counts.images} different ones",
+            f"{document.counts.images} images with different names",
         )
-    known = np.array([name in set(names) for name in views.image_ids], dtype=np.bool_)
+    listed = np.array([name in set(names) for name in views.image_ids], dtype=np.bool_)
     image_id = np.array(views.image_ids, dtype=object)[views.image]
     report.rows(
         (VIEWS_PARQUET, "image_id"),
-        ~known[views.image],
+        ~listed[views.image],
         image_id,
-        f"one of amers:images of {BLOCK_JSON}",
+        f"an image of amers:images in {BLOCK_JSON}",
     )
     gsds = document.metadata.specification.gsds_m
     report.rows(
@@ -152,7 +161,10 @@ def check_views(
     )
     coarser = np.diff(views.gsd_m, prepend=-np.inf) < 0.0
     report.rows(
-        (VIEWS_PARQUET, "gsd_m"), coarser & (views.view > 0), views.gsd_m, "finest first within a point"
+        (VIEWS_PARQUET, "gsd_m"),
+        coarser & (views.view > 0),
+        views.gsd_m,
+        "the finest first within each point",
     )
     owner = np.repeat(np.arange(len(points.id)), points.chip_count)
     report.rows(
@@ -164,13 +176,16 @@ def check_views(
     own_file = np.array(points.chip_files, dtype=object)[points.chip_file][owner]
     file = np.array(views.chip_files, dtype=object)[views.chip_file]
     report.rows(
-        (VIEWS_PARQUET, "chip_file"), file != own_file, file, f"the file named in {POINTS_PARQUET}"
+        (VIEWS_PARQUET, "chip_file"),
+        file != own_file,
+        file,
+        f"the chip_file of the point in {POINTS_PARQUET}",
     )
     pairs = np.unique(np.column_stack([owner, views.image]), axis=0)
-    seen = np.bincount(pairs[:, 0], minlength=len(points.id))
+    image_counts = np.bincount(pairs[:, 0], minlength=len(points.id))
     report.rows(
         (POINTS_PARQUET, "n_views"),
-        points.n_views != seen,
+        points.n_views != image_counts,
         points.n_views,
-        "the number of images of its views",
+        "the number of distinct images among its views",
     )

@@ -1,4 +1,4 @@
-"""The two tables of an Amers block, points.parquet and views.parquet, as arrays and back."""
+"""Reading and writing the two tables of an Amers block, `points.parquet` and `views.parquet`."""
 
 import json
 from dataclasses import dataclass
@@ -59,19 +59,19 @@ VIEWS_SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class PointRows:
-    """The rows of points.parquet.
+    """The rows of `points.parquet`.
 
     Attributes:
         id: (n,) int64.
-        lon_lat_h: (n, 3).
-        sigma_m: (n, 3) east, north, up.
+        lon_lat_h: (n, 3) degrees, degrees, metres.
+        sigma_m: (n, 3) east, north, up, one standard deviation.
         correlation: (n, 3) east-north, east-up, north-up.
         n_views: (n,) int64, images that see the point.
         saliency: (n,).
         typology: (n,) str or None.
         first_view, last_view: (n,) datetime64[D], NaT when unknown.
         chip_file: (n,) int64, rows of `chip_files`.
-        chip_row, chip_count: (n,) int64, the point's chips in its file.
+        chip_row, chip_count: (n,) int64, first row and number of the point's chips in its file.
         chip_files: paths in the block.
     """
 
@@ -92,7 +92,7 @@ class PointRows:
 
 @dataclass(frozen=True)
 class ViewRows:
-    """The rows of views.parquet that block.json does not say already.
+    """The columns of `views.parquet`, except those that `block.json` repeats for each image.
 
     Attributes:
         point_id, view: (m,) int64.
@@ -117,7 +117,7 @@ class ViewRows:
     chip_files: tuple[str, ...]
 
 
-def covariance_from_spread(sigma_m: Array, correlation: Array) -> Array:
+def covariance_from_sigmas(sigma_m: Array, correlation: Array) -> Array:
     """Covariances (n, 3, 3) of sigmas (n, 3) and correlations (n, 3) east-north, east-up, north-up."""
     covariance = sigma_m[:, :, None] * sigma_m[:, None, :]
     for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
@@ -126,7 +126,7 @@ def covariance_from_spread(sigma_m: Array, correlation: Array) -> Array:
     return covariance
 
 
-def spread_from_covariance(covariance_m2: Array) -> tuple[Array, Array]:
+def sigmas_from_covariance(covariance_m2: Array) -> tuple[Array, Array]:
     """Sigmas (n, 3) and correlations (n, 3) east-north, east-up, north-up of covariances (n, 3, 3)."""
     sigma = np.sqrt(np.diagonal(covariance_m2, axis1=1, axis2=2))
     rows, columns = [0, 0, 1], [1, 2, 2]
@@ -134,7 +134,7 @@ def spread_from_covariance(covariance_m2: Array) -> tuple[Array, Array]:
 
 
 def write_points(path: Path, rows: PointRows) -> None:
-    """Write points.parquet: GeoParquet 1.1, WKB PointZ in EPSG:4979."""
+    """Write `points.parquet`: GeoParquet 1.1, WKB PointZ in EPSG:4979."""
     columns = {
         "id": rows.id,
         "geometry": shapely.to_wkb(shapely.points(rows.lon_lat_h), flavor="iso"),
@@ -168,23 +168,23 @@ def write_points(path: Path, rows: PointRows) -> None:
 
 
 def write_views(path: Path, rows: ViewRows, images: tuple[Acquisition, ...]) -> None:
-    """Write views.parquet; `images` in the order of `rows.image_ids`."""
+    """Write `views.parquet`; `images` are in the order of `rows.image_ids`."""
     image = pa.array(rows.image)
 
-    def of_image(values: list[object], name: str) -> pa.Array:
+    def per_view(values: list[object], name: str) -> pa.Array:
         return pa.array(values, VIEWS_SCHEMA.field(name).type).take(image)
 
     columns = {
         "point_id": rows.point_id,
         "view": rows.view,
         "gsd_m": rows.gsd_m,
-        "image_id": of_image(list(rows.image_ids), "image_id"),
-        "sensor": of_image([image.sensor for image in images], "sensor"),
-        "acquired_at": of_image([image.acquired_at for image in images], "acquired_at"),
+        "image_id": per_view(list(rows.image_ids), "image_id"),
+        "sensor": per_view([image.sensor for image in images], "sensor"),
+        "acquired_at": per_view([image.acquired_at for image in images], "acquired_at"),
         "incidence_deg": rows.incidence_deg,
         "azimuth_deg": rows.azimuth_deg,
-        "sun_elevation_deg": of_image([i.sun_elevation_deg for i in images], "sun_elevation_deg"),
-        "sun_azimuth_deg": of_image([i.sun_azimuth_deg for i in images], "sun_azimuth_deg"),
+        "sun_elevation_deg": per_view([i.sun_elevation_deg for i in images], "sun_elevation_deg"),
+        "sun_azimuth_deg": per_view([i.sun_azimuth_deg for i in images], "sun_azimuth_deg"),
         "chip_file": pa.array(rows.chip_files, pa.string()).take(pa.array(rows.chip_file)),
         "chip_row": rows.chip_row,
     }
@@ -193,27 +193,27 @@ def write_views(path: Path, rows: ViewRows, images: tuple[Acquisition, ...]) -> 
 
 
 def read_points(path: Path) -> PointRows:
-    """Read points.parquet; values are not judged, a position that is none is NaN.
+    """The rows of a `points.parquet`; values are not checked, an empty point is NaN.
 
     Raises:
-        FormatError: when the file is not Parquet, or a column is missing, of another type or null.
+        FormatError: the file is not Parquet, or a column is missing, has another type or is null.
     """
     table = _read_table(path, POINTS_SCHEMA)
     try:
         geometry = shapely.from_wkb(table["geometry"].to_numpy())
     except shapely.errors.ShapelyError as error:
-        raise FormatError(f"{path.name}: geometry: not WKB: {error}") from error
+        raise FormatError(f"{path.name}: geometry: WKB expected: {error}") from error
     point = shapely.get_type_id(geometry) == shapely.GeometryType.POINT
     if not point.all():
         row = int(np.argmin(point))
         raise FormatError(
             f"{path.name}: geometry: row {row}: {geometry[row].geom_type} found, Point Z expected"
         )
-    # WKB writes an empty point as NaN coordinates, and what is empty has none to ask for.
+    # Shapely returns no coordinates for an empty point, which WKB encodes as NaN.
     placed = ~shapely.is_empty(geometry)
     lon_lat_h = np.full((len(geometry), 3), np.nan)
     lon_lat_h[placed] = shapely.get_coordinates(geometry[placed], include_z=True)
-    chip_file, chip_files = _coded(table["chip_file"])
+    chip_file, chip_files = _dictionary_encoded(table["chip_file"])
     return PointRows(
         id=table["id"].to_numpy(),
         lon_lat_h=lon_lat_h,
@@ -232,14 +232,14 @@ def read_points(path: Path) -> PointRows:
 
 
 def read_views(path: Path) -> ViewRows:
-    """Read views.parquet; values are not judged.
+    """The rows of a `views.parquet`; values are not checked.
 
     Raises:
-        FormatError: when the file is not Parquet, or a column is missing, of another type or null.
+        FormatError: the file is not Parquet, or a column is missing, has another type or is null.
     """
     table = _read_table(path, VIEWS_SCHEMA)
-    image, image_ids = _coded(table["image_id"])
-    chip_file, chip_files = _coded(table["chip_file"])
+    image, image_ids = _dictionary_encoded(table["image_id"])
+    chip_file, chip_files = _dictionary_encoded(table["chip_file"])
     return ViewRows(
         point_id=table["point_id"].to_numpy(),
         view=table["view"].to_numpy().astype(np.int64),
@@ -257,10 +257,9 @@ def read_views(path: Path) -> ViewRows:
 def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
     try:
         with pq.ParquetFile(path, memory_map=False) as file:
-            found = file.schema_arrow
-            _check_schema(path.name, found, schema)
+            _check_schema(path.name, file.schema_arrow, schema)
             table = file.read(columns=schema.names)
-        # A file may claim text that is not, or offsets that lead nowhere.
+        # A file may declare text that is not UTF-8, or offsets beyond its buffers.
         table.validate(full=True)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise FormatError(f"{path.name}: cannot be read as Parquet: {error}") from error
@@ -271,17 +270,17 @@ def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
     return table
 
 
-def _check_schema(name: str, found: pa.Schema, expected: pa.Schema) -> None:
+def _check_schema(name: str, actual: pa.Schema, expected: pa.Schema) -> None:
     for field in expected:
-        if field.name not in found.names:
+        if field.name not in actual.names:
             raise FormatError(f"{name}: {field.name}: no such column, {field.type} expected")
-        if found.field(field.name).type != field.type:
+        if actual.field(field.name).type != field.type:
             raise FormatError(
-                f"{name}: {field.name}: {found.field(field.name).type} found, {field.type} expected"
+                f"{name}: {field.name}: {actual.field(field.name).type} found, {field.type} expected"
             )
 
 
-def _coded(column: pa.ChunkedArray) -> tuple[IntArray, tuple[str, ...]]:
-    """A column of few texts as rows of the list of them."""
-    coded = column.combine_chunks().dictionary_encode()
-    return coded.indices.to_numpy().astype(np.int64), tuple(coded.dictionary.to_pylist())
+def _dictionary_encoded(column: pa.ChunkedArray) -> tuple[IntArray, tuple[str, ...]]:
+    """The index (n,) of each text of a column, and the tuple of its distinct texts."""
+    encoded = column.combine_chunks().dictionary_encode()
+    return encoded.indices.to_numpy().astype(np.int64), tuple(encoded.dictionary.to_pylist())

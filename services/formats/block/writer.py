@@ -1,6 +1,7 @@
-"""An Amers block written: all its files, and `block.json` last.
+"""Writing an Amers block: all its files, and `block.json` last.
 
-The folder takes its name only when it is complete: a broken run leaves nothing that looks like a block.
+The files go into a temporary folder, which is renamed when it is complete: an interrupted run leaves
+nothing that could be taken for a block.
 """
 
 import hashlib
@@ -26,7 +27,7 @@ from services.formats.block.tables import (
     PointRows,
     Texts,
     ViewRows,
-    spread_from_covariance,
+    sigmas_from_covariance,
     write_points,
     write_views,
 )
@@ -36,8 +37,9 @@ from services.sensors.rpc import RpcModel
 from services.types import Acquisition, ChipArray, ControlPoints, IntArray, Progress, no_progress
 
 CHIP_FILE_BYTES = 512 * 2**20
+"""Largest size of a file of chips; chips beyond it go into the next file."""
 IMAGE_ID_PATTERN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
-"""Names of images with a model: they become names of files."""
+"""Pattern of the names of images with a model: the file of the model has this name."""
 
 
 def write_block(
@@ -46,47 +48,52 @@ def write_block(
     points: ControlPoints,
     chips: Callable[[int], ChipArray],
     models: Mapping[str, RpcModel],
+    *,
     typology: Sequence[str | None] | None = None,
     progress: Progress = no_progress,
 ) -> IntArray:
-    """Write a block folder; points are put in Hilbert order and numbered in it, from 0.
+    """Write a block folder, with the points in Hilbert order and numbered from 0 in this order.
 
     Args:
         folder: must not exist.
-        metadata: what the producer says.
-        points: in any order; `id`, `chip_file`, `chip_row` and `chip_files` are not read.
-        chips: gives the chips (views, 101, 101) of the point of a row of `points`, in the order of its
-            views; uint8 or uint16, the same for all. Called once a point, in the order of writing.
+        metadata: description of the block by its producer.
+        points: in any order; `id`, `chip_file`, `chip_row` and `chip_files` are not used.
+        chips: returns the chips (views, 101, 101) of one row of `points`, in the order of its views;
+            uint8 or uint16, the same for all points. Called once for each point, in writing order.
         models: adjusted model of each image that has one, by image_id.
         typology: kind of detail of each point.
-        progress: told while chips are written.
+        progress: reports the progress of writing chips.
 
     Returns:
-        (n,) the row of `points` that each written point comes from.
+        (n,) the row of `points` of each point in the block.
 
     Raises:
-        InputError: the folder exists, there are no points, or a name cannot be a name of a file.
-        FormatError: chips of another shape or type than expected.
+        InputError: the folder exists, there are no points, or a name is not usable as a file name.
+        FormatError: chips have another shape or type than expected.
     """
     folder = Path(folder)
     if folder.exists():
-        raise InputError(f"{folder} exists already: a block is never overwritten")
+        raise InputError(
+            f"{folder}: the folder exists already, and a block is never overwritten; "
+            "give the name of a new folder"
+        )
     if len(points) == 0:
-        raise InputError("a block needs one point at least, 0 given")
+        raise InputError(f"{folder}: 0 points given, a block needs at least one")
     _check_names(metadata, models)
     order = hilbert_order(points.lon_lat_h[:, :2])
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
     (partial / "chips").mkdir(parents=True)
     try:
-        place = _write_chips(partial, np.diff(points.views.start)[order], order, chips, progress)
-        _write_tables(partial, points.take(order), place, _texts(typology, len(points))[order])
+        layout = _write_chips(partial, np.diff(points.views.start)[order], order, chips, progress)
+        typology_column = _typology_column(typology, len(points))[order]
+        _write_tables(partial, points.take(order), layout, typology_column)
         paths = _write_models(partial, points.views.images, models)
         document = BlockDocument(
             metadata=metadata,
             counts=BlockCounts(len(points), len(points.views.gsd_m), len(points.views.images)),
             images=points.views.images,
             models=paths,
-            checksums=place.checksums | _checksums(partial, excluding=place.checksums),
+            checksums=layout.checksums | _checksums(partial, excluding=layout.checksums),
         )
         (partial / BLOCK_JSON).write_text(format_block_json(document), encoding="utf-8")
         partial.rename(folder)
@@ -98,8 +105,8 @@ def write_block(
 
 
 @dataclass(frozen=True)
-class _ChipPlaces:
-    """Where the chips of each written point went, and the checksums of the files."""
+class _ChipLayout:
+    """File and first row of the chips of each written point, and names and checksums of the files."""
 
     file: IntArray
     row: IntArray
@@ -110,12 +117,15 @@ class _ChipPlaces:
 def _check_names(metadata: BlockMetadata, models: Mapping[str, RpcModel]) -> None:
     if not NAME_PATTERN.fullmatch(metadata.id):
         raise InputError(
-            f"{metadata.id!r:.120}: a block is named by a letter, then letters, digits, dots, dashes, "
-            "underscores"
+            f"name of the block: {metadata.id!r:.120} given, a letter followed by letters, digits, "
+            "dots, dashes or underscores expected"
         )
     for name in models:
         if not IMAGE_ID_PATTERN.fullmatch(name):
-            raise InputError(f"the name of an image cannot be the name of a file: {name!r:.200}")
+            raise InputError(
+                f"name of an image: {name!r:.200} given, letters, digits, dots, dashes or underscores "
+                "expected: the file of its model has this name"
+            )
 
 
 def _write_chips(
@@ -124,13 +134,13 @@ def _write_chips(
     order: IntArray,
     chips: Callable[[int], ChipArray],
     progress: Progress,
-) -> _ChipPlaces:
-    """Write the chips of all points, in files whose sizes are known before."""
+) -> _ChipLayout:
+    """Write the chips of all points into files of at most `CHIP_FILE_BYTES`."""
     first = np.asarray(chips(int(order[0])))
     if first.dtype not in CHIP_DTYPES:
-        raise FormatError(f"chips of type {first.dtype} given, uint8 or uint16 expected")
+        raise FormatError(f"type of the chips: {first.dtype} given, uint8 or uint16 expected")
     chip_bytes = CHIP_SIZE * CHIP_SIZE * first.dtype.itemsize
-    file, row = _planned(counts, CHIP_FILE_BYTES // chip_bytes)
+    file, row = _plan_files(counts, CHIP_FILE_BYTES // chip_bytes)
     names = tuple(f"chips/{i:04d}.npy" for i in range(int(file[-1]) + 1))
     checksums = {}
 
@@ -151,11 +161,11 @@ def _write_chips(
         members = np.flatnonzero(file == i)
         header = chip_file_header(first.dtype, int(counts[members].sum()))
         checksums[name] = _write_hashed(folder / name, header, chips_of(members))
-    return _ChipPlaces(file, row, names, checksums)
+    return _ChipLayout(file, row, names, checksums)
 
 
-def _planned(counts: IntArray, limit: int) -> tuple[IntArray, IntArray]:
-    """File and first row of each point's chips, so that no file holds more than `limit` chips."""
+def _plan_files(counts: IntArray, limit: int) -> tuple[IntArray, IntArray]:
+    """File (n,) and first row (n,) of the chips of each point, with at most `limit` chips in a file."""
     file, row = np.empty(len(counts), dtype=np.int64), np.empty(len(counts), dtype=np.int64)
     current, used = 0, 0
     for i, count in enumerate(counts.tolist()):
@@ -177,13 +187,13 @@ def _write_hashed(path: Path, header: bytes, arrays: Iterator[ChipArray]) -> str
     return digest.hexdigest()
 
 
-def _write_tables(folder: Path, points: ControlPoints, place: _ChipPlaces, typology: Texts) -> None:
+def _write_tables(folder: Path, points: ControlPoints, layout: _ChipLayout, typology: Texts) -> None:
     views = points.views
     count = np.diff(views.start)
     within = np.arange(len(views.gsd_m)) - np.repeat(views.start[:-1], count)
     owner = np.repeat(np.arange(len(points)), count)
-    n_views, first_view, last_view = _seen(points)
-    sigma_m, correlation = spread_from_covariance(points.covariance_m2)
+    n_views, first_view, last_view = _view_statistics(points)
+    sigma_m, correlation = sigmas_from_covariance(points.covariance_m2)
     rows = PointRows(
         id=np.arange(len(points), dtype=np.int64),
         lon_lat_h=points.lon_lat_h,
@@ -194,10 +204,10 @@ def _write_tables(folder: Path, points: ControlPoints, place: _ChipPlaces, typol
         typology=typology,
         first_view=first_view,
         last_view=last_view,
-        chip_file=place.file,
-        chip_row=place.row,
+        chip_file=layout.file,
+        chip_row=layout.row,
         chip_count=count,
-        chip_files=place.names,
+        chip_files=layout.names,
     )
     write_points(folder / POINTS_PARQUET, rows)
     view_rows = ViewRows(
@@ -207,16 +217,16 @@ def _write_tables(folder: Path, points: ControlPoints, place: _ChipPlaces, typol
         image=views.image,
         incidence_deg=views.incidence_deg,
         azimuth_deg=views.azimuth_deg,
-        chip_file=place.file[owner],
-        chip_row=place.row[owner] + within,
+        chip_file=layout.file[owner],
+        chip_row=layout.row[owner] + within,
         image_ids=tuple(image.image_id for image in views.images),
-        chip_files=place.names,
+        chip_files=layout.names,
     )
     write_views(folder / VIEWS_PARQUET, view_rows, views.images)
 
 
-def _seen(points: ControlPoints) -> tuple[IntArray, Dates, Dates]:
-    """Number of different images of each point, and the dates of its first and last one."""
+def _view_statistics(points: ControlPoints) -> tuple[IntArray, Dates, Dates]:
+    """Number of distinct images of each point, and the dates of the first and the last one."""
     views = points.views
     owner = np.repeat(np.arange(len(points)), np.diff(views.start))
     pairs = np.unique(np.column_stack([owner, views.image]), axis=0)
@@ -240,9 +250,9 @@ def _seen(points: ControlPoints) -> tuple[IntArray, Dates, Dates]:
 def _write_models(
     folder: Path, images: tuple[Acquisition, ...], models: Mapping[str, RpcModel]
 ) -> tuple[str | None, ...]:
-    unknown = sorted(set(models) - {image.image_id for image in images})
-    if unknown:
-        raise InputError(f"a model is given for {unknown[0]!r}, which no view is of")
+    unseen = sorted(set(models) - {image.image_id for image in images})
+    if unseen:
+        raise InputError(f"models: {unseen[0]!r} given, the name of an image with views expected")
     paths: list[str | None] = []
     for image in images:
         model = models.get(image.image_id)
@@ -258,10 +268,12 @@ def _checksums(folder: Path, excluding: Mapping[str, str]) -> dict[str, str]:
     return {name: file_sha256(folder / name) for name in names if name not in excluding}
 
 
-def _texts(values: Sequence[str | None] | None, count: int) -> Texts:
+def _typology_column(values: Sequence[str | None] | None, count: int) -> Texts:
     texts = np.full(count, None, dtype=object)
     if values is not None:
         if len(values) != count:
-            raise InputError(f"{len(values)} typologies given for {count} points")
+            raise InputError(
+                f"typology: {len(values)} values given, one for each of the {count} points expected"
+            )
         texts[:] = values
     return texts

@@ -1,7 +1,7 @@
-"""The chips of many points as the pages of one GeoTIFF, made page by page.
+"""The chips of many points as the pages of one GeoTIFF, generated page by page.
 
-Each page lies on its own map, as the chip of one point does in `chip_images`. No library writes pages
-that lie on different maps to a stream, so they are laid here: TIFF 6.0, OGC 19-008r4 (GeoTIFF 1.1).
+Each page has its own projection, as the GeoTIFF of one chip has (`chips.images`). No library writes such
+pages to a stream, so this module encodes them. Source: TIFF 6.0; OGC 19-008r4 (GeoTIFF 1.1).
 """
 
 import json
@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from services.conventions import CHIP_CENTRE
+from services.formats.chips.images import pixel_size_on_ellipsoid_m
 from services.formats.chips.stacks import chip_runs, chip_table, read_runs
-from services.geodesy import metres_per_degree
 from services.types import ChipArray, ChipSource, ControlPoints
 
 SHORT, LONG, DOUBLE, ASCII = 3, 4, 12, 2
 CODES = {SHORT: "H", LONG: "I", DOUBLE: "d"}
 HEADER = struct.pack("<2sHI", b"II", 42, 8)
 
-# Keys of a projection of its own: azimuthal equidistant (12) on WGS 84 (4326) in metres (9001), whose
-# centre is the point; numbers with 34736 stand in the list of doubles.
+# Keys of a user-defined projection: azimuthal equidistant (12) on WGS 84 (4326) in metres (9001), with
+# its centre at the point. A location of 34736 refers to the tag with the list of doubles.
 GEO_KEYS = (
     *(1, 1, 1, 11),
     *(1024, 0, 1, 1),
@@ -39,12 +39,13 @@ GEO_KEYS = (
 
 
 def stream_chips_tiff(points: ControlPoints, chips: ChipSource) -> Iterator[bytes]:
-    """The chips of points as pages with raw values, 0 is nodata; what each shows is its description.
+    """Yield the bytes of a GeoTIFF with one page for each chip of points: raw values, 0 is nodata.
 
-    Descriptions are JSON with the columns of `chip_stacks.chip_table`, null where unknown.
+    The description of a page is JSON with the columns of `stacks.chip_table`, null where unknown.
 
     Raises:
-        FormatError: chips are not where the store says; with the first piece, if with the first chips.
+        FormatError: a file of chips is unreadable or too short; before the first piece where it is the
+            file of the first chips.
     """
     table = chip_table(points)
     last, page, offset = len(table["point_id"]) - 1, 0, len(HEADER)
@@ -60,12 +61,9 @@ def stream_chips_tiff(points: ControlPoints, chips: ChipSource) -> Iterator[byte
 
 
 def _page(chip: ChipArray, row: dict[str, Any], offset: int, *, is_last: bool) -> bytes:
-    """One page: its directory, the values that do not fit into it, its pixels; of an even length."""
-    lon, lat, height_m = (float(value) for value in row["lon_lat_h"])
-    on_ellipsoid, at_height = metres_per_degree(lat, 0.0), metres_per_degree(lat, height_m)
-    east_m, north_m = (
-        float(row["gsd_m"]) * low / high for low, high in zip(on_ellipsoid, at_height, strict=True)
-    )
+    """The bytes of one page, of even length: directory, values too long for it, pixels."""
+    lon, lat, _ = (float(value) for value in row["lon_lat_h"])
+    east_m, north_m = pixel_size_on_ellipsoid_m(row["lon_lat_h"], float(row["gsd_m"]))
     corner = CHIP_CENTRE + 0.5
     height, width = chip.shape
     tags: list[tuple[int, int, tuple[Any, ...]]] = [
@@ -88,15 +86,15 @@ def _page(chip: ChipArray, row: dict[str, Any], offset: int, *, is_last: bool) -
     ]
     directory_end = offset + 2 + 12 * len(tags) + 4
     entries, values = [], b""
-    for tag, kind, said in tags:
-        count = len(said[0]) if kind == ASCII else len(said)
-        packed = said[0] if kind == ASCII else struct.pack(f"<{count}{CODES[kind]}", *said)
+    for tag, kind, content in tags:
+        count = len(content[0]) if kind == ASCII else len(content)
+        packed = content[0] if kind == ASCII else struct.pack(f"<{count}{CODES[kind]}", *content)
         if len(packed) > 4:
-            place = struct.pack("<I", directory_end + len(values))
+            value_or_offset = struct.pack("<I", directory_end + len(values))
             values += packed + b"\0" * (-len(packed) % 8)
         else:
-            place = packed.ljust(4, b"\0")
-        entries.append(struct.pack("<HHI", tag, kind, count) + place)
+            value_or_offset = packed.ljust(4, b"\0")
+        entries.append(struct.pack("<HHI", tag, kind, count) + value_or_offset)
     pixels_at = directory_end + len(values)
     entries[6] = struct.pack("<HHII", 273, LONG, 1, pixels_at)
     pixels = chip.astype(chip.dtype.newbyteorder("<"), copy=False).tobytes()
@@ -107,7 +105,8 @@ def _page(chip: ChipArray, row: dict[str, Any], offset: int, *, is_last: bool) -
 
 
 def _description(row: dict[str, Any]) -> bytes:
-    said = {name: value.tolist() for name, value in row.items() if name != "acquired_at"}
-    known = {name: None if value != value else value for name, value in said.items()}
+    """The metadata of a chip as JSON, ended by a zero byte."""
+    values = {name: value.tolist() for name, value in row.items() if name != "acquired_at"}
+    values = {name: None if value != value else value for name, value in values.items()}
     time = None if np.isnat(row["acquired_at"]) else f"{row['acquired_at']}Z"
-    return json.dumps({**known, "acquired_at": time}).encode("ascii") + b"\0"
+    return json.dumps({**values, "acquired_at": time}).encode("ascii") + b"\0"

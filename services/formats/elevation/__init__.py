@@ -1,0 +1,1 @@
+"""Digital elevation models and geoids, converted to heights above the WGS 84 ellipsoid."""

@@ -1,0 +1,1 @@
+"""Ground control points marked in images, in the exchange formats of the field."""

@@ -1,0 +1,1 @@
+"""Image files: rasters, bands, masks, scenes with their models, and ortho-images."""

@@ -1,0 +1,1 @@
+"""Vector files: feature tables as GeoParquet, GeoPackage, FlatGeobuf, and layers of residuals."""

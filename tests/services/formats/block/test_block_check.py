@@ -289,8 +289,11 @@ def test_a_wrong_field_of_the_document_is_named(block, path, value):
 def test_paths_that_leave_the_folder_are_refused_and_not_read(block, name):
     (block.folder.parent / "outside.npy").write_bytes((block.folder / "chips/0000.npy").read_bytes())
     edit_json(block.folder, lambda document: document["amers:checksums"].update({name: "0" * 64}))
-    assert "not a path inside the block" in str(problems_of(block.folder))
-    with FolderChips(block.folder) as chips, pytest.raises(FormatError, match="not a path inside"):
+    assert "a path inside the block, without links expected" in str(problems_of(block.folder))
+    with (
+        FolderChips(block.folder) as chips,
+        pytest.raises(FormatError, match="a relative path inside the block expected"),
+    ):
         chips.read(name, 0, 1)
 
 
@@ -306,5 +309,5 @@ def test_links_are_refused_even_when_what_they_point_to_is_right(block):
 
 @pytest.mark.parametrize(("row", "count"), [(-1, 2), (0, 241), (240, 1), (239, 2)])
 def test_chips_beyond_the_end_of_a_file_are_refused(block, row, count):
-    with FolderChips(block.folder) as chips, pytest.raises(FormatError, match="240 in the file"):
+    with FolderChips(block.folder) as chips, pytest.raises(FormatError, match="the file has 240 chips"):
         chips.read("chips/0000.npy", row, count)

@@ -37,7 +37,7 @@ def written(contents: BlockContents, tmp_path_factory: pytest.TempPathFactory) -
             contents.points,
             lambda row: point_chips(contents.points, chips, row),
             {"left": parse_rpc_text(read_text(FOLDER / MODEL))},
-            list(contents.typology),
+            typology=list(contents.typology),
         )
     assert order.tolist() == [0, 1, 2]
     return folder
