@@ -51,7 +51,7 @@ def authenticate(connection: Connection, secret: str) -> Token:
     """
     token = find_valid_token(connection, secret_hash(secret))
     if token is None:
-        raise NotAllowed(INVALID_TOKEN, known=False)
+        raise NotAllowed(INVALID_TOKEN, authenticated=False)
     return token
 
 
@@ -67,7 +67,7 @@ def authenticate_identity(database: Database, identity: Identity) -> Token:
         with database.transaction() as connection:
             token = keep_subject(connection, identity.subject, identity.name, identity.scopes)
     if token.revoked_at is not None:
-        raise NotAllowed(INVALID_TOKEN, known=False)
+        raise NotAllowed(INVALID_TOKEN, authenticated=False)
     return replace(token, scopes=identity.scopes)
 
 
@@ -86,6 +86,11 @@ def may_access(caller: Token, owner: UUID | None) -> bool:
     return owner == caller.id or is_administrator(caller)
 
 
+def owner_filter(caller: Token) -> UUID | None:
+    """The owner whose records a caller may list; None, for administrators, lists the records of all."""
+    return None if is_administrator(caller) else caller.id
+
+
 def require_token(caller: Token | None) -> Token:
     """The token of a caller.
 
@@ -93,7 +98,7 @@ def require_token(caller: Token | None) -> Token:
         NotAllowed: the caller sent none.
     """
     if caller is None:
-        raise NotAllowed(MISSING_TOKEN, known=False)
+        raise NotAllowed(MISSING_TOKEN, authenticated=False)
     return caller
 
 
@@ -107,6 +112,6 @@ def require(caller: Token | None, scope: Scope) -> Token:
     if not allows(token, scope):
         raise NotAllowed(
             f"this request needs scope {scope}; token {token.name} has {', '.join(token.scopes)}",
-            known=True,
+            authenticated=True,
         )
     return token

@@ -1,4 +1,4 @@
-"""The errors of the doors and the store; those of the science are in `services.errors`."""
+"""Errors of the entry points and the store; those of the science are in `services.errors`."""
 
 import errno
 
@@ -20,43 +20,43 @@ __all__ = [
     "is_no_room",
 ]
 DISK_FULL = "53100"
-"""What PostgreSQL calls it."""
+"""SQLSTATE of PostgreSQL's error `disk_full`."""
 
 
 class InvalidParameter(InputError):
-    """A parameter of a request does not hold what it should; OGC API calls for 400."""
+    """A request parameter has an unusable value; OGC API requires status 400 for it."""
 
 
 class NotFound(AmersError):
-    """There is no such thing, or not for this caller."""
+    """The requested thing does not exist, or this caller may not see it."""
 
 
 class NoSuchProcess(NotFound):
-    """There is no process of that name."""
+    """No process has this name."""
 
 
 class NoSuchJob(NotFound):
-    """There is no job of that number, or not for this caller."""
+    """No job has this id, or this caller may not see it."""
 
 
 class StorageOutage(Exception):
-    """The storage does not answer: nobody's fault, so that work which meets this is tried again."""
+    """The file storage does not answer. Not the user's fault: a job that meets it is tried again."""
 
 
 class Conflict(AmersError):
-    """The thing is not in a state that allows this."""
+    """The present state of the thing does not allow the request."""
 
 
 class TooLarge(AmersError):
-    """More bytes than the installation accepts."""
+    """More bytes than the installation or the caller's quota accepts."""
 
 
 class TooMany(AmersError):
-    """More at once than the caller may have; later it may be possible."""
+    """More at once than the caller's quota allows; the same request may succeed later."""
 
 
 def is_no_room(error: BaseException) -> bool:
-    """Whether an error says that a disk is full, that of the files or that of the database."""
+    """Whether an error means that a disk is full: that of the files or that of the database."""
     return (
         isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     ) or getattr(error, "sqlstate", None) == DISK_FULL
@@ -66,9 +66,9 @@ class NotAllowed(AmersError):
     """The caller may not do this.
 
     Attributes:
-        known: whether the caller showed a valid token (403) or not (401).
+        authenticated: whether the caller sent a valid token (403) or not (401).
     """
 
-    def __init__(self, message: str, *, known: bool) -> None:
+    def __init__(self, message: str, *, authenticated: bool) -> None:
         super().__init__(message)
-        self.known = known
+        self.authenticated = authenticated

@@ -79,12 +79,12 @@ class Issuer:
             )
         except (jwt.PyJWTError, httpx.HTTPError, ValueError) as error:
             log.info("a token of %s was refused: %s", self._issuer, error)
-            raise NotAllowed("the token is not a valid one of the issuer", known=False) from None
+            raise NotAllowed("the token is not a valid one of the issuer", authenticated=False) from None
         given = claims.get(self._claim, ())
         held = set(given.split() if isinstance(given, str) else map(str, given or ()))
         scopes = tuple(own for theirs, own in self._scopes.items() if theirs in held)
         if not scopes:
-            raise NotAllowed(f"the token's claim {self._claim} allows nothing here", known=True)
+            raise NotAllowed(f"the token's claim {self._claim} allows nothing here", authenticated=True)
         name = str(claims.get("preferred_username") or claims.get("name") or claims["sub"])
         return Identity(f"{self._issuer}|{claims['sub']}", name[:200], scopes)
 

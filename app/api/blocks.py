@@ -24,6 +24,9 @@ from app.usecases import jobs
 from app.usecases.blocks import lifecycle, uploads
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.lifecycle import Published
+from app.usecases.installation import Installation
+from app.usecases.jobs import JobRequest
+from app.usecases.scenes import SentFile
 from services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"])
@@ -77,9 +80,8 @@ def upload_block(
     """Upload a zip or tar of a block; the reply says how `POST /blocks` names it."""
     length = request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else None
-    upload_id = uploads.receive_block(
-        database, storage, settings, caller, name, body_chunks(request), announced
-    )
+    sent = SentFile(name, body_chunks(request), announced)
+    upload_id = uploads.receive_block(Installation(database, storage, settings), caller, sent)
     return {"upload": str(upload_id)}
 
 
@@ -99,7 +101,8 @@ def ingest(
     """
     inputs = body.model_dump(mode="json", exclude_none=True)
     with database.transaction() as connection:
-        job = jobs.execute(connection, settings, caller, INGEST_BLOCK.id, inputs, idempotency_key)
+        job_request = JobRequest(INGEST_BLOCK.id, inputs)
+        job = jobs.execute(connection, settings, caller, job_request, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     return status_info(request, job)
 

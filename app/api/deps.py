@@ -64,7 +64,7 @@ async def _caller(
         return None
     kind, _, secret = authorization.partition(" ")
     if kind.lower() != "bearer" or not secret.strip():
-        raise NotAllowed("the Authorization header must read `Bearer TOKEN`", known=False)
+        raise NotAllowed("the Authorization header must read `Bearer TOKEN`", authenticated=False)
     caller = await run_in_threadpool(_known, request.app.state.issuer, database, secret.strip())
     here = request_context.current()
     here.actor, here.actor_name = caller.id, caller.name

@@ -91,7 +91,7 @@ def problem(
 def status_of(error: AmersError) -> int:
     """The HTTP status of an error of Amers."""
     if isinstance(error, NotAllowed):
-        return 403 if error.known else 401
+        return 403 if error.authenticated else 401
     return next(HTTP_STATUS[kind] for kind in type(error).__mro__ if kind in HTTP_STATUS)
 
 

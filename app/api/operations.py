@@ -12,7 +12,7 @@ from prometheus_client.registry import Collector
 
 from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
 from app.usecases import operations
-from app.usecases.operations import Installation
+from app.usecases.operations import InstallationFigures
 
 router = APIRouter(tags=["operations"])
 
@@ -44,7 +44,7 @@ def audit(
 ) -> dict[str, Any]:
     """Every change of a token, a block, a scene or a job, the newest first; it only grows."""
     with database.reading() as connection:
-        found = operations.list_changes(connection, limit, before, kind, subject)
+        found = operations.list_changes(connection, limit, before=before, kind=kind, subject=subject)
     links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
     if len(found) == limit:
         following = str(request.url.include_query_params(before=found[-1].id))
@@ -53,7 +53,7 @@ def audit(
 
 
 class _Figures(Collector):
-    def __init__(self, figures: Installation) -> None:
+    def __init__(self, figures: InstallationFigures) -> None:
         self._figures = figures
 
     def collect(self) -> Iterator[GaugeMetricFamily]:

@@ -9,6 +9,7 @@ from app.api.deps import DatabaseDep, Reader, SettingsDep
 from app.api.jobs import job_url, status_info
 from app.errors import InputError
 from app.usecases import jobs
+from app.usecases.jobs import JobRequest
 from app.usecases.processes import Process
 from app.usecases.registration.deliverables import media_type
 
@@ -74,10 +75,11 @@ def describe_process(process_id: str, request: Request) -> dict[str, Any]:
     process = jobs.find_process(process_id)
     schema = process.input_schema()
     required = schema.get("required", [])
+    descriptions = process.input_descriptions()
     inputs = {
         name: {
             "title": name,
-            **({"description": process.input_text(name)} if process.input_text(name) else {}),
+            **({"description": descriptions[name]} if name in descriptions else {}),
             "minOccurs": 1 if name in required else 0,
             "schema": inlined(member, schema.get("$defs", {})),
         }
@@ -111,9 +113,8 @@ def execute(
     asked = body.outputs
     outputs = None if asked is None else {name: one.transmission_mode for name, one in asked.items()}
     with database.transaction() as connection:
-        job = jobs.execute(
-            connection, settings, caller, process_id, inputs, idempotency_key, outputs, body.response
-        )
+        job_request = JobRequest(process_id, inputs, outputs, body.response)
+        job = jobs.execute(connection, settings, caller, job_request, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     if "respond-async" in (prefer or ""):
         response.headers["Preference-Applied"] = "respond-async"

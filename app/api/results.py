@@ -20,7 +20,7 @@ from app.errors import AmersError
 from app.storage import Storage
 from app.usecases import jobs, results
 from app.usecases.registration.deliverables import media_type
-from app.usecases.results import ToldFile
+from app.usecases.results import ResultFile
 from services import errors as errors_of_science
 from services.reports import document
 
@@ -41,12 +41,14 @@ def show_results(
         return problem(404, job.message, title=title, type=f"{OGC_EXCEPTIONS}result-not-ready")
     if job.results_removed_at is not None:
         return problem(410, f"the results were removed on {job.results_removed_at:%Y-%m-%d}")
-    values, files = results.told_results(storage, job)
+    values, files = results.requested_results(storage, job)
     if job.response == "raw":
         return _raw(storage, job_url(request, job), values, files)
     here = job_url(request, job)
     told = {
-        file.name: results.file_value(storage, file) if file.by == "value" else _link(here, file)
+        file.name: results.file_value(storage, file)
+        if file.transmission == "value"
+        else _link(here, file)
         for file in files
     }
     return JSONResponse(jsonable_encoder({**values, **told}))
@@ -72,7 +74,7 @@ def report_schema() -> JSONResponse:
     return JSONResponse(document.report_schema(), media_type=SCHEMA_JSON)
 
 
-def _link(here: str, file: ToldFile) -> dict[str, str]:
+def _link(here: str, file: ResultFile) -> dict[str, str]:
     return {"href": f"{here}/results/{file.name}", "type": file.media_type, "title": file.name}
 
 
@@ -87,9 +89,9 @@ def _failed(job: Job) -> Response:
     return problem(status, **{"detail": "the job failed", **said})
 
 
-def _raw(storage: Storage, here: str, values: dict[str, Any], files: list[ToldFile]) -> Response:
+def _raw(storage: Storage, here: str, values: dict[str, Any], files: list[ResultFile]) -> Response:
     """Outputs as they are: one alone, several as parts, references alone as links of the header."""
-    if not values and all(file.by == "reference" for file in files):
+    if not values and all(file.transmission == "reference" for file in files):
         links = [f'<{here}/results/{f.name}>; rel="item"; type="{f.media_type}"' for f in files]
         return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Link": ", ".join(links)})
     if not values and len(files) == 1:
@@ -99,7 +101,7 @@ def _raw(storage: Storage, here: str, values: dict[str, Any], files: list[ToldFi
     ]
     for file in files:
         place = {"Content-Type": file.media_type}
-        if file.by == "reference":
+        if file.transmission == "reference":
             parts.append((file.name, {**place, "Content-Location": _link(here, file)["href"]}, b""))
         else:
             parts.append((file.name, place, results.file_bytes(storage, file)))

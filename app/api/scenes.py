@@ -16,7 +16,8 @@ from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
 from app.usecases.features.stac import scene_media_type
-from app.usecases.scenes import Upload
+from app.usecases.installation import Installation
+from app.usecases.scenes import SentFile
 
 router = APIRouter(tags=["scenes"])
 
@@ -62,8 +63,8 @@ def upload_scene(
     `X-Checksum` (sha256 in hexadecimal) is compared. Files with the model follow by
     `PUT /scenes/{id}/files/{name}`.
     """
-    upload = _upload(request, name or _disposition_name(request))
-    scene = scenes.upload_scene(database, storage, settings, caller, upload, sigma_m)
+    sent = _sent_file(request, name or _disposition_name(request))
+    scene = scenes.upload_scene(Installation(database, storage, settings), caller, sent, sigma_m)
     response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
     return _scene(scene)
 
@@ -83,8 +84,8 @@ def upload_beside(
     caller: Registrar,
 ) -> dict[str, Any]:
     """Upload a file to lie beside the image of a scene: model, terrain, mask or check points."""
-    upload = _upload(request, name)
-    stored = scenes.upload_beside(database, storage, settings, caller, scene_id, upload)
+    sent = _sent_file(request, name)
+    stored = scenes.upload_side_file(Installation(database, storage, settings), caller, scene_id, sent)
     return {
         "name": stored.key.rsplit("/", 1)[1],
         "size_bytes": stored.size_bytes,
@@ -113,7 +114,7 @@ def refer_to_scene(
 ) -> dict[str, Any]:
     """Take in a scene that lies on the server, below the folder of `AMERS_SCENE_FOLDER`."""
     with database.transaction() as connection:
-        scene = scenes.refer_to_scene(connection, settings, caller, body.path, body.sigma_m)
+        scene = scenes.add_server_scene(connection, settings, caller, body.path, body.sigma_m)
     response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
     return _scene(scene)
 
@@ -171,11 +172,11 @@ def _scene(scene: SceneRow) -> dict[str, Any]:
     }
 
 
-def _upload(request: Request, name: str | None) -> Upload:
+def _sent_file(request: Request, name: str | None) -> SentFile:
     if not name:
         raise InputError("the file has no name: send ?name= or Content-Disposition")
     length = request.headers.get("content-length", "")
-    return Upload(
+    return SentFile(
         name=name,
         chunks=body_chunks(request),
         size_bytes=int(length) if length.isdigit() else None,

@@ -41,7 +41,12 @@ def create(
     """Make a token; the reply holds its secret, this once."""
     with database.transaction() as connection:
         new = tokens.create_token(
-            connection, body.name, body.scopes, body.days, body.upload_quota_bytes, body.job_quota
+            connection,
+            body.name,
+            body.scopes,
+            body.days,
+            upload_quota_bytes=body.upload_quota_bytes,
+            job_quota=body.job_quota,
         )
     response.headers["Location"] = f"{request.base_url}tokens/{new.token.id}"
     response.headers["Cache-Control"] = "no-store"

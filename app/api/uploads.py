@@ -23,7 +23,8 @@ from app.api.error_responses import problem
 from app.db.uploads import UploadRow
 from app.errors import InputError
 from app.usecases import uploads
-from app.usecases.uploads import Busy, Checksum, NewUpload, WrongChecksum
+from app.usecases.installation import Installation
+from app.usecases.uploads import Busy, Checksum, NewUpload, Piece, WrongChecksum
 
 VERSION = "1.0.0"
 PIECE = "application/offset+octet-stream"
@@ -76,7 +77,7 @@ def create(
     """
     new = _announced(upload_length, upload_metadata)
     with database.transaction() as connection:
-        upload = uploads.begin(connection, storage, settings, caller, new)
+        upload = uploads.create_upload(connection, storage, settings, caller, new)
     place = {"Location": f"{request.base_url}uploads/{upload.id}"}
     return Response(status_code=201, headers=_headers(upload) | place)
 
@@ -85,9 +86,9 @@ def create(
 def ask(upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar) -> Response:
     """How much has arrived."""
     with database.reading() as connection:
-        upload = uploads.find(connection, caller, upload_id)
+        upload = uploads.find_upload(connection, caller, upload_id)
     told = {
-        "Upload-Offset": str(uploads.offset(storage, upload)),
+        "Upload-Offset": str(uploads.received_bytes(storage, upload)),
         "Upload-Length": str(upload.size_bytes),
         **({"Upload-Metadata": upload.metadata} if upload.metadata else {}),
     }
@@ -100,13 +101,13 @@ def show(
 ) -> dict[str, Any]:
     """An upload, for those who do not speak tus."""
     with database.reading() as connection:
-        upload = uploads.find(connection, caller, upload_id)
+        upload = uploads.find_upload(connection, caller, upload_id)
     return {
         "id": upload.id,
         "state": "arriving" if upload.finished_at is None else "finished",
         "purpose": upload.purpose,
         "name": upload.name,
-        "offset": uploads.offset(storage, upload),
+        "offset": uploads.received_bytes(storage, upload),
         "size_bytes": upload.size_bytes,
         "scene": upload.scene_id,
         "created": upload.created_at,
@@ -136,15 +137,14 @@ def send(
         raise HTTPException(415, f"Content-Type: {content_type!r} is not {PIECE}")
     checksum = None if upload_checksum is None else _checksum(upload_checksum)
     with database.reading() as connection:
-        upload = uploads.find(connection, caller, upload_id)
+        upload = uploads.find_upload(connection, caller, upload_id)
     if upload.finished_at is not None and upload_offset == upload.size_bytes:
         return Response(
             status_code=204, headers=_headers(upload) | {"Upload-Offset": str(upload_offset)}
         )
     try:
-        arrived = uploads.receive(
-            database, storage, settings, upload, upload_offset, body_chunks(request), checksum
-        )
+        piece = Piece(upload_offset, body_chunks(request), checksum)
+        arrived = uploads.append_piece(Installation(database, storage, settings), upload, piece)
     except Busy as busy:
         return problem(LOCKED, str(busy), headers=TUS)
     except WrongChecksum as wrong:
@@ -158,7 +158,7 @@ def send(
 def end(upload_id: UUID, database: DatabaseDep, storage: StorageDep, caller: Registrar) -> Response:
     """End an upload that is not complete; what has arrived of it is forgotten."""
     with database.transaction() as connection:
-        uploads.drop(connection, storage, uploads.find(connection, caller, upload_id))
+        uploads.terminate_upload(connection, storage, uploads.find_upload(connection, caller, upload_id))
     return Response(status_code=204, headers=TUS)
 
 

@@ -19,7 +19,7 @@ def audit(
 ) -> None:
     """Show the last changes of tokens, blocks, scenes and jobs, the newest first."""
     with transaction() as connection:
-        found = operations.list_changes(connection, limit, None, kind, subject)
+        found = operations.list_changes(connection, limit, kind=kind, subject=subject)
     if as_json:
         show([vars(change) for change in found], as_json=True)
         return

@@ -32,7 +32,14 @@ def create(
 ) -> None:
     """Make a token and print its secret, this once."""
     with transaction() as connection:
-        new = tokens.create_token(connection, name, scope, days, upload_quota_bytes, job_quota)
+        new = tokens.create_token(
+            connection,
+            name,
+            scope,
+            days,
+            upload_quota_bytes=upload_quota_bytes,
+            job_quota=job_quota,
+        )
     record = {**_record(new.token), "secret": new.secret}
     if as_json:
         show_one(record, as_json=True)

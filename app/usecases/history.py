@@ -1,4 +1,4 @@
-"""What registrations say of points: remembered, shown, and acted upon by an administrator."""
+"""History of points: record what registrations measured, list doubtful points, suspend and reinstate."""
 
 from uuid import UUID
 
@@ -12,20 +12,20 @@ MOST_HISTORIES = 1000
 LONGEST_REASON = 500
 
 
-def remember(
+def record_measures(
     connection: Connection, registration_id: UUID, registration: Registration, scene_key: str
 ) -> None:
-    """Keep what a registration did with each point and view; count it, if it can be trusted, once.
+    """Store the measures of a registration; count them towards the points' history once per scene.
 
-    A registration whose verdict is "failed" says nothing of its points: its model may be wrong, and
-    then the points that found their place are those that seem to have failed. Nor does a second
-    registration of the same scene say anything that the first did not.
+    A registration with the verdict "failed" does not count: its model may be wrong, and then the wrong
+    points look good. A second registration of the same scene does not count either: it adds no
+    information about the points.
 
     Args:
-        connection: of the transaction that ends the registration.
-        registration_id: its row.
+        connection: with the transaction that stores the registration.
+        registration_id: id of the registration's row.
         registration: on points of the store.
-        scene_key: the same for the same image.
+        scene_key: identifies the image; equal for equal images.
     """
     history.insert_measures(connection, registration_id, registration.measures)
     history.insert_views(connection, registration_id, registration.measures, registration.views)
@@ -36,22 +36,22 @@ def remember(
 
 
 def find_history(connection: Connection, point_id: int) -> PointHistory:
-    """How a point fared in the scenes that tried it.
+    """The history of a point: how often scenes tried and used it.
 
     Raises:
         NotFound: there is no such point.
     """
-    found = history.find_history(connection, point_id) if abs(point_id) < 2**63 else None
-    if found is None:
+    point = history.find_history(connection, point_id) if abs(point_id) < 2**63 else None
+    if point is None:
         raise NotFound(f"no point {point_id}")
-    return found
+    return point
 
 
 def list_histories(connection: Connection, state: str, limit: int = 100) -> list[PointHistory]:
-    """The points that are proposed for suspension, or suspended, or served though tried: worst first.
+    """The points proposed for suspension, or suspended, or served and tried; the worst first.
 
     Raises:
-        InputError: no such state, or the limit is out of range.
+        InputError: the state is unknown, or the limit is out of range.
     """
     if state not in history.STATES:
         raise InputError(f"state: {state!r:.40} found, one of {', '.join(history.STATES)} expected")
@@ -61,28 +61,29 @@ def list_histories(connection: Connection, state: str, limit: int = 100) -> list
 
 
 def suspend_point(connection: Connection, point_id: int, because: str) -> PointHistory:
-    """Serve a point no longer, neither to registrations nor to readers; it can be reinstated.
+    """Suspend a point: neither registrations nor readers get it any more. It can be reinstated.
 
     Raises:
-        InputError: no reason is given, or one that is too long.
+        InputError: the reason is empty or too long.
         NotFound: there is no such point.
-        Conflict: it is suspended already.
+        Conflict: the point is already suspended.
     """
-    if not 1 <= len(because.strip()) <= LONGEST_REASON:
-        raise InputError(f"because: 1 to {LONGEST_REASON} characters expected, {len(because)} found")
-    before = find_history(connection, point_id)
-    if not history.suspend(connection, point_id, because.strip()):
-        raise Conflict(f"point {point_id} is suspended already, because: {before.suspended_because}")
+    reason = because.strip()
+    if not 1 <= len(reason) <= LONGEST_REASON:
+        raise InputError(f"because: {len(because)} characters found, 1 to {LONGEST_REASON} expected")
+    point = find_history(connection, point_id)
+    if not history.suspend(connection, point_id, reason):
+        raise Conflict(f"point {point_id} is already suspended, because: {point.suspended_because}")
     superseding.count_unserved(connection)
     return find_history(connection, point_id)
 
 
 def reinstate_point(connection: Connection, point_id: int) -> PointHistory:
-    """Serve a suspended point again; its history begins anew.
+    """Serve a suspended point again; its history starts again from nothing.
 
     Raises:
         NotFound: there is no such point.
-        Conflict: it is not suspended.
+        Conflict: the point is not suspended.
     """
     find_history(connection, point_id)
     if not history.reinstate(connection, point_id):

@@ -1,4 +1,4 @@
-"""Asking for work, watching it, and doing it."""
+"""Jobs: create one for a process, follow it, dismiss it, and do one attempt at it."""
 
 import logging
 import re
@@ -12,11 +12,11 @@ from uuid import UUID
 
 from psycopg import OperationalError
 
-from app.auth import is_administrator, may_access, require
+from app.auth import may_access, owner_filter, require
 from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
-from app.db.jobs import progress as job_course
+from app.db.jobs import progress as job_progress
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job, JobFilter, Response
 from app.db.jobs.progress import JobMessage
@@ -35,20 +35,37 @@ PROCESSES: dict[str, Process] = {
 }
 LONGEST_KEY = 200
 MOST_MESSAGES = 1000
-REPORT_EVERY_S = 0.5
+REPORT_INTERVAL_S = 0.5
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class JobRequest:
+    """A request to execute a process.
+
+    Attributes:
+        process_id: name of the process.
+        inputs: as sent, not yet checked.
+        outputs: name of each requested output, to `value` or `reference`; None requests all of them.
+        response: how the results are sent: in a document, or as they are.
+    """
+
+    process_id: str
+    inputs: dict[str, Any]
+    outputs: Mapping[str, str] | None = None
+    response: Response = "document"
+
+
 def find_process(process_id: str) -> Process:
-    """The process of that name.
+    """The process of this name.
 
     Raises:
         NoSuchProcess: there is none.
     """
     process = PROCESSES.get(process_id)
     if process is None:
-        raise NoSuchProcess(f"no process {process_id:.100}: there are {', '.join(PROCESSES)}")
+        raise NoSuchProcess(f"no process {process_id:.100}: expected one of {', '.join(PROCESSES)}")
     return process
 
 
@@ -56,61 +73,66 @@ def execute(
     connection: Connection,
     settings: Settings,
     caller: Token,
-    process_id: str,
-    given: dict[str, Any],
+    request: JobRequest,
     idempotency_key: str | None = None,
-    outputs: Mapping[str, str] | None = None,
-    response: Response = "document",
 ) -> Job:
-    """Ask for work; the same request with the same key asks for it once.
-
-    Args:
-        outputs: name of each output that is wanted, to `value` or `reference`; None: all of them.
-        response: how results are told.
+    """Create a job; a repeated request with the same key returns the job of the first one.
 
     Raises:
-        NotFound: no such process, or an input that is not there for this caller.
+        NotFound: no such process, or an input that does not exist for this caller.
         NotAllowed: the caller's token lacks the scope.
-        TooMany: the caller has as many jobs as he may have at once.
-        InputError: the inputs or outputs are not those of the process, or the key came with other ones
-            before.
+        TooMany: the caller has as many open jobs as the quota allows.
+        InputError: unusable inputs or outputs, or the key was used with another request.
     """
-    process = find_process(process_id)
+    process = find_process(request.process_id)
     require(caller, process.scope)
     if idempotency_key is not None and not 0 < len(idempotency_key) <= LONGEST_KEY:
-        raise InputError(f"an idempotency key has 1 to {LONGEST_KEY} characters")
-    parsed = process.parse_inputs(given)
-    inputs = process.format_inputs(parsed)
-    process.check_outputs(outputs or {})
-    wanted = None if outputs is None else dict(outputs)
-    request = (process_id, inputs, wanted, response)
+        raise InputError(
+            f"idempotency key: {len(idempotency_key)} characters found, 1 to {LONGEST_KEY} expected"
+        )
+    parsed = process.parse_inputs(request.inputs)
+    process.check_outputs(request.outputs or {})
+    outputs = None if request.outputs is None else dict(request.outputs)
+    checked = JobRequest(process.id, process.format_inputs(parsed), outputs, request.response)
     if idempotency_key is not None:
-        known = jobs.find_by_key(connection, caller.id, idempotency_key)
-        if known is not None:
-            return _same_request(known, request)
+        earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
+        if earlier is not None:
+            return _same_request(earlier, checked)
     process.check(connection, caller, parsed)
     quotas.require_free_job(connection, settings, caller)
-    job = jobs.create(connection, process_id, inputs, caller.id, idempotency_key, wanted, response)
+    job = jobs.create(
+        connection,
+        kind=checked.process_id,
+        inputs=checked.inputs,
+        owner=caller.id,
+        idempotency_key=idempotency_key,
+        outputs=outputs,
+        response=checked.response,
+    )
     if job is not None:
         return job
     assert idempotency_key is not None
-    # Somebody else has just used the key: his job is visible now that the insert has waited for him.
-    known = jobs.find_by_key(connection, caller.id, idempotency_key)
-    assert known is not None
-    return _same_request(known, request)
+    # Another request has just used the key; the insert waited for it, so its job is visible now.
+    earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
+    assert earlier is not None
+    return _same_request(earlier, checked)
 
 
-def _same_request(known: Job, request: tuple[object, ...]) -> Job:
-    if (known.kind, known.inputs, known.outputs, known.response) != request:
-        raise InputError(f"the idempotency key was used for job {known.id}, which was asked otherwise")
-    return known
+def _same_request(job: Job, request: JobRequest) -> Job:
+    """The job of an idempotency key, if it was created by the same request."""
+    if JobRequest(job.kind, job.inputs, job.outputs, job.response) != request:
+        raise InputError(
+            f"idempotency key: job {job.id} was created with this key by a different request; "
+            "send a new key"
+        )
+    return job
 
 
 def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
     """The job, for its owner or an administrator.
 
     Raises:
-        NoSuchJob: there is none, or it is somebody else's: strangers cannot tell which.
+        NoSuchJob: there is none, or the caller may not see it; the message does not say which.
     """
     job = jobs.find(connection, job_id)
     if job is None or not may_access(caller, job.owner):
@@ -121,59 +143,58 @@ def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
 def list_jobs(
     connection: Connection, caller: Token, wanted: JobFilter, limit: int, after: UUID | None = None
 ) -> list[Job]:
-    """The caller's newest jobs, or those that follow one of them; everybody's for an administrator.
+    """The caller's newest jobs, or those that follow job `after`; administrators see all jobs.
 
     Raises:
-        NoSuchJob: the job to follow is none of the caller's.
+        NoSuchJob: the caller may not see the job `after`.
     """
     if after is not None:
         visible_job(connection, caller, after)
-    owner = None if is_administrator(caller) else caller.id
-    return jobs.newest(connection, owner, wanted, limit, after)
+    return jobs.newest(connection, owner_filter(caller), wanted, limit, after)
 
 
 def queue_position(connection: Connection, job: Job) -> int | None:
-    """How many jobs are to be begun before this one and with it; None when it does not wait."""
-    return job_course.position(connection, job) if job.state == "accepted" else None
+    """The position of a waiting job in the queue, 1 for the next one; None when it does not wait."""
+    return job_progress.position(connection, job) if job.state == "accepted" else None
 
 
 def expected_end(connection: Connection, job: Job) -> datetime | None:
-    """When an open job may end, as far as jobs before it tell."""
-    return job_course.expected_end(connection, job)
+    """The expected end of an open job, from the durations of earlier jobs; None when unknown."""
+    return job_progress.expected_end(connection, job)
 
 
 def read_messages(connection: Connection, caller: Token, job_id: UUID) -> list[JobMessage]:
     """The last messages of a job, the oldest of them first.
 
     Raises:
-        NoSuchJob: there is none, or not the caller's.
+        NoSuchJob: there is none, or the caller may not see it.
     """
     visible_job(connection, caller, job_id)
-    return job_course.read_messages(connection, job_id, MOST_MESSAGES)
+    return job_progress.read_messages(connection, job_id, MOST_MESSAGES)
 
 
 def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:
-    """End a job that nobody wants any more; work on it stops within seconds.
+    """Dismiss a job; the worker stops the work within seconds.
 
     Raises:
-        NoSuchJob: there is none, or not the caller's.
-        Conflict: it has ended; its record and its results are kept.
+        NoSuchJob: there is none, or the caller may not see it.
+        Conflict: the job has ended; its record and its results stay.
     """
     job = visible_job(connection, caller, job_id)
     if not jobs.dismiss(connection, job_id):
         job = visible_job(connection, caller, job_id)
         if job.state != "dismissed":
-            raise Conflict(f"job {job_id} has ended ({job.state}); it is kept")
+            raise Conflict(f"job {job_id} is {job.state} and cannot be dismissed; its results stay")
     return visible_job(connection, caller, job_id)
 
 
 def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: int) -> None:
-    """Do the work of a job and write its outcome, once.
+    """Do the work of a job and write its outcome.
 
-    An error that concerns the user ends the job; any other leaves it to the caller.
+    An `AmersError` ends the job as failed; any other exception is left to the caller.
 
     Raises:
-        LostJob: the job went on without this attempt; nothing was written.
+        LostJob: this attempt is no longer the current one; nothing is written.
     """
     with database.transaction() as connection:
         job = jobs.find(connection, job_id)
@@ -189,39 +210,39 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
             results = commit(connection)
             attempts.succeed(connection, job.id, attempt, results)
     except AmersError as error:
-        log.info("job %s: %s: %s", job.id, type(error).__name__, error)
+        log.info("job %s failed: %s: %s", job.id, type(error).__name__, error)
         with database.transaction() as connection:
             attempts.fail(connection, job.id, attempt, error_details(error, storage))
 
 
 def error_details(error: AmersError, storage: Storage) -> dict[str, Any]:
-    """Problem details (RFC 9457) of an error: the numbers it carries, no folder of this machine."""
+    """Problem details (RFC 9457) of an error, with its numbers and without folders of this machine."""
     folder = rf"{re.escape(str(storage.folder))}/(scenes|results)/[^/\s]+/"
     detail = re.sub(rf"{folder}|{re.escape(gettempdir())}/(amers-\w+/)?", "", str(error))
     name = type(error).__name__
     title = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).capitalize()
     numbers = {key: value for key, value in vars(error).items() if isinstance(value, int | float | str)}
     problems = [asdict(problem) for problem in getattr(error, "problems", ())]
-    told = {"problems": problems} if problems else {}
-    return {"type": "about:blank", "title": title, "detail": detail, "error": name, **numbers, **told}
+    details = {"type": "about:blank", "title": title, "detail": detail, "error": name, **numbers}
+    return {**details, "problems": problems} if problems else details
 
 
 @dataclass
 class _ReportedProgress:
-    """Progress that is written into the job, not too often."""
+    """Writes progress into the job, at most once in `REPORT_INTERVAL_S`."""
 
     database: Database
     job: Job
     written_at: float = field(default=float("-inf"))
 
     def __call__(self, fraction: float, message: str) -> None:
-        """Report the fraction done.
+        """Write the fraction done and the message.
 
         Raises:
-            LostJob: nobody waits for this attempt any more.
+            LostJob: this attempt is no longer the current one: the job was dismissed or taken over.
         """
         now = time.monotonic()
-        if now - self.written_at < REPORT_EVERY_S:
+        if now - self.written_at < REPORT_INTERVAL_S:
             return
         self.written_at = now
         percent = min(max(int(100.0 * fraction), 0), 99)
@@ -229,4 +250,4 @@ class _ReportedProgress:
             with self.database.transaction() as connection:
                 attempts.report(connection, self.job.id, self.job.attempt, percent, message)
         except OperationalError as outage:
-            log.warning("job %s: progress could not be written: %s", self.job.id, outage)
+            log.warning("job %s: the progress was not written: %s", self.job.id, outage)

@@ -1,4 +1,4 @@
-"""What those who keep an installation running ask of it: its figures, and the record of changes."""
+"""Operations of an installation: its figures, and the audit record of changes."""
 
 import shutil
 from dataclasses import dataclass
@@ -14,39 +14,40 @@ MOST_CHANGES = 1000
 
 
 @dataclass(frozen=True)
-class Installation:
-    """The figures of the store, and of the disk its files are on."""
+class InstallationFigures:
+    """The figures of the store, and of the disk with the data folder."""
 
     store: Gauges
     disk_free_bytes: int
     disk_total_bytes: int
 
 
-def installation_figures(connection: Connection, data_folder: Path) -> Installation:
-    """The figures of an installation at this moment."""
-    # The folder is made by the first who writes into it.
-    there = next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
-    disk = shutil.disk_usage(there)
-    return Installation(metrics.read_gauges(connection), disk.free, disk.total)
+def installation_figures(connection: Connection, data_folder: Path) -> InstallationFigures:
+    """The present figures of an installation."""
+    # The first write creates the data folder; before that, the nearest existing parent is measured.
+    existing = next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
+    disk = shutil.disk_usage(existing)
+    return InstallationFigures(metrics.read_gauges(connection), disk.free, disk.total)
 
 
 def list_changes(
     connection: Connection,
     limit: int,
+    *,
     before: int | None = None,
     kind: str | None = None,
     subject: str | None = None,
 ) -> list[Change]:
-    """Changes, the newest first.
+    """The recorded changes, the newest first.
 
     Args:
-        limit: most changes, 1 to 1,000.
-        before: changes with smaller ids only, to go on after a page.
-        kind: `token`, `block`, `scene` or `job`; None for all.
-        subject: id of one of them, ID@VERSION of a block.
+        limit: at most this many changes, 1 to 1,000.
+        before: only changes with an id below this one: the next page.
+        kind: only changes of this kind: `token`, `block`, `scene`, `job`, `point` or `reference_image`.
+        subject: only changes of the thing with this id; ID@VERSION for a block.
 
     Raises:
-        InputError: the limit, or a kind of which no changes are recorded.
+        InputError: the limit is out of range, or the kind is unknown.
     """
     if not 1 <= limit <= MOST_CHANGES:
         raise InputError(f"limit: {limit} found, 1 to {MOST_CHANGES} expected")

@@ -1,7 +1,5 @@
-"""What a process is: something a user can ask for that a worker does."""
+"""What a process is: work that users request and workers do, in the sense of OGC API - Processes."""
 
-import inspect
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,19 +13,23 @@ from app.db.jobs.jobs import Job
 from app.db.tokens import Token
 from app.errors import InputError
 from app.storage import Storage
+from services.docstrings import attribute_descriptions
 from services.types import Progress
 
 Commit = Callable[[Connection], dict[str, Any]]
-"""Writes the outcome of a job in the transaction that ends it, and returns what `results` shall say."""
+"""Writes the outcome of a job in the transaction that ends the job, and returns the job's results."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """A job as the process that does it sees it.
+    """A job and all that its process needs to do it.
 
     Attributes:
-        inputs: of the process's own type.
-        progress: to be called often; it also notices that the job was dismissed.
+        job: the job, with the number of this attempt.
+        inputs: of the process's own input type.
+        database, storage, settings: of the installation.
+        progress: receives the fraction done and a message; call it often, it also raises `LostJob` when
+            the job was dismissed.
     """
 
     job: Job
@@ -39,22 +41,22 @@ class Work:
 
     @property
     def attempt_folder(self) -> str:
-        """Where the storage keeps the files of this attempt and of no other."""
+        """Key prefix of the files of this attempt in the storage; no other attempt uses it."""
         return f"results/{self.job.id}/{self.job.attempt}"
 
 
 @dataclass(frozen=True)
 class Process:
-    """Something a user can ask for that a worker does.
+    """A process.
 
     Attributes:
         id, title, description: for users.
-        scope: what a token needs to ask for it.
-        inputs: a frozen dataclass: what a user can say.
-        outputs: files that it makes, name to description.
-        values: what else it tells, name to the JSON Schema of its value.
-        check: refuses inputs that cannot work, for this caller, when the job is asked for.
-        run: does the work, outside of any transaction; the outcome is written by what it returns.
+        scope: that a token needs to execute the process.
+        inputs: a frozen dataclass with the inputs.
+        outputs: the output files, name to description.
+        values: the other outputs, name to the JSON Schema of the value.
+        check: refuses unusable inputs of a caller before the job is created.
+        run: does the work outside of any transaction and returns the function that writes the outcome.
     """
 
     id: str
@@ -67,49 +69,49 @@ class Process:
     run: Callable[[Work], Commit]
     values: Mapping[str, dict[str, Any]] = field(default_factory=dict)
 
-    def check_outputs(self, asked: Mapping[str, str]) -> None:
-        """Refuse outputs that it does not make.
+    def check_outputs(self, requested: Mapping[str, str]) -> None:
+        """Refuse names of outputs that the process does not have.
 
         Raises:
-            InputError: naming them.
+            InputError: the message lists these names and the existing ones.
         """
-        known = (*self.values, *self.outputs)
-        unknown = [name for name in asked if name not in known]
+        existing = (*self.values, *self.outputs)
+        unknown = [name for name in requested if name not in existing]
         if unknown:
             raise InputError(
                 f"outputs of {self.id}: {', '.join(unknown)[:200]}: no such output; "
-                f"there are {', '.join(known)}"
+                f"expected one of {', '.join(existing)}"
             )
 
-    def parse_inputs(self, given: dict[str, Any]) -> Any:
-        """Inputs of the process's own type.
+    def parse_inputs(self, document: dict[str, Any]) -> Any:
+        """The inputs of a request as an object of the process's input type.
 
         Raises:
-            InputError: a value is missing, of another type, or unknown; the message names it.
+            InputError: a value is missing, has the wrong type, or is unknown; the message names it.
         """
         adapter: TypeAdapter[Any] = TypeAdapter(self.inputs)
         try:
-            parsed = adapter.validate_python(given)
+            inputs = adapter.validate_python(document)
         except ValidationError as error:
-            wrong = "; ".join(
+            problems = "; ".join(
                 f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}"
                 for item in error.errors()
             )
-            raise InputError(f"inputs of {self.id}: {wrong}") from None
-        unknown = _unknown_fields(given, adapter.dump_python(parsed, mode="json"))
+            raise InputError(f"inputs of {self.id}: {problems}") from None
+        unknown = _unknown_fields(document, adapter.dump_python(inputs, mode="json"))
         if unknown:
             raise InputError(f"inputs of {self.id}: {', '.join(unknown)}: no such input")
-        return parsed
+        return inputs
 
     def format_inputs(self, inputs: Any) -> dict[str, Any]:
-        """Inputs as JSON, all defaults filled in."""
+        """The inputs as JSON values, with all defaults filled in."""
         adapter: TypeAdapter[Any] = TypeAdapter(self.inputs)
-        formatted: dict[str, Any] = adapter.dump_python(inputs, mode="json")
-        return formatted
+        document: dict[str, Any] = adapter.dump_python(inputs, mode="json")
+        return document
 
-    def input_text(self, name: str) -> str:
-        """What an input is, in a few words; "" when nothing is said."""
-        return _texts(self.inputs.__doc__ or "").get(name, "")
+    def input_descriptions(self) -> dict[str, str]:
+        """The description of every input, by name."""
+        return attribute_descriptions(self.inputs)
 
     def input_schema(self) -> dict[str, Any]:
         """JSON Schema of the inputs."""
@@ -117,20 +119,12 @@ class Process:
         return adapter.json_schema()
 
 
-def _texts(docstring: str) -> dict[str, str]:
-    """What the docstring of a dataclass says of its attributes, by their names."""
-    _, _, said = inspect.cleandoc(docstring).partition("Attributes:\n")
-    entries = re.split(r"\n    (?=\S)", "\n" + said)
-    pairs = [entry.split(": ", 1) for entry in entries if ": " in entry]
-    return {name.strip(): " ".join(text.split()) for names, text in pairs for name in names.split(",")}
-
-
-def _unknown_fields(given: dict[str, Any], known: dict[str, Any], path: str = "") -> list[str]:
-    """Paths of what was given and not understood: a misspelt option must not be ignored."""
+def _unknown_fields(document: dict[str, Any], understood: dict[str, Any], path: str = "") -> list[str]:
+    """Paths of the fields that the input type does not have: a misspelt option must not be ignored."""
     unknown = []
-    for name, value in given.items():
-        if name not in known:
+    for name, value in document.items():
+        if name not in understood:
             unknown.append(path + name)
-        elif isinstance(value, dict) and isinstance(known[name], dict):
-            unknown += _unknown_fields(value, known[name], f"{path}{name}.")
+        elif isinstance(value, dict) and isinstance(understood[name], dict):
+            unknown += _unknown_fields(value, understood[name], f"{path}{name}.")
     return unknown

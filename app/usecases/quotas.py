@@ -1,4 +1,4 @@
-"""How much one token may have at once: bytes of uploads in the storage, jobs that have not ended."""
+"""Quotas of one token: bytes of uploads in the storage, and open jobs."""
 
 from app.config import Settings
 from app.db import tokens
@@ -10,15 +10,16 @@ from app.errors import TooLarge, TooMany
 def upload_allowance(
     connection: Connection, settings: Settings, caller: Token, announced_bytes: int | None = None
 ) -> int:
-    """The bytes a token may still upload; uploads that begin at the same time wait for each other here.
+    """The bytes that a token may still upload; locks the token until the end of the transaction.
 
-    To be asked in the transaction that writes the announced size down.
+    Call it in the transaction that records the announced size: concurrent uploads of one token then
+    wait for each other here.
 
     Args:
-        announced_bytes: size of the upload about to begin, None when its sender does not say.
+        announced_bytes: size of the upload; None when the sender does not announce it.
 
     Raises:
-        TooLarge: the upload, or any upload, would go beyond the quota.
+        TooLarge: the quota is used up, or the announced upload exceeds what is left of it.
     """
     quota = caller.upload_quota_bytes
     allowed = settings.quota_upload_bytes if quota is None else quota
@@ -26,21 +27,22 @@ def upload_allowance(
     used = tokens.uploaded_bytes(connection, caller.id)
     left = allowed - used
     if left <= 0 or (announced_bytes is not None and announced_bytes > left):
-        asked = "an upload" if announced_bytes is None else f"an upload of {announced_bytes} bytes"
+        upload = "an upload" if announced_bytes is None else f"an upload of {announced_bytes} bytes"
         raise TooLarge(
-            f"{asked} goes beyond the quota of token {caller.name}: {used} of {allowed} bytes are used; "
-            "remove scenes that are done with, or ask the administrator for more"
+            f"{upload} exceeds the quota of token {caller.name}: {used} of {allowed} bytes are used; "
+            "remove scenes that are no longer needed, or ask the administrator for a larger quota"
         )
     return left
 
 
 def require_free_job(connection: Connection, settings: Settings, caller: Token) -> None:
-    """Refuse one more job to a token that has as many as it may; jobs asked for at once wait here.
+    """Refuse a new job to a token whose open jobs reach its quota; locks the token.
 
-    To be asked in the transaction that creates the job.
+    Call it in the transaction that creates the job: concurrent requests of one token then wait for each
+    other here.
 
     Raises:
-        TooMany: the token has so many jobs that have not ended.
+        TooMany: the token has as many open jobs as its quota allows.
     """
     quota = caller.job_quota
     allowed = settings.quota_jobs if quota is None else quota
@@ -48,6 +50,6 @@ def require_free_job(connection: Connection, settings: Settings, caller: Token) 
     open_jobs = tokens.open_jobs(connection, caller.id)
     if open_jobs >= allowed:
         raise TooMany(
-            f"token {caller.name} has {open_jobs} jobs that have not ended, {allowed} are allowed "
-            "at once; wait for one to end, or dismiss one"
+            f"token {caller.name} has {open_jobs} open jobs of {allowed} allowed; "
+            "wait until one has ended, or dismiss one"
         )

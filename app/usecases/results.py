@@ -1,4 +1,4 @@
-"""What a job made, as it was asked to be told: values, files by reference or by value."""
+"""Results of a job, sent as its request asked: values, and files by value or by reference."""
 
 import base64
 import json
@@ -13,53 +13,53 @@ from app.usecases.registration.deliverables import media_type
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20
-"""Larger files go by reference whatever was asked for, but for one that is sent alone."""
+"""A larger file is sent by reference even if requested by value, unless it is the only raw output."""
 
 
 @dataclass(frozen=True)
-class ToldFile:
+class ResultFile:
     """A file of the results.
 
     Attributes:
+        name: of the output.
         key: in the storage.
-        by: how it is told.
+        transmission: whether the file itself is sent, or its address.
     """
 
     name: str
     key: str
-    by: Transmission
+    transmission: Transmission
 
     @property
     def media_type(self) -> str:
-        """Of its name."""
+        """The media type, by the suffix of the name."""
         return media_type(self.name)
 
 
-def told_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[ToldFile]]:
-    """The values and the files of a successful job that were asked for.
+def requested_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[ResultFile]]:
+    """The values and the files of a successful job that its request asked for.
 
-    Files are told by reference unless an output was asked for by name.
+    A request that names no outputs gets all of them, files by reference.
     """
     values = dict(job.results or {})
     keys = values.pop("files", {})
-    asked = job.outputs
-    if asked is None:
-        return values, [ToldFile(name, key, "reference") for name, key in keys.items()]
-    alone = job.response == "raw" and len(asked) == 1
+    if job.outputs is None:
+        return values, [ResultFile(name, key, "reference") for name, key in keys.items()]
+    is_only_raw_output = job.response == "raw" and len(job.outputs) == 1
     files = []
-    for name in asked:
+    for name, requested in job.outputs.items():
         if name in keys:
-            large = not alone and storage.size(keys[name]) > LARGEST_VALUE_BYTES
-            by: Transmission = "reference" if large or asked[name] == "reference" else "value"
-            files.append(ToldFile(name, keys[name], by))
-    return {name: values[name] for name in asked if name in values}, files
+            too_large = not is_only_raw_output and storage.size(keys[name]) > LARGEST_VALUE_BYTES
+            by_reference = too_large or requested == "reference"
+            files.append(ResultFile(name, keys[name], "reference" if by_reference else "value"))
+    return {name: values[name] for name in job.outputs if name in values}, files
 
 
 def result_key(job: Job, name: str) -> str:
-    """Where the storage has a file of the results.
+    """The storage key of a file of the results.
 
     Raises:
-        NotFound: there is none of that name.
+        NotFound: the job has no file of this name, or its files were removed.
     """
     key: str | None = (job.results or {}).get("files", {}).get(name)
     if key is None or job.results_removed_at is not None:
@@ -67,18 +67,18 @@ def result_key(job: Job, name: str) -> str:
     return key
 
 
-def file_bytes(storage: Storage, file: ToldFile) -> bytes:
-    """A file as it is."""
+def file_bytes(storage: Storage, file: ResultFile) -> bytes:
+    """The content of a file."""
     with storage.open(file.key) as opened:
         return opened.read()
 
 
-def file_value(storage: Storage, file: ToldFile) -> dict[str, Any]:
-    """A file within a document: JSON as what it means, text as text, anything else in base64."""
-    raw = file_bytes(storage, file)
-    kind = {"mediaType": file.media_type}
+def file_value(storage: Storage, file: ResultFile) -> dict[str, Any]:
+    """A file as part of a JSON document: JSON as it is, text as a string, other content in base64."""
+    content = file_bytes(storage, file)
+    media = {"mediaType": file.media_type}
     if Path(file.name).suffix in (".json", ".geojson"):
-        return {"value": json.loads(raw), **kind}
+        return {"value": json.loads(content), **media}
     if file.media_type.startswith(("text/", "application/xml")):
-        return {"value": raw.decode(), **kind}
-    return {"value": base64.b64encode(raw).decode(), "encoding": "base64", **kind}
+        return {"value": content.decode(), **media}
+    return {"value": base64.b64encode(content).decode(), "encoding": "base64", **media}

@@ -1,4 +1,4 @@
-"""What jobs on an uploaded scene ask of it and of the files that are named beside its image."""
+"""Checks of jobs on an uploaded scene: of the scene, and of the names of files beside its image."""
 
 from typing import Any
 from uuid import UUID
@@ -12,40 +12,40 @@ from app.usecases.scenes import clean_name, visible_scene
 
 
 def check_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
-    """Refuse a job on a scene that is not there to be worked on.
+    """Refuse a job on a scene without an image.
 
     Raises:
-        NotFound: there is none, or it is somebody else's.
-        Conflict: its image has not arrived, or is gone.
+        NotFound: there is no such scene, or the caller may not see it.
+        Conflict: its image has not arrived, or was removed.
     """
     scene = visible_scene(connection, caller, scene_id)
     if scene.state != "uploaded":
-        raise Conflict(f"scene {scene_id} cannot be worked on: its image is {scene.state}")
+        raise Conflict(f"scene {scene_id} is {scene.state}, uploaded is expected")
 
 
-def check_file_names(inputs: Any, *names: str) -> None:
-    """Refuse inputs that name anything but files as they lie beside an image.
+def check_file_names(inputs: Any, *fields: str) -> None:
+    """Refuse inputs with values that cannot be names of files beside an image.
 
     Args:
         inputs: of a process.
-        names: of its inputs that are None or the name of a file.
+        fields: names of the inputs that are None or a file name.
 
     Raises:
-        InputError: one of them is a path, or no name that a file can have.
+        InputError: a value is a path, or has characters that stored names do not have.
     """
-    for name in names:
-        given = getattr(inputs, name)
-        if given is not None and given != clean_name(given):
-            raise InputError(f"{name}: {given!r} is not the name of an uploaded file")
+    for field in fields:
+        name = getattr(inputs, field)
+        if name is not None and name != clean_name(name):
+            raise InputError(f"{field}: {name!r} is not the name of a file uploaded beside the image")
 
 
 def present_scene(connection: Connection, scene_id: UUID) -> SceneRow:
-    """The scene of a job, which may have been removed since the job was asked for.
+    """The scene of a job; it may have been removed since the job was created.
 
     Raises:
-        Conflict: it has been.
+        Conflict: it was removed.
     """
     scene = scenes.find_scene(connection, scene_id)
     if scene is None or scene.state == "removed":
-        raise Conflict(f"scene {scene_id} has been removed")
+        raise Conflict(f"scene {scene_id} was removed; upload it again")
     return scene

@@ -1,4 +1,4 @@
-"""Uploading, showing and removing scenes."""
+"""Upload, list and remove scenes, and the files beside their images."""
 
 import re
 import unicodedata
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
-from app.auth import is_administrator, may_access
+from app.auth import may_access, owner_filter
 from app.config import Settings
 from app.db import scenes
-from app.db.engine import Connection, Database
+from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge
 from app.storage import Storage, StoredFile
 from app.usecases import quotas
+from app.usecases.installation import Installation
 from app.usecases.server_files import file_below
 from services.errors import FormatError
 from services.formats.images.raster import DRIVER_OF_SIGNATURE
@@ -26,20 +27,20 @@ LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
 MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc")
 MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
 RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
-"""Terrains, masks and geoids, which are as large as images."""
-BESIDE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES
-MODEL_LIMIT_BYTES = 16 << 20
-"""Also of marks."""
+"""Terrains, masks and geoid grids: they may be as large as images."""
+SIDE_FILE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES
+SIDE_FILE_LIMIT_BYTES = 16 << 20
+"""Largest file with a model or with check points."""
 
 
 @dataclass(frozen=True)
-class Upload:
-    """A file on its way, as its sender announces it.
+class SentFile:
+    """A file in the body of a request.
 
     Attributes:
-        name: as the sender calls it; folders in it mean nothing.
+        name: as the sender calls it; folders in it are ignored.
         chunks: the bytes.
-        size_bytes, sha256: None when not announced; checked when they are.
+        size_bytes, sha256: as announced, and checked; None when not announced.
     """
 
     name: str
@@ -49,158 +50,162 @@ class Upload:
 
 
 def upload_scene(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    owner: Token,
-    upload: Upload,
-    sigma_m: float | None = None,
+    installation: Installation, owner: Token, sent: SentFile, sigma_m: float | None = None
 ) -> SceneRow:
-    """Take in the image of a new scene; it is looked into by the job that uses it, not here.
+    """Store the image of a new scene; the job that uses the image checks its content.
 
-    No transaction is open while the bytes arrive. Whatever goes wrong, nothing is left behind.
+    No transaction is open while the bytes arrive. A failed upload leaves nothing behind.
 
     Args:
+        installation: receives the scene.
+        owner: of the scene.
+        sent: the image.
         sigma_m: accuracy of the scene's model as the sender states it, metres.
 
     Raises:
-        TooLarge: more bytes than the limit or the quota of the owner, announced or sent.
-        FormatError: neither a TIFF, a JPEG 2000 nor a NITF by its first bytes.
-        InputError: the name is none, or size or checksum are not as announced.
+        TooLarge: the image exceeds the limit or the owner's quota.
+        FormatError: the first bytes are not those of a TIFF, JPEG 2000 or NITF file.
+        InputError: the name cannot be used, or size or checksum are not as announced.
     """
-    file_name = clean_name(upload.name)
-    _refuse_too_large(upload, settings.upload_limit_bytes)
+    database, storage = installation.database, installation.storage
+    limit = installation.settings.upload_limit_bytes
+    file_name = clean_name(sent.name)
+    _refuse_too_large(sent, limit)
     with database.transaction() as connection:
-        left = quotas.upload_allowance(connection, settings, owner, upload.size_bytes)
+        left = quotas.upload_allowance(connection, installation.settings, owner, sent.size_bytes)
         scene_id = scenes.begin_upload(
-            connection, owner.id, upload.name[-200:], file_name, sigma_m, upload.size_bytes
+            connection, owner.id, sent.name[-200:], file_name, sigma_m, sent.size_bytes
         )
-    limit_bytes = min(left, settings.upload_limit_bytes)
     key = f"{folder_of(scene_id)}/{file_name}"
     try:
-        image = _receive(storage, key, upload, _images_only(upload.chunks), limit_bytes)
+        image = _receive(storage, key, sent, _images_only(sent.chunks), min(left, limit))
         with database.transaction() as connection:
             row = scenes.finish_upload(connection, scene_id, key, image.size_bytes, image.sha256)
         if row is None:
-            raise Conflict("the upload took so long that it was given up")
+            raise Conflict(
+                f"the upload of scene {scene_id} took too long and has expired; send it again"
+            )
         return row
     except BaseException:
         with database.transaction() as connection:
             scenes.give_up_upload(connection, scene_id)
-        # What an outage leaves is swept.
+        # After an outage of the storage, garbage collection deletes what is left.
         with suppress(StorageOutage):
             storage.delete(key)
         raise
 
 
-def upload_beside(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    caller: Token,
-    scene_id: UUID,
-    upload: Upload,
+def upload_side_file(
+    installation: Installation, caller: Token, scene_id: UUID, sent: SentFile
 ) -> StoredFile:
-    """Lay a file beside the image of a scene, in place of one of the same name.
+    """Store a file beside the image of a scene; it replaces a file of the same name.
 
     Raises:
-        NotFound: no such scene, or not the caller's.
-        Conflict: the scene has no files any more, or not yet.
-        InputError: not a kind of file that belongs there.
-        TooLarge: more bytes than such files, or the caller, may have.
+        NotFound: there is no such scene, or the caller may not see it.
+        Conflict: the scene's files were removed, or lie on the server.
+        InputError: files of this kind do not belong beside an image.
+        TooLarge: the file exceeds the limit or the caller's quota.
     """
-    with database.transaction() as connection:
-        file_name = name_beside(visible_scene(connection, caller, scene_id), upload.name)
-        limit_bytes = limit_beside(settings, file_name)
-        _refuse_too_large(upload, limit_bytes)
-        left = quotas.upload_allowance(connection, settings, caller, upload.size_bytes)
+    settings = installation.settings
+    with installation.database.transaction() as connection:
+        file_name = side_file_name(visible_scene(connection, caller, scene_id), sent.name)
+        limit = side_file_limit(settings, file_name)
+        _refuse_too_large(sent, limit)
+        left = quotas.upload_allowance(connection, settings, caller, sent.size_bytes)
     key = f"{folder_of(scene_id)}/{file_name}"
-    stored = _receive(storage, key, upload, upload.chunks, min(limit_bytes, left))
-    with database.transaction() as connection:
-        note_model(connection, scene_id, file_name, stored.size_bytes, stored.sha256)
+    stored = _receive(installation.storage, key, sent, sent.chunks, min(limit, left))
+    with installation.database.transaction() as connection:
+        record_side_file(connection, scene_id, file_name, stored.size_bytes, stored.sha256)
     return stored
 
 
-def limit_beside(settings: Settings, file_name: str) -> int:
-    """How large a file beside an image may be, bytes."""
+def side_file_limit(settings: Settings, file_name: str) -> int:
+    """The size limit of a file beside an image, bytes."""
     is_raster = file_name.lower().endswith(RASTER_SUFFIXES)
-    return settings.upload_limit_bytes if is_raster else MODEL_LIMIT_BYTES
+    return settings.upload_limit_bytes if is_raster else SIDE_FILE_LIMIT_BYTES
 
 
-def name_beside(scene: SceneRow, name: str) -> str:
-    """The name under which a file lies beside the image of a scene: model, terrain, mask, check points.
+def side_file_name(scene: SceneRow, name: str) -> str:
+    """The stored name of a file beside an image: a model, terrain, mask or check points.
 
     Raises:
-        Conflict: the scene has no files of its own any more, or the name is that of its image.
-        InputError: not a kind of file that belongs there.
+        Conflict: the scene's files were removed or lie on the server, or the name is that of the image.
+        InputError: files of this kind do not belong beside an image.
     """
     file_name = clean_name(name)
-    if scene.state == "removed" or scene.reference is not None:
-        state = "removed" if scene.reference is None else "where they were before"
-        raise Conflict(f"the files of scene {scene.id} are {state}")
-    if not file_name.lower().endswith(BESIDE_SUFFIXES):
+    if scene.state == "removed":
+        raise Conflict(f"{file_name}: the files of scene {scene.id} were removed")
+    if scene.reference is not None:
+        raise Conflict(f"{file_name}: the files of scene {scene.id} lie on the server; put it there")
+    if not file_name.lower().endswith(SIDE_FILE_SUFFIXES):
         raise InputError(
-            f"a file beside an image ends in {', '.join(BESIDE_SUFFIXES)}; {file_name} does not"
+            f"{file_name}: unexpected suffix; a file beside an image has one of "
+            f"{', '.join(SIDE_FILE_SUFFIXES)}"
         )
     if file_name == scene.file_name:
-        raise Conflict(f"{file_name} is the image of the scene")
+        raise Conflict(f"{file_name} is the image of the scene; choose another name")
     return file_name
 
 
-def note_model(
+def record_side_file(
     connection: Connection, scene_id: UUID, file_name: str, size_bytes: int, sha256: str
 ) -> None:
-    """Remember a file that was laid beside an image.
+    """Add a stored file to the row of its scene.
 
     Raises:
-        Conflict: the scene was removed meanwhile; the file is swept.
+        Conflict: the scene was removed meanwhile; garbage collection deletes the file.
     """
     if not scenes.add_model(connection, scene_id, file_name, size_bytes, sha256):
-        raise Conflict(f"scene {scene_id} was removed meanwhile")
+        raise Conflict(f"scene {scene_id} was removed while {file_name} was uploaded")
 
 
-def refer_to_scene(
+def add_server_scene(
     connection: Connection, settings: Settings, owner: Token, path: str, sigma_m: float | None = None
 ) -> SceneRow:
-    """Take in a scene that stays where it lies, below the folder the administrator has opened.
+    """Create a scene whose image stays on the server, below AMERS_SCENE_FOLDER.
 
     Raises:
-        InputError: no folder is open, or the path is not one of a file below it.
+        InputError: AMERS_SCENE_FOLDER is not set, or has no such image.
     """
-    found = referred_image(settings, path)
+    image = server_image(settings, path)
     assert settings.scene_folder is not None
-    relative = found.relative_to(settings.scene_folder.resolve()).as_posix()
-    return scenes.insert_reference(connection, owner.id, found.name, relative, sigma_m)
+    relative = image.relative_to(settings.scene_folder.resolve()).as_posix()
+    return scenes.insert_reference(connection, owner.id, image.name, relative, sigma_m)
 
 
-def referred_image(settings: Settings, path: str) -> Path:
-    """The file of a scene below AMERS_SCENE_FOLDER.
+def server_image(settings: Settings, path: str) -> Path:
+    """The image of a scene below AMERS_SCENE_FOLDER.
 
     Raises:
-        InputError: there is no such file there.
+        InputError: AMERS_SCENE_FOLDER is not set, or has no such image.
     """
     if settings.scene_folder is None:
-        raise InputError("scenes on the server cannot be used: AMERS_SCENE_FOLDER is not set")
-    found = file_below(settings.scene_folder, path, "path", "AMERS_SCENE_FOLDER")
-    with found.open("rb") as file:
-        refuse_strange(file.read(LONGEST_SIGNATURE))
-    return found
+        raise InputError(
+            "path: scenes on the server cannot be used, because AMERS_SCENE_FOLDER is not set; "
+            "upload the image instead"
+        )
+    image = file_below(settings.scene_folder, path, "path", "AMERS_SCENE_FOLDER")
+    with image.open("rb") as file:
+        require_image_signature(file.read(LONGEST_SIGNATURE))
+    return image
 
 
 def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: Path) -> Path:
-    """The image of a scene on this machine, with its models beside it.
+    """The path of a scene's image on this machine, with its other files in the same folder.
 
     Args:
-        scratch: a folder of the caller's, for copies when the storage is elsewhere.
+        storage, settings: of the installation.
+        scene: the scene.
+        scratch: a folder of the caller's, for copies of files that lie in a bucket.
 
     Raises:
-        Conflict: the scene has no files any more.
-        InputError: a scene on the server is not where it was.
+        Conflict: the scene has no files.
+        InputError: the image of a scene on the server is no longer in its place.
     """
     if scene.reference is not None and scene.state != "removed":
-        return referred_image(settings, scene.reference)
+        return server_image(settings, scene.reference)
     if scene.file_key is None:
-        raise Conflict(f"scene {scene.id} has been removed, or has not arrived yet")
+        raise Conflict(f"scene {scene.id} was removed, or its image has not arrived yet")
     for key in storage.keys(folder_of(scene.id)):
         if key != scene.file_key:
             storage.fetch(key, scratch)
@@ -211,7 +216,7 @@ def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> Scen
     """The scene, for its owner or an administrator.
 
     Raises:
-        NotFound: there is none, or it is somebody else's: strangers cannot tell which.
+        NotFound: there is none, or the caller may not see it; the message does not say which.
     """
     scene = scenes.find_scene(connection, scene_id)
     if scene is None or not may_access(caller, scene.owner):
@@ -220,100 +225,104 @@ def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> Scen
 
 
 def file_key(connection: Connection, caller: Token, scene_id: UUID, name: str) -> str:
-    """Where the storage has a file of a scene.
+    """The storage key of a file of a scene.
 
     Raises:
-        NotFound: no such scene or not the caller's, or no such file of it in the storage.
+        NotFound: there is no such scene or file, or the caller may not see it.
     """
     scene = visible_scene(connection, caller, scene_id)
     names = {*scene.models, *([scene.file_name] if scene.file_key else [])}
     if scene.state == "removed" or scene.reference is not None or name not in names:
-        raise NotFound(f"no file {name:.100} of scene {scene_id} in the storage")
+        raise NotFound(f"scene {scene_id} has no file {name:.100} in the storage")
     return f"{folder_of(scene_id)}/{name}"
 
 
 def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
-    """The caller's newest scenes; everybody's for an administrator."""
-    return scenes.newest_scenes(connection, None if is_administrator(caller) else caller.id, limit)
+    """The newest scenes that the caller may see: owners see their own, administrators all."""
+    return scenes.newest_scenes(connection, owner_filter(caller), limit)
 
 
 def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
-    """Let go of the pixels of a scene; its record and what was made of it stay.
+    """Mark a scene as removed; its row and the results of its jobs stay.
 
-    The files are deleted once this is committed: rows go before files.
+    `delete_files` deletes its files once the transaction is committed: rows go before files.
 
     Raises:
-        NotFound: no such scene, or not the caller's.
-        Conflict: its image is still arriving.
+        NotFound: there is no such scene, or the caller may not see it.
+        Conflict: its image is still being uploaded.
     """
     scene = visible_scene(connection, caller, scene_id)
     if scene.state == "uploading":
-        raise Conflict(f"the image of scene {scene_id} is still arriving; its upload can be ended")
+        raise Conflict(
+            f"the image of scene {scene_id} is still being uploaded; delete the upload instead"
+        )
     scenes.remove_scene(connection, scene_id)
 
 
 def delete_files(storage: Storage, scene_id: UUID) -> None:
-    """Delete the files of a scene that was removed."""
+    """Delete the files of a removed scene."""
     for key in storage.keys(folder_of(scene_id)):
         storage.delete(key)
 
 
 def folder_of(scene_id: UUID) -> str:
-    """Where the storage has the files of a scene."""
+    """The key prefix of the files of a scene in the storage."""
     return f"scenes/{scene_id}"
 
 
 def clean_name(name: str) -> str:
-    """A file name without folders, in letters that every file system and the storage accept.
+    """A file name without folders, in characters that every file system and the storage accept.
 
     Raises:
-        InputError: nothing of the name is left.
+        InputError: no usable character is left.
     """
     last = re.split(r"[/\\]", name)[-1]
     plain = unicodedata.normalize("NFKD", last).encode("ascii", "ignore").decode()
     clean = re.sub(r"[^A-Za-z0-9_.-]+", "_", plain)[-LONGEST_NAME:].lstrip(".-")
     if not clean.strip("_."):
-        raise InputError(f"{name[:LONGEST_NAME]!r} is not the name of a file")
+        raise InputError(
+            f"{name[:LONGEST_NAME]!r} is not the name of a file; expected letters, digits, . _ or -"
+        )
     return clean
 
 
-def _refuse_too_large(upload: Upload, limit_bytes: int) -> None:
-    if upload.size_bytes is not None and upload.size_bytes > limit_bytes:
-        raise TooLarge(f"{upload.size_bytes} bytes announced, at most {limit_bytes} are accepted")
+def require_image_signature(head: bytes) -> None:
+    """Refuse a file whose first bytes are not those of an image.
+
+    Raises:
+        FormatError: they are not those of a TIFF, JPEG 2000 or NITF file.
+    """
+    if not head.startswith(tuple(DRIVER_OF_SIGNATURE)):
+        raise FormatError(f"the file begins with {head[:8]!r}: it is neither TIFF, JPEG 2000 nor NITF")
+
+
+def _refuse_too_large(sent: SentFile, limit_bytes: int) -> None:
+    if sent.size_bytes is not None and sent.size_bytes > limit_bytes:
+        raise TooLarge(f"{sent.size_bytes} bytes announced, at most {limit_bytes} accepted")
 
 
 def _receive(
-    storage: Storage, key: str, upload: Upload, chunks: Iterable[bytes], limit_bytes: int
+    storage: Storage, key: str, sent: SentFile, chunks: Iterable[bytes], limit_bytes: int
 ) -> StoredFile:
-    """Store a file that is as announced, or nothing."""
+    """Store a file if its size and checksum are as announced, else nothing."""
     with storage.writing(key, limit_bytes) as writing:
         for chunk in chunks:
             writing.write(chunk)
-        if upload.size_bytes not in (None, writing.size_bytes):
-            raise InputError(f"{upload.size_bytes} bytes announced, {writing.size_bytes} received")
-        if upload.sha256 not in (None, writing.sha256):
-            raise InputError(f"sha256 {upload.sha256} announced, {writing.sha256} received")
+        if sent.size_bytes not in (None, writing.size_bytes):
+            raise InputError(f"{sent.size_bytes} bytes announced, {writing.size_bytes} received")
+        if sent.sha256 not in (None, writing.sha256):
+            raise InputError(f"sha256 {sent.sha256} announced, {writing.sha256} received")
     return StoredFile(key, writing.size_bytes, writing.sha256)
 
 
 def _images_only(chunks: Iterable[bytes]) -> Iterator[bytes]:
-    """The same bytes, once the first of them are those of an image."""
+    """The same bytes, after a check that they begin like an image."""
     head = b""
     rest = iter(chunks)
     for chunk in rest:
         head += chunk
         if len(head) >= LONGEST_SIGNATURE:
             break
-    refuse_strange(head)
+    require_image_signature(head)
     yield head
     yield from rest
-
-
-def refuse_strange(head: bytes) -> None:
-    """Refuse a file that is no image by its first bytes.
-
-    Raises:
-        FormatError: it is not.
-    """
-    if not head.startswith(tuple(DRIVER_OF_SIGNATURE)):
-        raise FormatError(f"the file begins with {head[:8]!r}: neither TIFF, JPEG 2000 nor NITF")

@@ -1,4 +1,4 @@
-"""Files of the server that a setting opens: what lies below a folder, and nothing else."""
+"""Files on the server that a setting makes available: those below one folder, and no others."""
 
 from pathlib import Path
 
@@ -6,23 +6,23 @@ from app.errors import InputError
 
 
 def file_below(folder: Path, path: str, field: str, setting: str) -> Path:
-    """A file below a folder, all links followed and still below it.
+    """The path of an existing file below a folder, with all links resolved.
 
     Args:
-        folder: that is open.
-        path: as a request names it.
+        folder: that the setting names.
+        path: relative path, from a request.
         field: of the request, for the message.
-        setting: that opens the folder, for the message.
+        setting: for the message.
 
     Raises:
-        InputError: there is no such file there.
+        InputError: there is no such file, or it lies outside the folder.
     """
     try:
         top = folder.resolve()
-        found = (top / path).resolve()
-        usable = found.is_relative_to(top) and found.is_file()
+        file = (top / path).resolve()
+        is_usable = file.is_relative_to(top) and file.is_file()
     except (OSError, ValueError):
-        usable = False
-    if not usable:
-        raise InputError(f"{field}: {path[:200]!r} is no file below the folder of {setting}")
-    return found
+        is_usable = False
+    if not is_usable:
+        raise InputError(f"{field}: {path[:200]!r} is not a file below the folder of {setting}")
+    return file

@@ -1,4 +1,4 @@
-"""Making, listing and revoking tokens."""
+"""Create, list and revoke tokens."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ LARGEST_QUOTA = {"upload_quota_bytes": 2**62, "job_quota": 1_000_000}
 
 @dataclass(frozen=True)
 class NewToken:
-    """A token and its secret, which is shown once and kept nowhere."""
+    """A token and its secret, which is shown once and not stored."""
 
     token: Token
     secret: str
@@ -27,66 +27,68 @@ def create_token(
     name: str,
     scopes: Iterable[str],
     days: int | None = None,
+    *,
     upload_quota_bytes: int | None = None,
     job_quota: int | None = None,
 ) -> NewToken:
-    """Make a token.
+    """Create a token.
 
     Args:
-        name: for people, need not be unique.
+        name: for people; several tokens may have the same name.
         scopes: one or more of `read`, `register`, `monitor`, `admin`.
-        days: how long it is valid; None for ever.
-        upload_quota_bytes, job_quota: what it may have at once; None: as much as the settings say.
+        days: how long the token is valid; None without end.
+        upload_quota_bytes, job_quota: the token's quotas; None for those of the settings.
 
     Raises:
-        InputError: no name, an unknown scope or none, or a number that makes no sense.
+        InputError: no name, an unknown scope or none, or a number out of range.
     """
     if not 0 < len(name.strip()) <= LONGEST_NAME:
-        raise InputError(f"the name of a token has 1 to {LONGEST_NAME} characters")
+        raise InputError(f"name: {len(name.strip())} characters found, 1 to {LONGEST_NAME} expected")
     if days is not None and not 1 <= days <= LONGEST_DAYS:
-        raise InputError(f"a token is valid for 1 to {LONGEST_DAYS} days, {days} asked for")
+        raise InputError(f"days: {days} found, 1 to {LONGEST_DAYS} expected")
     for field, quota in (("upload_quota_bytes", upload_quota_bytes), ("job_quota", job_quota)):
         if quota is not None and not 0 <= quota <= LARGEST_QUOTA[field]:
             raise InputError(f"{field}: {quota} found, 0 to {LARGEST_QUOTA[field]} expected")
     secret = new_secret()
     token = tokens.insert_token(
         connection,
-        name.strip(),
-        secret_hash(secret),
-        _known(scopes),
-        days,
-        upload_quota_bytes,
-        job_quota,
+        name=name.strip(),
+        secret_hash=secret_hash(secret),
+        scopes=_checked_scopes(scopes),
+        days=days,
+        upload_quota_bytes=upload_quota_bytes,
+        job_quota=job_quota,
     )
     return NewToken(token, secret)
 
 
 def list_tokens(connection: Connection) -> list[Token]:
-    """All tokens, the newest first, revoked and expired ones too."""
+    """All tokens, the newest first, with the revoked and the expired ones."""
     return tokens.list_tokens(connection)
 
 
 def revoke_token(connection: Connection, name_or_id: str) -> Token:
-    """Revoke the token with this id, or the only one with this name.
+    """Revoke the token with this id, or the only valid one with this name.
 
     Raises:
-        NotFound: there is none that is not revoked yet.
+        NotFound: no valid token has this id or name.
         Conflict: several tokens have the name.
     """
-    found = tokens.find_tokens(connection, name_or_id)
-    if not found:
+    matches = tokens.find_tokens(connection, name_or_id)
+    if not matches:
         raise NotFound(f"no valid token {name_or_id}")
-    if len(found) > 1:
-        ids = ", ".join(str(token.id) for token in found)
-        raise Conflict(f"{len(found)} tokens are named {name_or_id}: revoke by id ({ids})")
-    return tokens.revoke_token(connection, found[0].id)
+    if len(matches) > 1:
+        ids = ", ".join(str(token.id) for token in matches)
+        raise Conflict(f"{len(matches)} tokens are named {name_or_id}: revoke by id ({ids})")
+    return tokens.revoke_token(connection, matches[0].id)
 
 
-def _known(scopes: Iterable[str]) -> tuple[str, ...]:
-    asked = set(scopes)
-    unknown = asked - set(Scope)
-    if unknown or not asked:
+def _checked_scopes(names: Iterable[str]) -> tuple[str, ...]:
+    """The scopes of these names, in the order of `Scope`."""
+    requested = set(names)
+    if not requested or requested - set(Scope):
         raise InputError(
-            f"scopes are {', '.join(Scope)}; asked for: {', '.join(sorted(asked)) or 'none'}"
+            f"scopes: {', '.join(sorted(requested)) or 'none'} found, "
+            f"one or more of {', '.join(Scope)} expected"
         )
-    return tuple(str(scope) for scope in Scope if scope in asked)
+    return tuple(str(scope) for scope in Scope if scope in requested)

@@ -1,4 +1,4 @@
-"""Files that arrive in pieces, over lines that break: begun, gone on with, put in their places."""
+"""Create, append to and complete resumable uploads (tus 1.0)."""
 
 import fcntl
 import hashlib
@@ -20,15 +20,16 @@ from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage
 from app.usecases import quotas
 from app.usecases.blocks.uploads import block_key
+from app.usecases.installation import Installation
 from app.usecases.scenes import (
-    MODEL_LIMIT_BYTES,
     MODEL_SUFFIXES,
+    SIDE_FILE_LIMIT_BYTES,
     clean_name,
     folder_of,
-    limit_beside,
-    name_beside,
-    note_model,
-    refuse_strange,
+    record_side_file,
+    require_image_signature,
+    side_file_limit,
+    side_file_name,
     visible_scene,
 )
 from services.formats.archives import (
@@ -41,30 +42,30 @@ from services.formats.archives import (
 
 IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".j2k", ".ntf", ".nitf")
 PURPOSES: tuple[Purpose, ...] = ("image", "model", "block")
-PREFIX = "upload-"
-READ_BYTES = 1 << 20
+UPLOAD_PREFIX = "upload-"
+"""Beginning of the names of unfinished files of uploads in the scratch folder."""
 
 
 class Busy(AmersError):
-    """Somebody else is sending to this upload just now."""
+    """Another request is sending to this upload."""
 
 
 class WrongChecksum(AmersError):
-    """A piece is not as announced; it was thrown away."""
+    """A piece does not have the announced checksum; it was discarded."""
 
 
 @dataclass(frozen=True)
 class NewUpload:
-    """A file as its sender announces it.
+    """A file that a sender announces.
 
     Attributes:
-        name: as the sender calls it; folders in it mean nothing.
+        name: as the sender calls the file; folders in it are ignored.
         size_bytes: of the whole file.
-        purpose: None: a model if it is to lie beside an image, else an image.
-        scene: beside whose image it is to lie.
-        sha256: of the whole file, in hexadecimal; not checked when None.
+        purpose: None means "model" with a scene, else "image".
+        scene: id of the scene that a model belongs to.
+        sha256: of the whole file, in hexadecimal; None is not checked.
         sigma_m: accuracy of the model of an image, metres.
-        metadata: all of this as sent, to be repeated.
+        metadata: the announcement as sent, returned on request.
     """
 
     name: str
@@ -78,43 +79,58 @@ class NewUpload:
 
 @dataclass(frozen=True)
 class Checksum:
-    """What a piece must hash to.
+    """The announced checksum of a piece.
 
     Attributes:
-        algorithm: one that hashlib knows.
+        algorithm: name of a hashlib algorithm.
+        digest: expected.
     """
 
     algorithm: str
     digest: bytes
 
 
-def begin(
+@dataclass(frozen=True)
+class Piece:
+    """A part of a file.
+
+    Attributes:
+        start: position of its first byte in the file.
+        chunks: its bytes.
+        checksum: None is not checked.
+    """
+
+    start: int
+    chunks: Iterable[bytes]
+    checksum: Checksum | None = None
+
+
+def create_upload(
     connection: Connection, storage: Storage, settings: Settings, caller: Token, new: NewUpload
 ) -> UploadRow:
-    """Make room for a file; that of an image begins a scene.
+    """Create an upload; that of an image also creates the scene.
 
     Raises:
-        NotAllowed: the caller may not send such files.
-        TooLarge: more bytes than the limit or the caller's quota.
-        InputError, NotFound, Conflict: it can have no place.
+        NotAllowed: the caller's token lacks the scope.
+        TooLarge: the announced size exceeds the limit or the caller's quota.
+        InputError, NotFound, Conflict: name, purpose or scene cannot be used.
     """
     purpose: Purpose = new.purpose or ("image" if new.scene is None else "model")
     require(caller, Scope.ADMIN if purpose == "block" else Scope.REGISTER)
-    is_beside = purpose == "model"
-    limit = limit_beside(settings, new.name) if is_beside else settings.upload_limit_bytes
+    is_side_file = purpose == "model"
+    limit = side_file_limit(settings, new.name) if is_side_file else settings.upload_limit_bytes
     if new.size_bytes > limit:
-        raise TooLarge(f"{new.size_bytes} bytes announced, at most {limit} are accepted")
+        raise TooLarge(f"{new.name[-200:]}: {new.size_bytes} bytes announced, at most {limit} accepted")
     quotas.upload_allowance(connection, settings, caller, new.size_bytes)
     file_name, scene_id = clean_name(new.name), new.scene
-    if purpose == "model":
+    if is_side_file:
         if scene_id is None:
-            raise InputError("scene: a model needs the id of the scene beside whose image it lies")
-        file_name = name_beside(visible_scene(connection, caller, scene_id), new.name)
+            raise InputError("scene: missing; a model needs the id of the scene it belongs to")
+        file_name = side_file_name(visible_scene(connection, caller, scene_id), new.name)
     elif purpose == "image":
         if scene_id is not None:
-            raise InputError("scene: an image begins a scene of its own")
-        name = new.name[-200:]
-        scene_id = scenes.begin_upload(connection, caller.id, name, file_name, new.sigma_m)
+            raise InputError("scene: not expected; the upload of an image creates a new scene")
+        scene_id = scenes.begin_upload(connection, caller.id, new.name[-200:], file_name, new.sigma_m)
     upload = uploads.insert_upload(
         connection,
         owner=caller.id,
@@ -130,158 +146,164 @@ def begin(
     return upload
 
 
-def find(connection: Connection, caller: Token, upload_id: UUID) -> UploadRow:
+def find_upload(connection: Connection, caller: Token, upload_id: UUID) -> UploadRow:
     """The upload, for its owner or an administrator.
 
     Raises:
-        NotFound: there is none, it was given up, or it is somebody else's: strangers cannot tell which.
+        NotFound: there is none, it has expired, or the caller may not see it; the message does not say
+            which.
     """
     upload = uploads.find_upload(connection, upload_id)
-    if upload is None or not may_access(caller, upload.owner) or upload.expired:
+    if upload is None or upload.expired or not may_access(caller, upload.owner):
         raise NotFound(f"no upload {upload_id}")
     return upload
 
 
-def offset(storage: Storage, upload: UploadRow) -> int:
-    """How much of a file has arrived, bytes.
+def received_bytes(storage: Storage, upload: UploadRow) -> int:
+    """The number of bytes of an upload that have arrived.
 
     Raises:
-        NotFound: nothing of it is on this machine.
+        NotFound: this machine has no file of the upload.
     """
     if upload.finished_at is not None:
         return upload.size_bytes
     try:
         return _path(storage, upload.id).stat().st_size
     except FileNotFoundError:
-        raise NotFound(f"nothing of upload {upload.id} is left on this machine") from None
+        raise _missing_file(upload.id) from None
 
 
-def receive(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    upload: UploadRow,
-    start: int,
-    chunks: Iterable[bytes],
-    checksum: Checksum | None = None,
-) -> int:
-    """Append a piece; the last one puts the file into its place.
+def append_piece(installation: Installation, upload: UploadRow, piece: Piece) -> int:
+    """Append a piece to an upload; the last piece completes it and moves the file to its place.
 
-    What arrived before a line broke is kept, but for a piece with a checksum.
+    When the connection breaks, the bytes that arrived stay, unless the piece has a checksum.
 
     Returns:
-        How much has arrived, bytes.
+        The number of bytes of the file that have arrived.
 
     Raises:
-        Busy: somebody else is sending.
-        Conflict: the piece does not begin where the file ends.
-        WrongChecksum: the piece is not as announced.
-        TooLarge: the piece goes beyond the announced size.
-        InputError: the whole file is not what it should be; it is thrown away.
+        Busy: another request is sending to the upload.
+        Conflict: the piece does not start where the received bytes end.
+        WrongChecksum: the piece does not have the announced checksum.
+        TooLarge: the piece exceeds the announced size of the file.
+        InputError: the complete file cannot be used; it is deleted.
     """
-    path = _path(storage, upload.id)
-    with _locked(path) as file:
-        arrived = file.seek(0, os.SEEK_END)
-        if start != arrived:
-            raise Conflict(f"{arrived} bytes have arrived, the piece begins at {start}")
-        _append(file, start, upload.size_bytes, chunks, checksum)
-        arrived = file.tell()
-        with database.transaction() as connection:
+    path = _path(installation.storage, upload.id)
+    with _locked(path, upload.id) as file:
+        received = file.seek(0, os.SEEK_END)
+        if piece.start != received:
+            raise Conflict(
+                f"the piece starts at byte {piece.start}, but {received} bytes have arrived; "
+                f"continue from byte {received}"
+            )
+        _append(file, piece, upload.size_bytes)
+        received = file.tell()
+        with installation.database.transaction() as connection:
             if uploads.prolong(connection, upload.id) is None:
                 raise NotFound(f"no upload {upload.id}")
-        if arrived == upload.size_bytes:
-            _settle(database, storage, settings, upload, path)
-    return arrived
+        if received == upload.size_bytes:
+            _complete(installation, upload, path)
+    return received
 
 
-def drop(connection: Connection, storage: Storage, upload: UploadRow) -> None:
-    """End an upload and forget what has arrived of it; a complete one stays where it is.
+def terminate_upload(connection: Connection, storage: Storage, upload: UploadRow) -> None:
+    """Delete an incomplete upload with the bytes that have arrived.
 
     Raises:
-        Conflict: it is complete.
+        Conflict: the upload is complete.
     """
     if upload.finished_at is not None:
-        raise Conflict(f"upload {upload.id} is complete: remove the scene instead")
-    _forget(connection, upload)
+        raise Conflict(f"upload {upload.id} is complete: remove its scene instead")
+    _delete_row(connection, upload)
     _path(storage, upload.id).unlink(missing_ok=True)
 
 
-def sweep_uploads(database: Database, storage: Storage) -> list[str]:
-    """Give up the uploads nobody went on with; returns the names of the files removed.
+def remove_abandoned_uploads(database: Database, storage: Storage) -> list[str]:
+    """Delete the expired uploads and their files; returns the names of the deleted files.
 
-    A file without a row is one whose upload was given up: rows come first.
+    Rows are written before files, so a file without a row belongs to a deleted upload.
     """
     with database.transaction() as connection:
         uploads.delete_expired(connection)
-    files = {UUID(path.name.removeprefix(PREFIX)): path for path in storage.scratch().glob(f"{PREFIX}*")}
+    paths = storage.scratch().glob(f"{UPLOAD_PREFIX}*")
+    files = {UUID(path.name.removeprefix(UPLOAD_PREFIX)): path for path in paths}
     with database.transaction() as connection:
-        kept = uploads.arriving(connection, list(files))
-    gone = [path for upload_id, path in files.items() if upload_id not in kept]
-    for path in gone:
+        arriving = uploads.arriving(connection, list(files))
+    abandoned = [path for upload_id, path in files.items() if upload_id not in arriving]
+    for path in abandoned:
         path.unlink(missing_ok=True)
-    return [path.name for path in gone]
+    return [path.name for path in abandoned]
 
 
 def _path(storage: Storage, upload_id: UUID) -> Path:
-    return storage.scratch() / f"{PREFIX}{upload_id}"
+    return storage.scratch() / f"{UPLOAD_PREFIX}{upload_id}"
+
+
+def _missing_file(upload_id: UUID) -> NotFound:
+    return NotFound(f"upload {upload_id}: its file is not on this machine; start a new upload")
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[IO[bytes]]:
-    """The file, for one sender; the kernel lets go of it however that one ends."""
+def _locked(path: Path, upload_id: UUID) -> Iterator[IO[bytes]]:
+    """The file of an upload, locked for one sender; the kernel releases the lock of a killed process."""
     try:
         file = path.open("r+b", buffering=0)
     except FileNotFoundError:
-        raise NotFound(f"nothing of {path.name} is left on this machine") from None
+        raise _missing_file(upload_id) from None
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise Busy("somebody else is sending to this upload just now") from None
+            raise Busy(f"another request is sending to upload {upload_id}; try again later") from None
         yield file
 
 
-def _append(
-    file: IO[bytes], start: int, size_bytes: int, chunks: Iterable[bytes], checksum: Checksum | None
-) -> None:
+def _append(file: IO[bytes], piece: Piece, size_bytes: int) -> None:
+    """Write a piece; whatever ends it, a piece with a wrong or unchecked checksum leaves nothing."""
+    checksum = piece.checksum
     digest = hashlib.new(checksum.algorithm) if checksum else None
-    whole = False
+    is_complete = False
     try:
-        for chunk in chunks:
+        for chunk in piece.chunks:
             if file.tell() + len(chunk) > size_bytes:
-                raise TooLarge(f"the piece goes beyond the {size_bytes} bytes announced")
+                raise TooLarge(f"the piece exceeds the announced size of {size_bytes} bytes")
             if digest is not None:
                 digest.update(chunk)
-            left = memoryview(chunk)
-            while left:
-                left = left[file.write(left) :]
-        whole = True
+            rest = memoryview(chunk)
+            while rest:
+                rest = rest[file.write(rest) :]
+        is_complete = True
     finally:
-        right = checksum is None or (whole and digest is not None and digest.digest() == checksum.digest)
-        if not right:
-            file.truncate(start)
-            file.seek(start)
+        is_right = checksum is None or (
+            is_complete and digest is not None and digest.digest() == checksum.digest
+        )
+        if not is_right:
+            file.truncate(piece.start)
+            file.seek(piece.start)
         os.fsync(file.fileno())
-    if not right:
-        raise WrongChecksum(f"the piece from byte {start} does not have the checksum announced")
+    if not is_right:
+        raise WrongChecksum(
+            f"the piece from byte {piece.start} does not have the announced checksum; send it again"
+        )
 
 
-def _settle(
-    database: Database, storage: Storage, settings: Settings, upload: UploadRow, path: Path
-) -> None:
-    """Put a file that has arrived into its place, or throw it away and say why."""
+def _complete(installation: Installation, upload: UploadRow, path: Path) -> None:
+    """Move a complete file to its place in the storage, or delete it and raise the reason."""
+    database, storage = installation.database, installation.storage
     try:
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         if upload.sha256 not in (None, sha256):
             raise InputError(f"sha256 {upload.sha256} announced, {sha256} received")
         if upload.purpose == "image":
-            _place_image(database, storage, settings, upload, path, sha256)
+            _complete_image(installation, upload, path, sha256)
         elif upload.purpose == "model":
             assert upload.scene_id is not None
             storage.adopt(path, f"{folder_of(upload.scene_id)}/{upload.file_name}")
             with database.transaction() as connection:
-                note_model(connection, upload.scene_id, upload.file_name, upload.size_bytes, sha256)
+                record_side_file(
+                    connection, upload.scene_id, upload.file_name, upload.size_bytes, sha256
+                )
                 uploads.finish(connection, upload.id)
         else:
             key = block_key(upload)
@@ -290,80 +312,79 @@ def _settle(
                 uploads.finish(connection, upload.id, key)
     except AmersError:
         with database.transaction() as connection:
-            _forget(connection, upload)
+            _delete_row(connection, upload)
         path.unlink(missing_ok=True)
         raise
 
 
-def _forget(connection: Connection, upload: UploadRow) -> None:
+def _delete_row(connection: Connection, upload: UploadRow) -> None:
+    """Delete the row of an upload, and the scene that the upload of an image created."""
     uploads.delete_upload(connection, upload.id)
     if upload.purpose == "image" and upload.scene_id is not None:
         scenes.give_up_upload(connection, upload.scene_id)
 
 
-def _place_image(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    upload: UploadRow,
-    path: Path,
-    sha256: str,
-) -> None:
+def _complete_image(installation: Installation, upload: UploadRow, path: Path, sha256: str) -> None:
+    """Move an image, or the image and the models of an archive, into the folder of the scene."""
     assert upload.scene_id is not None
+    storage = installation.storage
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     with storage.scratch_folder("unpacked-") as folder:
         models: list[Path] = []
         image, name = path, upload.file_name
         if is_archive(head):
-            image, models = _unpacked(path, folder, settings)
+            image, models = _unpack(path, folder, installation.settings)
             name = image.name
             with image.open("rb") as file:
                 head = file.read(HEAD_BYTES)
                 file.seek(0)
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        refuse_strange(head)
+        require_image_signature(head)
         size_bytes = image.stat().st_size
-        noted = [
-            (one.name, one.stat().st_size, hashlib.sha256(one.read_bytes()).hexdigest())
-            for one in models
+        model_files = [
+            (model.name, model.stat().st_size, hashlib.sha256(model.read_bytes()).hexdigest())
+            for model in models
         ]
-        for one in [*models, image]:
-            storage.adopt(one, f"{folder_of(upload.scene_id)}/{one.name if one != path else name}")
+        for source in [*models, image]:
+            file_name = name if source == path else source.name
+            storage.adopt(source, f"{folder_of(upload.scene_id)}/{file_name}")
     key = f"{folder_of(upload.scene_id)}/{name}"
-    with database.transaction() as connection:
+    with installation.database.transaction() as connection:
         if scenes.finish_upload(connection, upload.scene_id, key, size_bytes, sha256) is None:
-            raise Conflict("the upload took so long that it was given up")
-        for model in noted:
-            note_model(connection, upload.scene_id, *model)
+            raise Conflict(f"upload {upload.id} took too long and has expired; start a new one")
+        for model in model_files:
+            record_side_file(connection, upload.scene_id, *model)
         uploads.finish(connection, upload.id)
     path.unlink(missing_ok=True)
 
 
-def _unpacked(archive: Path, folder: Path, settings: Settings) -> tuple[Path, list[Path]]:
-    """The one image of an archive and the models beside it, unpacked into a folder.
+def _unpack(archive: Path, folder: Path, settings: Settings) -> tuple[Path, list[Path]]:
+    """Unpack the one image of an archive and the models beside it into a folder; returns their paths.
 
     Raises:
-        FormatError: the archive is broken or holds what it may not.
-        InputError: it does not hold exactly one image.
+        FormatError: the archive is damaged or contains what is not allowed.
+        InputError: it does not contain exactly one image, or two files would get the same name.
     """
     limits = ArchiveLimits(settings.upload_limit_bytes)
     members = check_archive(archive, limits)
-    images = [one.path for one in members if one.path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [member.path for member in members if member.path.suffix.lower() in IMAGE_SUFFIXES]
     if len(images) != 1:
         names = ", ".join(str(path) for path in images[:5]) or "none"
-        raise InputError(f"an archive with a scene holds one image, this one {len(images)}: {names}")
-    beside = [
-        one.path
-        for one in members
-        if one.path.parent == images[0].parent
-        and one.path.suffix.lower() in MODEL_SUFFIXES
-        and one.size_bytes <= MODEL_LIMIT_BYTES
+        raise InputError(f"the archive contains {len(images)} images ({names}), exactly one is expected")
+    models = [
+        member.path
+        for member in members
+        if member.path.parent == images[0].parent
+        and member.path.suffix.lower() in MODEL_SUFFIXES
+        and member.size_bytes <= SIDE_FILE_LIMIT_BYTES
     ]
-    places: dict[PurePosixPath, Path] = {
-        path: folder / clean_name(path.name) for path in (images[0], *beside)
+    targets: dict[PurePosixPath, Path] = {
+        path: folder / clean_name(path.name) for path in (images[0], *models)
     }
-    if len(set(places.values())) < len(places):
-        raise InputError("two files of the archive have the same name but for letters that are not kept")
-    unpack_archive(archive, places, limits)
-    return places[images[0]], [places[path] for path in beside]
+    if len(set(targets.values())) < len(targets):
+        raise InputError(
+            "two files of the archive get the same name once unusual letters are replaced; rename one"
+        )
+    unpack_archive(archive, targets, limits)
+    return targets[images[0]], [targets[path] for path in models]

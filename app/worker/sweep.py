@@ -17,11 +17,9 @@ from app.db.engine import Database
 from app.db.jobs import attempts, jobs, queue
 from app.request_context import Origin, working_for
 from app.storage import Storage
-from app.usecases.blocks.lifecycle import sweep_storage
-from app.usecases.blocks.uploads import sweep_blocks
-from app.usecases.garbage_collection import remove_unnamed_files
-from app.usecases.uploads import PREFIX as UPLOADED
-from app.usecases.uploads import sweep_uploads
+from app.usecases.blocks.uploads import remove_expired_archives
+from app.usecases.garbage_collection import remove_unnamed_chips, remove_unnamed_files
+from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
@@ -96,13 +94,14 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     """
     with database.transaction() as connection:
         uptime.advance(connection, MOST_BETWEEN_S)
-    removed = sweep_uploads(database, storage)
+    removed = remove_abandoned_uploads(database, storage)
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
     removed += remove_unnamed_files(database, storage)
-    removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s, UPLOADED)
+    removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s, UPLOAD_PREFIX)
     with database.transaction() as connection:
         connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
-        removed += sweep_storage(connection, storage) + sweep_blocks(connection, storage)
+        removed += remove_unnamed_chips(connection, storage)
+        removed += remove_expired_archives(connection, storage)
     for name in removed:
         log.info("removed %s, which nothing names", name)

@@ -7,7 +7,6 @@ computed is null, and the descriptions are those of the docstrings.
 import inspect
 import json
 import math
-import re
 import types
 from dataclasses import fields, is_dataclass
 from datetime import datetime
@@ -15,6 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from services.docstrings import attribute_descriptions
 from services.reports.report import REPORT_FORMAT, RegistrationReport
 
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
@@ -70,7 +70,7 @@ def report_schema() -> dict[str, Any]:
 
 def _object_schema(kind: type, definitions: dict[str, Any]) -> dict[str, Any]:
     """Schema of a dataclass; those inside it are added to the definitions."""
-    hints, described = get_type_hints(kind), _attribute_descriptions(kind)
+    hints, described = get_type_hints(kind), attribute_descriptions(kind)
     properties = {}
     for field in fields(kind):
         schema = _value_schema(hints[field.name], definitions)
@@ -117,14 +117,3 @@ def _value_schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if origin in (Union, types.UnionType):
         return {"anyOf": [_value_schema(argument, definitions) for argument in arguments]}
     raise TypeError(f"no JSON Schema for {hint}")
-
-
-def _attribute_descriptions(kind: type) -> dict[str, str]:
-    """The `Attributes:` of a docstring, by name."""
-    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
-    described: dict[str, str] = {}
-    for entry in re.split(r"\n(?=    \w)", section.rstrip()):
-        names, colon, text = entry.partition(":")
-        if colon:
-            described.update(dict.fromkeys(re.findall(r"\w+", names), " ".join(text.split())))
-    return described

@@ -125,7 +125,7 @@ def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_pa
 
         again = ingested_by_job(client, settings, admin, {"path": "calanques_v1"})
         assert again["status"] == "failed"
-        assert "in the store already" in again["message"]
+        assert "already in the store" in again["message"]
 
         assert (
             client.post("/blocks/calanques/publish", headers=admin).json()["block"]["state"]

@@ -10,6 +10,7 @@ from app.db import points as point_store
 from app.errors import Conflict, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
+from app.usecases.garbage_collection import remove_unnamed_chips
 from services.formats.block.document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
@@ -58,7 +59,7 @@ def test_wrong_steps_are_conflicts_that_say_the_state(connection, ingested):
 
 def test_the_same_version_twice_is_a_conflict_and_changes_nothing(connection, storage, ingested):
     made, result = ingested
-    with pytest.raises(Conflict, match="calanques version 1 is in the store already"):
+    with pytest.raises(Conflict, match="calanques version 1 is already in the store"):
         lifecycle.ingest_block(connection, storage, made.folder)
     connection.rollback()
     assert [block.number for block in lifecycle.list_blocks(connection)] == [result.block.number]
@@ -178,7 +179,7 @@ def test_an_outline_across_the_antimeridian_finds_both_sides(connection, storage
 
 def test_quality_figures_are_those_of_the_points(connection, ingested):
     made, result = ingested
-    quality = lifecycle.find_quality(connection, "calanques")
+    quality = lifecycle.block_report(connection, lifecycle.find_block(connection, "calanques")).quality
     variance = np.diagonal(made.points.covariance_m2, axis1=1, axis2=2)
     assert quality.points == 40
     assert quality.points_per_km2 == pytest.approx(40 / quality.area_km2)
@@ -196,6 +197,6 @@ def test_quality_figures_are_those_of_the_points(connection, ingested):
 def test_files_no_row_names_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
     orphan = make_block(tmp_path / "orphan", count=3, seed=9).folder / "chips/0000.npy"
     key = storage.put_chips(orphan).key
-    assert lifecycle.sweep_storage(connection, storage) == [key]
+    assert remove_unnamed_chips(connection, storage) == [key]
     assert not storage.exists(key)
     assert len(storage.keys("chips")) == 1

@@ -17,7 +17,7 @@ from app.db.cluster.embedded import Cluster
 from app.errors import is_no_room
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.lifecycle import sweep_storage
+from app.usecases.garbage_collection import remove_unnamed_chips
 from tests.app.workers import ended, running_worker
 from tests.factories import make_block
 
@@ -139,7 +139,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
         assert "full" in str(failed["message"])
         with engine.connect(dsn) as connection:
             assert lifecycle.list_blocks(connection) == []
-            sweep_storage(connection, storage)
+            remove_unnamed_chips(connection, storage)
         assert files(storage) == []
 
         disk.grow(20 * ROOM)
@@ -148,7 +148,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
     with engine.connect(dsn) as connection:
         (block,) = lifecycle.list_blocks(connection)
         assert block.n_points == len(made.points)
-        assert sweep_storage(connection, storage) == []
+        assert remove_unnamed_chips(connection, storage) == []
 
 
 def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is_room(

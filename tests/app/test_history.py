@@ -20,7 +20,7 @@ from app.db.jobs import attempts, jobs
 from app.db.jobs.attempts import LostJob
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.history import remember
+from app.usecases.history import record_measures
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
 from services.formats.block.check import check_block
@@ -91,7 +91,7 @@ def remembered(connection: Connection, registration: Registration, scene: str) -
         verdict=registration.qualification.verdict,
         files={},
     )
-    remember(connection, registration_id, registration, scene)
+    record_measures(connection, registration_id, registration, scene)
 
 
 def failing(registration: Registration, verdict: str = "failed") -> Registration:

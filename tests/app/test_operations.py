@@ -133,7 +133,7 @@ def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
     few = create_token(connection, "few", ["register"], job_quota=1).token
     quotas.require_free_job(connection, settings, few)
     job = jobs.create(connection, "register-scene", {}, few.id)
-    with pytest.raises(TooMany, match="has 1 jobs that have not ended, 1 are allowed"):
+    with pytest.raises(TooMany, match="has 1 open jobs of 1 allowed"):
         quotas.require_free_job(connection, settings, few)
     jobs.dismiss(connection, job.id)
     quotas.require_free_job(connection, settings, few)

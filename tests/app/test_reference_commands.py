@@ -90,12 +90,12 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("../beside/land.tif", "--name", "x"), "no file below the folder"),
-        (("none.tif", "--name", "x"), "no file below the folder"),
+        (("../beside/land.tif", "--name", "x"), "not a file below the folder"),
+        (("none.tif", "--name", "x"), "not a file below the folder"),
         (("land.tif", "--name", " "), "1 to 120 characters"),
         (("land.tif", "--name", "x", "--dem", "heights.tif"), "heights.tif"),
         (("land.tif", "--name", "x", "--vertical", "ellipsoid"), "of the heights of a dem"),
-        (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "no file below the folder"),
+        (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "not a file below the folder"),
     ],
 )
 def test_what_can_be_no_reference_is_refused_in_one_line(

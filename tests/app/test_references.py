@@ -117,10 +117,10 @@ def test_only_files_of_the_folder_that_lie_on_a_map_become_references(
         with pytest.raises(InputError, match=reason):
             add_reference(connection, settings, new)
 
-    refused("image: '../first.tif' is no file below", image="../first.tif")
-    refused("image: .* is no file below", image=str(folder / "first.tif"))
-    refused("image: 'none.tif' is no file below", image="none.tif")
-    refused("dem: 'none.tif' is no file below", dem="none.tif")
+    refused("image: '../first.tif' is not a file below", image="../first.tif")
+    refused("image: .* is not a file below", image=str(folder / "first.tif"))
+    refused("image: 'none.tif' is not a file below", image="none.tif")
+    refused("dem: 'none.tif' is not a file below", dem="none.tif")
     refused("name: 1 to 120 characters", name=" ")
     refused("sigma_m: 0 found", sigma_m=0.0)
     refused("of the heights of a dem", vertical="EGM96")

@@ -89,7 +89,7 @@ def test_a_token_that_makes_no_sense_is_not_made(connection, name, scopes, days)
 def test_nobody_is_let_in_without_a_token(connection):
     with pytest.raises(NotAllowed) as refused:
         require(None, Scope.READ)
-    assert not refused.value.known
+    assert not refused.value.authenticated
 
 
 def test_the_command_line_makes_lists_and_revokes(dsn):

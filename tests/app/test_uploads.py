@@ -25,8 +25,8 @@ from app.db import engine
 from app.db.uploads import LIFE_HOURS
 from app.main import create_app
 from app.storage import Storage
-from app.usecases.blocks.uploads import finished_block
-from app.usecases.uploads import sweep_uploads
+from app.usecases.blocks.uploads import find_uploaded_block
+from app.usecases.uploads import remove_abandoned_uploads
 from app.worker.sweep import sweep_files
 from tests.app.point_history import let_pass
 
@@ -325,12 +325,12 @@ def test_an_upload_that_is_ended_or_expires_leaves_nothing(
     assert client.delete(first.headers["location"], headers=me).status_code == 204
     assert client.head(first.headers["location"], headers=me).status_code == 404
     database = client.app.state.database  # type: ignore[attr-defined]
-    sweep_uploads(database, storage)
+    remove_abandoned_uploads(database, storage)
     assert client.head(second.headers["location"], headers=me).status_code == 200
     with database.transaction() as connection:
         let_pass(connection, hours=LIFE_HOURS + 1)
     assert client.head(second.headers["location"], headers=me).status_code == 404
-    sweep_uploads(database, storage)
+    remove_abandoned_uploads(database, storage)
     assert list(storage.scratch().iterdir()) == []
 
 
@@ -375,7 +375,7 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
 
     with engine.connect(dsn) as connection:
         caller = list_tokens(connection)[0]
-        key = finished_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
+        key = find_uploaded_block(connection, caller, UUID(url.rsplit("/", 1)[-1]))
     assert storage.size(key) == 100
 
 

@@ -1,4 +1,4 @@
-"""Taking in blocks: the job that checks and loads one."""
+"""The process `ingest-block`: check a block on the server or an uploaded archive, and load it."""
 
 import tempfile
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError, NotFound
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.uploads import finished_block
+from app.usecases.blocks.uploads import find_uploaded_block
 from app.usecases.processes import Commit, Process, Work
 from services.errors import FormatError
 from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
@@ -20,18 +20,18 @@ from services.formats.block.document_json import BLOCK_JSON
 from services.quality.block import quality_document
 
 UNPACKED_TIMES = 4
-"""A block unpacks to at most so many times the largest upload."""
+"""An archive may unpack to this many times the size limit of uploads."""
 
 
 @dataclass(frozen=True)
 class IngestBlock:
-    """What an administrator says to have a block ingested: a folder of the server, or an upload.
+    """The inputs of an ingestion: a folder on the server, or an upload.
 
     Attributes:
-        path: of the block's folder on the server, below AMERS_INGEST_FOLDER.
-        upload: id of an archive that was uploaded.
-        publish: whether it becomes visible at once.
-        priority: of blocks over one place the points of the greater one are served.
+        path: folder of the block on the server, below AMERS_INGEST_FOLDER.
+        upload: id of an uploaded archive.
+        publish: whether the block is published at once.
+        priority: where blocks overlap, points of the block with the greater priority are served.
     """
 
     path: str | None = None
@@ -41,22 +41,22 @@ class IngestBlock:
 
 
 def _check(connection: Connection, caller: Token, inputs: IngestBlock) -> None:
-    """Whether there is such a folder is for the worker to see: it may have other disks than the API."""
+    """Check the inputs but not the folder, which may lie on a disk that only the worker has."""
     if (inputs.path is None) == (inputs.upload is None):
         raise InputError("inputs of ingest-block: either path or upload is expected")
     if inputs.upload is not None:
-        finished_block(connection, caller, inputs.upload)
+        find_uploaded_block(connection, caller, inputs.upload)
 
 
 def _run(work: Work) -> Commit:
-    """The block is loaded in the transaction that ends the job: all of it is there, or nothing."""
+    """Find the block; the transaction that ends the job loads it completely or not at all."""
     inputs: IngestBlock = work.inputs
-    # Lives as long as the transaction may need it; goes with the attempt's process at the latest.
+    # Lives as long as the transaction may need it; it ends with the attempt's process at the latest.
     scratch = tempfile.TemporaryDirectory(prefix="amers-block-")
     folder = (
         lifecycle.folder_to_ingest(work.settings.ingest_folder, inputs.path)
         if inputs.path is not None
-        else _unpacked(work, inputs.upload, Path(scratch.name))
+        else _unpack(work, inputs.upload, Path(scratch.name))
     )
 
     def commit(connection: Connection) -> dict[str, Any]:
@@ -80,8 +80,8 @@ def _run(work: Work) -> Commit:
     return commit
 
 
-def _unpacked(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
-    """The folder of a block that came as an archive."""
+def _unpack(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
+    """Unpack an uploaded block; returns its folder."""
     assert upload_id is not None
     with work.database.reading() as connection:
         key = uploads.find_block(connection, upload_id)
@@ -91,22 +91,22 @@ def _unpacked(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
     archive = work.storage.fetch(key, scratch)
     limits = ArchiveLimits(UNPACKED_TIMES * work.settings.upload_limit_bytes)
     members = check_archive(archive, limits)
-    root = _root(archive.name, members)
+    root = _block_root(archive.name, members)
     folder = scratch / "block"
-    places = {}
+    targets = {}
     for member in members:
-        place = folder / member.path.relative_to(root)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        places[member.path] = place
-    unpack_archive(archive, places, limits)
+        target = folder / member.path.relative_to(root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        targets[member.path] = target
+    unpack_archive(archive, targets, limits)
     return folder
 
 
-def _root(name: str, members: tuple[Member, ...]) -> PurePosixPath:
-    """The folder of the archive that holds block.json and everything else."""
+def _block_root(name: str, members: tuple[Member, ...]) -> PurePosixPath:
+    """The folder inside an archive that contains block.json and all other members."""
     documents = [member.path for member in members if member.path.name == BLOCK_JSON]
     if not documents:
-        raise FormatError(f"{name}: no {BLOCK_JSON} in it")
+        raise FormatError(f"{name}: no {BLOCK_JSON} found in the archive; a block is expected")
     root = min(documents, key=lambda path: len(path.parts)).parent
     outside = next((m.path for m in members if not m.path.is_relative_to(root)), None)
     if outside is not None:
@@ -127,8 +127,8 @@ INGEST_BLOCK = Process(
         "number": {"type": "integer", "title": "Number of this version"},
         "id": {"type": "string", "title": "Name of the block"},
         "version": {"type": "string", "title": "Version"},
-        "state": {"enum": ["staged", "published"], "title": "What it has become"},
-        "points": {"type": "integer", "title": "Points that were loaded"},
-        "quality": {"type": "object", "title": "Density, views a point, stated precision"},
+        "state": {"enum": ["staged", "published"], "title": "State after the ingestion"},
+        "points": {"type": "integer", "title": "Points loaded"},
+        "quality": {"type": "object", "title": "Density, views per point and stated precision"},
     },
 )

@@ -1,4 +1,4 @@
-"""The life of a block: ingested and checked, staged, published, withdrawn."""
+"""The life of a block: check and ingest it (staged), publish, withdraw, restore and prioritise it."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,14 +27,13 @@ MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
     "published": ("withdrawn",),
     "withdrawn": ("published",),
 }
-CHIPS = "chips"
 LARGEST_PRIORITY = 1000
-FILES_AT_ONCE = 4
+PARALLEL_COPIES = 4
 
 
 @dataclass(frozen=True)
 class Ingested:
-    """What an ingestion left in the store."""
+    """A block that was ingested, and the quality figures of its points."""
 
     block: Block
     quality: BlockQuality
@@ -42,11 +41,11 @@ class Ingested:
 
 @dataclass(frozen=True)
 class BlockReport:
-    """How good a block is.
+    """The quality of a block.
 
     Attributes:
-        quality: of its points, told from themselves.
-        accuracy: as its producer states it, with what it was measured against.
+        quality: figures computed from its points.
+        accuracy: figures that its producer states, each with what it was measured against.
     """
 
     quality: BlockQuality
@@ -55,10 +54,11 @@ class BlockReport:
 
 @dataclass(frozen=True)
 class Published:
-    """A block that became visible.
+    """A block that was published.
 
     Attributes:
-        superseded: the version of the same block that was visible before and no longer is.
+        block: the published version.
+        superseded: the version of the same block that was published before; None when there was none.
     """
 
     block: Block
@@ -72,25 +72,25 @@ def ingest_block(
     progress: Progress = no_progress,
     priority: int = 0,
 ) -> Ingested:
-    """Check a block folder, put its chips into the storage and its rows into the store, staged.
+    """Check a block folder, then copy its chips into the storage and its rows into the store, staged.
 
-    Nothing is visible before the transaction of the connection is committed. Files that a broken
-    ingestion leaves in the storage belong to no row; `sweep_storage` removes them.
+    Nothing is visible before the transaction of the connection is committed. Files that a failed
+    ingestion leaves in the storage belong to no row; `remove_unnamed_chips` deletes them.
 
     Args:
-        connection: no transaction is opened before the block is checked.
-        storage: where the chips go.
+        connection: its transaction begins after the check of the block.
+        storage: receives the chips.
         folder: of the block.
-        progress: told on the way.
-        priority: against other blocks over the same place; the greater one wins.
+        progress: receives the fraction done and a message.
+        priority: where blocks overlap, points of the block with the greater priority are served.
 
     Raises:
-        FormatError: the block is not what it should be; nothing is changed.
-        Conflict: that version of the block is in the store already.
+        FormatError: the block breaks the format; nothing is changed.
+        Conflict: the store already has this version of the block.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError(f"{folder}: no such folder; expected the folder of a block with {BLOCK_JSON}")
     _check_priority(priority)
     contents = check_block(folder, part_of(progress, 0.0, 0.1), chip_checksums=False)
     document = (folder / BLOCK_JSON).read_bytes()
@@ -102,27 +102,30 @@ def ingest_block(
             connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
         )
         if block is None:
-            raise Conflict(f"block {metadata.id} version {metadata.version} is in the store already")
+            raise Conflict(
+                f"block {metadata.id} version {metadata.version} is already in the store; "
+                "a changed block needs a new version"
+            )
         files = _store_chips(storage, folder, contents, part_of(progress, 0.1, 0.5))
         load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
     return Ingested(block, quality)
 
 
 def publish_block(connection: Connection, reference: str) -> Published:
-    """Make a block visible, and the version of it that was visible before no longer, in one step.
+    """Publish a block and, in the same step, withdraw the version of it that was published before.
 
     Where several blocks have a point at one place, the point of the better block is served: see
     `app.db.superseding`.
 
     Raises:
         NotFound: there is no such block.
-        Conflict: it is published already, or the reference means several versions.
+        Conflict: it is already published, or the reference fits several versions.
     """
-    block, versions = _to_change(connection, reference)
+    block, versions = _lock_block(connection, reference)
     before = next((v for v in versions if v.state == "published" and v.number != block.number), None)
-    _change(connection, block, "published")
+    _set_state(connection, block, "published")
     if before is not None:
-        _change(connection, before, "withdrawn")
+        _set_state(connection, before, "withdrawn")
         superseding.recompute(connection, before.number)
     superseding.recompute(connection, block.number)
     return Published(
@@ -132,43 +135,43 @@ def publish_block(connection: Connection, reference: str) -> Published:
 
 
 def withdraw_block(connection: Connection, reference: str) -> Block:
-    """Make a block invisible; it can be restored.
+    """Withdraw a published block; it can be restored.
 
     Raises:
         NotFound: there is no such block.
-        Conflict: it is not published, or the reference means several versions.
+        Conflict: it is not published, or the reference fits several versions.
     """
-    block, _ = _to_change(connection, reference)
-    _change(connection, block, "withdrawn")
+    block, _ = _lock_block(connection, reference)
+    _set_state(connection, block, "withdrawn")
     superseding.recompute(connection, block.number)
     return blocks.read_block_row(connection, block.number)
 
 
 def restore_block(connection: Connection, reference: str) -> Published:
-    """Make a block visible again that was withdrawn or superseded, in place of its visible version.
+    """Publish a withdrawn or superseded block again, in place of its published version.
 
     Raises:
         NotFound: there is no such block.
-        Conflict: it was never published or is published, or the reference means several versions.
+        Conflict: it was never published or is published, or the reference fits several versions.
     """
     block = find_block(connection, reference)
     if block.state == "staged":
         raise Conflict(
-            f"block {block.id}@{block.version} was never published: there is nothing to restore"
+            f"block {block.id}@{block.version} was never published: publish it instead of restoring it"
         )
     return publish_block(connection, str(block.number))
 
 
 def prioritise_block(connection: Connection, reference: str, priority: int) -> Block:
-    """Let a block win or lose against other blocks over the same place, at once if it is published.
+    """Set the priority of a block among overlapping blocks; it takes effect at once if it is published.
 
     Raises:
         NotFound: there is no such block.
-        Conflict: the reference means several versions.
+        Conflict: the reference fits several versions.
         InputError: the priority is out of range.
     """
     _check_priority(priority)
-    block, _ = _to_change(connection, reference)
+    block, _ = _lock_block(connection, reference)
     blocks.set_priority(connection, block.number, priority)
     if block.state == "published":
         superseding.recompute(connection, block.number)
@@ -176,43 +179,31 @@ def prioritise_block(connection: Connection, reference: str, priority: int) -> B
 
 
 def find_block(connection: Connection, reference: str) -> Block:
-    """The block that a number, ID or ID@VERSION means.
+    """The block with this number, ID or ID@VERSION.
 
     Raises:
         NotFound: there is no such block.
-        Conflict: an ID has several versions.
+        Conflict: the ID has several versions.
     """
-    found = blocks.find_blocks(connection, reference)
-    if not found:
+    matches = blocks.find_blocks(connection, reference)
+    if not matches:
         raise NotFound(f"no block {reference:.100}")
-    if len(found) > 1:
-        versions = ", ".join(f"{block.id}@{block.version}" for block in found)
-        raise Conflict(f"block {reference} has {len(found)} versions, name one: {versions}")
-    return found[0]
+    if len(matches) > 1:
+        versions = ", ".join(f"{block.id}@{block.version}" for block in matches)
+        raise Conflict(f"block {reference} has {len(matches)} versions, name one: {versions}")
+    return matches[0]
 
 
 def find_published(connection: Connection, reference: str) -> Block:
-    """The published block that a number, ID or ID@VERSION means; an ID never has two published versions.
+    """The published block with this number, ID or ID@VERSION; an ID has at most one published version.
 
     Raises:
         NotFound: there is no such block, or it is not published.
     """
-    found = [block for block in blocks.find_blocks(connection, reference) if block.state == "published"]
-    if not found:
-        raise NotFound(f"no block {reference:.100}")
-    return found[0]
-
-
-def published_bounds(connection: Connection) -> tuple[float, ...] | None:
-    """West, south, east, north of all published blocks, None without any."""
-    outlines = [block.outline for block in blocks.list_blocks(connection, ("published",))]
-    if not outlines:
-        return None
-    corners = np.concatenate(outlines)
-    if np.abs(corners[:, 0]).max() > 180.0:
-        corners[:, 0] = np.clip(corners[:, 0], -180.0, 180.0)
-        corners = np.concatenate([corners, [[-180.0, corners[0, 1]], [180.0, corners[0, 1]]]])
-    return (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
+    for block in blocks.find_blocks(connection, reference):
+        if block.state == "published":
+            return block
+    raise NotFound(f"no block {reference:.100}")
 
 
 def list_blocks(
@@ -222,35 +213,27 @@ def list_blocks(
     return blocks.list_blocks(connection, states)
 
 
-def find_quality(connection: Connection, reference: str) -> BlockQuality:
-    """The quality figures of a block.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: the reference means several versions.
-    """
-    block = find_block(connection, reference)
-    return blocks.find_quality(connection, block.number)
-
-
 def block_report(connection: Connection, block: Block) -> BlockReport:
-    """How good a block is: our figures of its points, and what its producer measured."""
+    """The quality of a block: figures of its points, and the accuracy that its producer states."""
     document = parse_block_json(blocks.find_document(connection, block.number))
     return BlockReport(blocks.find_quality(connection, block.number), document.metadata.accuracy)
 
 
 def folder_to_ingest(allowed: Path | None, name: str) -> Path:
-    """A folder on the server that may be ingested by request.
+    """The path of a block folder on the server that a request may ingest.
 
     Args:
-        allowed: the folder that holds such folders, None when there is none.
+        allowed: the folder AMERS_INGEST_FOLDER; None when it is not set.
         name: path below it.
 
     Raises:
-        InputError: the path is not below the allowed folder.
+        InputError: the path does not lead to a folder below the allowed one.
     """
     if allowed is None:
-        raise InputError("this server ingests no folders by request: AMERS_INGEST_FOLDER is not set")
+        raise InputError(
+            "path: this server ingests no folders on request, because AMERS_INGEST_FOLDER is not set; "
+            "upload an archive of the block instead"
+        )
     try:
         folder = block_member(allowed, name)
     except FormatError as error:
@@ -260,20 +243,8 @@ def folder_to_ingest(allowed: Path | None, name: str) -> Path:
     return folder
 
 
-def sweep_storage(connection: Connection, storage: Storage) -> list[str]:
-    """Remove files of chips that no row names, left by broken ingestions; returns their keys.
-
-    Waits for the ingestions under way.
-    """
-    blocks.lock_sweep(connection)
-    unnamed = sorted(set(storage.keys(CHIPS)) - blocks.storage_keys(connection))
-    for key in unnamed:
-        storage.delete(key)
-    return unnamed
-
-
-def _to_change(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
-    """A block as it stands once nobody else is changing it, and all versions of it."""
+def _lock_block(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
+    """Lock a block against changes by others; returns its present state, and all its versions."""
     superseding.lock_publications(connection)
     number = find_block(connection, reference).number
     versions = blocks.lock_versions(connection, blocks.read_block_row(connection, number).id)
@@ -287,7 +258,7 @@ def _check_priority(priority: int) -> None:
         )
 
 
-def _change(connection: Connection, block: Block, state: BlockState) -> Block:
+def _set_state(connection: Connection, block: Block, state: BlockState) -> Block:
     if state not in MAY_BECOME[block.state]:
         raise Conflict(f"block {block.id}@{block.version} is {block.state}: it cannot become {state}")
     return blocks.set_state(connection, block.number, state)
@@ -296,21 +267,21 @@ def _change(connection: Connection, block: Block, state: BlockState) -> Block:
 def _store_chips(
     storage: Storage, folder: Path, contents: BlockContents, progress: Progress
 ) -> list[StoredChipFile]:
-    """Copy the files of chips, some at once; what arrives must be what the block promises.
+    """Copy the chip files into the storage, several in parallel.
 
     Raises:
-        BlockProblems: files have other checksums; they are not stored.
+        BlockProblems: files have other checksums than the block states; they are not stored.
     """
-    names, promised = contents.points.chip_files, contents.document.checksums
+    names, stated_sha256 = contents.points.chip_files, contents.document.checksums
 
     def store(name: str) -> tuple[StoredFile, ChipFile]:
         path = block_member(folder, name)
         layout = read_chip_file(path, name)
-        return storage.put_chips(path, promised[name].lower()), layout
+        return storage.put_chips(path, stated_sha256[name].lower()), layout
 
     progress(0.0, "storing chips")
     stored: dict[str, tuple[StoredFile, ChipFile]] = {}
-    with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
+    with ThreadPoolExecutor(PARALLEL_COPIES) as pool:
         for name, file in zip(names, pool.map(store, names), strict=True):
             stored[name] = file
             progress(len(stored) / len(names), "storing chips")

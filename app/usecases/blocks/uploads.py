@@ -1,66 +1,58 @@
-"""Archives of blocks that were uploaded, in one piece or by tus: where they lie, how long they wait."""
+"""Uploaded archives of blocks: receive one, find one that is complete, delete the expired ones."""
 
-from collections.abc import Iterable
 from contextlib import suppress
 from uuid import UUID
 
 from app.auth import may_access
-from app.config import Settings
 from app.db import uploads
-from app.db.engine import Connection, Database
+from app.db.engine import Connection
 from app.db.tokens import Token
 from app.db.uploads import UploadRow
 from app.errors import Conflict, InputError, NotFound, StorageOutage
 from app.storage import Storage
 from app.usecases import quotas
-from app.usecases.scenes import clean_name
+from app.usecases.installation import Installation
+from app.usecases.scenes import SentFile, clean_name
 
 
-def receive_block(
-    database: Database,
-    storage: Storage,
-    settings: Settings,
-    caller: Token,
-    name: str,
-    chunks: Iterable[bytes],
-    announced_bytes: int | None = None,
-) -> UUID:
-    """Take in a zip or tar of a block; it is looked into by the job that ingests it, not here.
+def receive_block(installation: Installation, caller: Token, sent: SentFile) -> UUID:
+    """Store a zip or tar archive of a block; the job that ingests it checks its content.
 
     Returns:
-        The id by which an ingestion names it.
+        The id of the upload, an input of the process `ingest-block`.
 
     Raises:
-        TooLarge: more bytes than are accepted, or than the caller's quota leaves.
-        InputError: the name is none, or the archive is empty.
+        TooLarge: the archive exceeds the limit or the caller's quota.
+        InputError: the name cannot be used, or the archive is empty.
     """
-    file_name = clean_name(name)
+    database, storage = installation.database, installation.storage
+    file_name = clean_name(sent.name)
     with database.transaction() as connection:
-        left = quotas.upload_allowance(connection, settings, caller, announced_bytes)
-        limit = min(left, settings.upload_limit_bytes)
-        # An archive that does not say its size may take all that is left until it has arrived.
+        left = quotas.upload_allowance(connection, installation.settings, caller, sent.size_bytes)
+        limit = min(left, installation.settings.upload_limit_bytes)
+        # An archive of unknown size reserves all that is left of the quota until it has arrived.
         upload = uploads.insert_upload(
             connection,
             owner=caller.id,
             purpose="block",
             scene_id=None,
-            name=name[-200:],
+            name=sent.name[-200:],
             file_name=file_name,
-            size_bytes=announced_bytes or limit,
+            size_bytes=sent.size_bytes or limit,
             sha256=None,
             metadata="",
         )
     try:
-        stored = storage.put(block_key(upload), chunks, limit)
+        stored = storage.put(block_key(upload), sent.chunks, limit)
         if stored.size_bytes == 0:
-            raise InputError(f"{file_name}: empty; a zip or tar of a block expected")
+            raise InputError(f"{file_name}: empty file found, a zip or tar of a block expected")
         with database.transaction() as connection:
             if not uploads.finish(connection, upload.id, stored.key, stored.size_bytes, stored.sha256):
-                raise Conflict("the upload took so long that it was given up")
+                raise Conflict(f"upload {upload.id} took too long and has expired; start a new one")
     except BaseException:
         with database.transaction() as connection:
             uploads.delete_upload(connection, upload.id)
-        # What an outage leaves is swept.
+        # After an outage of the storage, garbage collection deletes what is left.
         with suppress(StorageOutage):
             storage.delete(block_key(upload))
         raise
@@ -68,31 +60,31 @@ def receive_block(
 
 
 def block_key(upload: UploadRow) -> str:
-    """Where the storage has the archive of an upload."""
+    """The storage key of the archive of an upload."""
     return f"uploads/{upload.id}/{upload.file_name}"
 
 
-def finished_block(connection: Connection, caller: Token, upload_id: UUID) -> str:
-    """The key of an archive with a block that has arrived.
+def find_uploaded_block(connection: Connection, caller: Token, upload_id: UUID) -> str:
+    """The storage key of a completely uploaded archive of a block.
 
     Raises:
-        NotFound: there is no such upload of this caller.
-        Conflict: it has not arrived yet.
-        InputError: it is no block.
+        NotFound: there is no such upload, or the caller may not see it.
+        Conflict: it is not complete yet.
+        InputError: it is not the archive of a block.
     """
     upload = uploads.find_upload(connection, upload_id)
-    if upload is None or not may_access(caller, upload.owner) or upload.expired:
+    if upload is None or upload.expired or not may_access(caller, upload.owner):
         raise NotFound(f"no uploaded block {upload_id}")
     if upload.purpose != "block":
-        raise InputError(f"upload {upload_id} is not one of a block")
+        raise InputError(f"upload {upload_id} has the purpose {upload.purpose}, block is expected")
     if upload.file_key is None:
-        raise Conflict(f"upload {upload_id} has not arrived yet")
+        raise Conflict(f"upload {upload_id} is not complete yet; send the rest of it first")
     return upload.file_key
 
 
-def sweep_blocks(connection: Connection, storage: Storage) -> list[str]:
-    """Remove the archives that nobody had ingested in time; returns their keys."""
-    unwanted = uploads.delete_unwanted_blocks(connection)
-    for key in unwanted:
+def remove_expired_archives(connection: Connection, storage: Storage) -> list[str]:
+    """Delete the archives that were not ingested in time; returns their keys."""
+    keys = uploads.delete_unwanted_blocks(connection)
+    for key in keys:
         storage.delete(key)
-    return unwanted
+    return keys

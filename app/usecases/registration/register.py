@@ -202,7 +202,7 @@ def record(
     """Remember a registration and what happened to each point in it.
 
     Args:
-        scene_key: the same for the same image; see `history.remember`.
+        scene_key: the same for the same image; see `history.record_measures`.
     """
     report = report_document(registered.report)
     registration_id = registrations.insert_registration(
@@ -217,7 +217,7 @@ def record(
     )
     made, reference = registered.registration, registered.reference
     if reference is None:
-        history.remember(connection, registration_id, made, scene_key)
+        history.record_measures(connection, registration_id, made, scene_key)
     else:
         keep_places(connection, reference, made, registered.footprint)
     return registration_id
