@@ -13,7 +13,7 @@ from app.db.blocks import Block
 from app.errors import InputError
 from app.storage import StoredChips, open_storage
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.export import ExportBlock, export_block
+from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.blocks.lifecycle import Published
 from services.quality.block import BlockQuality, Distribution, quality_document
 
@@ -119,14 +119,16 @@ def export(
     except ValueError:
         raise InputError(f"--bbox: {bbox!r:.100} found, four numbers W,S,E,N expected") from None
     settings = read_settings()
-    chips = StoredChips(open_storage(settings))
     inputs = ExportBlock((west, south, east, north), name, version, title)
+    with transaction(settings) as connection:
+        selected = select_points(connection, inputs)
+    chips = StoredChips(open_storage(settings))
     try:
-        with transaction(settings) as connection, shown_progress() as progress:
-            written = export_block(connection, chips, inputs, output, progress=progress)
+        with shown_progress() as progress:
+            n_points = write_selected(selected, chips, output, progress)
     finally:
         chips.close()
-    show_one({"block": output, "points": written}, as_json=as_json)
+    show_one({"block": output, "points": n_points}, as_json=as_json)
 
 
 @app.command()

@@ -85,6 +85,16 @@ class Database:
             yield connection
 
     @contextmanager
+    def snapshot(self) -> Iterator[Connection]:
+        """A read-only transaction whose statements all see one state of the database, for jobs.
+
+        It has no time limit: keep it short, and compute and write files after its end.
+        """
+        with _connection(self.writer) as connection:
+            connection.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+            yield connection
+
+    @contextmanager
     def transaction(self) -> Iterator[Connection]:
         """One transaction, committed at the end of the context, rolled back by an exception."""
         with _connection(self.writer) as connection:

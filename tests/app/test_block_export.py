@@ -1,9 +1,10 @@
-"""Points of the store as a block again, that ingests again as the same points."""
+"""An exported block ingests again as the same points; an export writes outside of transactions."""
 
 import zipfile
 from uuid import UUID
 
 import numpy as np
+import psycopg
 import pytest
 from numpy.testing import assert_allclose
 
@@ -13,15 +14,19 @@ from app.db.jobs import attempts
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.export import ExportBlock, export_block
+from app.usecases.blocks.export import EXPORT_BLOCK, ExportBlock, select_points, write_selected
 from app.usecases.jobs import do_attempt
+from app.usecases.processes import Work
 from services.formats.block.check import check_block
 from services.formats.block.document import rectangle
 from services.types import point_chips
+from tests.app.job_queue import new_job
 from tests.factories import BOX, make_block
 
 COLUMNS = """st_asewkb(geom) as place, sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north,
     corr_east_up, corr_north_up, n_views, saliency, typology, first_view, last_view, chip_count"""
+OPEN_TRANSACTIONS = """select count(*) from pg_stat_activity
+    where datname = current_database() and pid <> pg_backend_pid() and xact_start is not null"""
 
 
 @pytest.fixture
@@ -50,7 +55,8 @@ def test_a_block_that_is_exported_ingests_again_as_the_same_points_with_the_same
     made = make_block(tmp_path / "block")
     first = lifecycle.ingest_block(connection, storage, made.folder).block
     lifecycle.publish_block(connection, "calanques")
-    written = export_block(connection, chips, ExportBlock(BOX, id="copy"), tmp_path / "copy")
+    selected = select_points(connection, ExportBlock(BOX, id="copy"))
+    written = write_selected(selected, chips, tmp_path / "copy")
     assert written == 40
     second = lifecycle.ingest_block(connection, storage, tmp_path / "copy").block
 
@@ -69,7 +75,7 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
         lifecycle.publish_block(connection, name)
     expected = point_store.control_points(connection, rectangle(*half))
 
-    written = export_block(connection, chips, ExportBlock(half), tmp_path / "out")
+    written = write_selected(select_points(connection, ExportBlock(half)), chips, tmp_path / "out")
 
     contents = check_block(tmp_path / "out")
     assert written == len(contents.points) == len(expected.points) > 10
@@ -92,7 +98,7 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
 
 
 @pytest.mark.parametrize(
-    ("said", "error", "named"),
+    ("inputs", "error", "named"),
     [
         ({"bbox": (5.0, 44.0, 6.0, 43.0)}, InputError, "bbox"),
         ({"bbox": (5.0, 43.0, 600.0, 44.0)}, InputError, "bbox"),
@@ -102,12 +108,12 @@ def test_a_footprint_over_two_blocks_holds_what_is_served_of_both(connection, st
     ],
 )
 def test_an_export_that_cannot_be_is_refused_and_writes_nothing(
-    connection, storage, chips, tmp_path, said, error, named
+    connection, storage, chips, tmp_path, inputs, error, named
 ):
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
     lifecycle.publish_block(connection, "calanques")
     with pytest.raises(error, match=named):
-        export_block(connection, chips, ExportBlock(**said), tmp_path / "out")
+        write_selected(select_points(connection, ExportBlock(**inputs)), chips, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -115,7 +121,25 @@ def test_an_export_of_too_many_points_is_refused(connection, storage, chips, tmp
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
     lifecycle.publish_block(connection, "calanques")
     with pytest.raises(InputError, match="more than 4 points"):
-        export_block(connection, chips, ExportBlock(BOX), tmp_path / "out", most=4)
+        select_points(connection, ExportBlock(BOX), most=4)
+
+
+def test_no_transaction_is_open_while_an_export_writes_files(
+    connection, database, dsn, settings, storage, tmp_path
+):
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
+    lifecycle.publish_block(connection, "calanques")
+    connection.commit()
+    open_transactions = []
+
+    def count_transactions(fraction: float, message: str) -> None:
+        if fraction > 0.1:
+            with psycopg.connect(dsn, autocommit=True) as watcher:
+                open_transactions.append(watcher.execute(OPEN_TRANSACTIONS).fetchone()[0])
+
+    work = Work(new_job(database), ExportBlock(BOX), database, storage, settings, count_transactions)
+    EXPORT_BLOCK.run(work)
+    assert set(open_transactions) == {0}
 
 
 def test_a_block_is_exported_by_a_job_as_an_archive(

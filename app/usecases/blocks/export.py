@@ -1,7 +1,7 @@
-"""Points of the store as a block again: what is served inside an outline, to take elsewhere."""
+"""Export the served points of a box as a new block: select them in the store, write a block folder."""
 
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +21,6 @@ from app.usecases.processes import Commit, Process, Work
 from services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
-    BlockDocument,
     BlockMetadata,
     BlockSpecification,
     Provenance,
@@ -41,14 +40,14 @@ from services.types import (
 )
 
 MOST_POINTS = 50_000
-"""Of an export by request; the command line writes as many as there are."""
-FRAME = "frame_sigma_m"
+"""Limit of an export on request; the command line has none."""
+FRAME_FIGURE = "frame_sigma_m"
 ARCHIVE = "block.zip"
 
 
 @dataclass(frozen=True)
 class ExportBlock:
-    """What somebody says to have points as a block.
+    """The inputs of an export.
 
     Attributes:
         bbox: west, south, east, north in degrees; west greater than east crosses the antimeridian.
@@ -61,11 +60,26 @@ class ExportBlock:
     title: str = ""
 
 
+@dataclass(frozen=True)
+class SelectedPoints:
+    """Points of the store that make a new block.
+
+    Attributes:
+        metadata: of the new block.
+        points: with the keys of their chip files in the storage.
+        typology: what each point is on the ground; None where unknown.
+    """
+
+    metadata: BlockMetadata
+    points: ControlPoints
+    typology: Sequence[str | None]
+
+
 def bbox_outline(bbox: tuple[float, ...]) -> Array:
     """The outline (4, 2) of a box.
 
     Raises:
-        InputError: these are not west, south, east, north in degrees.
+        InputError: the numbers are not west, south, east, north in degrees.
     """
     west, south, east, north = bbox if len(bbox) == 4 else (np.nan,) * 4
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90):
@@ -73,109 +87,119 @@ def bbox_outline(bbox: tuple[float, ...]) -> Array:
     return rectangle(west, south, east, north)
 
 
-def export_block(
-    connection: Connection,
-    chips: ChipSource,
-    inputs: ExportBlock,
-    folder: Path,
-    most: int | None = None,
-    progress: Progress = no_progress,
-) -> int:
-    """Write the points that are served in a box into a new block folder.
+def select_points(
+    connection: Connection, inputs: ExportBlock, most: int | None = None
+) -> SelectedPoints:
+    """Read the points that are served in a box, and describe the block that they make.
 
     Args:
-        chips: of the storage.
-        inputs: the box, and what the block is called.
-        folder: must not exist.
-        most: refuse to write more points.
-        progress: told while chips are written.
-
-    Returns:
-        How many points were written.
+        connection: of a snapshot: the points and their blocks are read by several statements.
+        inputs: the box, and the name of the block.
+        most: the limit of the number of points; None for no limit.
 
     Raises:
-        NotFound: no points are served there.
-        InputError: box, names or number of points cannot be used.
+        NotFound: no points are served in the box.
+        InputError: the box or the name cannot be used, or the points exceed the limit.
     """
     outline = bbox_outline(inputs.bbox)
     if not NAME_PATTERN.fullmatch(inputs.id) or not inputs.version:
-        raise InputError(f"id, version: {inputs.id!r:.120} {inputs.version!r:.120} cannot name a block")
-    progress(0.0, "reading points")
+        raise InputError(
+            f"id, version: {inputs.id!r:.120} {inputs.version!r:.120} cannot name a block; expected a "
+            "letter, then letters, digits, dots, dashes or underscores, and a version"
+        )
     stored = points.control_points(connection, outline, None if most is None else most + 1)
     if len(stored.points) == 0:
-        raise NotFound(f"no points are served in {list(inputs.bbox)}")
+        raise NotFound(f"bbox: no points are served in {list(inputs.bbox)}")
     if most is not None and len(stored.points) > most:
-        raise InputError(f"more than {most} points lie in the box, the most that are exported")
-    sources = {
-        block.number: parse_block_json(blocks.find_document(connection, block.number))
+        raise InputError(f"bbox: more than {most} points lie in the box; choose a smaller box")
+    sources = [
+        parse_block_json(blocks.find_document(connection, block.number)).metadata
         for block in stored.blocks
-    }
-    chosen = _with_unique_images(stored)
+    ]
+    selected = _with_unique_images(stored)
     typology = blocks.find_typology(connection, stored.points.id)
+    return SelectedPoints(_metadata(inputs, outline, selected, stored, sources), selected, typology)
+
+
+def write_selected(
+    selected: SelectedPoints, chips: ChipSource, folder: Path, progress: Progress = no_progress
+) -> int:
+    """Write points with their chips into a new block folder; returns the number of points.
+
+    Args:
+        selected: the points.
+        chips: of the storage.
+        folder: must not exist.
+        progress: receives the fraction done and a message.
+    """
     write_block(
         folder,
-        _metadata(inputs, outline, chosen, stored, sources),
-        chosen,
-        _reading(chosen, chips),
+        selected.metadata,
+        selected.points,
+        _chip_reader(selected.points, chips),
         {},
-        typology=typology,
-        progress=part_of(progress, 0.1, 0.9),
+        typology=selected.typology,
+        progress=progress,
     )
-    return len(chosen)
+    return len(selected.points)
 
 
 def _metadata(
     inputs: ExportBlock,
     outline: Array,
-    chosen: ControlPoints,
+    selected: ControlPoints,
     stored: StoredPoints,
-    sources: Mapping[int, BlockDocument],
+    sources: Sequence[BlockMetadata],
 ) -> BlockMetadata:
-    said = [document.metadata for document in sources.values()]
     names = tuple(f"{block.id}@{block.version}" for block in stored.blocks)
-    seen = [
-        len(set(chosen.views.image[a:b].tolist()))
-        for a, b in zip(chosen.views.start[:-1], chosen.views.start[1:], strict=True)
+    views = selected.views
+    images_per_point = [
+        len(set(views.image[first:end].tolist()))
+        for first, end in zip(views.start[:-1], views.start[1:], strict=True)
     ]
-    epochs = {one.epoch for one in said}
+    epochs = {source.epoch for source in sources}
     return BlockMetadata(
         id=inputs.id,
         version=inputs.version,
         title=inputs.title or f"Points of {', '.join(names)}",
         description="Points served in a box. Covariances are relative to the frame of the block that "
         f"each point comes from: {', '.join(names)}.",
-        license=" AND ".join(sorted({one.license for one in said})),
+        license=" AND ".join(sorted({source.license for source in sources})),
         extent=outline,
         created=datetime.now(UTC),
         specification=BlockSpecification(
-            gsds_m=tuple(np.unique(chosen.views.gsd_m).tolist()), min_views=min(seen)
+            gsds_m=tuple(np.unique(views.gsd_m).tolist()), min_views=min(images_per_point)
         ),
         provenance=Provenance("amers", "export", names, {"bbox": list(inputs.bbox)}),
         epoch=epochs.pop() if len(epochs) == 1 else None,
-        accuracy=said[0].accuracy if len(said) == 1 else _worst_frame(stored),
+        accuracy=sources[0].accuracy if len(sources) == 1 else _worst_frame(stored),
     )
 
 
 def _worst_frame(stored: StoredPoints) -> tuple[AccuracyFigure, ...]:
-    """The frame of the points of several blocks, if each of these says how well its own is known."""
+    """The frame accuracy of points of several blocks: the worst one, if all blocks state theirs."""
     sigmas = [block.frame_sigma_m for block in stored.blocks]
     if any(sigma is None for sigma in sigmas):
         return ()
     worst = max(sigma for sigma in sigmas if sigma is not None)
-    return (AccuracyFigure("absolute", FRAME, worst, 0, "as stated by the worst of the source blocks"),)
+    return (
+        AccuracyFigure(
+            "absolute", FRAME_FIGURE, worst, 0, "as stated by the worst of the source blocks"
+        ),
+    )
 
 
 def _with_unique_images(stored: StoredPoints) -> ControlPoints:
-    """The points with the images that they name, each by a name that no other has."""
+    """The points with only the images they use, each under a name that no other image has."""
     views = stored.points.views
     used, image = np.unique(views.image, return_inverse=True)
-    owner = np.repeat(stored.points.id, np.diff(views.start)) >> blocks.ID_BITS
-    number = np.zeros(len(used), dtype=np.int64)
-    number[image] = owner
-    of_block = {block.number: block.id for block in stored.blocks}
+    block_of_view = np.repeat(stored.points.id, np.diff(views.start)) >> blocks.ID_BITS
+    block_of_image = np.zeros(len(used), dtype=np.int64)
+    block_of_image[image] = block_of_view
+    block_ids = {block.number: block.id for block in stored.blocks}
     names = [views.images[row].image_id for row in used]
     images = tuple(
-        replace(views.images[row], image_id=f"{of_block[int(number[i])]}.{names[i]}")
+        replace(views.images[row], image_id=f"{block_ids[int(block_of_image[i])]}.{names[i]}")
         if names.count(names[i]) > 1
         else views.images[row]
         for i, row in enumerate(used)
@@ -183,14 +207,14 @@ def _with_unique_images(stored: StoredPoints) -> ControlPoints:
     return replace(stored.points, views=replace(views, image=image.astype(np.int64), images=images))
 
 
-def _reading(chosen: ControlPoints, chips: ChipSource) -> Callable[[int], ChipArray]:
-    """Chips of the point of a row, all of one type: 8 bits become 16 where some have 16."""
-    kinds = {chips.read(file, 0, 1).dtype for file in chosen.chip_files}
-    dtype = max(kinds, key=lambda kind: kind.itemsize)
+def _chip_reader(selected: ControlPoints, chips: ChipSource) -> Callable[[int], ChipArray]:
+    """Reads the chips of the point of a row; 8-bit chips become 16-bit if some of the chips have 16."""
+    dtypes = {chips.read(file, 0, 1).dtype for file in selected.chip_files}
+    dtype = max(dtypes, key=lambda kind: kind.itemsize)
 
     def read(row: int) -> ChipArray:
-        found: ChipArray = point_chips(chosen, chips, row).astype(dtype, copy=False)
-        return found
+        point: ChipArray = point_chips(selected, chips, row).astype(dtype, copy=False)
+        return point
 
     return read
 
@@ -200,21 +224,17 @@ def _check(connection: Connection, caller: Token, inputs: ExportBlock) -> None:
 
 
 def _run(work: Work) -> Commit:
+    """Export into an archive in the storage; no transaction is open while files are written."""
+    work.progress(0.0, "reading points")
+    with work.database.snapshot() as connection:
+        selected = select_points(connection, work.inputs, MOST_POINTS)
     chips = StoredChips(work.storage)
     try:
         with TemporaryDirectory(prefix="amers-export-") as scratch:
             folder = Path(scratch) / "block"
-            with work.database.transaction() as connection:
-                written = export_block(
-                    connection,
-                    chips,
-                    work.inputs,
-                    folder,
-                    MOST_POINTS,
-                    part_of(work.progress, 0.0, 0.8),
-                )
+            n_points = write_selected(selected, chips, folder, part_of(work.progress, 0.1, 0.7))
             archive = Path(scratch) / ARCHIVE
-            # Stored, not deflated: chips are noise to a compressor, and the block has its checksums.
+            # Stored, not compressed: chips are close to noise, and the block has its checksums.
             with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as packed:
                 for path in sorted(folder.rglob("*")):
                     packed.write(path, path.relative_to(folder.parent))
@@ -224,7 +244,7 @@ def _run(work: Work) -> Commit:
         chips.close()
 
     def commit(connection: Connection) -> dict[str, Any]:
-        return {"points": written, "files": {ARCHIVE: key}}
+        return {"points": n_points, "files": {ARCHIVE: key}}
 
     return commit
 
@@ -235,8 +255,8 @@ EXPORT_BLOCK = Process(
     description="Write the points served in a box, with their chips, as a block to take elsewhere.",
     scope=Scope.READ,
     inputs=ExportBlock,
-    outputs={ARCHIVE: "The block, a zip of its folder."},
+    outputs={ARCHIVE: "The block: a zip of its folder."},
     check=_check,
     run=_run,
-    values={"points": {"type": "integer", "title": "Points that were written"}},
+    values={"points": {"type": "integer", "title": "Points written"}},
 )
