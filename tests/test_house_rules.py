@@ -27,6 +27,7 @@ TOUR = (
 )
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
 FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web"
+EXAMPLES_OF_NAMES = {"match_count", "reported_sigma_m"}
 NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}
 LONGEST_FILE = 500
 
@@ -34,6 +35,16 @@ LONGEST_FILE = 500
 def modules() -> Iterator[Path]:
     for package in ("app", "services", "migrations"):
         yield from sorted((ROOT / package).rglob("*.py"))
+
+
+def sources() -> Iterator[Path]:
+    """Every text of the product and its tests that names things."""
+    yield from ROOT.glob("*.yml")
+    for folder in FOLDERS.replace("docs|", "").split("|"):
+        for path in (ROOT / folder).rglob("*"):
+            generated = {"built", "node_modules"} & set(path.parts)
+            if path.suffix in {".py", ".sql", ".ts", ".html"} and not generated:
+                yield path
 
 
 def commands() -> list[str]:
@@ -79,6 +90,15 @@ def test_every_file_that_a_document_names_exists(document):
     paths = re.findall(rf"`((?:{FOLDERS})/[\w./-]+)`", text)
     real = [path for path in paths if not re.search("NAME|NNNN|built|results", path)]
     assert [path for path in real if not (ROOT / path).exists()] == []
+
+
+def test_every_name_that_a_document_uses_exists_in_the_code():
+    """Of columns, parameters, options: words in code style with an underscore."""
+    words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in sources())))
+    for document in DOCUMENTS:
+        code = " ".join(re.findall(r"`([^`\n]+)`", document.read_text()))
+        names = set(re.findall(r"(?<![\w/.-])[a-z]+(?:_[a-z0-9]+)+(?!\w)", code))
+        assert names - words - EXAMPLES_OF_NAMES == set(), document
 
 
 @pytest.mark.parametrize("name", Settings.model_fields)
