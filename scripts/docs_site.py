@@ -74,27 +74,33 @@ def reference_page(page: str, modules: list[str]) -> str:
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the entries of the navigation that stand for all pages of a folder."""
-    filled = {
-        "library/": [f"library/{page}.md" for page in library()],
-        "decisions/": sorted(
-            f"decisions/{path.name}" for path in (ROOT / "docs/decisions").glob("*.md")
-        ),
-    }
+    decisions = sorted(f"decisions/{path.name}" for path in (ROOT / "docs/decisions").glob("*.md"))
+    filled = {"decisions/": decisions, "library/": [f"library/{page}.md" for page in library()]}
     for section in config.nav or []:
-        for title, entry in section.items():
-            if isinstance(entry, str) and entry in filled:
-                section[title] = filled[entry]
+        for title, entries in section.items():
+            if isinstance(entries, list):
+                section[title] = [page for entry in entries for page in filled.get(str(entry), [entry])]
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the documents that lie outside docs/ and the pages of the reference."""
     for source, page in PAGES.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text()))
+        files.append(
+            File.generated(config, page, content=(ROOT / source).read_text() + listings(source))
+        )
     for page, modules in library().items():
         name = f"library/{page}.md"
         files.append(File.generated(config, name, content=reference_page(page, modules)))
     return files
+
+
+def listings(source: str) -> str:
+    """Markdown of the scripts beside a document: the examples; nothing for other documents."""
+    if source != "examples/README.md":
+        return ""
+    scripts = sorted((ROOT / source).parent.glob("*.py"))
+    return "".join(f"\n## {path.name}\n\n```python\n{path.read_text()}```\n" for path in scripts)
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
