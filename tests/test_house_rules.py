@@ -92,6 +92,12 @@ def test_every_file_that_a_document_names_exists(document):
     assert [path for path in real if not (ROOT / path).exists()] == []
 
 
+def test_the_glossary_defines_a_term_once():
+    terms = re.findall(r"^\| \*\*(.+?)\*\*", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    names = [name for term in terms for name in term.split(", ")]
+    assert sorted(set(names)) == sorted(names)
+
+
 def test_every_name_that_a_document_uses_exists_in_the_code():
     """Of columns, parameters, options: words in code style with an underscore."""
     words = set(re.findall(r"\w+", "\n".join(path.read_text() for path in sources())))
