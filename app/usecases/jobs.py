@@ -18,8 +18,9 @@ from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
 from app.db.jobs import progress as job_progress
 from app.db.jobs.attempts import LostJob
-from app.db.jobs.jobs import Job, JobFilter, Response
+from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage
+from app.db.schema import JobResponse
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
@@ -54,7 +55,7 @@ class JobRequest:
     process_id: str
     inputs: dict[str, Any]
     outputs: Mapping[str, str] | None = None
-    response: Response = "document"
+    response: JobResponse = "document"
 
 
 def find_process(process_id: str) -> Process:

@@ -1,73 +1,69 @@
-"""Attempts at jobs: claimed under a lease, they report, end well or badly, or are given up.
+"""Attempts at jobs: an attempt is claimed under a lease, reports progress, and succeeds, fails or ends.
 
-Whatever an attempt writes names its number and is refused once the job has gone on without it, so that a
-worker that comes back from the dead changes nothing.
+Each write of an attempt names its number. It is refused once the job has gone on without that attempt:
+a worker that was believed dead changes nothing.
 """
 
 from datetime import timedelta
 from typing import Any
 from uuid import UUID
 
-from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
+from sqlalchemy import func, select, update
 
 from app.db.engine import Connection
 from app.db.jobs.jobs import COLUMNS, Job
 from app.db.jobs.queue import enqueue
+from app.db.rows import every, first
+from app.db.schema import clock, job
 
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 
 
 class LostJob(Exception):
-    """The job went on without this attempt: dismissed, or taken over."""
+    """The job went on without this attempt: it was dismissed, or another worker took it over."""
 
 
 def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> Job | None:
-    """Begin the next attempt of an accepted job; None when it is not there to be taken."""
-    with connection.cursor(row_factory=class_row(Job)) as cursor:
-        return cursor.execute(
-            f"""update job set state = 'running', attempt = attempt + 1, worker = %s,
-                lease_until = clock_timestamp() + %s, progress = 0, message = 'started',
-                claimed_at = clock_timestamp(),
-                started_at = coalesce(started_at, clock_timestamp()), updated_at = clock_timestamp()
-            where id = %s and state = 'accepted' returning {COLUMNS}""",
-            (worker, timedelta(seconds=lease_s), job_id),
-        ).fetchone()
+    """Start the next attempt at an accepted job; None when the job cannot be claimed."""
+    claimed = connection.execute(
+        update(job)
+        .where(job.c.id == job_id, job.c.state == "accepted")
+        .values(
+            state="running",
+            attempt=job.c.attempt + 1,
+            worker=worker,
+            lease_until=clock + timedelta(seconds=lease_s),
+            progress=0,
+            message="started",
+            claimed_at=clock,
+            started_at=func.coalesce(job.c.started_at, clock),
+            updated_at=clock,
+        )
+        .returning(*COLUMNS)
+    )
+    return first(Job, claimed)
 
 
 def renew(connection: Connection, job_id: UUID, attempt: int, lease_s: float) -> None:
-    """Prolong the lease of an attempt.
+    """Extend the lease of an attempt.
 
     Raises:
         LostJob: the attempt is over.
     """
-    _write(
-        connection,
-        job_id,
-        attempt,
-        "lease_until = clock_timestamp() + %(lease)s",
-        lease=timedelta(seconds=lease_s),
-    )
+    _write(connection, job_id, attempt, lease_until=clock + timedelta(seconds=lease_s))
 
 
 def report(connection: Connection, job_id: UUID, attempt: int, percent: int, message: str) -> None:
-    """Say where an attempt stands.
+    """Record the progress of an attempt.
 
     Raises:
         LostJob: the attempt is over.
     """
-    _write(
-        connection,
-        job_id,
-        attempt,
-        "progress = %(percent)s, message = %(message)s",
-        percent=percent,
-        message=message,
-    )
+    _write(connection, job_id, attempt, progress=percent, message=message)
 
 
 def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[str, Any]) -> None:
-    """End a job well; belongs into the transaction that writes its results, as the last statement.
+    """End a job with its results; the last statement of the transaction that writes them.
 
     Raises:
         LostJob: the attempt is over; the transaction must be rolled back.
@@ -76,14 +72,18 @@ def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[st
         connection,
         job_id,
         attempt,
-        """state = 'successful', progress = 100, message = 'done', results = %(results)s, error = null,
-           lease_until = null, finished_at = clock_timestamp()""",
-        results=Jsonb(results),
+        state="successful",
+        progress=100,
+        message="done",
+        results=results,
+        error=None,
+        lease_until=None,
+        finished_at=clock,
     )
 
 
 def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, Any]) -> None:
-    """End a job for good, with problem details that tell its owner why.
+    """End a job for good, with problem details for its owner.
 
     Raises:
         LostJob: the attempt is over.
@@ -92,10 +92,11 @@ def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, An
         connection,
         job_id,
         attempt,
-        """state = 'failed', message = %(message)s, error = %(error)s, lease_until = null,
-           finished_at = clock_timestamp()""",
+        state="failed",
         message=error.get("detail", error["title"]),
-        error=Jsonb(error),
+        error=error,
+        lease_until=None,
+        finished_at=clock,
     )
 
 
@@ -109,13 +110,16 @@ def give_back(connection: Connection, job_id: UUID, attempt: int) -> None:
         connection,
         job_id,
         attempt,
-        "state = 'accepted', message = 'waiting for a worker', lease_until = null, worker = null",
+        state="accepted",
+        message="waiting for a worker",
+        lease_until=None,
+        worker=None,
     )
     enqueue(connection, job_id)
 
 
 def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float) -> None:
-    """Return a job whose attempt ended without an outcome, to be done after a delay.
+    """Return a job whose attempt ended without an outcome, for another attempt after a delay.
 
     Raises:
         LostJob: the attempt is over.
@@ -124,8 +128,11 @@ def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float
         connection,
         job_id,
         attempt,
-        """state = 'accepted', failures = failures + 1, lease_until = null, worker = null,
-           message = 'broke off, waiting for the next attempt'""",
+        state="accepted",
+        failures=job.c.failures + 1,
+        lease_until=None,
+        worker=None,
+        message="broke off, waiting for the next attempt",
     )
     enqueue(connection, job_id, delay_s)
 
@@ -135,45 +142,57 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
 
     Rows that are being written are left to their writers.
     """
-    with connection.cursor(row_factory=class_row(Job)) as cursor:
-        lapsed = cursor.execute(
-            f"""update job set failures = failures + 1, lease_until = null, worker = null,
-                    state = 'accepted', message = 'the worker was lost, waiting for another',
-                    updated_at = clock_timestamp()
-                where id in (select id from job
-                             where state = 'running' and lease_until < clock_timestamp()
-                             for update skip locked)
-                returning {COLUMNS}"""
-        ).fetchall()
-    for job in lapsed:
-        if job.failures < failures_allowed:
-            enqueue(connection, job.id)
-            continue
-        detail = f"the worker died {job.failures} times while it did this job"
+    over = (
+        select(job.c.id)
+        .where(job.c.state == "running", job.c.lease_until < clock)
+        .with_for_update(skip_locked=True)
+    )
+    lapsed = every(
+        Job,
         connection.execute(
-            """update job set state = 'failed', message = %s, error = %s, finished_at = clock_timestamp()
-               where id = %s""",
-            (detail, Jsonb({**LOST_WORKER, "detail": detail, "failures": job.failures}), job.id),
+            update(job)
+            .where(job.c.id.in_(over))
+            .values(
+                failures=job.c.failures + 1,
+                lease_until=None,
+                worker=None,
+                state="accepted",
+                message="the worker was lost, waiting for another",
+                updated_at=clock,
+            )
+            .returning(*COLUMNS)
+        ),
+    )
+    for lost in lapsed:
+        if lost.failures < failures_allowed:
+            enqueue(connection, lost.id)
+            continue
+        detail = f"the worker died {lost.failures} times while it did this job"
+        error = {**LOST_WORKER, "detail": detail, "failures": lost.failures}
+        connection.execute(
+            update(job)
+            .where(job.c.id == lost.id)
+            .values(state="failed", message=detail, error=error, finished_at=clock)
         )
-    return [job.id for job in lapsed]
+    return [lost.id for lost in lapsed]
 
 
 def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int]:
-    """The attempt of each of some jobs that is under way or succeeded, if its results are kept."""
-    rows = connection.execute(
-        "select id, attempt from job where id = any(%s) and results_removed_at is null"
-        " and state in ('running', 'successful')",
-        [job_ids],
+    """The attempt of each of some jobs that runs or succeeded, if its results are kept."""
+    statement = select(job.c.id, job.c.attempt).where(
+        job.c.id.in_(job_ids),
+        job.c.results_removed_at.is_(None),
+        job.c.state.in_(("running", "successful")),
     )
-    return {row["id"]: row["attempt"] for row in rows}
+    return {row.id: row.attempt for row in connection.execute(statement)}
 
 
-def _write(connection: Connection, job_id: UUID, attempt: int, assignments: str, **values: Any) -> None:
+def _write(connection: Connection, job_id: UUID, attempt: int, **values: Any) -> None:
     """Change the row of a running job if the attempt is still the one that counts."""
     written = connection.execute(
-        f"""update job set {assignments}, updated_at = clock_timestamp()
-            where id = %(id)s and attempt = %(attempt)s and state = 'running'""".encode(),
-        {"id": job_id, "attempt": attempt, **values},
+        update(job)
+        .where(job.c.id == job_id, job.c.attempt == attempt, job.c.state == "running")
+        .values(**values, updated_at=clock)
     )
     if written.rowcount != 1:
         raise LostJob(f"attempt {attempt} of job {job_id} is over")

@@ -1,22 +1,21 @@
-"""Jobs: what was asked for, and where it stands."""
+"""Jobs: what was requested, and its state."""
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Any, Literal
+from typing import Any
 from uuid import UUID, uuid4
 
-from psycopg.rows import class_row, scalar_row
-from psycopg.types.json import Jsonb
+from sqlalchemy import ColumnElement, extract, func, select, tuple_, update
+from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
 from app.db.jobs.queue import enqueue
+from app.db.rows import columns_of, every, first
+from app.db.schema import JobResponse, JobState, clock, job
 
-JobState = Literal["accepted", "running", "successful", "failed", "dismissed"]
-Response = Literal["document", "raw"]
-
-DURATION_S = "extract(epoch from coalesce(finished_at, clock_timestamp()) - started_at)"
-COLUMNS = """id, kind, state, progress, message, inputs, outputs, response, owner, attempt, failures,
-    created_at, claimed_at, started_at, finished_at, updated_at, error, results, results_removed_at"""
+OPEN: tuple[JobState, ...] = ("accepted", "running")
+"""States of jobs that have not ended."""
+DURATION_S = extract("epoch", func.coalesce(job.c.finished_at, clock) - job.c.started_at)
 
 
 @dataclass(frozen=True)
@@ -24,18 +23,17 @@ class Job:
     """One row of the table.
 
     Attributes:
-        kind: the process that was asked for.
+        kind: the process.
         progress: percent.
-        inputs: what it was asked with.
-        outputs: name of each output asked for, to how it shall be sent; None: all of them.
-        response: whether results are told in a document or sent as they are.
-        owner: the token that asked; None for the command line.
+        outputs: name of each requested output, to its form; None: all of them.
+        response: whether the results are returned in a document or as they are.
+        owner: the token of the request; None for the command line.
         attempt: number of the last claim.
         failures: attempts that ended without an outcome: a crash, an outage, a lost worker.
         claimed_at, started_at: when the last attempt began, and the first.
         error: problem details of a failure.
         results: what a successful job made.
-        results_removed_at: when the files of the results went.
+        results_removed_at: when the files of the results were removed.
     """
 
     id: UUID
@@ -45,7 +43,7 @@ class Job:
     message: str
     inputs: dict[str, Any]
     outputs: dict[str, str] | None
-    response: Response
+    response: JobResponse
     owner: UUID | None
     attempt: int
     failures: int
@@ -65,8 +63,8 @@ class JobFilter:
 
     Attributes:
         kinds: processes.
-        since, until: when they were asked for.
-        min_duration_s, max_duration_s: from the beginning of the first attempt to the end, or to now.
+        since, until: when they were created.
+        min_duration_s, max_duration_s: from the start of the first attempt to the end, or to now.
     """
 
     kinds: tuple[str, ...] = ()
@@ -77,6 +75,9 @@ class JobFilter:
     max_duration_s: float | None = None
 
 
+COLUMNS = columns_of(Job, job)
+
+
 def create(
     connection: Connection,
     kind: str,
@@ -84,39 +85,47 @@ def create(
     owner: UUID | None = None,
     idempotency_key: str | None = None,
     outputs: dict[str, str] | None = None,
-    response: Response = "document",
+    response: JobResponse = "document",
 ) -> Job | None:
     """A new accepted job, in the queue once the transaction is committed.
 
     Returns:
         None when the owner has used the idempotency key before.
     """
-    job = _one(
-        connection,
-        f"""insert into job (id, kind, state, progress, message, inputs, outputs, response, owner,
-                idempotency_key)
-            values (%s, %s, 'accepted', 0, 'waiting for a worker', %s, %s, %s, %s, %s)
-            on conflict (owner, idempotency_key) do nothing returning {COLUMNS}""",
-        (uuid4(), kind, Jsonb(inputs), None if outputs is None else Jsonb(outputs), response)
-        + (owner, idempotency_key),
+    statement = (
+        insert(job)
+        .values(
+            id=uuid4(),
+            kind=kind,
+            state="accepted",
+            progress=0,
+            message="waiting for a worker",
+            inputs=inputs,
+            outputs=outputs,
+            response=response,
+            owner=owner,
+            idempotency_key=idempotency_key,
+        )
+        .on_conflict_do_nothing(index_elements=[job.c.owner, job.c.idempotency_key])
+        .returning(*COLUMNS)
     )
-    if job is not None:
-        enqueue(connection, job.id)
-    return job
+    created = first(Job, connection.execute(statement))
+    if created is not None:
+        enqueue(connection, created.id)
+    return created
 
 
 def find(connection: Connection, job_id: UUID) -> Job | None:
-    """The job of that number."""
-    return _one(connection, f"select {COLUMNS} from job where id = %s", (job_id,))
+    """The job with that id."""
+    return first(Job, connection.execute(select(*COLUMNS).where(job.c.id == job_id)))
 
 
 def find_by_key(connection: Connection, owner: UUID | None, idempotency_key: str) -> Job | None:
-    """The job an owner asked for with that key."""
-    return _one(
-        connection,
-        f"select {COLUMNS} from job where owner is not distinct from %s and idempotency_key = %s",
-        (owner, idempotency_key),
+    """The job that an owner created with that key."""
+    statement = select(*COLUMNS).where(
+        job.c.owner.is_not_distinct_from(owner), job.c.idempotency_key == idempotency_key
     )
+    return first(Job, connection.execute(statement))
 
 
 def newest(
@@ -129,58 +138,68 @@ def newest(
     """The last jobs of an owner, or of everybody for None; newest first.
 
     Args:
-        after: the page begins behind this job.
+        after: the page starts behind this job.
     """
-    with connection.cursor(row_factory=class_row(Job)) as cursor:
-        return cursor.execute(
-            f"""select {COLUMNS} from job
-                where (%(owner)s::uuid is null or owner = %(owner)s)
-                  and (%(kinds)s::text[] is null or kind = any(%(kinds)s))
-                  and (%(states)s::text[] is null or state = any(%(states)s))
-                  and created_at between coalesce(%(since)s::timestamptz, '-infinity')
-                                     and coalesce(%(until)s::timestamptz, 'infinity')
-                  and (%(least)s::float8 is null or {DURATION_S} >= %(least)s)
-                  and (%(most)s::float8 is null or {DURATION_S} <= %(most)s)
-                  and (%(after)s::uuid is null
-                       or (created_at, id) < (select created_at, id from job where id = %(after)s))
-                order by created_at desc, id desc limit %(limit)s""",
-            {
-                "owner": owner,
-                "kinds": list(wanted.kinds) or None,
-                "states": list(wanted.states) or None,
-                "since": wanted.since,
-                "until": wanted.until,
-                "least": wanted.min_duration_s,
-                "most": wanted.max_duration_s,
-                "limit": limit,
-                "after": after,
-            },
-        ).fetchall()
+    conditions = _conditions(wanted)
+    if owner is not None:
+        conditions.append(job.c.owner == owner)
+    if after is not None:
+        last = job.alias("last")
+        key = select(last.c.created_at, last.c.id).where(last.c.id == after).scalar_subquery()
+        conditions.append(tuple_(job.c.created_at, job.c.id) < key)
+    statement = (
+        select(*COLUMNS)
+        .where(*conditions)
+        .order_by(job.c.created_at.desc(), job.c.id.desc())
+        .limit(limit)
+    )
+    return every(Job, connection.execute(statement))
 
 
 def dismiss(connection: Connection, job_id: UUID) -> bool:
-    """End a job nobody wants any more; whoever works on it finds out at its next write."""
-    done = connection.execute(
-        """update job set state = 'dismissed', message = 'dismissed',
-               lease_until = null, finished_at = clock_timestamp(), updated_at = clock_timestamp()
-           where id = %s and state in ('accepted', 'running')""",
-        (job_id,),
+    """End a job that nobody wants any more; its worker notices at its next write."""
+    dismissed = connection.execute(
+        update(job)
+        .where(job.c.id == job_id, job.c.state.in_(OPEN))
+        .values(
+            state="dismissed",
+            message="dismissed",
+            lease_until=None,
+            finished_at=clock,
+            updated_at=clock,
+        )
     )
-    return done.rowcount == 1
+    return dismissed.rowcount == 1
 
 
 def remove_old_results(connection: Connection, older_than_s: float) -> list[UUID]:
     """Give up the results of jobs that ended so long ago; their files are swept, the jobs stay."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        removed: list[UUID] = cursor.execute(
-            """update job set results_removed_at = clock_timestamp()
-               where state = 'successful' and results_removed_at is null and results ? 'files'
-                 and finished_at < clock_timestamp() - %s returning id""",
-            (timedelta(seconds=older_than_s),),
-        ).fetchall()
-    return removed
+    removed = connection.execute(
+        update(job)
+        .where(
+            job.c.state == "successful",
+            job.c.results_removed_at.is_(None),
+            job.c.results.has_key("files"),
+            job.c.finished_at < clock - timedelta(seconds=older_than_s),
+        )
+        .values(results_removed_at=clock)
+        .returning(job.c.id)
+    )
+    return list(removed.scalars())
 
 
-def _one(connection: Connection, query: str, values: tuple[Any, ...]) -> Job | None:
-    with connection.cursor(row_factory=class_row(Job)) as cursor:
-        return cursor.execute(query.encode(), values).fetchone()
+def _conditions(wanted: JobFilter) -> list[ColumnElement[bool]]:
+    conditions: list[ColumnElement[bool]] = []
+    if wanted.kinds:
+        conditions.append(job.c.kind.in_(wanted.kinds))
+    if wanted.states:
+        conditions.append(job.c.state.in_(wanted.states))
+    if wanted.since is not None:
+        conditions.append(job.c.created_at >= wanted.since)
+    if wanted.until is not None:
+        conditions.append(job.c.created_at <= wanted.until)
+    if wanted.min_duration_s is not None:
+        conditions.append(wanted.min_duration_s <= DURATION_S)
+    if wanted.max_duration_s is not None:
+        conditions.append(wanted.max_duration_s >= DURATION_S)
+    return conditions

@@ -1,24 +1,29 @@
-"""The queue that workers take jobs from: one entry a job, or more, which do no harm."""
+"""The queue that workers take jobs from; a second entry of the same job does no harm."""
 
-from datetime import timedelta
 from uuid import UUID
 
 import procrastinate
-from psycopg.rows import scalar_row
+from sqlalchemy import func, select, update
 
 from app.db.engine import Connection, driver
+from app.db.schema import clock, job
+from app.db.statements import named
 
 QUEUE = "amers"
 TASK = "amers:job"
 SWEEP_LOCK = 0x414D4552
 """Advisory lock that keeps two workers from sweeping at once."""
 
+FORGOTTEN_JOBS = named("jobs.sql", "forgotten_jobs")
+PRUNE_SILENT_WORKERS = named("jobs.sql", "prune_silent_workers")
+DELETE_DEAD_ENTRIES = named("jobs.sql", "delete_dead_entries")
+
 queue = procrastinate.App(connector=procrastinate.SyncPsycopgConnector())
-"""Only writes queue entries, through the connection of the caller's transaction; it is never opened."""
+"""Writes queue entries through the connection of the caller's transaction; it is never opened."""
 
 
 def enqueue(connection: Connection, job_id: UUID, delay_s: float = 0.0) -> None:
-    """Put a job into the queue; a job that is in it twice is done once."""
+    """Put a job into the queue, in the transaction of its row; a job with two entries is done once."""
     queue.configure_task(
         TASK,
         queue=QUEUE,
@@ -28,32 +33,20 @@ def enqueue(connection: Connection, job_id: UUID, delay_s: float = 0.0) -> None:
 
 
 def enqueue_forgotten(connection: Connection, after_s: float) -> list[UUID]:
-    """Put accepted jobs into the queue that are in it no longer, for instance after a restore."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        forgotten: list[UUID] = cursor.execute(
-            """select id from job where state = 'accepted' and updated_at < clock_timestamp() - %s
-               and not exists (select from procrastinate_jobs where task_name = %s and status = 'todo'
-                               and args ->> 'job_id' = job.id::text)
-               for update skip locked""",
-            (timedelta(seconds=after_s), TASK),
-        ).fetchall()
+    """Put accepted jobs into the queue that it does not have any more, for instance after a restore."""
+    forgotten = list(connection.scalars(FORGOTTEN_JOBS, {"after_s": after_s, "task": TASK}))
     for job_id in forgotten:
-        connection.execute("update job set updated_at = clock_timestamp() where id = %s", (job_id,))
+        connection.execute(update(job).where(job.c.id == job_id).values(updated_at=clock))
         enqueue(connection, job_id)
     return forgotten
 
 
 def forget_dead_entries(connection: Connection, silent_s: float) -> None:
-    """Delete the queue entries that died with their workers; the jobs themselves are taken back."""
-    connection.execute("select * from procrastinate_prune_stalled_workers_v1(%s)", (silent_s,))
-    connection.execute(
-        "delete from procrastinate_jobs where task_name = %s and status = 'doing' and worker_id is null",
-        (TASK,),
-    )
+    """Delete the queue entries of dead workers; the jobs themselves are taken back."""
+    connection.execute(PRUNE_SILENT_WORKERS, {"silent_s": silent_s})
+    connection.execute(DELETE_DEAD_ENTRIES, {"task": TASK})
 
 
 def may_sweep(connection: Connection) -> bool:
-    """Whether nobody else sweeps; holds until the end of the transaction."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        cursor.execute("select pg_try_advisory_xact_lock(%s)", (SWEEP_LOCK,))
-        return bool(cursor.fetchone())
+    """Whether nobody else sweeps; true until the end of the transaction."""
+    return bool(connection.scalar(select(func.pg_try_advisory_xact_lock(SWEEP_LOCK))))

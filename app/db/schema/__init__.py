@@ -8,7 +8,17 @@ The tables of the queue belong to procrastinate and are not described here.
 """
 
 from app.db.schema.access import audit, installation, token, uptime
-from app.db.schema.base import BlockState, JobResponse, JobState, SceneState, UploadPurpose, metadata
+from app.db.schema.base import (
+    BlockState,
+    JobResponse,
+    JobState,
+    SceneState,
+    UploadPurpose,
+    clock,
+    metadata,
+    now,
+    uptime_s,
+)
 from app.db.schema.jobs import job, job_message, scene, upload
 from app.db.schema.points import block, chip_file, density_cell, image, point, view
 from app.db.schema.registrations import (
@@ -30,6 +40,7 @@ __all__ = [
     "audit",
     "block",
     "chip_file",
+    "clock",
     "density_cell",
     "image",
     "installation",
@@ -37,6 +48,7 @@ __all__ = [
     "job_message",
     "measure",
     "metadata",
+    "now",
     "point",
     "point_history",
     "reference_image",
@@ -46,6 +58,7 @@ __all__ = [
     "token",
     "upload",
     "uptime",
+    "uptime_s",
     "view",
     "view_history",
     "view_measure",

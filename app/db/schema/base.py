@@ -34,7 +34,7 @@ PointZ = Geometry("POINTZ", srid=4979, dimension=3, spatial_index=False)
 
 now = func.now()
 # Rows written in one transaction differ in this one.
-clock = func.clock_timestamp()
+clock = func.clock_timestamp(type_=Timestamp)
 uptime_s = func.uptime_s()
 
 
