@@ -6,7 +6,8 @@ from uuid import UUID
 from fastapi import APIRouter, Depends, Query, Request
 
 from app.api.deps import DatabaseDep, Reader
-from app.db.jobs.jobs import Job, JobFilter, JobState
+from app.db.jobs.jobs import Job, JobFilter
+from app.db.schema import JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs
 from app.usecases.features.query import parse_interval

@@ -5,9 +5,11 @@ from datetime import datetime
 from typing import Any, Literal
 from uuid import UUID
 
-from psycopg.rows import class_row
+from sqlalchemy import func, select
 
 from app.db.engine import Connection
+from app.db.rows import columns_of, every
+from app.db.schema import audit, job
 
 KINDS = ("token", "block", "scene", "job", "point", "reference_image")
 
@@ -17,12 +19,12 @@ class Change:
     """One row of the record.
 
     Attributes:
-        actor: id of the token behind it: that of the caller, else that of the owner of the job.
+        actor: id of the token of the caller, else of the owner of the job.
         actor_name: of the caller, or who ran the command.
-        request_id, job_id: what it was done for, None when for neither.
+        request_id, job_id: the request or job that made the change; None for neither.
         kind: table.
         subject: id of the row; ID@VERSION of a block.
-        before, after: what is recorded of the row; None where it did not exist.
+        before, after: recorded columns of the row; None where it did not exist.
     """
 
     id: int
@@ -38,6 +40,9 @@ class Change:
     after: dict[str, Any] | None
 
 
+COLUMNS = columns_of(Change, audit, actor=func.coalesce(audit.c.actor, job.c.owner))
+
+
 def list_changes(
     connection: Connection, limit: int, before: int | None, kind: str | None, subject: str | None
 ) -> list[Change]:
@@ -47,14 +52,16 @@ def list_changes(
         before: changes with smaller ids only.
         kind, subject: None for all.
     """
-    with connection.cursor(row_factory=class_row(Change)) as cursor:
-        return cursor.execute(
-            """select a.id, a.at, coalesce(a.actor, j.owner) as actor, a.actor_name, a.request_id,
-                   a.job_id, a.kind, a.subject, a.action, a.before, a.after
-               from audit a left join job j on j.id = a.job_id
-               where (%(before)s::bigint is null or a.id < %(before)s)
-                   and (%(kind)s::text is null or a.kind = %(kind)s)
-                   and (%(subject)s::text is null or a.subject = %(subject)s)
-               order by a.id desc limit %(limit)s""",
-            {"limit": limit, "before": before, "kind": kind, "subject": subject},
-        ).fetchall()
+    statement = (
+        select(*COLUMNS)
+        .select_from(audit.outerjoin(job, job.c.id == audit.c.job_id))
+        .order_by(audit.c.id.desc())
+        .limit(limit)
+    )
+    if before is not None:
+        statement = statement.where(audit.c.id < before)
+    if kind is not None:
+        statement = statement.where(audit.c.kind == kind)
+    if subject is not None:
+        statement = statement.where(audit.c.subject == subject)
+    return every(Change, connection.execute(statement))

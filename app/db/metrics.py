@@ -2,7 +2,13 @@
 
 from dataclasses import dataclass
 
+from sqlalchemy import func, select
+
 from app.db.engine import Connection
+from app.db.schema import block, job
+from app.db.statements import named
+
+INSTALLATION = named("metrics.sql", "installation")
 
 
 @dataclass(frozen=True)
@@ -28,20 +34,10 @@ class Gauges:
 
 def read_gauges(connection: Connection) -> Gauges:
     """The figures of this moment."""
-    jobs = connection.execute("select kind, state, count(*) as n from job group by kind, state")
-    blocks = connection.execute("select state, count(*) as n from block group by state")
-    row = connection.execute(
-        """select
-            (select coalesce(extract(epoch from clock_timestamp() - min(created_at)), 0)
-                from job where state = 'accepted')::float8 as oldest_waiting_s,
-            (select count(*) from procrastinate_jobs where status = 'todo') as queue,
-            (select coalesce(sum(n_points - n_unserved), 0) from block
-                where state = 'published')::bigint as points,
-            pg_database_size(current_database()) as database_bytes"""
-    ).fetchone()
-    assert row is not None
+    jobs = select(job.c.kind, job.c.state, func.count().label("n")).group_by(job.c.kind, job.c.state)
+    blocks = select(block.c.state, func.count().label("n")).group_by(block.c.state)
     return Gauges(
-        jobs={(one["kind"], one["state"]): one["n"] for one in jobs},
-        blocks={one["state"]: one["n"] for one in blocks},
-        **row,
+        jobs={(row.kind, row.state): row.n for row in connection.execute(jobs)},
+        blocks={row.state: row.n for row in connection.execute(blocks)},
+        **connection.execute(INSTALLATION).one()._mapping,
     )

@@ -5,17 +5,21 @@ from datetime import datetime
 
 import numpy as np
 import shapely
-from psycopg.rows import class_row
+from sqlalchemy import JSON, Numeric, bindparam, cast, delete, func, insert, select
+from sqlalchemy.dialects import postgresql
 
 from app.db.engine import Connection
 from app.db.features.antimeridian import TURNS_DEG, on_the_map
+from app.db.rows import columns_of, every, first
+from app.db.schema import reference_image, reference_point
+from app.db.statements import named
 from services.types import Array, BoolArray, IntArray
 
-COLUMNS = """id, name, image, dem, vertical, geoid, sigma_m, gsd_m, created_at,
-    st_asgeojson(footprint, 7)::json as footprint"""
+FEW_ATTEMPTS = 3
+"""A place with so many attempts, fewer than half of them successful, is left out."""
 
-FEW_TRIES = 3
-"""A place that was looked for so often and found in less than half of the scenes is left out."""
+PLACES_INSIDE = named("references.sql", "places_inside")
+COUNT_PLACES = named("references.sql", "count_places")
 
 
 @dataclass(frozen=True)
@@ -23,12 +27,12 @@ class ReferenceRow:
     """A reference image; paths are below AMERS_REFERENCE_FOLDER.
 
     Attributes:
-        name: for people, of one reference.
+        name: unique, for people.
         image: the ortho-image.
         dem: heights of the same place; None: only ortho-images can be registered on it.
-        vertical, geoid: what the heights are counted from, when their file does not say.
-        sigma_m: how well it lies on the Earth as a whole, one standard deviation a coordinate; None
-            when unknown.
+        vertical, geoid: vertical datum of the heights, when their file does not name it.
+        sigma_m: absolute accuracy of the whole image, one standard deviation per coordinate; None when
+            unknown.
         gsd_m: its ground sampling.
         footprint: GeoJSON.
     """
@@ -46,8 +50,8 @@ class ReferenceRow:
 
 
 @dataclass(frozen=True)
-class HomologousPlaces:
-    """n places of a reference that scenes were looked for at.
+class ReferencePlaces:
+    """n places of a reference image where scenes were matched.
 
     Attributes:
         id: (n,) int64.
@@ -56,6 +60,13 @@ class HomologousPlaces:
 
     id: IntArray
     lon_lat_h: Array
+
+
+COLUMNS = columns_of(
+    ReferenceRow,
+    reference_image,
+    footprint=cast(func.ST_AsGeoJSON(reference_image.c.footprint, 7), JSON),
+)
 
 
 def insert_reference(
@@ -75,90 +86,108 @@ def insert_reference(
     Args:
         outline: (m, 2) lon, lat, not closed.
     """
-    with connection.cursor(row_factory=class_row(ReferenceRow)) as cursor:
-        return cursor.execute(
-            f"""insert into reference_image
-                    (name, image, dem, vertical, geoid, sigma_m, gsd_m, footprint)
-                values (%s, %s, %s, %s, %s, %s, %s, st_geomfromwkb(%s, 4326))
-                on conflict (name) do nothing returning {COLUMNS}""",
-            [name, image, dem, vertical, geoid, sigma_m, gsd_m, _wkb(outline)],
-        ).fetchone()
+    statement = (
+        postgresql.insert(reference_image)
+        .values(
+            name=name,
+            image=image,
+            dem=dem,
+            vertical=vertical,
+            geoid=geoid,
+            sigma_m=sigma_m,
+            gsd_m=gsd_m,
+            footprint=func.ST_GeomFromWKB(_wkb(outline), 4326),
+        )
+        .on_conflict_do_nothing(index_elements=[reference_image.c.name])
+        .returning(*COLUMNS)
+    )
+    return first(ReferenceRow, connection.execute(statement))
 
 
 def list_references(connection: Connection) -> list[ReferenceRow]:
     """All references, by name."""
-    with connection.cursor(row_factory=class_row(ReferenceRow)) as cursor:
-        return cursor.execute(f"select {COLUMNS} from reference_image order by name").fetchall()
+    statement = select(*COLUMNS).order_by(reference_image.c.name)
+    return every(ReferenceRow, connection.execute(statement))
 
 
 def delete_reference(connection: Connection, name: str) -> bool:
-    """Forget a reference and the places on it; False when there is none of that name."""
-    done = connection.execute("delete from reference_image where name = %s", [name])
-    return done.rowcount == 1
+    """Delete a reference and its places; False when there is none of that name."""
+    deleted = connection.execute(delete(reference_image).where(reference_image.c.name == name))
+    return deleted.rowcount == 1
 
 
 def best_reference(connection: Connection, outline: Array) -> ReferenceRow | None:
-    """The reference that shows most of an outline (m, 2); of those that show as much, the finest."""
-    with connection.cursor(row_factory=class_row(ReferenceRow)) as cursor:
-        return cursor.execute(
-            f"""with asked as (select st_geomfromwkb(%s, 4326) as area, %s::float as area_deg2)
-                select {COLUMNS} from reference_image, asked
-                where st_intersects(footprint, area)
-                order by round((st_area(st_intersection(footprint, area)) / area_deg2)::numeric, 2)
-                    desc, gsd_m, id desc limit 1""",
-            [_wkb_all_round(outline), shapely.Polygon(outline).area],
-        ).fetchone()
+    """The reference that covers most of an outline (m, 2); of equal ones, the finest."""
+    footprint = reference_image.c.footprint
+    area = func.ST_GeomFromWKB(bindparam("area", _wkb_all_round(outline)), 4326)
+    covered = func.ST_Area(func.ST_Intersection(footprint, area)) / shapely.Polygon(outline).area
+    statement = (
+        select(*COLUMNS)
+        .where(func.ST_Intersects(footprint, area))
+        .order_by(
+            func.round(cast(covered, Numeric), 2).desc(),
+            reference_image.c.gsd_m,
+            reference_image.c.id.desc(),
+        )
+        .limit(1)
+    )
+    return first(ReferenceRow, connection.execute(statement))
 
 
 def places_inside(
     connection: Connection, reference_id: int, outline: Array, worthwhile: bool
-) -> HomologousPlaces:
-    """The places of a reference inside an outline (m, 2), those found most often first.
+) -> ReferencePlaces:
+    """The places of a reference inside an outline (m, 2), the most successful first.
 
     Args:
-        worthwhile: without those that are not found any more.
+        worthwhile: without those where scenes are not matched any more.
     """
     area = on_the_map(shapely.Polygon(outline))
     rows = connection.execute(
-        """select id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h from reference_point
-           where reference_id = %s and st_intersects(geom, st_setsrid(st_geomfromwkb(%s), 4979))
-               and not (%s and attempts >= %s and 2 * successes < attempts)
-           order by successes::real / attempts desc, successes desc, id""",
-        [reference_id, shapely.to_wkb(area), worthwhile, FEW_TRIES],
-    ).fetchall()
-    return HomologousPlaces(
-        np.array([row["id"] for row in rows], dtype=np.int64),
-        np.array([(row["lon"], row["lat"], row["h"]) for row in rows], dtype=np.float64).reshape(-1, 3),
+        PLACES_INSIDE,
+        {
+            "reference_id": reference_id,
+            "area": shapely.to_wkb(area),
+            "worthwhile": worthwhile,
+            "few_attempts": FEW_ATTEMPTS,
+        },
+    ).all()
+    return ReferencePlaces(
+        np.array([row.id for row in rows], dtype=np.int64),
+        np.array([(row.lon, row.lat, row.h) for row in rows], dtype=np.float64).reshape(-1, 3),
     )
 
 
-def count_places(connection: Connection, ids: IntArray, found: BoolArray) -> None:
-    """Note of places (n,) that a scene was looked for there, and whether it was found."""
-    connection.execute(
-        """update reference_point p set attempts = attempts + 1, successes = successes + new.found::int,
-               last_success_at = case when new.found then now() else last_success_at end
-           from (select * from unnest(%s::bigint[], %s::bool[]) as n(id, found) order by id) new
-           where p.id = new.id""",
-        [ids.tolist(), found.tolist()],
-    )
+def count_places(connection: Connection, ids: IntArray, successes: BoolArray) -> None:
+    """Count an attempt at each of some places (n,), and where the scene was matched a success."""
+    connection.execute(COUNT_PLACES, {"ids": ids.tolist(), "successes": successes.tolist()})
 
 
 def insert_places(connection: Connection, reference_id: int, lon_lat_h: Array) -> None:
-    """Keep new places (n, 3) that a scene was found by."""
-    with connection.cursor() as cursor:
-        cursor.executemany(
-            """insert into reference_point (reference_id, geom, attempts, successes, last_success_at)
-               values (%s, st_setsrid(st_makepoint(%s, %s, %s), 4979), 1, 1, now())""",
-            [(reference_id, *place) for place in lon_lat_h.tolist()],
-        )
+    """Store new places (n, 3) where a scene was matched."""
+    if len(lon_lat_h) == 0:
+        return
+    place = func.ST_MakePoint(bindparam("lon"), bindparam("lat"), bindparam("h"))
+    statement = insert(reference_point).values(
+        reference_id=reference_id,
+        geom=func.ST_SetSRID(place, 4979),
+        attempts=1,
+        successes=1,
+        last_success_at=func.now(),
+    )
+    connection.execute(
+        statement, [dict(zip(("lon", "lat", "h"), row, strict=True)) for row in lon_lat_h.tolist()]
+    )
 
 
 def lock_reference(connection: Connection, reference_id: int) -> bool:
-    """Let one registration after the other keep its places; False when the reference is gone."""
-    row = connection.execute(
-        "select 1 from reference_image where id = %s for no key update", [reference_id]
-    ).fetchone()
-    return row is not None
+    """Let one registration after the other store its places; False when the reference was deleted."""
+    statement = (
+        select(reference_image.c.id)
+        .where(reference_image.c.id == reference_id)
+        .with_for_update(key_share=True)
+    )
+    return connection.scalar(statement) is not None
 
 
 def _wkb(outline: Array) -> bytes:
@@ -166,9 +195,9 @@ def _wkb(outline: Array) -> bytes:
 
 
 def _wkb_all_round(outline: Array) -> bytes:
-    """An outline a turn to the west, as it is, and a turn to the east.
+    """An outline moved 360 degrees to the west, as it is, and moved to the east.
 
-    Footprints go on beyond 180 degrees on the side where they begin, which may be the other one.
+    A footprint that crosses 180 degrees has longitudes beyond it, on one side or the other.
     """
     around = [shapely.Polygon(outline + [turn, 0.0]) for turn in TURNS_DEG]
     return bytes(shapely.to_wkb(shapely.MultiPolygon(around)))

@@ -5,12 +5,11 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
+from sqlalchemy import exists, func, insert, select, update
 
 from app.db.engine import Connection
-
-COLUMNS = "id, job_id, scene_id, block_versions, options, report, verdict, files, created_at"
+from app.db.rows import columns_of, first
+from app.db.schema import registration
 
 
 @dataclass(frozen=True)
@@ -18,10 +17,9 @@ class RegistrationRow:
     """A registered scene.
 
     Attributes:
-        job_id: the job that did it; a job registers once.
+        job_id: the job that made it; a job registers once.
         block_versions: id and version of every block whose points were used.
-        options: of the registration.
-        report: as `report.json` has it.
+        report: the content of `report.json`.
         files: name to key in the storage.
     """
 
@@ -36,6 +34,9 @@ class RegistrationRow:
     created_at: datetime
 
 
+COLUMNS = columns_of(RegistrationRow, registration)
+
+
 def insert_registration(
     connection: Connection,
     *,
@@ -47,40 +48,37 @@ def insert_registration(
     verdict: str,
     files: dict[str, str],
 ) -> UUID:
-    """Store what a registration found."""
+    """Store a registration; returns its id."""
     registration_id = uuid4()
     connection.execute(
-        "insert into registration"
-        " (id, job_id, scene_id, block_versions, options, report, verdict, files)"
-        " values (%s, %s, %s, %s, %s, %s, %s, %s)",
-        [
-            registration_id,
-            job_id,
-            scene_id,
-            Jsonb(block_versions),
-            Jsonb(options),
-            Jsonb(report),
-            verdict,
-            Jsonb(files),
-        ],
+        insert(registration).values(
+            id=registration_id,
+            job_id=job_id,
+            scene_id=scene_id,
+            block_versions=block_versions,
+            options=options,
+            report=report,
+            verdict=verdict,
+            files=files,
+        )
     )
     return registration_id
 
 
 def claim_scene(connection: Connection, registration_id: UUID, scene_key: str) -> bool:
-    """Let a registration speak for its scene; False when an earlier one does."""
-    connection.execute("select pg_advisory_xact_lock(hashtextextended(%s, 0))", [scene_key])
-    done = connection.execute(
-        """update registration set scene_key = %(key)s, counted = true where id = %(id)s
-           and not exists (select from registration where scene_key = %(key)s and counted)""",
-        {"key": scene_key, "id": registration_id},
+    """Count a registration as the one of its scene; False when an earlier one counts."""
+    connection.execute(select(func.pg_advisory_xact_lock(func.hashtextextended(scene_key, 0))))
+    earlier = registration.alias("earlier")
+    counted = exists(earlier.c.id).where(earlier.c.scene_key == scene_key, earlier.c.counted)
+    claimed = connection.execute(
+        update(registration)
+        .where(registration.c.id == registration_id, ~counted)
+        .values(scene_key=scene_key, counted=True)
     )
-    return done.rowcount == 1
+    return claimed.rowcount == 1
 
 
 def find_by_job(connection: Connection, job_id: UUID) -> RegistrationRow | None:
-    """The registration a job made."""
-    with connection.cursor(row_factory=class_row(RegistrationRow)) as cursor:
-        return cursor.execute(
-            f"select {COLUMNS} from registration where job_id = %s", [job_id]
-        ).fetchone()
+    """The registration that a job made."""
+    statement = select(*COLUMNS).where(registration.c.job_id == job_id)
+    return first(RegistrationRow, connection.execute(statement))

@@ -3,20 +3,17 @@
 import math
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any
 from uuid import UUID, uuid4
 
-from psycopg.rows import class_row, scalar_row
-from psycopg.types.json import Jsonb
+from sqlalchemy import JSON, cast, delete, exists, func, insert, literal, select, update
+from sqlalchemy.dialects.postgresql import JSONB
 
 from app.db.engine import Connection
+from app.db.rows import columns_of, every, first, only
+from app.db.schema import SceneState, hours, now, scene, upload, uptime_s
 from services.types import Acquisition, Array
 
-SceneState = Literal["uploading", "uploaded", "removed"]
-
-COLUMNS = """id, owner, name, state, file_name, file_key, size_bytes, sha256, sigma_m, created_at,
-    removed_at, models, reference, acquired_at, sensor, gsd_m,
-    st_asgeojson(footprint, 7)::json as footprint"""
 LONGEST_UPLOAD_HOURS = 24
 
 
@@ -26,12 +23,12 @@ class SceneRow:
 
     Attributes:
         owner: the token that uploaded it; None for the command line.
-        file_name: of the image, as the storage has it.
-        file_key, size_bytes, sha256: of the image; None while it is on its way, no key once removed.
+        file_name: of the image in the storage.
+        file_key, size_bytes, sha256: of the image; None during the upload; no key after the removal.
         sigma_m: accuracy of the model as the owner states it, metres.
         models: the files beside the image, name to size and checksum.
         reference: path below AMERS_SCENE_FOLDER of an image that was not uploaded.
-        acquired_at, sensor, gsd_m, footprint: what the files say; None before a registration.
+        acquired_at, sensor, gsd_m, footprint: read from the files; None before a registration.
     """
 
     id: UUID
@@ -53,6 +50,9 @@ class SceneRow:
     footprint: dict[str, object] | None
 
 
+COLUMNS = columns_of(SceneRow, scene, footprint=cast(func.ST_AsGeoJSON(scene.c.footprint, 7), JSON))
+
+
 def begin_upload(
     connection: Connection,
     owner: UUID | None,
@@ -61,12 +61,18 @@ def begin_upload(
     sigma_m: float | None,
     announced_bytes: int | None = None,
 ) -> UUID:
-    """A scene whose image is about to arrive."""
+    """Insert a scene whose image will be uploaded; returns its id."""
     scene_id = uuid4()
     connection.execute(
-        "insert into scene (id, owner, name, state, file_name, sigma_m, size_bytes)"
-        " values (%s, %s, %s, 'uploading', %s, %s, %s)",
-        [scene_id, owner, name, file_name, sigma_m, announced_bytes],
+        insert(scene).values(
+            id=scene_id,
+            owner=owner,
+            name=name,
+            state="uploading",
+            file_name=file_name,
+            sigma_m=sigma_m,
+            size_bytes=announced_bytes,
+        )
     )
     return scene_id
 
@@ -74,25 +80,32 @@ def begin_upload(
 def insert_reference(
     connection: Connection, owner: UUID, name: str, path: str, sigma_m: float | None
 ) -> SceneRow:
-    """A scene that stays where it lies, below the folder of the settings."""
-    with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
-        row = cursor.execute(
-            f"""insert into scene (id, owner, name, state, file_name, reference, sigma_m)
-                values (%s, %s, %s, 'uploaded', %s, %s, %s) returning {COLUMNS}""",
-            [uuid4(), owner, name, name, path, sigma_m],
-        ).fetchone()
-    assert row is not None
-    return row
+    """A new scene whose image stays in the folder of the settings."""
+    statement = (
+        insert(scene)
+        .values(
+            id=uuid4(),
+            owner=owner,
+            name=name,
+            state="uploaded",
+            file_name=name,
+            reference=path,
+            sigma_m=sigma_m,
+        )
+        .returning(*COLUMNS)
+    )
+    return only(SceneRow, connection.execute(statement))
 
 
 def add_model(connection: Connection, scene_id: UUID, name: str, size_bytes: int, sha256: str) -> bool:
-    """Note a file beside the image; False when the scene has no files any more."""
-    done = connection.execute(
-        """update scene set models = models || jsonb_build_object(%s::text, %s::jsonb)
-           where id = %s and state <> 'removed'""",
-        [name, Jsonb({"size_bytes": size_bytes, "sha256": sha256}), scene_id],
+    """Record a file beside the image; False when the files of the scene were removed."""
+    file = literal({name: {"size_bytes": size_bytes, "sha256": sha256}}, JSONB)
+    updated = connection.execute(
+        update(scene)
+        .where(scene.c.id == scene_id, scene.c.state != "removed")
+        .values(models=scene.c.models.concat(file))
     )
-    return done.rowcount == 1
+    return updated.rowcount == 1
 
 
 def finish_upload(
@@ -103,57 +116,65 @@ def finish_upload(
     sha256: str,
 ) -> SceneRow | None:
     """The scene, now that its image is in the storage; None when it was given up meanwhile."""
-    with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
-        return cursor.execute(
-            f"""update scene set state = 'uploaded', file_key = %s, file_name = %s, size_bytes = %s,
-                    sha256 = %s
-                where id = %s and state = 'uploading' returning {COLUMNS}""",
-            [key, key.rsplit("/", 1)[-1], size_bytes, sha256, scene_id],
-        ).fetchone()
+    statement = (
+        update(scene)
+        .where(scene.c.id == scene_id, scene.c.state == "uploading")
+        .values(
+            state="uploaded",
+            file_key=key,
+            file_name=key.rsplit("/", 1)[-1],
+            size_bytes=size_bytes,
+            sha256=sha256,
+        )
+        .returning(*COLUMNS)
+    )
+    return first(SceneRow, connection.execute(statement))
 
 
 def give_up_upload(connection: Connection, scene_id: UUID) -> None:
-    """Forget a scene whose image did not arrive."""
-    connection.execute("delete from scene where id = %s and state = 'uploading'", [scene_id])
+    """Delete a scene whose image did not arrive."""
+    connection.execute(delete(scene).where(scene.c.id == scene_id, scene.c.state == "uploading"))
 
 
 def give_up_old_uploads(connection: Connection) -> None:
-    """Forget the scenes whose upload was cut off with the process that received it."""
+    """Delete the scenes whose upload ended with the process that received it."""
+    under_way = exists(upload.c.id).where(
+        upload.c.scene_id == scene.c.id, upload.c.finished_at.is_(None)
+    )
     connection.execute(
-        "delete from scene where state = 'uploading'"
-        " and created_at < now() - make_interval(hours => %(hours)s)"
-        " and created_at_uptime_s < uptime_s() - 3600 * %(hours)s"
-        " and not exists (select from upload where scene_id = scene.id and finished_at is null)",
-        {"hours": LONGEST_UPLOAD_HOURS},
+        delete(scene).where(
+            scene.c.state == "uploading",
+            scene.c.created_at < now - hours(LONGEST_UPLOAD_HOURS),
+            scene.c.created_at_uptime_s < uptime_s - 3600 * LONGEST_UPLOAD_HOURS,
+            ~under_way.correlate(scene),
+        )
     )
 
 
 def find_scene(connection: Connection, scene_id: UUID) -> SceneRow | None:
     """The scene with that id."""
-    with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
-        return cursor.execute(f"select {COLUMNS} from scene where id = %s", [scene_id]).fetchone()
+    return first(SceneRow, connection.execute(select(*COLUMNS).where(scene.c.id == scene_id)))
 
 
 def newest_scenes(connection: Connection, owner: UUID | None, limit: int) -> list[SceneRow]:
     """The last scenes of an owner, or of everybody for None; the newest first."""
-    with connection.cursor(row_factory=class_row(SceneRow)) as cursor:
-        return cursor.execute(
-            f"""select {COLUMNS} from scene where %(owner)s::uuid is null or owner = %(owner)s
-                order by created_at desc, id limit %(limit)s""",
-            {"owner": owner, "limit": limit},
-        ).fetchall()
+    statement = select(*COLUMNS).order_by(scene.c.created_at.desc(), scene.c.id).limit(limit)
+    if owner is not None:
+        statement = statement.where(scene.c.owner == owner)
+    return every(SceneRow, connection.execute(statement))
 
 
 def set_footprint(connection: Connection, scene_id: UUID, outline: Array) -> None:
-    """Remember the ground a scene can show.
+    """Store the ground that a scene can show.
 
     Args:
         outline: (n, 2) lon, lat, degrees, not closed.
     """
     ring = ", ".join(f"{lon:.9f} {lat:.9f}" for lon, lat in [*outline, outline[0]])
     connection.execute(
-        "update scene set footprint = st_geomfromtext(%s, 4326) where id = %s",
-        [f"POLYGON(({ring}))", scene_id],
+        update(scene)
+        .where(scene.c.id == scene_id)
+        .values(footprint=func.ST_GeomFromText(f"POLYGON(({ring}))", 4326))
     )
 
 
@@ -164,35 +185,38 @@ def describe(
     shape: tuple[int, int],
     gsd_m: float,
 ) -> None:
-    """Remember what the files of a scene say of it."""
-    angles = (taken.incidence_deg, taken.azimuth_deg, taken.sun_elevation_deg, taken.sun_azimuth_deg)
+    """Store what the files of a scene contain about it."""
     connection.execute(
-        """update scene set sensor = %s, acquired_at = %s, incidence_deg = %s, azimuth_deg = %s,
-               sun_elevation_deg = %s, sun_azimuth_deg = %s, lines = %s, samples = %s, gsd_m = %s
-           where id = %s""",
-        [
-            taken.sensor or None,
-            taken.acquired_at,
-            *(None if angle is None or math.isnan(angle) else angle for angle in angles),
-            *shape,
-            gsd_m,
-            scene_id,
-        ],
+        update(scene)
+        .where(scene.c.id == scene_id)
+        .values(
+            sensor=taken.sensor or None,
+            acquired_at=taken.acquired_at,
+            incidence_deg=_finite(taken.incidence_deg),
+            azimuth_deg=_finite(taken.azimuth_deg),
+            sun_elevation_deg=_finite(taken.sun_elevation_deg),
+            sun_azimuth_deg=_finite(taken.sun_azimuth_deg),
+            lines=shape[0],
+            samples=shape[1],
+            gsd_m=gsd_m,
+        )
     )
 
 
 def remove_scene(connection: Connection, scene_id: UUID) -> None:
-    """Forget where the files of a scene are; what is known about it stays."""
+    """Mark a scene as removed, without the key of its files; the rest of its row stays."""
     connection.execute(
-        "update scene set state = 'removed', file_key = null, removed_at = now() where id = %s",
-        [scene_id],
+        update(scene)
+        .where(scene.c.id == scene_id)
+        .values(state="removed", file_key=None, removed_at=now)
     )
 
 
 def with_files(connection: Connection, scene_ids: list[UUID]) -> set[UUID]:
-    """Those of some scenes whose files are still wanted."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        rows = cursor.execute(
-            "select id from scene where id = any(%s) and state <> 'removed'", [scene_ids]
-        )
-        return set(rows)
+    """Those of some scenes that are not removed."""
+    statement = select(scene.c.id).where(scene.c.id.in_(scene_ids), scene.c.state != "removed")
+    return set(connection.scalars(statement))
+
+
+def _finite(angle_deg: float | None) -> float | None:
+    return None if angle_deg is None or math.isnan(angle_deg) else angle_deg

@@ -2,22 +2,27 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 from uuid import UUID, uuid4
 
-from app.db.engine import Connection
+from sqlalchemy import Text, cast, func, or_, select, update
+from sqlalchemy.dialects.postgresql import insert
 
-COLUMNS = "id, name, scopes, created_at, expires_at, revoked_at, subject, upload_quota_bytes, job_quota"
+from app.db.engine import Connection
+from app.db.rows import columns_of, every, first, only
+from app.db.schema import job, now, token
+from app.db.statements import named
+
+UPLOADED_BYTES = named("tokens.sql", "uploaded_bytes")
 
 
 @dataclass(frozen=True)
 class Token:
-    """Somebody who may call: a bearer token without its secret, or an identity vouched for elsewhere.
+    """A caller: a bearer token without its secret, or an identity of an OpenID Connect issuer.
 
     Attributes:
         scopes: some of `read`, `register`, `monitor`, `admin`.
         expires_at, revoked_at: None: never, not.
-        subject: who it is at an OpenID Connect issuer; None for a token with a secret.
+        subject: the identity at the issuer; None for a token with a secret.
         upload_quota_bytes, job_quota: None: those of the settings.
     """
 
@@ -32,6 +37,9 @@ class Token:
     job_quota: int | None = None
 
 
+COLUMNS = columns_of(Token, token)
+
+
 def insert_token(
     connection: Connection,
     name: str,
@@ -42,101 +50,92 @@ def insert_token(
     job_quota: int | None = None,
 ) -> Token:
     """Store a new token that expires after so many days, or never."""
-    row = connection.execute(
-        "insert into token (id, name, secret_hash, scopes, expires_at, upload_quota_bytes, job_quota)"
-        f" values (%s, %s, %s, %s, now() + make_interval(days => %s), %s, %s) returning {COLUMNS}",
-        [uuid4(), name, secret_hash, list(scopes), days, upload_quota_bytes, job_quota],
-    ).fetchone()
-    assert row is not None
-    return _token(row)
+    statement = (
+        insert(token)
+        .values(
+            id=uuid4(),
+            name=name,
+            secret_hash=secret_hash,
+            scopes=scopes,
+            expires_at=None if days is None else now + func.make_interval(0, 0, 0, days),
+            upload_quota_bytes=upload_quota_bytes,
+            job_quota=job_quota,
+        )
+        .returning(*COLUMNS)
+    )
+    return only(Token, connection.execute(statement))
 
 
 def find_valid_token(connection: Connection, secret_hash: bytes) -> Token | None:
     """The token of a secret if it is neither expired nor revoked."""
-    row = connection.execute(
-        f"select {COLUMNS} from token where secret_hash = %s"
-        " and revoked_at is null and (expires_at is null or expires_at > now())",
-        [secret_hash],
-    ).fetchone()
-    return _token(row) if row else None
+    statement = select(*COLUMNS).where(
+        token.c.secret_hash == secret_hash,
+        token.c.revoked_at.is_(None),
+        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+    )
+    return first(Token, connection.execute(statement))
 
 
 def find_subject(connection: Connection, subject: str) -> Token | None:
-    """The row that stands for an identity vouched for elsewhere, revoked or not."""
-    row = connection.execute(f"select {COLUMNS} from token where subject = %s", [subject]).fetchone()
-    return _token(row) if row else None
+    """The row of an identity of an OpenID Connect issuer, revoked or not."""
+    return first(Token, connection.execute(select(*COLUMNS).where(token.c.subject == subject)))
 
 
 def keep_subject(connection: Connection, subject: str, name: str, scopes: tuple[str, ...]) -> Token:
-    """The row that stands for an identity vouched for elsewhere, made at its first call."""
+    """The row of an identity of an OpenID Connect issuer, inserted at its first call."""
     connection.execute(
-        "insert into token (id, name, subject, scopes) values (%s, %s, %s, %s)"
-        " on conflict (subject) do nothing",
-        [uuid4(), name, subject, list(scopes)],
+        insert(token)
+        .values(id=uuid4(), name=name, subject=subject, scopes=scopes)
+        .on_conflict_do_nothing(index_elements=[token.c.subject])
     )
-    found = find_subject(connection, subject)
-    assert found is not None
-    return found
+    return only(Token, connection.execute(select(*COLUMNS).where(token.c.subject == subject)))
 
 
 def list_tokens(connection: Connection) -> list[Token]:
     """All tokens, the newest first."""
-    rows = connection.execute(f"select {COLUMNS} from token order by created_at desc, id").fetchall()
-    return [_token(row) for row in rows]
+    statement = select(*COLUMNS).order_by(token.c.created_at.desc(), token.c.id)
+    return every(Token, connection.execute(statement))
 
 
 def find_tokens(connection: Connection, name_or_id: str) -> list[Token]:
     """The tokens not revoked yet that have this name, or the one with this id."""
-    rows = connection.execute(
-        f"select {COLUMNS} from token where revoked_at is null and (name = %s or id::text = %s)"
-        " order by created_at",
-        [name_or_id, name_or_id],
-    ).fetchall()
-    return [_token(row) for row in rows]
+    statement = (
+        select(*COLUMNS)
+        .where(
+            token.c.revoked_at.is_(None),
+            or_(token.c.name == name_or_id, cast(token.c.id, Text) == name_or_id),
+        )
+        .order_by(token.c.created_at)
+    )
+    return every(Token, connection.execute(statement))
 
 
 def revoke_token(connection: Connection, token_id: UUID) -> Token:
     """Refuse a token from now on; a token revoked before keeps its date."""
-    row = connection.execute(
-        f"update token set revoked_at = coalesce(revoked_at, now()) where id = %s returning {COLUMNS}",
-        [token_id],
-    ).fetchone()
-    assert row is not None
-    return _token(row)
+    statement = (
+        update(token)
+        .where(token.c.id == token_id)
+        .values(revoked_at=func.coalesce(token.c.revoked_at, now))
+        .returning(*COLUMNS)
+    )
+    return only(Token, connection.execute(statement))
 
 
 def lock_token(connection: Connection, token_id: UUID) -> None:
-    """Make others who count what this token has wait until the end of the transaction."""
-    connection.execute("select 1 from token where id = %s for no key update", [token_id])
+    """Make others who count what this token uses wait until the end of the transaction."""
+    connection.execute(select(token.c.id).where(token.c.id == token_id).with_for_update(key_share=True))
 
 
 def uploaded_bytes(connection: Connection, token_id: UUID) -> int:
-    """Bytes that the scenes of a token take in the storage, and its uploads under way will take."""
-    row = connection.execute(
-        """select (select coalesce(sum(size_bytes), 0) from scene s
-                   where owner = %(owner)s and state <> 'removed'
-                       and not exists (select from upload u where u.scene_id = s.id
-                                       and u.purpose = 'image' and u.finished_at is null))
-                + (select coalesce(sum((beside.value->>'size_bytes')::bigint), 0)
-                   from scene s, jsonb_each(s.models) beside
-                   where owner = %(owner)s and state <> 'removed')
-                + (select coalesce(sum(size_bytes), 0) from upload
-                   where owner = %(owner)s and finished_at is null) as used""",
-        {"owner": token_id},
-    ).fetchone()
-    assert row is not None
-    return int(row["used"])
+    """Bytes in the storage that the scenes of a token use and its unfinished uploads will use."""
+    return int(connection.execute(UPLOADED_BYTES, {"owner": token_id}).scalar_one())
 
 
 def open_jobs(connection: Connection, token_id: UUID) -> int:
     """How many jobs of a token have not ended."""
-    row = connection.execute(
-        "select count(*) as n from job where owner = %s and state in ('accepted', 'running')",
-        [token_id],
-    ).fetchone()
-    assert row is not None
-    return int(row["n"])
-
-
-def _token(row: dict[str, Any]) -> Token:
-    return Token(**{**row, "scopes": tuple(row["scopes"])})
+    count = (
+        select(func.count())
+        .select_from(job)
+        .where(job.c.owner == token_id, job.c.state.in_(("accepted", "running")))
+    )
+    return int(connection.execute(count).scalar_one())

@@ -2,21 +2,18 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
 from uuid import UUID, uuid4
 
-from psycopg.rows import class_row, scalar_row
+from sqlalchemy import Text, and_, cast, delete, exists, func, insert, select, update
 
 from app.db.engine import Connection
-
-Purpose = Literal["image", "model", "block"]
+from app.db.rows import columns_of, first, only
+from app.db.schema import UploadPurpose, hours, job, now, upload, uptime_s
 
 LIFE_HOURS = 24
 """An upload is given up so long after its last piece."""
-IDLE = f"(expires_at < now() and active_at_uptime_s < uptime_s() - {3600 * LIFE_HOURS})"
-"""Nobody went on with it, by the clock and by the time that the service has run."""
-COLUMNS = f"""id, owner, purpose, scene_id, name, file_name, size_bytes, sha256, metadata, file_key,
-    created_at, expires_at, finished_at, {IDLE} and finished_at is null as expired"""
+IDLE = and_(upload.c.expires_at < now, upload.c.active_at_uptime_s < uptime_s - 3600 * LIFE_HOURS)
+"""Nobody continued the upload, neither by the clock nor by the time that the service has run."""
 
 
 @dataclass(frozen=True)
@@ -24,16 +21,17 @@ class UploadRow:
     """A file that arrives in pieces.
 
     Attributes:
-        scene_id: whose image or model it is; None for a block.
-        name, file_name: as the sender calls it, and as the storage does.
-        size_bytes, sha256: of the whole, as announced; no checksum if none was.
-        metadata: as sent, to be repeated.
-        file_key: where it lies once it is complete and is nobody else's: a block.
+        scene_id: the scene of an image or model; None for a block.
+        name, file_name: the sender's name, and that in the storage.
+        size_bytes, sha256: of the whole file as announced; None without a checksum.
+        metadata: as sent; replies repeat it.
+        file_key: of a complete archive of a block in the storage.
+        expired: nobody continued the upload for too long.
     """
 
     id: UUID
     owner: UUID | None
-    purpose: Purpose
+    purpose: UploadPurpose
     scene_id: UUID | None
     name: str
     file_name: str
@@ -47,11 +45,14 @@ class UploadRow:
     expired: bool
 
 
+COLUMNS = columns_of(UploadRow, upload, expired=and_(IDLE, upload.c.finished_at.is_(None)))
+
+
 def insert_upload(
     connection: Connection,
     *,
     owner: UUID,
-    purpose: Purpose,
+    purpose: UploadPurpose,
     scene_id: UUID | None,
     name: str,
     file_name: str,
@@ -59,35 +60,40 @@ def insert_upload(
     sha256: str | None,
     metadata: str,
 ) -> UploadRow:
-    """A file that is about to arrive."""
-    with connection.cursor(row_factory=class_row(UploadRow)) as cursor:
-        row = cursor.execute(
-            f"""insert into upload (id, owner, purpose, scene_id, name, file_name, size_bytes, sha256,
-                    metadata, expires_at)
-                values (%s, %s, %s, %s, %s, %s, %s, %s, %s, now() + make_interval(hours => %s))
-                returning {COLUMNS}""",
-            (uuid4(), owner, purpose, scene_id, name, file_name, size_bytes, sha256, metadata)
-            + (LIFE_HOURS,),
-        ).fetchone()
-    assert row is not None
-    return row
+    """A new upload of which no piece has arrived."""
+    statement = (
+        insert(upload)
+        .values(
+            id=uuid4(),
+            owner=owner,
+            purpose=purpose,
+            scene_id=scene_id,
+            name=name,
+            file_name=file_name,
+            size_bytes=size_bytes,
+            sha256=sha256,
+            metadata=metadata,
+            expires_at=now + hours(LIFE_HOURS),
+        )
+        .returning(*COLUMNS)
+    )
+    return only(UploadRow, connection.execute(statement))
 
 
 def find_upload(connection: Connection, upload_id: UUID) -> UploadRow | None:
     """The upload with that id."""
-    with connection.cursor(row_factory=class_row(UploadRow)) as cursor:
-        return cursor.execute(f"select {COLUMNS} from upload where id = %s", [upload_id]).fetchone()
+    return first(UploadRow, connection.execute(select(*COLUMNS).where(upload.c.id == upload_id)))
 
 
 def prolong(connection: Connection, upload_id: UUID) -> UploadRow | None:
-    """The upload, whose life begins anew; None when it has been given up."""
-    with connection.cursor(row_factory=class_row(UploadRow)) as cursor:
-        return cursor.execute(
-            f"""update upload set expires_at = now() + make_interval(hours => %s),
-                    active_at_uptime_s = uptime_s()
-                where id = %s returning {COLUMNS}""",
-            [LIFE_HOURS, upload_id],
-        ).fetchone()
+    """The upload with a new expiry; None when it was given up."""
+    statement = (
+        update(upload)
+        .where(upload.c.id == upload_id)
+        .values(expires_at=now + hours(LIFE_HOURS), active_at_uptime_s=uptime_s)
+        .returning(*COLUMNS)
+    )
+    return first(UploadRow, connection.execute(statement))
 
 
 def finish(
@@ -97,68 +103,68 @@ def finish(
     size_bytes: int | None = None,
     sha256: str | None = None,
 ) -> bool:
-    """Note that the file is complete and in its place; False when it was given up meanwhile.
+    """Record that the file is complete and in its place; False when it was given up meanwhile.
 
     Args:
-        file_key: where it lies when it is nobody else's.
-        size_bytes, sha256: as found, where they had not been announced.
+        file_key: where a block lies.
+        size_bytes, sha256: of the complete file, where they were not announced.
     """
-    done = connection.execute(
-        """update upload set finished_at = now(), file_key = %s, size_bytes = coalesce(%s, size_bytes),
-               sha256 = coalesce(%s, sha256)
-           where id = %s and finished_at is null""",
-        [file_key, size_bytes, sha256, upload_id],
+    finished = connection.execute(
+        update(upload)
+        .where(upload.c.id == upload_id, upload.c.finished_at.is_(None))
+        .values(
+            finished_at=now,
+            file_key=file_key,
+            size_bytes=func.coalesce(size_bytes, upload.c.size_bytes),
+            sha256=func.coalesce(sha256, upload.c.sha256),
+        )
     )
-    return done.rowcount == 1
+    return finished.rowcount == 1
 
 
 def delete_upload(connection: Connection, upload_id: UUID) -> None:
-    """Forget an upload."""
-    connection.execute("delete from upload where id = %s", [upload_id])
+    """Delete an upload."""
+    connection.execute(delete(upload).where(upload.c.id == upload_id))
 
 
 def delete_expired(connection: Connection) -> list[UUID]:
-    """Forget the uploads that nobody went on with."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        expired: list[UUID] = cursor.execute(
-            f"delete from upload where finished_at is null and {IDLE} returning id"
-        ).fetchall()
-    return expired
+    """Delete the unfinished uploads that nobody continued; returns their ids."""
+    expired = delete(upload).where(upload.c.finished_at.is_(None), IDLE).returning(upload.c.id)
+    return list(connection.scalars(expired))
 
 
 def find_block(connection: Connection, upload_id: UUID) -> str | None:
-    """Where the storage has the archive of a block that has arrived."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        found: str | None = cursor.execute(
-            "select file_key from upload where id = %s and purpose = 'block'", [upload_id]
-        ).fetchone()
-    return found
+    """The key in the storage of an uploaded block."""
+    statement = select(upload.c.file_key).where(upload.c.id == upload_id, upload.c.purpose == "block")
+    key: str | None = connection.scalar(statement)
+    return key
 
 
 def delete_unwanted_blocks(connection: Connection) -> list[str]:
-    """Forget archives that nobody asked for in time and no open job names; returns their keys."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        keys: list[str] = cursor.execute(
-            f"""delete from upload u where purpose = 'block' and finished_at is not null
-                   and {IDLE}
-                   and not exists (select from job where state in ('accepted', 'running')
-                                   and inputs ->> 'upload' = u.id::text)
-               returning file_key"""
-        ).fetchall()
-    return keys
+    """Delete uploaded blocks that nobody ingested in time and no open job names; returns their keys."""
+    named_by_job = exists(job.c.id).where(
+        job.c.state.in_(("accepted", "running")),
+        job.c.inputs["upload"].astext == cast(upload.c.id, Text),
+    )
+    unwanted = (
+        delete(upload)
+        .where(
+            upload.c.purpose == "block",
+            upload.c.finished_at.is_not(None),
+            IDLE,
+            ~named_by_job.correlate(upload),
+        )
+        .returning(upload.c.file_key)
+    )
+    return list(connection.scalars(unwanted))
 
 
 def present(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:
-    """Those of some uploads that are not forgotten."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        return set(cursor.execute("select id from upload where id = any(%s)", [upload_ids]))
+    """Those of some uploads that were not deleted."""
+    return set(connection.scalars(select(upload.c.id).where(upload.c.id.in_(upload_ids))))
 
 
 def arriving(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:
-    """Those of some uploads that are still to be completed."""
-    with connection.cursor(row_factory=scalar_row) as cursor:
-        return set(
-            cursor.execute(
-                "select id from upload where id = any(%s) and finished_at is null", [upload_ids]
-            )
-        )
+    """Those of some uploads that are not complete."""
+    statement = select(upload.c.id).where(upload.c.id.in_(upload_ids), upload.c.finished_at.is_(None))
+    return set(connection.scalars(statement))

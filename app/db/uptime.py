@@ -3,7 +3,10 @@
 Ages that decide over files are counted in it: `uptime_s()` in SQL.
 """
 
+from sqlalchemy import extract, func, update
+
 from app.db.engine import Connection
+from app.db.schema import clock, uptime
 
 
 def advance(connection: Connection, most_s: float) -> None:
@@ -13,9 +16,10 @@ def advance(connection: Connection, most_s: float) -> None:
         most_s: the longest step; beyond it the clock of the database has jumped, or the service did not
             run.
     """
+    step_s = extract("epoch", clock - uptime.c.advanced_at)
     connection.execute(
-        """update uptime set advanced_at = clock_timestamp(),
-               elapsed_s = elapsed_s
-                   + least(greatest(extract(epoch from clock_timestamp() - advanced_at), 0.0), %s)""",
-        [most_s],
+        update(uptime).values(
+            advanced_at=clock,
+            elapsed_s=uptime.c.elapsed_s + func.least(func.greatest(step_s, 0.0), most_s),
+        )
     )

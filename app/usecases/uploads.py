@@ -14,8 +14,9 @@ from app.auth import Scope, may_access, require
 from app.config import Settings
 from app.db import scenes, uploads
 from app.db.engine import Connection, Database
+from app.db.schema import UploadPurpose
 from app.db.tokens import Token
-from app.db.uploads import Purpose, UploadRow
+from app.db.uploads import UploadRow
 from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage
 from app.usecases import quotas
@@ -41,7 +42,7 @@ from services.formats.archives import (
 )
 
 IMAGE_SUFFIXES = (".tif", ".tiff", ".jp2", ".j2k", ".ntf", ".nitf")
-PURPOSES: tuple[Purpose, ...] = ("image", "model", "block")
+PURPOSES: tuple[UploadPurpose, ...] = ("image", "model", "block")
 UPLOAD_PREFIX = "upload-"
 """Beginning of the names of unfinished files of uploads in the scratch folder."""
 
@@ -70,7 +71,7 @@ class NewUpload:
 
     name: str
     size_bytes: int
-    purpose: Purpose | None = None
+    purpose: UploadPurpose | None = None
     scene: UUID | None = None
     sha256: str | None = None
     sigma_m: float | None = None
@@ -115,7 +116,7 @@ def create_upload(
         TooLarge: the announced size exceeds the limit or the caller's quota.
         InputError, NotFound, Conflict: name, purpose or scene cannot be used.
     """
-    purpose: Purpose = new.purpose or ("image" if new.scene is None else "model")
+    purpose: UploadPurpose = new.purpose or ("image" if new.scene is None else "model")
     require(caller, Scope.ADMIN if purpose == "block" else Scope.REGISTER)
     is_side_file = purpose == "model"
     limit = side_file_limit(settings, new.name) if is_side_file else settings.upload_limit_bytes

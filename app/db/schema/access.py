@@ -27,7 +27,7 @@ token = Table(
     Column("name", Text, nullable=False),
     # SHA-256 of the secret; null for an identity of an OpenID Connect issuer.
     Column("secret_hash", LargeBinary, unique=True),
-    Column("scopes", ARRAY(Text), nullable=False),
+    Column("scopes", ARRAY(Text, as_tuple=True), nullable=False),
     Column("created_at", Timestamp, nullable=False, server_default=now),
     Column("expires_at", Timestamp),
     Column("revoked_at", Timestamp),

@@ -1,9 +1,10 @@
 """What the tables share: the metadata with its names of constraints, types, defaults and choices."""
 
+from datetime import timedelta
 from typing import Any, Literal, get_args
 
 from geoalchemy2 import Geometry
-from sqlalchemy import CheckConstraint, Computed, DateTime, MetaData, func
+from sqlalchemy import CheckConstraint, ColumnElement, Computed, DateTime, Interval, MetaData, func
 from sqlalchemy import column as column_named
 from sqlalchemy.dialects.postgresql import DOUBLE_PRECISION, JSONB, REAL
 
@@ -35,12 +36,17 @@ PointZ = Geometry("POINTZ", srid=4979, dimension=3, spatial_index=False)
 now = func.now()
 # Rows written in one transaction differ in this one.
 clock = func.clock_timestamp(type_=Timestamp)
-uptime_s = func.uptime_s()
+uptime_s = func.uptime_s(type_=Double)
 
 
 def one_of(column: str, choices: Any) -> CheckConstraint:
     """A check that a column has one of the values of a `Literal`."""
     return CheckConstraint(column_named(column).in_(get_args(choices)), name=column)
+
+
+def hours(count: float) -> ColumnElement[timedelta]:
+    """An interval of hours: unlike a day, it is as long on the day when clocks change."""
+    return func.make_interval(0, 0, 0, 0, count, type_=Interval)
 
 
 def on_map(outline: str) -> Computed:

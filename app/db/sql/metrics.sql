@@ -1,0 +1,9 @@
+-- name: installation
+-- Figures of the whole installation, in one row.
+select
+    (select coalesce(extract(epoch from clock_timestamp() - min(created_at)), 0)
+        from job where state = 'accepted')::float8 as oldest_waiting_s,
+    (select count(*) from procrastinate_jobs where status = 'todo') as queue,
+    (select coalesce(sum(n_points - n_unserved), 0) from block
+        where state = 'published')::bigint as points,
+    pg_database_size(current_database()) as database_bytes

@@ -1,0 +1,14 @@
+-- name: scene_files
+-- Files of some scenes: image, models, and results of the last registration whose files are still there.
+select s.id as scene_id,
+    case when s.state = 'uploaded' and s.file_key is not null then s.file_name end as image,
+    case when s.state = 'removed' then '{}'::text[]
+         else array(select jsonb_object_keys(s.models) order by 1) end as models,
+    r.job_id,
+    array(select jsonb_object_keys(r.files) order by 1) as results
+from scene s left join lateral (
+    select r.job_id, r.files
+    from registration r join job j on j.id = r.job_id
+    where r.scene_id = s.id and j.results_removed_at is null
+    order by r.created_at desc limit 1) r on true
+where s.id = any(:scene_ids)
