@@ -1,10 +1,10 @@
 """Rows as dataclasses: the fields of a dataclass are the column list of its statements."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, CursorResult, Label, Table
+from sqlalchemy import ARRAY, ColumnElement, CursorResult, Label, Table, any_, literal
 
 T = TypeVar("T")
 
@@ -39,3 +39,8 @@ def only(row_type: type[T], result: CursorResult[Any]) -> T:
 def every(row_type: type[T], result: Iterable[Any]) -> list[T]:
     """All rows of a result as dataclasses."""
     return [row_type(**row._mapping) for row in result]
+
+
+def among(column: ColumnElement[Any], values: Sequence[Any]) -> ColumnElement[bool]:
+    """Whether a column has one of many values; they are one parameter, an array."""
+    return column == any_(literal(list(values), ARRAY(column.type)))

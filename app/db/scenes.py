@@ -10,7 +10,7 @@ from sqlalchemy import JSON, cast, delete, exists, func, insert, literal, select
 from sqlalchemy.dialects.postgresql import JSONB
 
 from app.db.engine import Connection
-from app.db.rows import columns_of, every, first, only
+from app.db.rows import among, columns_of, every, first, only
 from app.db.schema import SceneState, hours, now, scene, upload, uptime_s
 from services.types import Acquisition, Array
 
@@ -214,7 +214,7 @@ def remove_scene(connection: Connection, scene_id: UUID) -> None:
 
 def with_files(connection: Connection, scene_ids: list[UUID]) -> set[UUID]:
     """Those of some scenes that are not removed."""
-    statement = select(scene.c.id).where(scene.c.id.in_(scene_ids), scene.c.state != "removed")
+    statement = select(scene.c.id).where(among(scene.c.id, scene_ids), scene.c.state != "removed")
     return set(connection.scalars(statement))
 
 

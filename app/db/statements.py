@@ -9,14 +9,16 @@ straight to the driver.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
 
-from sqlalchemy import ClauseElement, Dialect, TextClause, text
+from sqlalchemy import ClauseElement, Dialect, Select, Table, TextClause, text
 from sqlalchemy.dialects import postgresql
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
 
 DIALECT: Dialect = postgresql.psycopg.dialect()  # type: ignore[no-untyped-call]
 NAME = re.compile(r"^-- name: (\w+)$", re.MULTILINE)
@@ -44,6 +46,35 @@ def hot(statement: ClauseElement) -> HotStatement:
     compiled = statement.compile(dialect=DIALECT, compile_kwargs={"render_postcompile": True})
     constants = {name: value for name, value in compiled.params.items() if value is not None}
     return HotStatement(str(compiled).encode(), constants)
+
+
+class CopyIn(ClauseElement):
+    """COPY of rows in binary format into columns of a table."""
+
+    def __init__(self, table: Table, columns: Iterable[str]) -> None:
+        self.table = table
+        self.columns = [table.c[name] for name in columns]
+
+
+class CopyOut(ClauseElement):
+    """COPY of the rows of a query, in a format of COPY such as `binary`."""
+
+    def __init__(self, query: Select[Any], options: str) -> None:
+        self.query = query
+        self.options = options
+
+
+@compiles(CopyIn)
+def _copy_in(element: CopyIn, compiler: SQLCompiler, **_: Any) -> str:
+    preparer = compiler.preparer
+    columns = ", ".join(preparer.format_column(column) for column in element.columns)
+    return f"COPY {preparer.format_table(element.table)} ({columns}) FROM STDIN (FORMAT BINARY)"
+
+
+@compiles(CopyOut)
+def _copy_out(element: CopyOut, compiler: SQLCompiler, **options: Any) -> str:
+    query = compiler.process(element.query, **options)
+    return f"COPY ({query}) TO STDOUT (FORMAT {element.options})"
 
 
 def named(file: str, name: str) -> TextClause:

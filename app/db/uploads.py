@@ -7,7 +7,7 @@ from uuid import UUID, uuid4
 from sqlalchemy import Text, and_, cast, delete, exists, func, insert, select, update
 
 from app.db.engine import Connection
-from app.db.rows import columns_of, first, only
+from app.db.rows import among, columns_of, first, only
 from app.db.schema import UploadPurpose, hours, job, now, upload, uptime_s
 
 LIFE_HOURS = 24
@@ -161,10 +161,10 @@ def delete_unwanted_blocks(connection: Connection) -> list[str]:
 
 def present(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:
     """Those of some uploads that were not deleted."""
-    return set(connection.scalars(select(upload.c.id).where(upload.c.id.in_(upload_ids))))
+    return set(connection.scalars(select(upload.c.id).where(among(upload.c.id, upload_ids))))
 
 
 def arriving(connection: Connection, upload_ids: list[UUID]) -> set[UUID]:
     """Those of some uploads that are not complete."""
-    statement = select(upload.c.id).where(upload.c.id.in_(upload_ids), upload.c.finished_at.is_(None))
+    statement = select(upload.c.id).where(among(upload.c.id, upload_ids), upload.c.finished_at.is_(None))
     return set(connection.scalars(statement))

@@ -13,7 +13,7 @@ from sqlalchemy import func, select, update
 from app.db.engine import Connection
 from app.db.jobs.jobs import COLUMNS, Job
 from app.db.jobs.queue import enqueue
-from app.db.rows import every, first
+from app.db.rows import among, every, first
 from app.db.schema import clock, job
 
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
@@ -180,7 +180,7 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
 def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int]:
     """The attempt of each of some jobs that runs or succeeded, if its results are kept."""
     statement = select(job.c.id, job.c.attempt).where(
-        job.c.id.in_(job_ids),
+        among(job.c.id, job_ids),
         job.c.results_removed_at.is_(None),
         job.c.state.in_(("running", "successful")),
     )

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from app.db import blocks, superseding
-from app.db.blocks import Block, BlockState
+from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
+from app.db.schema import BlockState
 from app.errors import Conflict, InputError, NotFound
 from app.storage import Storage, StoredFile
 from services.errors import FormatError
@@ -96,7 +97,7 @@ def ingest_block(
     document = (folder / BLOCK_JSON).read_bytes()
     metadata = contents.document.metadata
     quality = block_quality(contents.points, contents.n_views, metadata.extent)
-    with connection.transaction():
+    with connection.begin_nested():
         blocks.lock_ingestion(connection)
         block = blocks.insert_block(
             connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
