@@ -1,4 +1,4 @@
-"""Pixels between pixels: cubic splines through an image, exact at its pixels, at any fraction."""
+"""Cubic spline interpolation of images: exact at the pixels, accurate at any fraction of a pixel."""
 
 from functools import lru_cache
 
@@ -10,18 +10,18 @@ from services.types import Array, FloatImage
 
 _POLE = np.sqrt(3.0) - 2.0
 SPLINE_REACH_PX = 8
-"""Half the length of the filter that makes coefficients of pixels: the rest of it is below 3e-5."""
+"""Half length of the filter from pixels to spline coefficients; the omitted taps are below 3e-5."""
 
 
 def resample(coefficients: FloatImage, line_sample: Array) -> FloatImage:
-    """Values of an image between its pixels.
+    """Values of an image at any positions.
 
     Args:
-        coefficients: of the image, by `spline_coefficients`.
-        line_sample: (..., 2) positions, (0, 0) is the centre of the first pixel.
+        coefficients: (lines, samples) of the image, see `spline_coefficients`.
+        line_sample: (..., 2) positions, pixels.
 
     Returns:
-        (...) float32; NaN beyond the image and beside what is missing.
+        (...) float32; NaN beyond the image and beside missing pixels.
     """
     flat = np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2)
     return np.asarray(_values(coefficients, flat).reshape(line_sample.shape[:-1]))
@@ -30,35 +30,36 @@ def resample(coefficients: FloatImage, line_sample: Array) -> FloatImage:
 def spline_coefficients(pixels: FloatImage, blur_px: float = 0.0) -> FloatImage:
     """Coefficients of the cubic spline through an image, or through a blurred copy of it.
 
-    What is smooth enough to be sampled keeps its place and its strength at any fraction of a pixel.
-    Bicubic convolution moves slopes by some hundredths of a pixel, and blurs most at a half.
+    The spline preserves position and amplitude of well-sampled detail at any fraction of a pixel.
+    Bicubic convolution displaces gradients by some hundredths of a pixel, and blurs most at half a
+    pixel.
 
-    Source: Unser, Aldroubi and Eden (1993), B-spline signal processing; its recursions as one filter
-    with the blur.
+    Source: Unser, Aldroubi and Eden (1993), B-spline signal processing; the recursions of the paper and
+    the blur are combined in one filter.
 
     Args:
-        pixels: (lines, samples); NaN where there is nothing.
-        blur_px: standard deviation of a Gaussian.
+        pixels: (lines, samples); NaN where there is no data.
+        blur_px: standard deviation of the Gaussian blur, pixels.
 
     Returns:
-        (lines, samples); NaN within reach of the blur, and two pixels at least, of what is missing.
+        (lines, samples) float32; NaN within reach of the blur, at least two pixels, of missing ones.
     """
     kernel = _kernel(round(blur_px, 3))
     missing = ~np.isfinite(pixels)
-    some = bool(missing.any())
-    if some:
+    has_gaps = bool(missing.any())
+    if has_gaps:
         pixels = np.where(missing, np.float32(_mean_of(pixels, missing)), pixels)
-    found = cv2.sepFilter2D(pixels, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-    if some:
+    coefficients = cv2.sepFilter2D(pixels, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    if has_gaps:
         reach = 2 * max(2, round(3.0 * blur_px)) + 1
         beside = cv2.dilate(missing.astype(np.uint8), np.ones((reach, reach), np.uint8))
-        found[beside > 0] = np.nan
-    return np.asarray(found)
+        coefficients[beside > 0] = np.nan
+    return np.asarray(coefficients)
 
 
-def extent(line_sample: Array) -> tuple[Array, Array]:
-    """Lowest and highest (2,) of the positions (..., 2) that are finite; inf and -inf of none."""
-    return _extent(np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2))
+def finite_bounds(line_sample: Array) -> tuple[Array, Array]:
+    """Lowest and highest (2,) of the finite positions (..., 2); inf and -inf where there are none."""
+    return _finite_bounds(np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2))
 
 
 def _mean_of(pixels: FloatImage, missing: np.ndarray) -> float:
@@ -67,7 +68,7 @@ def _mean_of(pixels: FloatImage, missing: np.ndarray) -> float:
 
 @lru_cache(maxsize=256)
 def _kernel(blur_px: float) -> FloatImage:
-    """A Gaussian and, after it, the inverse of the samples of a cubic B-spline."""
+    """The convolution of a Gaussian with the inverse filter of the sampled cubic B-spline."""
     k = np.arange(-SPLINE_REACH_PX, SPLINE_REACH_PX + 1)
     inverse = np.sqrt(3.0) * _POLE ** np.abs(k)
     if blur_px == 0.0:
@@ -81,7 +82,7 @@ def _kernel(blur_px: float) -> FloatImage:
 
 @njit(cache=True, inline="always")
 def spline_weights(t: float) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Weights of the four coefficients around a place `t` (0 to 1) beyond the second of them."""
+    """Weights of four coefficients for a position a fraction `t` (0 to 1) beyond the second of them."""
     s = 1.0 - t
     return (
         np.float32(s * s * s / 6.0),
@@ -92,7 +93,7 @@ def spline_weights(t: float) -> tuple[np.float32, np.float32, np.float32, np.flo
 
 
 @njit(cache=True)
-def _extent(line_sample: Array) -> tuple[Array, Array]:
+def _finite_bounds(line_sample: Array) -> tuple[Array, Array]:
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(line_sample)):
         line, sample = line_sample[k, 0], line_sample[k, 1]

@@ -1,4 +1,4 @@
-"""An image, its model and how it was taken: the input of registration and production."""
+"""A scene: an image, its model and its acquisition, the input of registration and production."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Scene:
     Attributes:
         image: its pixels.
         model: from ground to image.
-        acquisition: how it was taken.
+        acquisition: how the image was taken.
         sigma_m: horizontal accuracy of the model before registration, one standard deviation a
             coordinate, metres.
     """
@@ -42,11 +42,15 @@ def scene_gsd_m(scene: Scene) -> float:
 
 
 def scene_footprint(scene: Scene, per_side: int = 8) -> Array:
-    """Outline of the ground the image can show at any height of its model.
+    """Outline of the ground that the image can show at any height of its model.
+
+    Args:
+        scene: image and model.
+        per_side: number of positions along each side of the image that are located.
 
     Returns:
-        (m, 2) lon, lat of the convex hull of the image's border at both ends of the height range,
-        counter-clockwise, not closed. Longitudes are continuous: beyond 180 degrees where the
+        (m, 2) lon, lat of the convex hull of the border of the image at both ends of the height range,
+        counter-clockwise, not closed. Longitudes are continuous: they exceed 180 degrees where the
         outline crosses the antimeridian.
     """
     lines, samples = scene.image.shape
@@ -73,11 +77,11 @@ def scene_footprint(scene: Scene, per_side: int = 8) -> Array:
 
 
 def view_direction(model: SensorModel, line_sample: Array, lon_lat_h: Array) -> tuple[Array, Array]:
-    """Incidence and azimuth from ground points to the sensor.
+    """Incidence and azimuth of the directions from ground points to the sensor.
 
     Args:
         model: of the image.
-        line_sample: (n, 2) where the points are in the image.
+        line_sample: (n, 2) positions of the points in the image, pixels.
         lon_lat_h: (n, 3) the points.
 
     Returns:

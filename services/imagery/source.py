@@ -1,4 +1,4 @@
-"""Reading pixels at a scale, and cutting chips out of images."""
+"""Pixels of an image at any scale, and chips rendered from an image."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -8,24 +8,24 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import lon_lat_h_from_east_north_up
-from services.imagery.resampling import extent, resample, spline_coefficients
+from services.imagery.resampling import finite_bounds, resample, spline_coefficients
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
 
 _MARGIN_PX = 6
-"""Pixels read around those asked for, so that the spline is not that of the window's border."""
+"""Pixels read beyond the positions sampled, so that the spline does not depend on the window."""
 
 _NODE_PX = 10
-"""Chip pixels between the places that go through the model."""
+"""Chip pixels between the nodes that are projected through the model."""
 
 BLUR_PER_RATIO = 0.4
-"""Width of the low-pass, in source pixels per unit of sqrt(ratio^2 - 1): between the aliasing of a plain
-box (0.29) and the loss of detail of a half-pixel Gaussian (0.5)."""
+"""Sigma of the low-pass, in source pixels per unit of sqrt(ratio^2 - 1): a compromise between the
+aliasing of a box filter (0.29) and the loss of detail of a half-pixel Gaussian (0.5)."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of pixels; it may reach beyond the image.
+    """A rectangle of pixels, which may extend beyond the image.
 
     Attributes:
         line, sample: of its first pixel.
@@ -39,7 +39,7 @@ class Window:
 
 
 class ImageSource(Protocol):
-    """One band of an image, readable by windows."""
+    """One band of an image that is read by windows."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -53,10 +53,10 @@ class ImageSource(Protocol):
 
 @dataclass(frozen=True)
 class ArrayImage:
-    """An image held in memory.
+    """An image in memory.
 
     Attributes:
-        pixels: (lines, samples) float32, NaN where nodata.
+        pixels: (lines, samples) float32; NaN where nodata.
     """
 
     pixels: FloatImage
@@ -83,7 +83,7 @@ class ArrayImage:
 
 @dataclass(frozen=True)
 class ReducedImage:
-    """An image at a fraction of its resolution, held in memory.
+    """A reduced image in memory.
 
     Attributes:
         pixels: (lines, samples) float32, means over `factor` x `factor` pixels of the original.
@@ -95,23 +95,23 @@ class ReducedImage:
 
 
 class CachedImage:
-    """An image whose windows are read once, as far as memory is allowed for them.
+    """An image whose windows are read once, up to a limit of memory.
 
-    A registration looks at the same places pass after pass; what `sample_image` has made of a window
-    serves the smaller ones inside it.
+    A registration searches the same positions several times. The block means that `sample_image`
+    computes of a window serve the smaller windows inside it.
 
     Attributes:
         source: the image.
-        max_bytes: what may be kept; windows read after that are not.
-        cached_bytes: what is kept.
+        max_bytes: limit of the cache; windows that would exceed it are not cached.
+        cached_bytes: size of the cache.
     """
 
     def __init__(self, source: ImageSource, max_bytes: int = 96_000_000) -> None:
-        """Keep nothing yet."""
+        """Start with an empty cache."""
         self.source = source
         self.max_bytes = max_bytes
         self.cached_bytes = 0
-        self._kept: list[tuple[int, Window, FloatImage]] = []
+        self._cache: list[tuple[int, Window, FloatImage]] = []
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -123,34 +123,36 @@ class CachedImage:
         return self.source.read(window)
 
     def means(self, window: Window, factor: int) -> FloatImage:
-        """Means over squares of pixels of a window that begins and ends with a square."""
-        for kept_factor, kept, means in self._kept:
-            line, sample = window.line - kept.line, window.sample - kept.sample
-            inside = line >= 0 and sample >= 0 and kept_factor == factor
-            if inside and line + window.lines <= kept.lines and sample + window.samples <= kept.samples:
+        """Means over squares of pixels of a window whose borders are borders of squares."""
+        for cached_factor, cached, means in self._cache:
+            line, sample = window.line - cached.line, window.sample - cached.sample
+            inside = line >= 0 and sample >= 0 and cached_factor == factor
+            inside = inside and line + window.lines <= cached.lines
+            if inside and sample + window.samples <= cached.samples:
                 top, left = line // factor, sample // factor
                 bottom, right = top + window.lines // factor, left + window.samples // factor
                 return means[top:bottom, left:right]
         means = block_means(self.source.read(window), factor)
         if self.cached_bytes + means.nbytes <= self.max_bytes:
             self.cached_bytes += means.nbytes
-            self._kept.append((factor, window, means))
+            self._cache.append((factor, window, means))
         return means
 
 
 def _means(image: ImageSource, window: Window, factor: int) -> FloatImage:
+    """Means over squares of pixels of a window, from the cache of the image if it has one."""
     if isinstance(image, CachedImage):
         return image.means(window, factor)
     return block_means(image.read(window), factor)
 
 
 def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_000) -> ReducedImage:
-    """The whole image at a fraction of its resolution, read once, strip by strip.
+    """The whole image reduced by a factor, read once, strip by strip.
 
     Args:
         source: the image.
-        factor: whole number of pixels averaged in each direction.
-        strip_pixels: pixels of the original held in memory at once.
+        factor: number of pixels averaged in each direction.
+        strip_pixels: largest number of pixels of the original in memory at once.
     """
     lines, samples = source.shape[0] // factor, source.shape[1] // factor
     pixels = np.empty((lines, samples), dtype=np.float32)
@@ -163,7 +165,7 @@ def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_00
 
 
 def block_means(pixels: FloatImage, factor: int) -> FloatImage:
-    """Means over squares of `factor` pixels; what does not fill a square at the end is left out."""
+    """Means over squares of `factor` x `factor` pixels; incomplete squares at the end are dropped."""
     if factor == 1:
         return pixels
     lines, samples = pixels.shape[0] // factor, pixels.shape[1] // factor
@@ -172,19 +174,21 @@ def block_means(pixels: FloatImage, factor: int) -> FloatImage:
 
 
 def low_pass(pixels: FloatImage, ratio: float) -> FloatImage:
-    """Pixels blurred to the resolution of pixels `ratio` times larger; unchanged below 1."""
+    """Pixels low-passed to the resolution of pixels `ratio` times larger; unchanged up to ratio 1."""
     if ratio <= 1.0:
         return pixels
-    return np.asarray(cv2.GaussianBlur(pixels, (0, 0), blur_px(ratio), borderType=cv2.BORDER_REFLECT))
+    return np.asarray(
+        cv2.GaussianBlur(pixels, (0, 0), low_pass_sigma_px(ratio), borderType=cv2.BORDER_REFLECT)
+    )
 
 
-def blur_px(ratio: float) -> float:
+def low_pass_sigma_px(ratio: float) -> float:
     """Standard deviation of the low-pass for pixels `ratio` times larger, source pixels."""
     return BLUR_PER_RATIO * float(np.sqrt(max(ratio * ratio - 1.0, 0.0)))
 
 
 def image_gsd_m(model: SensorModel, lon_lat_h: Array) -> float:
-    """Ground sampling at one point (3,): side of the square as large as a pixel's footprint, metres."""
+    """Ground sampling at one point (3,), metres: square root of the area of a pixel on the ground."""
     return float(image_gsds_m(model, lon_lat_h[None, :])[0])
 
 
@@ -195,12 +199,12 @@ def image_gsds_m(model: SensorModel, lon_lat_h: Array) -> Array:
 
 
 def chip_ground(lon_lat_h: Array, gsd_m: float, size: int) -> Array:
-    """Ground positions of the pixels of a chip around one point (3,).
+    """Ground positions of the pixels of a chip.
 
     Args:
-        lon_lat_h: the point, at the centre of the chip.
-        gsd_m: ground sampling.
-        size: odd number of pixels a side.
+        lon_lat_h: (3,) the point at the centre of the chip.
+        gsd_m: ground sampling of the chip, metres.
+        size: side of the chip, an odd number of pixels.
 
     Returns:
         (size * size, 3), row by row from the north-west.
@@ -213,30 +217,50 @@ def chip_ground(lon_lat_h: Array, gsd_m: float, size: int) -> Array:
 
 
 def chip_positions(model: SensorModel, lon_lat_h: Array, gsd_m: float, size: int) -> Array:
-    """Where the pixels of a chip lie in an image: (size, size, 2).
+    """Positions (size, size, 2) in an image of the pixels of a chip.
 
-    Only nodes go through the model: a sensor is smooth, and bilinear positions between them are off by
-    1.3e-5 px where the chip is four times coarser than the image.
+    Only nodes are projected through the model. Sensor models are smooth: the bilinear positions between
+    nodes have an error of 1.3e-5 px where the chip is four times coarser than the image.
 
     Args:
         model: of the image.
         lon_lat_h: (3,) the point at the centre of the chip.
-        gsd_m: ground sampling of the chip.
-        size: odd number of pixels a side.
+        gsd_m: ground sampling of the chip, metres.
+        size: side of the chip, an odd number of pixels.
+
+    Returns:
+        Pixels of the image; NaN beside nodes outside the range of the model.
     """
     half = -(-(size // 2) // _NODE_PX)
     count = 2 * half + 1
     ground = chip_ground(lon_lat_h, gsd_m * _NODE_PX, count)
     nodes = model.project(ground).reshape(count, count, 2)
-    pixel = (np.arange(size) - size // 2) / _NODE_PX
-    weight = np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
     missing = ~np.isfinite(nodes).all(axis=2)
     if missing.any():
         nodes[missing] = 0.0
-    positions = np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+    positions = interpolate_nodes(nodes, size, _NODE_PX)
     if missing.any():
+        weight = _node_weights(half, size, _NODE_PX)
         positions[weight @ missing @ weight.T > 0.0] = np.nan
     return positions
+
+
+def interpolate_nodes(nodes: Array, size: int, node_px: int) -> Array:
+    """Positions (size, size, 2) of pixels between nodes (k, k, 2), bilinear.
+
+    Args:
+        nodes: positions of every `node_px`-th pixel around the central one.
+        size: odd number of pixels a side.
+        node_px: pixels between nodes.
+    """
+    weight = _node_weights(nodes.shape[0] // 2, size, node_px)
+    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+
+
+def _node_weights(half: int, size: int, node_px: int) -> Array:
+    """Weights (size, 2 half + 1) of the nodes in each pixel along an axis."""
+    pixel = (np.arange(size) - size // 2) / node_px
+    return np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
 
 
 def render_chip(
@@ -246,35 +270,35 @@ def render_chip(
     gsd_m: float,
     size: int = 2 * CHIP_CENTRE + 1,
 ) -> FloatImage:
-    """What an image shows around a point, in the geometry of a chip.
+    """An image around a point, rendered in the geometry of a chip.
 
-    The image is low-passed to the resolution of the chip before it is resampled; where the image is
-    coarser than the chip it is only resampled.
+    The image is low-passed to the resolution of the chip before it is resampled. An image coarser than
+    the chip is only resampled.
 
     Args:
         source: the image, or a reduction of it.
-        model: its model; positions are those of the original image.
+        model: of the original image.
         lon_lat_h: (3,) the point.
-        gsd_m: ground sampling of the chip.
-        size: odd number of pixels a side.
+        gsd_m: ground sampling of the chip, metres.
+        size: side of the chip, an odd number of pixels.
 
     Returns:
-        (size, size) float32; NaN where the image shows nothing.
+        (size, size) float32; NaN where the image has no data.
     """
     positions = chip_positions(model, lon_lat_h, gsd_m, size)
     return sample_image(source, positions, gsd_m / image_gsd_m(model, lon_lat_h))
 
 
 def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: float) -> FloatImage:
-    """An image at many places near each other, at a resolution.
+    """Values of an image at many positions near each other, at a given resolution.
 
-    Only the window of these places is read. It is averaged over whole pixels and blurred down to the
-    resolution asked for, then resampled by a cubic spline.
+    Only the window of these positions is read. It is averaged over whole pixels, low-passed to the
+    resolution, then resampled by a cubic spline.
 
     Args:
         source: the image, or a reduction of it.
-        line_sample: (rows, columns, 2) positions in the original image.
-        ratio: size of the pixels wanted over that of the original's; an image is never sharpened.
+        line_sample: (rows, columns, 2) positions in the original image, pixels.
+        ratio: size of the pixels wanted over that of the original pixels; below 1 nothing is sharpened.
 
     Returns:
         (rows, columns) float32; NaN beyond the image, beside nodata and where a position is NaN.
@@ -285,21 +309,21 @@ def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: 
         ratio /= source.factor
     else:
         image = source
-    nothing = np.full(line_sample.shape[:2], np.nan, dtype=np.float32)
-    low, high = extent(line_sample)
+    empty = np.full(line_sample.shape[:2], np.nan, dtype=np.float32)
+    low, high = finite_bounds(line_sample)
     if not (high >= low).all():
-        return nothing
+        return empty
     factor = max(1, int(ratio / 2.0))
     margin = _MARGIN_PX * factor + int(2.0 * ratio)
     first = np.floor(low).astype(int) - margin
     last = np.ceil(high).astype(int) + margin + 1
     first, last = np.maximum(first, -margin), np.minimum(last, np.array(image.shape) + margin)
     if (last <= 0).any() or (first >= image.shape).any() or (last - first < 4 * factor).any():
-        return nothing
-    # Squares of pixels that lie the same in every window, so that means of one serve another.
+        return empty
+    # Squares begin at multiples of the factor in every window, so that the means of one serve another.
     first -= first % factor
     last += -last % factor
     window = Window(int(first[0]), int(first[1]), *(int(v) for v in last - first))
     pixels = _means(image, window, factor)
     position = (line_sample - first - (factor - 1) / 2.0) / factor
-    return resample(spline_coefficients(pixels, blur_px(ratio / factor)), position)
+    return resample(spline_coefficients(pixels, low_pass_sigma_px(ratio / factor)), position)

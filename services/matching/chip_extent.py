@@ -1,36 +1,37 @@
-"""The middle of a chip: what of it a scene shows that ends beside its point."""
+"""The part of a chip that a scene shows where the scene ends, or lacks data, beside the point."""
 
 import numpy as np
 
 from services.types import FloatImage
 
 MIN_VISIBLE_SIDE = 0.5
-"""Of the half side of a chip: less of it is not searched. What is searched stays round the point, so
-that slopes lean to all sides alike."""
+"""Smallest part of a chip that is searched, as a fraction of the chip's half side. The part is always
+centred on the point, so that the slopes of its ground face all directions alike."""
 
 
 def visible_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
-    """Half the side of the part of a chip, round its point, that a patch shows at all places searched.
+    """Half side of the central square of a chip that a patch shows at all positions searched.
 
     Args:
-        patch: square, with the point expected in its middle; NaN where there is nothing.
+        patch: square, with the point expected at its centre; NaN where there is no data.
         half_side: of the whole chip, pixels.
-        radius_px: how far the point may be from the middle.
+        radius_px: search radius around the centre, pixels.
 
     Returns:
-        `half_side` where the whole chip is shown, or less than `MIN_VISIBLE_SIDE` of it everywhere.
+        Pixels. `half_side` when the patch has no gaps, and also when the visible square is smaller than
+        `MIN_VISIBLE_SIDE` of the chip: such a chip is not reduced.
     """
     row, col = np.nonzero(~np.isfinite(patch))
     if len(row) == 0:
         return half_side
     centre = patch.shape[0] // 2
-    nearest = int(np.maximum(np.abs(row - centre), np.abs(col - centre)).min())
-    shown = min(nearest - 1 - radius_px, half_side)
-    return shown if shown >= MIN_VISIBLE_SIDE * half_side else half_side
+    nearest_gap = int(np.maximum(np.abs(row - centre), np.abs(col - centre)).min())
+    visible = min(nearest_gap - 1 - radius_px, half_side)
+    return visible if visible >= MIN_VISIBLE_SIDE * half_side else half_side
 
 
 def central_square(pixels: FloatImage, half_side: int) -> FloatImage:
-    """The (2 h + 1, 2 h + 1) pixels in the middle of a square."""
+    """The (2 h + 1, 2 h + 1) pixels at the centre of a square image."""
     first = pixels.shape[0] // 2 - half_side
     return np.ascontiguousarray(
         pixels[first : first + 2 * half_side + 1, first : first + 2 * half_side + 1]

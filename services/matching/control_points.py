@@ -1,7 +1,7 @@
-"""Control points found in a scene: their chips, the views combined, every failure with its reason."""
+"""Control points matched in a scene: their chips, the views combined, every failure with its reason."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,9 +9,16 @@ from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
 from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.matching.chip_extent import central_square, visible_half_side
-from services.matching.correlate import FOUND, CorrelationOptions, Peak, find_chip, sigma_per_coordinate
+from services.matching.correlate import (
+    FOUND,
+    CorrelationOptions,
+    Peak,
+    PeakThresholds,
+    find_chip,
+    sigma_per_coordinate,
+)
 from services.matching.least_squares import covariance_from_influence
-from services.matching.radiometry import cloud_mask, edges, patch_statistics
+from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
 from services.matching.shadows import ShadowShift, shadow_shift
 from services.matching.systematic_error import common_covariance_px2
 from services.matching.view_selection import ViewDistanceScales, select_views
@@ -20,6 +27,7 @@ from services.types import (
     Acquisition,
     Array,
     BoolArray,
+    ChipArray,
     ChipSource,
     ControlPoints,
     FloatImage,
@@ -35,22 +43,23 @@ TILE_PX = 512
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """How points are searched.
+    """How control points are matched.
 
     Attributes:
-        max_views: how many views of a point are tried.
-        agreement_px: views of a point agree when their measures are this near, in chip pixels.
-        min_gradient_score: least correlation of gradients for a point that is not found by its grey
-            values.
-        likeness: which views are tried first.
-        correlation: when a correlation peak is believed. From 0.6 on 215 of 216 peaks of four simulated
-            scenes were right; views and the other points have to agree with it all the same.
+        max_views: largest number of views of a point that are tried.
+        agreement_px: largest distance between measures of one point by several views that agree, pixels
+            of the chips as they are searched.
+        min_gradient_score: smallest correlation of gradients that is accepted for a point whose grey
+            values do not correlate.
+        view_distance: differences between a view and the scene that decide which views are tried.
+        correlation: acceptance of correlation peaks. With a `min_score` of 0.6, 215 of 216 peaks in four
+            simulated scenes were right; the agreement of views and points rejects others.
     """
 
     max_views: int = 4
     agreement_px: float = 0.7
     min_gradient_score: float = 0.5
-    likeness: ViewDistanceScales = field(default_factory=ViewDistanceScales)
+    view_distance: ViewDistanceScales = field(default_factory=ViewDistanceScales)
     correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.6))
 
 
@@ -60,15 +69,17 @@ class PointMatches:
 
     Attributes:
         line_sample: (n, 2) pixels of the scene; NaN where not found.
-        displacement_m: (n, 2) east, north, from where the model expected them; NaN where not found.
-        sigma_px: (n,) pixels of the scene.
-        score: (n,) best correlation among the views; of edges where `by_gradient`.
-        views: (n,) how many views agree.
-        reason: (n,) "" where found; "cloud" where what was not found is bright and smooth.
-        by_gradient: (n,) found by the edges of the chips only.
-        common_covariance_m2: (2, 2) east, north, of what all the measures have in common: see
-            `shared_error`.
-        view_measures: what became of every view that was tried; its rows are those of the points.
+        displacement_m: (n, 2) east and north, from the predicted to the measured position; NaN where not
+            found.
+        sigma_px: (n,) one standard deviation a coordinate, pixels of the scene.
+        score: (n,) best correlation among the views; of gradients where `by_gradient`.
+        views: (n,) number of views that agree.
+        reason: (n,) "" where found; "cloud" where a point was not found and its surroundings are bright
+            and smooth.
+        by_gradient: (n,) found by the gradients of the chips only.
+        common_covariance_m2: (2, 2) east and north, of the error that all the measures share: see
+            `systematic_error`.
+        view_measures: result of every view that was tried; its rows are those of the points.
     """
 
     line_sample: Array
@@ -93,6 +104,7 @@ class ChipSearch:
         gsd_m: ground sampling of the chips to use, metres, as they are stored.
         radius_px: search radius, pixels of the chips after their reduction.
         reduction: factor by which the chips are reduced before the search.
+        thresholds: of the correlation of grey values; None takes those of the options.
     """
 
     image: ImageSource | ReducedImage
@@ -101,6 +113,55 @@ class ChipSearch:
     gsd_m: float
     radius_px: int
     reduction: int = 1
+    thresholds: PeakThresholds | None = None
+
+    @property
+    def level_m(self) -> float:
+        """Ground sampling of the chips after their reduction, metres."""
+        return self.gsd_m * self.reduction
+
+    @property
+    def half_side(self) -> int:
+        """Half side of the chips after their reduction, pixels."""
+        return CHIP_CENTRE // self.reduction
+
+
+@dataclass(frozen=True)
+class _Combination:
+    """The measures of one point by several views, combined.
+
+    Attributes:
+        row_col: (2,) displacement, pixels of the reduced chips; NaN where the views give no measure.
+        sigma_px: one standard deviation a coordinate, same unit.
+        agreeing: (views,) which views the measure comes from.
+        reason: `FOUND`, or why there is no measure.
+    """
+
+    row_col: Array
+    sigma_px: float
+    agreeing: BoolArray
+    reason: str
+
+
+@dataclass(frozen=True)
+class _PointMatch:
+    """The match of one point.
+
+    Attributes:
+        combination: of its views.
+        views: (k,) numbers of the views tried, within the point.
+        peaks: of these views.
+        by_gradient: whether the peaks are those of gradients.
+        scene_gsd_m: ground sampling of the scene at the point, metres.
+        statistics: (squares, 2) of the scene around the point, see `patch_statistics`.
+    """
+
+    combination: _Combination
+    views: IntArray
+    peaks: list[Peak]
+    by_gradient: bool
+    scene_gsd_m: float
+    statistics: Array
 
 
 def match_points(
@@ -110,189 +171,238 @@ def match_points(
     options: MatchingOptions,
     progress: Progress = no_progress,
 ) -> PointMatches:
-    """Search every point around where a model expects it.
+    """Positions of control points in a scene, searched around where its model predicts them.
 
-    The scene is rendered into the geometry of the chips through the model; the displacement found there
-    goes back through the same model, so that relief and sampling are the chip's own.
+    The scene is rendered into the geometry of the chips through the model. The displacement measured
+    there goes back through the same model, so that relief and sampling are those of the chip.
 
     Args:
-        image: the scene, or a reduction of it.
-        model: of the scene.
+        search: the scene, which chips, and how far.
         points: all of them are tried.
         chips: of the points.
-        gsd_m: ground sampling of the chips to use.
-        radius_px: how far to search, pixels of the chips as they are searched.
-        scene: how it was taken.
         options: thresholds.
-        progress: told the fraction of the points done.
-        reduction: chips are degraded to so many times their ground sampling before they are searched.
+        progress: receives the fraction of the points done.
     """
-    n = len(points)
-    image, model, scene = search.image, search.model, search.acquisition
-    gsd_m, radius_px, reduction = search.gsd_m, search.radius_px, search.reduction
-    level_m, whole = gsd_m * reduction, CHIP_CENTRE // reduction
-    displacement_m = np.full((n, 2), np.nan)
-    sigma_m = np.full(n, np.nan)
-    score = np.full(n, np.nan)
-    views = np.zeros(n, dtype=np.int64)
-    reason = np.full(n, "", dtype="<U16")
-    by_gradient = np.zeros(n, dtype=bool)
-    looks = [np.empty((0, 2))] * n
-    scene_gsd_m = np.full(n, np.nan)
-    chosen = select_views(points, gsd_m, scene, options.max_views, options.likeness)
-    shadows = [shadow_shift(image, scene, level_m) for image in points.views.images]
-    offsets: list[Array] = []
-    seen: list[tuple[int, int, Peak, bool]] = []
-    for done, row in enumerate(_tile_order(model.project(points.lon_lat_h))):
-        if done % 64 == 0:
-            progress(done / n, f"searching {n} points with chips of {level_m:g} m")
-        rows = chosen.row[chosen.start[row] : chosen.start[row + 1]]
-        numbers = rows - points.views.start[row]
-        if len(numbers) == 0:
-            reason[row] = "no_chip"
+    selected = select_views(
+        points, search.gsd_m, search.acquisition, options.max_views, options.view_distance
+    )
+    shifts = [shadow_shift(image, search.acquisition, search.level_m) for image in points.views.images]
+    matches = [_not_searched("")] * len(points)
+    order = _tile_order(search.model.project(points.lon_lat_h))
+    for count, row in enumerate(order):
+        if count % 64 == 0:
+            progress(
+                count / len(points), f"searching {len(points)} points with chips of {search.level_m:g} m"
+            )
+        view_rows = selected.row[selected.start[row] : selected.start[row + 1]]
+        if len(view_rows) == 0:
+            matches[row] = _not_searched("no_chip")
             continue
-        ground = points.lon_lat_h[row]
-        patch = render_chip(image, model, ground, level_m, 2 * (whole + radius_px) + 1)
+        patch = _predicted_patch(search, points.lon_lat_h[row])
         if not np.isfinite(patch).any():
-            reason[row] = "nodata"
+            matches[row] = _not_searched("nodata")
             continue
-        scene_gsd_m[row] = image_gsd_m(model, ground)
-        stack = point_chips(points, chips, row)
-        ratio = scene_gsd_m[row] / gsd_m
-        looks[row] = patch_statistics(patch)
-        half = visible_half_side(patch, whole, radius_px)
-        patch = central_square(patch, half + radius_px)
-        like_scene = [
-            central_square(_as_seen(stack[number], ratio, reduction), half) for number in numbers
+        views = view_rows - points.views.start[row]
+        stored = point_chips(points, chips, row)
+        candidates = [
+            (stored[view], shifts[image])
+            for view, image in zip(views, points.views.image[view_rows], strict=True)
         ]
-        moves = [shadows[image] for image in points.views.image[rows]]
-        peaks, combined, by_gradient[row] = _search(patch, like_scene, moves, options)
-        row_col, sigma, agreeing, reason[row] = combined
-        for number, peak, agreed in zip(numbers, peaks, agreeing, strict=True):
-            seen.append((row, int(number), peak, bool(agreed)))
-            offsets.append((peak.row_col - row_col)[::-1] * [1.0, -1.0])
-        views[row] = agreeing.sum()
-        score[row] = max((p.score for p in peaks if np.isfinite(p.score)), default=np.nan)
-        displacement_m[row] = row_col[1] * level_m, -row_col[0] * level_m
-        sigma_m[row] = sigma * level_m
-    # Where the scene ends it is not a cloud that hides a point.
-    reason[cloud_mask(looks, reason == FOUND) & (reason != "nodata")] = "cloud"
-    moved = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
-    found_views = np.array([np.isfinite(offset).all() for offset in offsets], dtype=bool)
-    view_row = np.array([points.views.start[row] + number for row, number, *_ in seen], dtype=np.int64)
-    shared_px2 = common_covariance_px2(
-        scene,
-        points.views,
-        view_row[found_views],
-        np.array(offsets).reshape(-1, 2)[found_views],
-        np.array([agreed for *_, agreed in seen], dtype=bool)[found_views],
-    )
-    return PointMatches(
-        model.project(moved),
-        displacement_m,
-        sigma_m / scene_gsd_m,
-        score,
-        views,
-        reason,
-        by_gradient,
-        shared_px2 * level_m**2,
-        _view_measures(seen),
-    )
+        scene_gsd_m = image_gsd_m(search.model, points.lon_lat_h[row])
+        peaks, combination, by_gradient = _match_point(search, patch, candidates, scene_gsd_m, options)
+        matches[row] = _PointMatch(
+            combination, views, peaks, by_gradient, scene_gsd_m, patch_statistics(patch)
+        )
+    return _assembled(search, points, matches, order)
 
 
-Combined = tuple[Array, float, BoolArray, str]
-"""Displacement (2,), sigma, which views agree, reason."""
+def _not_searched(reason: str) -> _PointMatch:
+    nowhere = _Combination(np.full(2, np.nan), np.nan, np.zeros(0, dtype=bool), reason)
+    return _PointMatch(nowhere, np.zeros(0, dtype=np.int64), [], False, np.nan, np.empty((0, 2)))
 
 
-def _search(
+def _predicted_patch(search: ChipSearch, lon_lat_h: Array) -> FloatImage:
+    """The scene around a point (3,), in the geometry of its reduced chips, as far as it is searched."""
+    size = 2 * (search.half_side + search.radius_px) + 1
+    return render_chip(search.image, search.model, lon_lat_h, search.level_m, size)
+
+
+def _match_point(
+    search: ChipSearch,
     patch: FloatImage,
-    chips: list[FloatImage],
-    shadows: list[ShadowShift | None],
+    candidates: list[tuple[ChipArray, ShadowShift | None]],
+    scene_gsd_m: float,
     options: MatchingOptions,
-) -> tuple[list[Peak], Combined, bool]:
-    """The views of a point in a patch: by grey values, else by their edges alone."""
-    peaks = [
-        find_chip(patch, chip, options.correlation, moved)
-        for chip, moved in zip(chips, shadows, strict=True)
+) -> tuple[list[Peak], _Combination, bool]:
+    """The peaks of the views of a point in a patch, combined, and whether gradients were used.
+
+    Grey values are correlated first. Gradients replace them where the score alone is too low.
+
+    Args:
+        search: see `match_points`.
+        patch: the scene around the point.
+        candidates: the views, each with its stored chip and the shift of its shadows.
+        scene_gsd_m: ground sampling of the scene at the point, metres.
+        options: thresholds.
+    """
+    half_side = visible_half_side(patch, search.half_side, search.radius_px)
+    patch = central_square(patch, half_side + search.radius_px)
+    ratio = scene_gsd_m / search.gsd_m
+    chips = [
+        central_square(_at_scene_resolution(stored, ratio, search.reduction), half_side)
+        for stored, _ in candidates
     ]
-    combined = _combined(peaks, options.agreement_px)
-    if combined[-1] == "low_score":
-        outlines = edges(patch)
-        correlation = replace(options.correlation, min_score=options.min_gradient_score)
-        by_edges = [find_chip(outlines, edges(chip), correlation) for chip in chips]
-        again = _combined(by_edges, options.agreement_px)
-        if again[-1] == FOUND:
-            return by_edges, again, True
-    return peaks, combined, False
+    thresholds = search.thresholds or options.correlation.thresholds
+    peaks = [
+        find_chip(patch, chip, options.correlation, thresholds=thresholds, shadows=shift)
+        for chip, (_, shift) in zip(chips, candidates, strict=True)
+    ]
+    combination = _combined(peaks, options.agreement_px)
+    if combination.reason == "low_score":
+        patch = gradient_image(patch)
+        thresholds = PeakThresholds(options.min_gradient_score, thresholds.max_second)
+        gradient_peaks = [
+            find_chip(patch, gradient_image(chip), options.correlation, thresholds=thresholds)
+            for chip in chips
+        ]
+        gradient_combination = _combined(gradient_peaks, options.agreement_px)
+        if gradient_combination.reason == FOUND:
+            return gradient_peaks, gradient_combination, True
+    return peaks, combination, False
 
 
-def _view_measures(seen: list[tuple[int, int, Peak, bool]]) -> ViewMeasures:
-    """The views tried: point, number, peak, whether it agrees; by point and number."""
-    seen = sorted(seen, key=lambda view: view[:2])
-    return ViewMeasures(
-        point=np.array([point for point, *_ in seen], dtype=np.int64),
-        view=np.array([number for _, number, *_ in seen], dtype=np.int64),
-        score=np.array([peak.score for *_, peak, _ in seen], dtype=np.float64),
-        agreed=np.array([agreed for *_, agreed in seen], dtype=bool),
-        reason=np.array([peak.reason for *_, peak, _ in seen], dtype="<U16"),
+def _assembled(
+    search: ChipSearch, points: ControlPoints, matches: list[_PointMatch], order: Sequence[int]
+) -> PointMatches:
+    """The matches of all points, in the rows of the points; `order` is that of the search."""
+    level_m, n = search.level_m, len(points)
+    row_col = np.array([match.combination.row_col for match in matches]).reshape(-1, 2)
+    displacement_m = np.column_stack([row_col[:, 1] * level_m, -row_col[:, 0] * level_m])
+    sigma_m = np.array([match.combination.sigma_px for match in matches]) * level_m
+    reason = np.array([match.combination.reason for match in matches], dtype="<U16")
+    # A point beyond the border of the scene is missing, whatever the brightness around it.
+    clouded = cloud_mask([match.statistics for match in matches], reason == FOUND)
+    reason[clouded & (reason != "nodata")] = "cloud"
+    measured = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
+    return PointMatches(
+        line_sample=search.model.project(measured),
+        displacement_m=displacement_m,
+        sigma_px=sigma_m / np.array([match.scene_gsd_m for match in matches]),
+        score=np.array([_best_score(match.peaks) for match in matches]),
+        views=np.array([match.combination.agreeing.sum() for match in matches], dtype=np.int64),
+        reason=reason,
+        by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
+        common_covariance_m2=_common_covariance_px2(search, points, matches, order) * level_m**2,
+        view_measures=_view_measures(matches),
     )
 
 
-def chip_pixels(chip: np.ndarray) -> FloatImage:
-    """A stored chip as float32, NaN where nodata."""
+def _best_score(peaks: list[Peak]) -> float:
+    return max((peak.score for peak in peaks if np.isfinite(peak.score)), default=np.nan)
+
+
+def _common_covariance_px2(
+    search: ChipSearch, points: ControlPoints, matches: list[_PointMatch], order: Sequence[int]
+) -> Array:
+    """Covariance (2, 2), east and north, of the error that all measures share, reduced chip pixels."""
+    view_row: list[int] = []
+    offset: list[Array] = []
+    agreeing: list[bool] = []
+    for row in order:
+        match = matches[row]
+        for view, peak, agrees in zip(match.views, match.peaks, match.combination.agreeing, strict=True):
+            view_row.append(points.views.start[row] + view)
+            offset.append((peak.row_col - match.combination.row_col)[::-1] * [1.0, -1.0])
+            agreeing.append(agrees)
+    offsets = np.array(offset).reshape(-1, 2)
+    measured = np.isfinite(offsets).all(axis=1)
+    return common_covariance_px2(
+        search.acquisition,
+        points.views,
+        np.array(view_row, dtype=np.int64)[measured],
+        offsets[measured],
+        np.array(agreeing, dtype=bool)[measured],
+    )
+
+
+def _view_measures(matches: list[_PointMatch]) -> ViewMeasures:
+    """The views tried, by point and number of the view."""
+    tried = [
+        (row, int(view), peak, bool(agrees))
+        for row, match in enumerate(matches)
+        for view, peak, agrees in sorted(
+            zip(match.views, match.peaks, match.combination.agreeing, strict=True),
+            key=lambda of_view: int(of_view[0]),
+        )
+    ]
+    return ViewMeasures(
+        point=np.array([row for row, *_ in tried], dtype=np.int64),
+        view=np.array([view for _, view, *_ in tried], dtype=np.int64),
+        score=np.array([peak.score for *_, peak, _ in tried], dtype=np.float64),
+        agreed=np.array([agrees for *_, agrees in tried], dtype=bool),
+        reason=np.array([peak.reason for *_, peak, _ in tried], dtype="<U16"),
+    )
+
+
+def chip_pixels(chip: ChipArray) -> FloatImage:
+    """A stored chip as float32; NaN where nodata."""
     pixels = chip.astype(np.float32)
     pixels[chip == 0] = np.nan
     return pixels
 
 
-def _as_seen(chip: np.ndarray, ratio: float, reduction: int) -> FloatImage:
-    """A chip at the resolution of a scene whose pixels are `ratio` times larger, degraded or not.
+def _at_scene_resolution(chip: ChipArray, ratio: float, reduction: int) -> FloatImage:
+    """A stored chip low-passed to the resolution of the scene or of the reduction, then reduced.
 
-    Every `reduction`-th pixel is kept, the centre among them.
+    Args:
+        chip: as stored.
+        ratio: ground sampling of the scene over that of the chip.
+        reduction: every so many pixels one is kept, the centre among them.
     """
-    seen = low_pass(chip_pixels(chip), max(ratio, float(reduction)))
+    smooth = low_pass(chip_pixels(chip), max(ratio, float(reduction)))
     first = CHIP_CENTRE % reduction
-    return np.ascontiguousarray(seen[first::reduction, first::reduction])
+    return np.ascontiguousarray(smooth[first::reduction, first::reduction])
 
 
 def _tile_order(line_sample: Array) -> Sequence[int]:
-    """Rows in the order of the tiles of the image they fall in."""
+    """Rows of positions in the order of the image tiles they fall in."""
     tile = np.nan_to_num(line_sample // TILE_PX, nan=-1.0)
     return [int(row) for row in np.lexsort((tile[:, 1], tile[:, 0]))]
 
 
-def _combined(peaks: list[Peak], agreement_px: float) -> Combined:
-    """One measure from the views of a point."""
-    nothing, none = np.full(2, np.nan), np.zeros(len(peaks), dtype=bool)
-    found = [p for p in peaks if p.reason == FOUND]
-    if not found:
-        best = max(peaks, key=lambda p: -1.0 if np.isnan(p.score) else p.score)
-        return nothing, np.nan, none, best.reason
-    row_col = np.array([p.row_col for p in found])
+def _combined(peaks: list[Peak], agreement_px: float) -> _Combination:
+    """One measure from the peaks of the views of a point."""
+    nowhere, nobody = np.full(2, np.nan), np.zeros(len(peaks), dtype=bool)
+    accepted = np.array([peak.reason == FOUND for peak in peaks])
+    if not accepted.any():
+        best = max(peaks, key=lambda peak: -1.0 if np.isnan(peak.score) else peak.score)
+        return _Combination(nowhere, np.nan, nobody, best.reason)
+    row_col = np.array([peak.row_col for peak in peaks])[accepted]
     near = np.hypot(*(row_col - np.median(row_col, axis=0)).T) <= agreement_px
-    if 2 * near.sum() <= len(found) and len(found) > 1:
-        return nothing, np.nan, none, "views_disagree"
-    agreeing = none.copy()
-    agreeing[np.flatnonzero([p.reason == FOUND for p in peaks])[near]] = True
-    mean, sigma = weighted_mean([p for p, agreed in zip(peaks, agreeing, strict=True) if agreed])
-    return mean, sigma, agreeing, FOUND
+    if 2 * near.sum() <= len(row_col) and len(row_col) > 1:
+        return _Combination(nowhere, np.nan, nobody, "views_disagree")
+    agreeing = nobody.copy()
+    agreeing[np.flatnonzero(accepted)[near]] = True
+    mean, sigma_px = _weighted_mean(
+        [peak for peak, agrees in zip(peaks, agreeing, strict=True) if agrees]
+    )
+    return _Combination(mean, sigma_px, agreeing, FOUND)
 
 
-def weighted_mean(peaks: list[Peak]) -> tuple[Array, float]:
-    """The weighted mean (2,) of places of one point, and its sigma.
+def _weighted_mean(peaks: list[Peak]) -> tuple[Array, float]:
+    """The weighted mean (2,) of the measures of one point, and its sigma per coordinate.
 
-    Views of one scene share its noise and its shadows: their influences are averaged square by square,
-    and what they have in common stays. What scatters beyond that is added.
+    The views of a point share the noise and the shadows of the scene. So their influences are averaged
+    square by square, which keeps what they have in common. The scatter beyond it is added.
     """
     weight = np.array([peak.sigma_px for peak in peaks]) ** -2.0
     weight /= weight.sum()
-    places = np.array([peak.row_col for peak in peaks])
-    mean = weight @ places
+    row_col = np.array([peak.row_col for peak in peaks])
+    mean = weight @ row_col
     influences = np.stack([peak.influence for peak in peaks])
     common = np.tensordot(weight, influences, axes=1)
     own = sum(np.trace(covariance_from_influence(each - common)) for each in influences)
-    scatter = float(((places - mean) ** 2).sum())
-    beyond = max(0.0, scatter - own) / (2.0 * len(peaks) ** 2)
-    return mean, float(
-        np.hypot(sigma_per_coordinate(covariance_from_influence(common)), np.sqrt(beyond))
-    )
+    scatter = float(((row_col - mean) ** 2).sum())
+    excess = max(0.0, scatter - own) / (2.0 * len(peaks) ** 2)
+    common_sigma_px = sigma_per_coordinate(covariance_from_influence(common))
+    return mean, float(np.hypot(common_sigma_px, np.sqrt(excess)))

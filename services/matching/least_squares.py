@@ -1,4 +1,4 @@
-"""Least-squares matching: a chip laid on a patch to a fraction of a pixel, and what noise did to it."""
+"""Least-squares matching: the position of a chip in a patch to a fraction of a pixel, with its noise."""
 
 from dataclasses import dataclass
 
@@ -10,28 +10,30 @@ from services.types import Array, FloatImage
 
 MAX_STEPS = 12
 STEP_PX = 2e-3
-"""A step this small ends the search."""
+"""A step shorter than this ends the iteration."""
+
+REACH_PX = 1.5
+"""Largest distance of the fitted position from the start, along each axis."""
 
 CELL_PX = 4
-"""Side of the squares of the chip over which influences are summed."""
+"""Side of the squares of the chip in which influences are summed."""
 
 REACH_CELLS = 5
-"""Squares this far apart have nothing to do with each other; fewer in a small chip."""
-
+"""Distance in squares beyond which influences are uncorrelated; less in a small chip."""
 
 _SUMS = {"reassoc", "contract", "nsz", "arcp"}
-"""What the compiler may do to sums to fill vector registers; NaN and infinity stay what they are."""
+"""Fast-math flags that let the compiler vectorise sums; NaN and infinity keep their meaning."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A chip laid on a patch.
+    """The least-squares position of a chip in a patch.
 
     Attributes:
-        row_col: (2,) where the chip's first pixel lies in the patch, pixels.
+        row_col: (2,) position of the chip's first pixel in the patch, pixels.
         score: normalised correlation there.
-        influence: (c, c, 2) by how much what chip and patch do not share in each square of the chip has
-            moved the place, rows and columns; their sum is zero.
+        influence: (c, c, 2) shift of the position, rows and columns, by the residuals in each square of
+            the chip; the sum over the squares is zero.
     """
 
     row_col: Array
@@ -40,39 +42,34 @@ class Fit:
 
 
 def fit_chip(
-    patch: FloatImage,
-    chip: FloatImage,
-    start: Array,
-    reach_px: float = 1.5,
-    weight: FloatImage | None = None,
+    patch: FloatImage, chip: FloatImage, start: Array, weight: FloatImage | None = None
 ) -> Fit | None:
-    """Lay a chip on a patch by least squares: two displacements, a gain and an offset.
+    """Position of a chip in a patch by least squares over two displacements, a gain and an offset.
 
-    Gauss-Newton with the gradients of the chip, which stay, so that a step costs one interpolation of
-    the patch. Where it ends, the chip's gradients are orthogonal to what is left: noise does not
-    move the place but by chance.
+    Gauss-Newton with the constant gradients of the chip, so that a step costs one interpolation of the
+    patch. At convergence the residuals are orthogonal to the gradients of the chip: the noise has no
+    systematic effect on the position.
 
     Source: Gruen (1985), Adaptive least squares correlation; Baker and Matthews (2004), Lucas-Kanade 20
     years on, for the direction of the linearisation.
 
     Args:
-        patch: larger than the chip; NaN where there is nothing.
+        patch: larger than the chip; NaN where there is no data.
         chip: (s, s) without NaN.
-        start: (2,) row and column of the chip's first pixel in the patch, to a pixel or so.
-        reach_px: how far from there the place may be.
-        weight: (s - 2, s - 2) of the chip's pixels without the outermost; all alike when None.
+        start: (2,) row and column of the chip's first pixel in the patch, to about a pixel.
+        weight: (s - 2, s - 2) of the chip's pixels without the outermost; None weights all alike.
 
     Returns:
-        None where there is no such place, or the patch has nothing beside it.
+        None where the iteration leaves `REACH_PX` or the patch, or meets missing data.
     """
-    margin = SPLINE_REACH_PX + int(np.ceil(reach_px))
+    margin = SPLINE_REACH_PX + int(np.ceil(REACH_PX))
     first = np.maximum(np.floor(start).astype(int) - margin, 0)
     last = np.minimum(np.ceil(start).astype(int) + chip.shape[0] + margin, patch.shape)
     coefficients = spline_coefficients(patch[first[0] : last[0], first[1] : last[1]])
     if weight is None:
         weight = np.ones((chip.shape[0] - 2, chip.shape[1] - 2), dtype=np.float32)
     row, col, score, influence = _fit(
-        coefficients, chip, weight, float(start[0] - first[0]), float(start[1] - first[1]), reach_px
+        coefficients, chip, weight, float(start[0] - first[0]), float(start[1] - first[1])
     )
     if not np.isfinite(score):
         return None
@@ -80,22 +77,22 @@ def fit_chip(
 
 
 def covariance_from_influence(influence: Array) -> Array:
-    """Covariance (2, 2) of a place from the influences of the squares of its chip.
+    """Covariance (2, 2) of a position from the influences of the squares of its chip.
 
-    What chip and patch do not share is rarely white: it is as smooth as the land, and sits where
-    shadows and roofs are. So neighbouring squares count as they vary together, up to some distance
-    and less with it (a sandwich with Bartlett's weights).
+    The residuals between chip and patch are rarely white: they are correlated over short distances and
+    concentrated at shadows and roofs. So the products of neighbouring squares count, with Bartlett
+    weights that fall to zero at a fixed distance (a sandwich estimator).
 
     Source: Newey and West (1987), in two dimensions as in Conley (1999).
 
     Args:
-        influence: (c, c, 2) summing to zero.
+        influence: (c, c, 2) with a sum of zero.
     """
     cells = len(influence)
     reach = min(REACH_CELLS, max(1, cells // 5))
     covariance = np.zeros((2, 2))
     _bartlett(np.ascontiguousarray(influence), reach, covariance)
-    # Influences that sum to zero vary less than those they stand for.
+    # The constraint of a zero sum reduces the variance of the influences: this factor restores it.
     return covariance / (1.0 - (reach / cells) ** 2)
 
 
@@ -106,8 +103,8 @@ def _fit(
     weight: FloatImage,
     row: float,
     col: float,
-    reach_px: float,
 ) -> tuple[float, float, float, Array]:
+    """Row, column, score and influence of the fitted position; NaN scores where there is none."""
     side = chip.shape[0] - 2
     lines, samples = coefficients.shape
     gradients, inverse = _design(chip, weight)
@@ -127,7 +124,7 @@ def _fit(
             return failed
         scale = min(1.0, 0.7 / max(size, 1e-9))
         r, c = r + scale * step_r, c + scale * step_c
-        if abs(r - row) > reach_px or abs(c - col) > reach_px:
+        if abs(r - row) > REACH_PX or abs(c - col) > REACH_PX:
             return failed
         if size < STEP_PX:
             break
@@ -139,9 +136,9 @@ def _fit(
 
 @njit(cache=True, fastmath=_SUMS)
 def _design(chip: FloatImage, weight: FloatImage) -> tuple[FloatImage, Array]:
-    """Weighted gradients of the chip without its grey values and mean; their normal matrix inverted.
+    """Weighted gradients (2, s, s) of the chip, orthogonal to gain and offset; inverse normal matrix.
 
-    What they are multiplied with is weighted by them, and freed of gain and offset.
+    A scalar product with them weights the other factor and removes its gain and offset.
     """
     side = chip.shape[0] - 2
     gradients = np.empty((2, side, side), dtype=np.float32)
@@ -186,7 +183,7 @@ def _design(chip: FloatImage, weight: FloatImage) -> tuple[FloatImage, Array]:
 def _interpolated(
     coefficients: FloatImage, row: float, col: float, out: FloatImage, derivative: int
 ) -> None:
-    """The patch from one place on; or its derivative by row (1) or by column (2)."""
+    """Fill `out` with the patch from a position on, or with its derivative by row (1) or column (2)."""
     i, j = int(row), int(col)
     u, v = np.empty(4, np.float32), np.empty(4, np.float32)
     _taps(row - i, u, derivative == 1)
@@ -212,6 +209,7 @@ def _interpolated(
 
 @njit(cache=True)
 def _taps(t: float, out: FloatImage, derivative: bool) -> None:
+    """Fill `out` (4,) with the spline weights at a fraction `t`, or with their derivatives."""
     if derivative:
         s = 1.0 - t
         out[0] = -0.5 * s * s
@@ -226,7 +224,7 @@ def _taps(t: float, out: FloatImage, derivative: bool) -> None:
 def _projected(
     at: FloatImage, chip: FloatImage, gradients: FloatImage, inverse: Array
 ) -> tuple[float, float, float]:
-    """Gain of the chip in a patch, and how much of its gradients is in there."""
+    """Gain of the chip in a patch, and the components of the patch along the chip's gradients."""
     side = at.shape[0]
     mean, chip_mean = 0.0, 0.0
     for i in range(side):
@@ -251,7 +249,7 @@ def _projected(
 def _influence(
     coefficients: FloatImage, chip: FloatImage, gradients: FloatImage, row: float, col: float
 ) -> tuple[float, Array]:
-    """Correlation of chip and patch, and the influence of the squares of the chip."""
+    """Correlation of chip and patch, and the influences (c, c, 2) of the squares of the chip."""
     side = chip.shape[0] - 2
     at = np.empty((side, side), dtype=np.float32)
     down = np.empty((side, side), dtype=np.float32)
@@ -278,8 +276,8 @@ def _influence(
             m10 += gradients[1, i, j] * down[i, j]
             m11 += gradients[1, i, j] * right[i, j]
     score = product / np.sqrt(square * chip_square)
-    # Noise in the chip makes the regression's gain too small, noise in the patch its inverse: between
-    # the two lies the one that leaves of both what is noise.
+    # Noise in the chip biases the regression gain low, noise in the patch biases its inverse low. The
+    # ratio of the spreads lies between the two.
     gain = np.sqrt(square / chip_square)
     determinant = m00 * m11 - m01 * m10
     cells = -(-side // CELL_PX)
@@ -295,7 +293,11 @@ def _influence(
 
 @njit(cache=True, fastmath=_SUMS)
 def _bartlett(influence: Array, reach: int, covariance: Array) -> None:
-    """Sum over all squares `reach` wide, whole or not, of the products of their sums."""
+    """Fill `covariance` (2, 2) with the products of the sums over all windows `reach` cells wide.
+
+    Windows beyond the border count with the cells they contain. The result is the double sum over pairs
+    of cells with Bartlett weights.
+    """
     cells = influence.shape[0]
     for i in range(1 - reach, cells):
         for j in range(1 - reach, cells):

@@ -1,4 +1,4 @@
-"""Points measured chip against chip in all the images that see them."""
+"""Points measured by chip matching in all the images that see them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,7 +21,8 @@ from services.types import (
     no_progress,
 )
 
-_KERNEL = 51
+_CORE_PX = 51
+"""Side of the core of a chip whose correlation with the whole chip measures the saliency."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +30,16 @@ class RefinementOptions:
     """How points are measured on chips.
 
     Attributes:
-        radius_px: how far from the adjusted models' prediction, chip pixels.
-        min_sigma_px: no measure is believed to be better than this, chip pixels.
-        correlation: when a correlation peak is believed.
+        radius_px: search radius around the prediction of the adjusted models, chip pixels.
+        min_sigma_px: smallest sigma of a measure, chip pixels.
+        correlation: when a correlation peak is accepted.
     """
 
     radius_px: int = 6
     min_sigma_px: float = 0.03
-    # Steep ground looks different from two sides: half of it in common tells a place among the few that
-    # are left. Along the parallax it is blurred then; the rays say how much that matters.
+    # Steep ground looks different from two directions: a correlation of 0.5 is enough within the small
+    # search radius. The position is then uncertain along the parallax, which the residuals of the rays
+    # show.
     correlation: CorrelationOptions = field(
         default_factory=lambda: CorrelationOptions(min_score=0.5, max_sigma_px=2.0)
     )
@@ -52,21 +54,21 @@ def refine_on_chips(
     *,
     progress: Progress = no_progress,
 ) -> Observations:
-    """Measure points again, in every image that shows their chip whole.
+    """Positions of points in every image that shows their whole chip, measured by chip matching.
 
-    The chip of the steepest view is looked for in the others, all in the geometry of the chip.
+    The view closest to the vertical gives the chip, which is searched in the other images, rendered into
+    the geometry of the chip.
 
     Args:
         scenes: the images.
-        models: one per image, already in agreement to a few chip pixels.
+        models: one per image, consistent with each other to a few chip pixels.
         lon_lat_h: (n, 3) the points.
-        gsd_m: ground sampling of the chips.
+        gsd_m: ground sampling of the chips, metres.
         options: thresholds.
-        progress: told the fraction of the points done.
+        progress: receives the fraction of the points done.
 
     Returns:
-        Image positions of those points that two images or more agree on; `point` is the row of
-        `lon_lat_h`.
+        Image positions of the points that two images or more measure; `point` is the row of `lon_lat_h`.
     """
     whole = np.stack(
         [
@@ -74,18 +76,19 @@ def refine_on_chips(
             for scene, model in zip(scenes, models, strict=True)
         ]
     )
-    steepest = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
+    by_incidence = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
     point, image, line_sample, sigma = [], [], [], []
     for row, ground in enumerate(lon_lat_h):
         if row % 64 == 0:
             progress(row / len(lon_lat_h), f"measuring {len(lon_lat_h)} points on chips")
-        seen_by = [int(i) for i in steepest if whole[i, row]]
-        found = _measure(scenes, models, ground, seen_by, gsd_m, options)
-        if len(found) < 2:
+        views = [(scenes[i], models[i]) for i in by_incidence if whole[i, row]]
+        numbers = [int(i) for i in by_incidence if whole[i, row]]
+        measures = _measure_point(views, ground, gsd_m, options)
+        if len(measures) < 2:
             continue
-        for i, position, sigma_px in found:
+        for view, position, sigma_px in measures:
             point.append(row)
-            image.append(i)
+            image.append(numbers[view])
             line_sample.append(position)
             sigma.append(sigma_px)
     return Observations(
@@ -96,42 +99,51 @@ def refine_on_chips(
     )
 
 
-def _measure(
-    scenes: Sequence[Scene],
-    models: Sequence[SensorModel],
+def _measure_point(
+    views: Sequence[tuple[Scene, SensorModel]],
     ground: Array,
-    seen_by: list[int],
     gsd_m: float,
     options: RefinementOptions,
 ) -> list[tuple[int, Array, float]]:
-    """Image, position and sigma of one point in the images that see it."""
-    if len(seen_by) < 2:
+    """View, position (2,) in pixels and sigma in pixels of one point (3,) where its chip is found.
+
+    The first view gives the chip; its measure, the last one returned, is the projection of the point.
+    """
+    if len(views) < 2:
         return []
-    first = seen_by[0]
-    chip = render_chip(scenes[first].image, models[first], ground, gsd_m)
-    found = []
-    best = np.inf
-    for i in seen_by[1:]:
-        patch = render_chip(scenes[i].image, models[i], ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
+    first_scene, first_model = views[0]
+    chip = render_chip(first_scene.image, first_model, ground, gsd_m)
+    measures = []
+    best_sigma_px = np.inf
+    for view, (scene, model) in enumerate(views[1:], start=1):
+        patch = render_chip(scene.image, model, ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
         peak = find_chip(patch, chip, options.correlation)
         if peak.reason != FOUND:
             continue
-        moved = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
-        position = models[i].project(move_metres(ground[None, :], np.array(moved)))[0]
+        displacement_m = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
+        position = model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]
         sigma_px = max(peak.sigma_px, options.min_sigma_px)
-        best = min(best, sigma_px)
-        found.append((i, position, sigma_px * gsd_m / image_gsd_m(models[i], ground)))
-    if found:
-        # The first view defines the detail: it is as sharp as the best of the others could be measured.
-        scale = gsd_m / image_gsd_m(models[first], ground)
-        found.append((first, models[first].project(ground[None, :])[0], best * scale))
-    return found
+        best_sigma_px = min(best_sigma_px, sigma_px)
+        measures.append((view, position, sigma_px * gsd_m / image_gsd_m(model, ground)))
+    if measures:
+        # The first view defines the detail: its position is as precise as the best of the others.
+        scale = gsd_m / image_gsd_m(first_model, ground)
+        measures.append((0, first_model.project(ground[None, :])[0], best_sigma_px * scale))
+    return measures
 
 
 def chip_inside(
     model: SensorModel, shape: tuple[int, int], lon_lat_h: Array, gsd_m: float, margin_px: int = 0
 ) -> BoolArray:
-    """Which points (n, 3) have a chip that the image shows whole."""
+    """Which points (n, 3) have a chip that lies completely inside the image.
+
+    Args:
+        model: of the image.
+        shape: lines and samples of the image.
+        lon_lat_h: (n, 3) the points.
+        gsd_m: ground sampling of the chip, metres.
+        margin_px: distance from the border of the image that is kept free, chip pixels.
+    """
     reach_m = (CHIP_CENTRE + margin_px + 2.0) * gsd_m
     inside = np.ones(len(lon_lat_h), dtype=bool)
     for east, north in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
@@ -144,16 +156,16 @@ def chip_inside(
 def chip_saliency(chip: FloatImage) -> float:
     """How well a chip can be located by its own content, 0 to 1.
 
-    The heart of the chip is looked for in the whole of it: what counts is how much worse the next best
-    place is than the right one. Lines and repeated patterns have none.
+    The core of the chip is correlated with the whole chip. The saliency is 1 minus the second best
+    score, the best being 1 at the true position. Lines and repeated patterns have a saliency near 0.
     """
     if not np.isfinite(chip).all():
         return 0.0
-    margin = (CHIP_SIZE - _KERNEL) // 2
-    heart = np.ascontiguousarray(chip[margin:-margin, margin:-margin])
-    if heart.std() == 0.0:
+    margin = (CHIP_SIZE - _CORE_PX) // 2
+    core = np.ascontiguousarray(chip[margin:-margin, margin:-margin])
+    if core.std() == 0.0:
         return 0.0
-    scores = correlation_map(chip, heart)
+    scores = correlation_map(chip, core)
     if scores is None:
         return 0.0
     scores[margin - 4 : margin + 5, margin - 4 : margin + 5] = -1.0
@@ -161,6 +173,6 @@ def chip_saliency(chip: FloatImage) -> float:
 
 
 def stored_chip(pixels: FloatImage) -> ChipArray:
-    """A chip as it is stored: uint16, 0 where there is nodata."""
+    """A chip as it is stored: uint16, 0 where nodata, 1 at least elsewhere."""
     stored = np.clip(np.rint(np.nan_to_num(pixels, nan=0.0)), 1, np.iinfo(np.uint16).max)
     return np.where(np.isfinite(pixels), stored, 0).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Where points should be in a scene, and which of them to try."""
+"""Predicted positions: which lie in an image, and a well-distributed selection of them."""
 
 import numpy as np
 
@@ -6,7 +6,13 @@ from services.types import Array, BoolArray, IntArray
 
 
 def in_image(line_sample: Array, shape: tuple[int, int], margin_px: Array | float = 0.0) -> BoolArray:
-    """Which positions (n, 2) lie in an image grown by a margin; NaN positions do not."""
+    """Which positions (n, 2) lie in an image enlarged by a margin; NaN positions do not.
+
+    Args:
+        line_sample: (n, 2) pixels.
+        shape: lines and samples of the image.
+        margin_px: of all positions, or (n,) of each; pixels.
+    """
     size = np.array(shape)
     margin = np.broadcast_to(margin_px, (len(line_sample),))[:, None]
     return np.asarray(
@@ -21,20 +27,20 @@ def spread_over_image(
     shape: tuple[int, int],
     count: int,
 ) -> IntArray:
-    """A well-distributed choice of points.
+    """Rows of well-distributed points, the best of every part of the image first.
 
-    The image is cut into about `count` / 2 square cells; the best point of every cell comes first, then
-    the second best of every cell, and so on. Within a cell low, middle and high ground take turns.
+    The image is divided into about `count` / 2 square cells. The best point of every cell comes first,
+    then the second best of every cell, and so on. Within a cell low, middle and high ground alternate.
 
     Args:
         line_sample: (n, 2) positions.
-        height_m: (n,).
+        height_m: (n,) of the ground.
         preference: (n,) larger is better.
         shape: lines and samples of the image.
-        count: how many to choose at most.
+        count: largest number of points selected.
 
     Returns:
-        Rows of the chosen points, best first.
+        (m,) rows, in order of selection.
     """
     if len(line_sample) <= count:
         return np.argsort(-preference, kind="stable")
@@ -42,16 +48,16 @@ def spread_over_image(
     cell = np.floor(line_sample / side).astype(np.int64)
     key = cell[:, 0] * 1_000_003 + cell[:, 1]
     third = np.searchsorted(np.quantile(height_m, [1 / 3, 2 / 3]), height_m)
-    turn = rank_in_group(key * 3 + third, preference)
+    rank_in_third = rank_in_group(key * 3 + third, preference)
     # The best of every third of the heights comes before the second best of any.
-    order = np.lexsort((-preference, turn))
-    place = np.empty(len(order))
-    place[order] = np.arange(len(order))
-    return np.lexsort((-preference, rank_in_group(key, -place)))[:count]
+    order = np.lexsort((-preference, rank_in_third))
+    rank = np.empty(len(order))
+    rank[order] = np.arange(len(order))
+    return np.lexsort((-preference, rank_in_group(key, -rank)))[:count]
 
 
 def rank_in_group(group: IntArray, preference: Array) -> IntArray:
-    """How many members of its own group come before each, the larger preference first: (n,) from 0."""
+    """Rank (n,) of every member within its group, from 0 for the largest preference."""
     order = np.lexsort((-preference, group))
     first = np.concatenate([[True], group[order][1:] != group[order][:-1]])
     start = np.maximum.accumulate(np.where(first, np.arange(len(order)), 0))

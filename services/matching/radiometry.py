@@ -1,4 +1,4 @@
-"""Ground that does not look as it did: edges where contrast has changed, clouds over the rest."""
+"""Changed radiometry: gradients for inverted contrast, and the detection of clouds."""
 
 from collections.abc import Sequence
 
@@ -7,34 +7,35 @@ import numpy as np
 
 from services.types import Array, BoolArray, FloatImage
 
-ENOUGH_FOUND = 5
-"""From so many points found on, others can be compared with them."""
+MIN_FOUND = 5
+"""Fewest points found whose surroundings serve as the reference for those of the others."""
 
 CLOUD_ROUGHNESS = 0.4
-"""A cloud is at most so rough as half of the ground around points that were found."""
+"""Largest roughness of a cloud, as a fraction of the median roughness around the points found."""
 
 CLOUD_BRIGHTNESS = 0.9
-"""It is brighter than this share of that ground."""
+"""Quantile of the brightness around the points found that a cloud exceeds."""
 
 CLOUD_SHARE = 0.1
-"""So much of what is around a point under clouds hides it: nothing else is as bright, and correlation
-follows what is brightest."""
+"""Smallest share of cloud around a point that hides it: nothing else is as bright, and correlation
+follows the brightest part."""
 
 CELL_PX = 10
-"""Side of the squares that are bright and smooth or not."""
+"""Side of the squares in which brightness and roughness are computed."""
 
 
-def edges(pixels: FloatImage) -> FloatImage:
-    """Root of the length of the gradient, without the outermost pixels.
+def gradient_image(pixels: FloatImage) -> FloatImage:
+    """Square root of the gradient magnitude, without the outermost pixels.
 
-    It keeps where things end, not which side is brighter: inverted bands, other crops and wet ground
-    have the same. The root keeps a few roofs from deciding alone.
+    It depends on where the brightness changes, not on which side is brighter: inverted bands, other
+    crops and wet ground leave it unchanged. The square root keeps a few roofs from dominating the
+    correlation.
 
     Args:
-        pixels: (r, c); what is beside a NaN is one.
+        pixels: (r, c); NaN where there is no data.
 
     Returns:
-        (r - 2, c - 2).
+        (r - 2, c - 2); NaN beside missing pixels.
     """
     down = pixels[2:, 1:-1] - pixels[:-2, 1:-1]
     right = pixels[1:-1, 2:] - pixels[1:-1, :-2]
@@ -42,37 +43,38 @@ def edges(pixels: FloatImage) -> FloatImage:
 
 
 def patch_statistics(pixels: FloatImage) -> Array:
-    """Brightness and roughness of the squares of a patch: mean, and mean difference of neighbours.
+    """Brightness and roughness of the squares of a patch.
 
     Args:
-        pixels: (r, c), NaN where there is nothing.
+        pixels: (r, c); NaN where there is no data.
 
     Returns:
-        (squares, 2); NaN where a square is not seen whole.
+        (squares, 2): mean, and mean absolute difference of neighbours; NaN where a square has missing
+        pixels.
     """
     rows, columns = (size // CELL_PX for size in pixels.shape)
     inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
     squares = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
     cells = squares.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
-    rough = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
-    return np.column_stack([cells.mean(axis=(1, 2)), rough])
+    roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
+    return np.column_stack([cells.mean(axis=(1, 2)), roughness])
 
 
-def cloud_mask(looks: Sequence[Array], found: BoolArray) -> BoolArray:
-    """Which points are hidden by clouds: not found, and much around them is bright and smooth.
+def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:
+    """Which points (n,) clouds hide: not found, and much of their surroundings is bright and smooth.
 
     Args:
-        looks: (squares, 2) around each of n points, as `patch_statistics` gives them.
-        found: (n,) points that were found. With fewer than `ENOUGH_FOUND` nothing is called a cloud.
+        statistics: (squares, 2) around each of n points, see `patch_statistics`.
+        found: (n,) points that were found. With fewer than `MIN_FOUND` of them the mask is empty.
     """
     hidden = np.zeros(len(found), dtype=bool)
-    if found.sum() < ENOUGH_FOUND:
+    if found.sum() < MIN_FOUND:
         return hidden
-    ground = np.concatenate([look for look, seen in zip(looks, found, strict=True) if seen])
-    bright = np.nanquantile(ground[:, 0], CLOUD_BRIGHTNESS)
-    rough = np.nanmedian(ground[:, 1])
+    ground = np.concatenate([of_point for of_point, seen in zip(statistics, found, strict=True) if seen])
+    min_brightness = np.nanquantile(ground[:, 0], CLOUD_BRIGHTNESS)
+    median_roughness = np.nanmedian(ground[:, 1])
     for row in np.flatnonzero(~found).tolist():
-        look = looks[row][np.isfinite(looks[row]).all(axis=1)]
-        cloud = (look[:, 0] > bright) & (look[:, 1] < CLOUD_ROUGHNESS * rough)
-        hidden[row] = len(look) > 0 and cloud.mean() >= CLOUD_SHARE
+        squares = statistics[row][np.isfinite(statistics[row]).all(axis=1)]
+        cloud = (squares[:, 0] > min_brightness) & (squares[:, 1] < CLOUD_ROUGHNESS * median_roughness)
+        hidden[row] = len(squares) > 0 and cloud.mean() >= CLOUD_SHARE
     return hidden

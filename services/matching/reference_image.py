@@ -1,4 +1,4 @@
-"""Places of a scene looked for on a reference ortho-image, rendered into the scene's own geometry."""
+"""Positions of a scene matched on a reference ortho-image, rendered into the geometry of the scene."""
 
 from dataclasses import dataclass, field
 
@@ -12,6 +12,7 @@ from services.imagery.source import (
     Window,
     block_means,
     image_gsds_m,
+    interpolate_nodes,
     low_pass,
     sample_image,
 )
@@ -22,22 +23,23 @@ from services.terrain import Terrain, intersect_terrain
 from services.types import Array, FloatImage, IntArray, Progress, ViewMeasures, no_progress
 
 _NODE_PX = 4
-"""Pixels of a level between the lines of sight that are followed down to the ground."""
+"""Pixels of a level between the lines of sight that are intersected with the terrain."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference ortho-image and the ground it shows.
+    """A reference ortho-image and the terrain under it.
 
     Attributes:
         image: its pixels.
         model: an ortho model.
-        terrain: the ground; None takes it at height zero, which only a scene without parallax allows.
-        sigma_m: how far a detail of it lies off the rest of it, one standard deviation a coordinate.
-        height_sigma_m: the same of the heights.
-        common_sigma_m: what all the places measured on it have in common, one standard deviation a
-            coordinate: shadows and roofs lean the same way all over.
-        frame_sigma_m: how well it lies on the Earth as a whole, one standard deviation a coordinate; NaN
+        terrain: the ground; None assumes height zero, which only a scene without parallax allows.
+        sigma_m: position of a detail relative to the rest of the image, one standard deviation a
+            coordinate.
+        height_sigma_m: height of the terrain, one standard deviation.
+        common_sigma_m: error that all positions measured on the image share, one standard deviation a
+            coordinate: shadows and roofs lean the same way everywhere.
+        frame_sigma_m: position of the whole image on the Earth, one standard deviation a coordinate; NaN
             when unknown.
     """
 
@@ -52,34 +54,34 @@ class Reference:
 
 @dataclass(frozen=True)
 class ReferenceMatchingOptions:
-    """How places are searched.
+    """How places are matched on a reference.
 
     Attributes:
-        window_px: side of the piece of the reference that is looked for, pixels of the level; odd.
-        correlation: when a correlation peak is believed.
+        window_px: side of the window of the reference that is correlated, pixels of the level; odd.
+        correlation: when a correlation peak is accepted.
     """
 
     window_px: int = 41
     correlation: CorrelationOptions = field(default_factory=lambda: CorrelationOptions(min_score=0.7))
 
     def __post_init__(self) -> None:
-        """Refuse windows that have no centre or nothing to correlate."""
+        """Reject windows that have no centre or too little content."""
         if self.window_px < 11 or self.window_px % 2 == 0:
-            raise InputError(f"window_px: {self.window_px} given, an odd number from 11 on expected")
+            raise InputError(f"window_px: {self.window_px} given, an odd number of at least 11 expected")
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places of a level of a scene, and the ground a model sees there.
+    """Places of a level of a scene, and the ground that a model locates there.
 
     Attributes:
         model: of the scene.
         reference: what the scene is matched against.
         cell: (n, 2) pixels of the level; pixel c covers `factor` pixels of the scene from c * factor on.
-        factor: pixels of the scene to one of the level.
-        line_sample: (n, 2) their centres, pixels of the scene.
+        factor: pixels of the scene per pixel of the level.
+        line_sample: (n, 2) centres of these pixels, pixels of the scene.
         lon_lat_h: (n, 3) the ground.
-        nodes: (n, k, k, 2) where the ground around is in the reference.
+        nodes: (n, k, k, 2) positions in the reference of nodes around each place, pixels.
     """
 
     model: SensorModel
@@ -94,17 +96,18 @@ class Places:
 def visible_places(
     model: SensorModel, reference: Reference, line_sample: Array, factor: int, window_px: int
 ) -> Places:
-    """The places nearest to image positions (n, 2) whose surroundings lie on the reference's terrain.
+    """The places nearest to image positions (n, 2) whose windows lie inside the reference.
 
     Args:
         model: of the scene.
-        reference: what it will be held against.
+        reference: what the scene is matched against.
         line_sample: (n, 2) pixels of the scene.
-        factor: pixels of the scene to one of the level.
-        window_px: side of what will be looked for, pixels of the level.
+        factor: pixels of the scene per pixel of the level.
+        window_px: side of the window that is correlated, pixels of the level.
 
     Raises:
-        CoverageError: the terrain is nowhere near.
+        CoverageError: the terrain does not reach the scene.
+        InputError: the scene has a parallax, and there is no terrain.
     """
     cell = np.floor((line_sample + 0.5) / factor).astype(np.int64)
     centre = np.asarray(cell * float(factor) + (factor - 1) / 2.0, dtype=np.float64)
@@ -128,32 +131,30 @@ def match_places(
     options: ReferenceMatchingOptions,
     progress: Progress = no_progress,
 ) -> PointMatches:
-    """Search the ground that a model sees at some places of a scene around them.
+    """Positions in a scene of the ground at its places, as the reference shows that ground.
 
-    The reference and its terrain are rendered into the geometry of the scene, so that what differs is
-    the error of the model; the scene itself is averaged, never resampled.
+    The reference and its terrain are rendered into the geometry of the scene, so that the displacement
+    is the error of the model. The scene itself is averaged, never resampled.
 
     Args:
         image: the scene, or its reduction by the factor of the places.
-        model: of the scene.
-        reference: what it is held against.
         places: all of them are tried.
-        radius_px: how far to search, pixels of the level.
+        radius_px: search radius, pixels of the level.
         options: thresholds.
-        progress: told the fraction of the places done.
+        progress: receives the fraction of the places done.
     """
     n, factor = len(places.cell), places.factor
-    model, reference = places.model, places.reference
+    reference = places.reference
     line_sample = np.full((n, 2), np.nan)
     sigma_px = np.full(n, np.nan)
     score = np.full(n, np.nan)
     reason = np.full(n, "", dtype="<U16")
-    gsds_m = (image_gsds_m(of, places.lon_lat_h) for of in (model, reference.model))
+    gsds_m = (image_gsds_m(model, places.lon_lat_h) for model in (places.model, reference.model))
     ratios = (factor * np.divide(*gsds_m)).tolist()
     for i, ratio in enumerate(ratios):
         if i % 64 == 0:
             progress(i / n, f"searching {n} places at 1:{factor}")
-        positions = _between_nodes(places.nodes[i], options.window_px)
+        positions = interpolate_nodes(places.nodes[i], options.window_px, _NODE_PX)
         chip = sample_image(reference.image, positions, ratio)
         patch = _level_patch(image, places.cell[i], options.window_px // 2 + radius_px, factor)
         peak = find_chip(low_pass(patch, 1.0 / ratio), chip, options.correlation)
@@ -161,13 +162,13 @@ def match_places(
         if peak.reason == FOUND:
             line_sample[i] = places.line_sample[i] + peak.row_col * factor
             sigma_px[i] = peak.sigma_px * factor
-    derivative = model.project_derivative(places.lon_lat_h)[:, :, :2]
-    moved_px = line_sample - places.line_sample
+    derivative = places.model.project_derivative(places.lon_lat_h)[:, :, :2]
+    displacement_px = line_sample - places.line_sample
     found = reason == FOUND
     return PointMatches(
         line_sample=line_sample,
         displacement_m=np.asarray(
-            np.linalg.solve(derivative, moved_px[:, :, None])[:, :, 0], np.float64
+            np.linalg.solve(derivative, displacement_px[:, :, None])[:, :, 0], np.float64
         ),
         sigma_px=sigma_px,
         score=score,
@@ -180,32 +181,26 @@ def match_places(
 
 
 def locate_on_terrain(model: SensorModel, line_sample: Array, terrain: Terrain | None) -> Array:
-    """The ground (n, 3) lon, lat, height that a model sees at image positions (n, 2).
+    """Ground positions (n, 3) lon, lat, height of image positions (n, 2), on the terrain or at height 0.
 
     Raises:
-        InputError: when there is no terrain and heights move what the scene shows.
+        InputError: the scene has a parallax, and there is no terrain.
     """
     if terrain is not None:
         return intersect_terrain(model, line_sample, terrain)
     middle_m = np.array([sum(model.height_range_m) / 2.0])
     if model.project_derivative(model.locate(line_sample[:1], middle_m))[0, :, 2].any():
-        raise InputError("a terrain model is needed: heights move what this scene shows")
-    ground = model.locate(line_sample, np.zeros(len(line_sample)))
-    return ground
-
-
-def _between_nodes(nodes: Array, size: int) -> Array:
-    """Positions (size, size, 2) between nodes (k, k, 2), bilinear."""
-    half = nodes.shape[0] // 2
-    pixel = (np.arange(size) - size // 2) / _NODE_PX
-    weight = np.maximum(0.0, 1.0 - np.abs(pixel[:, None] - np.arange(-half, half + 1)))
-    return np.stack([weight @ nodes[..., k] @ weight.T for k in range(2)], axis=-1)
+        raise InputError(
+            "a terrain model is needed: the positions in this scene depend on the height of the ground. "
+            "Give a terrain with the reference image"
+        )
+    return model.locate(line_sample, np.zeros(len(line_sample)))
 
 
 def _level_patch(
     image: ImageSource | ReducedImage, cell: IntArray, half: int, factor: int
 ) -> FloatImage:
-    """Pixels (2 half + 1) squared of a level around one of them."""
+    """Pixels (2 half + 1, 2 half + 1) of a level around one of its pixels."""
     line, sample = (int(v) - half for v in cell)
     size = 2 * half + 1
     if isinstance(image, ReducedImage):

@@ -1,4 +1,4 @@
-"""Ends of shadows: edges that lie elsewhere under another sun, and how little they count for a place."""
+"""Shadows that differ between a chip and a scene, and the weights that reduce their effect."""
 
 import math
 from dataclasses import dataclass
@@ -10,29 +10,30 @@ from numba import njit
 from services.types import Acquisition, Array, FloatImage
 
 CASTER_M = 6.0
-"""How high that is which casts shadows: houses of two floors, small trees."""
+"""Assumed height of the objects that cast shadows: houses of two floors, small trees."""
 
 
 @dataclass(frozen=True)
 class ShadowShift:
-    """How the shadows of a chip lie in the image it is searched in.
+    """How the shadows of a chip differ from those of the image it is searched in.
 
     Attributes:
-        away: (2,) rows and columns away from the sun of the chip; of any length.
-        move_px: (2,) rows and columns by which the end of a shadow of `CASTER_M` moved, chip pixels.
+        away: (2,) rows and columns, the direction away from the sun of the chip; of any length.
+        shift_px: (2,) rows and columns from the end of the shadow of an object of `CASTER_M` in the chip
+            to its end in the image, chip pixels.
     """
 
     away: Array
-    move_px: Array
+    shift_px: Array
 
 
 def shadow_shift(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowShift | None:
-    """How shadows have moved from a chip to a scene; None where one of the suns is not known.
+    """Shift of the shadows from a chip to a scene; None where the sun of one is unknown.
 
     Args:
-        chip: how the image it was cut from was taken.
-        scene: how the scene was taken.
-        gsd_m: of the chip as it is searched.
+        chip: acquisition of the image that the chip was cut from.
+        scene: acquisition of the scene.
+        gsd_m: ground sampling of the chip as it is searched, metres.
     """
     before, after = shadow_vector(chip), shadow_vector(scene)
     if not np.isfinite(before + after).all():
@@ -41,34 +42,34 @@ def shadow_shift(chip: Acquisition, scene: Acquisition, gsd_m: float) -> ShadowS
 
 
 def shadow_vector(image: Acquisition) -> Array:
-    """East and north (2,) by which a metre of height throws its shadow; NaN when unknown."""
+    """East and north (2,) of the shadow of an object of unit height; NaN when the sun is unknown."""
     azimuth = np.radians(image.sun_azimuth_deg + 180.0)
     length = np.tan(np.radians(90.0 - image.sun_elevation_deg))
     return np.asarray(length * np.array([np.sin(azimuth), np.cos(azimuth)]))
 
 
 def shadow_weights(chip: FloatImage, score: float, shadows: ShadowShift) -> FloatImage:
-    """How much each pixel of a chip counts for its place: little, where a shadow may have ended.
+    """Weight of each pixel of a chip in its position: small where a shadow may end.
 
-    Where a chip grows brighter away from its sun, a shadow may end. Under another sun that edge lies
-    elsewhere: it differs there by its slope times the move, which counts as noise beside that of all
-    pixels (variances add; the weight is that of the noise over their sum). Edges of the other sign, such
-    as a roof before its own shadow, stay where they are, and so does their weight; under the same
-    sun all have theirs.
+    A shadow may end where the brightness of a chip grows away from its sun. Under another sun this
+    gradient lies elsewhere. The grey values then differ by the gradient times the shift, which counts as
+    noise in addition to that of all pixels: variances add, and the weight is the ratio of the noise to
+    the sum. Gradients of the other sign, such as that of a roof before its own shadow, do not move and
+    keep their weight. Under the same sun all pixels have the weight 1.
 
     Args:
         chip: (s, s) without NaN.
-        score: normalised correlation at the place, which tells the noise of all pixels.
-        shadows: how they have moved.
+        score: normalised correlation at the position, from which the noise of all pixels follows.
+        shadows: their shift.
 
     Returns:
         (s - 2, s - 2), 0 to 1: of the chip without its outermost pixels.
     """
     spread = float(cv2.meanStdDev(chip)[1][0, 0])
     noise = math.sqrt(max(1.0 - score * score, 0.01)) * spread
-    # Half of it: differences of neighbours are over two pixels.
-    move = np.float32(0.5 / noise) * shadows.move_px.astype(np.float32)
-    return _weights(chip, shadows.away.astype(np.float32), move)
+    # The factor 0.5: the kernel takes differences over two pixels.
+    shift = np.float32(0.5 / noise) * shadows.shift_px.astype(np.float32)
+    return _weights(chip, shadows.away.astype(np.float32), shift)
 
 
 def _rows_cols(east_north: Array) -> Array:
@@ -76,16 +77,16 @@ def _rows_cols(east_north: Array) -> Array:
 
 
 @njit(cache=True, fastmath=True)
-def _weights(chip: FloatImage, away: FloatImage, move: FloatImage) -> FloatImage:
+def _weights(chip: FloatImage, away: FloatImage, shift: FloatImage) -> FloatImage:
     side = chip.shape[0] - 2
     one = np.float32(1.0)
     weight = np.empty((side, side), dtype=np.float32)
-    away_r, away_c, move_r, move_c = away[0], away[1], move[0], move[1]
+    away_r, away_c, shift_r, shift_c = away[0], away[1], shift[0], shift[1]
     for i in range(side):
         for j in range(side):
             down = chip[i + 2, j + 1] - chip[i, j + 1]
             right = chip[i + 1, j + 2] - chip[i + 1, j]
-            changed = down * move_r + right * move_c
-            tip = down * away_r + right * away_c > np.float32(0.0)
-            weight[i, j] = one / (one + changed * changed) if tip else one
+            change = down * shift_r + right * shift_c
+            may_end = down * away_r + right * away_c > np.float32(0.0)
+            weight[i, j] = one / (one + change * change) if may_end else one
     return weight

@@ -1,4 +1,4 @@
-"""Tie points: details seen in several images, found with the help of the models."""
+"""Tie points: details seen in several images, matched with the help of the sensor models."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +16,8 @@ from services.types import Array, BoolArray, FloatImage, IntArray, Observations,
 
 _TILE_PX = 2048
 _TILE_MARGIN_PX = 32
+_MIN_PAIRS = 8
+"""Fewest matches of two images from which their relative error is estimated."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +25,13 @@ class FeatureOptions:
     """How tie points are found.
 
     Attributes:
-        per_image: features aimed at in an image, the strongest of each tile.
-        per_megapixel: most features kept for a million pixels; small images reach it first.
-        largest_px: diameter beyond which a feature is too vague to be placed.
-        max_ratio: largest ratio between the distances to the best and the second best descriptor.
-        tolerance_px: how far matches may scatter across the rays round their common offset.
-        sigma_px: of a feature's position, one standard deviation a coordinate.
-        cell_px: features are compared within squares of this size, pixels of the second image.
+        per_image: number of features aimed at in an image, the strongest of each tile.
+        per_megapixel: largest number of features per million pixels; it limits small images.
+        largest_px: largest diameter of a feature; larger ones cannot be located precisely.
+        max_ratio: largest ratio of the descriptor distances to the best and the second best candidate.
+        tolerance_px: largest distance of matches from their common offset across the epipolar lines.
+        sigma_px: of the position of a feature, one standard deviation a coordinate.
+        cell_px: side of the squares of the second image in which features are compared, pixels.
     """
 
     per_image: int = 12_000
@@ -54,18 +56,18 @@ class Features:
     descriptor: FloatImage
 
 
-def tie_points(
+def find_tie_points(
     scenes: Sequence[Scene], options: FeatureOptions = FeatureOptions(), progress: Progress = no_progress
 ) -> Observations:
-    """Details seen in two images or more.
+    """Image positions of details that two images or more show.
 
     Args:
         scenes: images with their models as delivered.
         options: thresholds.
-        progress: told where the work stands.
+        progress: receives the fraction done.
 
     Returns:
-        Image positions of tie points; `point` counts from 0.
+        Observations of tie points; `point` counts from 0.
     """
     features = []
     for number, scene in enumerate(scenes):
@@ -81,7 +83,7 @@ def tie_points(
 
 
 def find_features(image: ImageSource, options: FeatureOptions) -> Features:
-    """SIFT features of an image, tile by tile, the strongest of every tile."""
+    """SIFT features of an image: the strongest of every tile, in proportion to the area of the tile."""
     positions, descriptors = [], []
     per_pixel = min(options.per_megapixel / 1e6, options.per_image / (image.shape[0] * image.shape[1]))
     for line in range(0, image.shape[0], _TILE_PX):
@@ -95,16 +97,16 @@ def find_features(image: ImageSource, options: FeatureOptions) -> Features:
                 samples + 2 * _TILE_MARGIN_PX,
             )
             count = int(per_pixel * lines * samples)
-            found = _tile_features(image.read(window), count, options.largest_px)
-            own = found.line_sample - _TILE_MARGIN_PX
-            kept = ((own >= -0.5) & (own < [lines - 0.5, samples - 0.5])).all(axis=1)
-            positions.append(own[kept] + [line, sample])
-            descriptors.append(found.descriptor[kept])
+            features = _tile_features(image.read(window), count, options.largest_px)
+            in_tile = features.line_sample - _TILE_MARGIN_PX
+            inside = ((in_tile >= -0.5) & (in_tile < [lines - 0.5, samples - 0.5])).all(axis=1)
+            positions.append(in_tile[inside] + [line, sample])
+            descriptors.append(features.descriptor[inside])
     return Features(np.concatenate(positions), np.concatenate(descriptors))
 
 
 def _tile_features(pixels: FloatImage, count: int, largest_px: float) -> Features:
-    """SIFT features of one tile, away from what is missing."""
+    """SIFT features of one tile, away from missing pixels."""
     missing = ~np.isfinite(pixels)
     if missing.all():
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
@@ -118,13 +120,16 @@ def _tile_features(pixels: FloatImage, count: int, largest_px: float) -> Feature
     if descriptor is None:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     sample_line = np.array(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-    # One detail may carry several orientations: they are one position, and would vote twice.
+    # SIFT returns a detail with several orientations several times: only the first counts.
     _, first = np.unique(sample_line, axis=0, return_index=True)
     return Features(sample_line[first][:, ::-1], _root_sift(np.asarray(descriptor[first], np.float32)))
 
 
 def _root_sift(descriptor: FloatImage) -> FloatImage:
-    """Descriptors whose euclidean distance is Hellinger's (Arandjelovic and Zisserman, 2012)."""
+    """Descriptors whose Euclidean distance is the Hellinger distance.
+
+    Source: Arandjelovic and Zisserman (2012), Three things everyone should know: RootSIFT.
+    """
     total = descriptor.sum(axis=1, keepdims=True) + 1e-9
     return np.asarray(np.sqrt(descriptor / total), dtype=np.float32)
 
@@ -134,10 +139,14 @@ def match_features(
 ) -> IntArray:
     """Pairs of features of two images that show the same detail.
 
-    Features are compared where the models say they can be the same: within a cell of ground, at any
-    height of the models, near the epipolar line. Those that are kept share one offset across that line,
-    which is the relative error of the two models. A second round knows that offset and the heights of
-    the place, and finds what was ambiguous in the first.
+    Features are compared where the models allow a match: near the epipolar line, at any height of the
+    models. The matches share one offset across that line, which is the relative error of the two models.
+    A second round uses this offset and the heights of the first round, and resolves ambiguous features.
+
+    Args:
+        one, other: the two images with their models.
+        features, others: of the two images.
+        options: thresholds.
 
     Returns:
         (k, 2) rows of both feature sets.
@@ -151,32 +160,32 @@ def match_features(
         height_m = (band.low_m + band.high_m) / 2.0
         lines = _epipolar_lines(one.model, other.model, features.line_sample, height_m)
         pairs = _descriptor_pairs(features, others, lines, band, options)
-        across, along_m = lines.of(pairs[:, 0], others.line_sample[pairs[:, 1]])
-        agreeing = _densest(across, options.tolerance_px)
-        if agreeing.sum() < 8:
-            return pairs[agreeing]
-        heights = height_m + np.percentile(along_m[agreeing], [2.0, 98.0])
+        across, along_m = lines.coordinates(pairs[:, 0], others.line_sample[pairs[:, 1]])
+        inliers = _densest_window(across, options.tolerance_px)
+        if inliers.sum() < _MIN_PAIRS:
+            return pairs[inliers]
+        heights = height_m + np.percentile(along_m[inliers], [2.0, 98.0])
         margin_m = 10.0 + 0.5 * (heights[1] - heights[0])
         band = _Band(
             low_m=max(low, heights[0] - margin_m),
             high_m=min(high, heights[1] + margin_m),
-            across_px=float(np.median(across[agreeing])),
+            across_px=float(np.median(across[inliers])),
             gate_px=2.0 * options.tolerance_px,
             end_px=gate_px,
         )
-        pairs = pairs[agreeing]
+        pairs = pairs[inliers]
     return pairs
 
 
 @dataclass(frozen=True)
 class _Band:
-    """Where the other image may show a feature, relative to its epipolar line.
+    """The part of the other image that may show a feature, relative to its epipolar line.
 
     Attributes:
-        low_m, high_m: heights between which the line is looked along.
-        across_px: offset across the line.
+        low_m, high_m: heights at the ends of the line.
+        across_px: offset of the band across the line.
         gate_px: half width of the band.
-        end_px: how far it reaches beyond the ends of the line.
+        end_px: extension of the band beyond the ends of the line.
     """
 
     low_m: float
@@ -188,21 +197,21 @@ class _Band:
 
 @dataclass(frozen=True)
 class _EpipolarLines:
-    """Where n details of one image are in another one.
+    """Epipolar lines in one image of n details of another.
 
     Attributes:
-        expected: (n, 2) at the reference height.
-        per_metre: (n, 2) how far that moves per metre of height.
+        expected: (n, 2) positions at the reference height, pixels.
+        per_metre: (n, 2) derivative of the positions by the height, pixels per metre.
     """
 
     expected: Array
     per_metre: Array
 
-    def of(self, rows: IntArray, line_sample: Array) -> tuple[Array, Array]:
-        """Distance across the lines in pixels, and height above the reference in metres, of positions.
+    def coordinates(self, rows: IntArray, line_sample: Array) -> tuple[Array, Array]:
+        """Distance across the lines in pixels and height above the reference in metres of positions.
 
         Args:
-            rows: (..., ) lines.
+            rows: (...) of the lines.
             line_sample: (..., 2) positions, broadcast against the rows.
         """
         offset = line_sample - self.expected[rows]
@@ -228,12 +237,12 @@ def _descriptor_pairs(
     band: _Band,
     options: FeatureOptions,
 ) -> IntArray:
-    """Mutual best descriptors within the band, looked for cell by cell of the second image."""
+    """Rows (k, 2) of mutually best descriptors within the band, by cells of the second image."""
     half_m = (band.high_m - band.low_m) / 2.0
     usable: BoolArray = np.asarray(np.isfinite(lines.expected).all(axis=1))
     cell = np.floor(np.where(usable[:, None], lines.expected, 0.0) / options.cell_px).astype(np.int64)
     reach_px = half_m * np.abs(lines.per_metre) + band.end_px + band.gate_px + abs(band.across_px)
-    found = [np.empty((0, 2), dtype=np.int64)]
+    pairs = [np.empty((0, 2), dtype=np.int64)]
     for key in np.unique(cell[usable], axis=0):
         mine = np.flatnonzero(usable & np.all(cell == key, axis=1))
         low = (lines.expected[mine] - reach_px[mine]).min(axis=0)
@@ -243,23 +252,23 @@ def _descriptor_pairs(
         )
         if len(theirs) < 2:
             continue
-        across, along_m = lines.of(mine[:, None], others.line_sample[theirs][None, :])
+        across, along_m = lines.coordinates(mine[:, None], others.line_sample[theirs][None, :])
         end_m = band.end_px / np.linalg.norm(lines.per_metre[mine], axis=1)[:, None]
         possible = (np.abs(across - band.across_px) <= band.gate_px) & (
             np.abs(along_m) <= half_m + end_m
         )
         similarity = np.where(possible, features.descriptor[mine] @ others.descriptor[theirs].T, -1.0)
         matched = _mutual_best(similarity, options.max_ratio)
-        found.append(np.column_stack([mine[matched[:, 0]], theirs[matched[:, 1]]]))
-    return np.concatenate(found)
+        pairs.append(np.column_stack([mine[matched[:, 0]], theirs[matched[:, 1]]]))
+    return np.concatenate(pairs)
 
 
 def _mutual_best(similarity: Array, max_ratio: float) -> IntArray:
-    """Pairs of rows and columns that are each other's best, clearly better than the row's second best.
+    """Pairs (k, 2) of rows and columns that are each other's best, clearly above the row's second best.
 
     Args:
         similarity: (a, b) scalar products of unit descriptors; -1 where a pair is impossible.
-        max_ratio: largest ratio of the distances to the best and to the second best.
+        max_ratio: largest ratio of the distances to the best and the second best column.
     """
     rows = np.arange(len(similarity))
     best = similarity.argmax(axis=1)
@@ -267,14 +276,14 @@ def _mutual_best(similarity: Array, max_ratio: float) -> IntArray:
     mutual = similarity.argmax(axis=0)[best] == rows
     similarity[rows, best] = -1.0
     second = similarity.max(axis=1)
-    # Unit descriptors: squared distance is 2 (1 - similarity).
+    # The squared distance of unit descriptors is 2 (1 - similarity).
     clear = (top > 0.5) & ((1.0 - top) <= max_ratio**2 * (1.0 - np.maximum(second, 0.5)))
-    kept = np.flatnonzero(mutual & clear)
-    return np.column_stack([kept, best[kept]])
+    matched = np.flatnonzero(mutual & clear)
+    return np.column_stack([matched, best[matched]])
 
 
-def _densest(values: Array, tolerance: float) -> BoolArray:
-    """Which values lie in the window of the given half width that holds most of them."""
+def _densest_window(values: Array, tolerance: float) -> BoolArray:
+    """Which values lie in the window of half width `tolerance` that contains most of them."""
     if len(values) == 0:
         return np.zeros(0, dtype=bool)
     ordered = np.sort(values)
@@ -287,18 +296,24 @@ def _densest(values: Array, tolerance: float) -> BoolArray:
 def _tracks(
     features: Sequence[Features], links: Sequence[tuple[int, int, IntArray]], sigma_px: float
 ) -> Observations:
-    """Connected matches as tie points; two features of one image in a track contradict each other."""
+    """Tie points from connected matches; tracks with two features of one image are dropped.
+
+    Args:
+        features: of every image.
+        links: two images and the (k, 2) rows of their matched features.
+        sigma_px: of a feature.
+    """
     start = np.concatenate([[0], np.cumsum([len(f.line_sample) for f in features])])
     image = np.repeat(np.arange(len(features)), np.diff(start))
     line_sample = np.concatenate([f.line_sample for f in features])
-    edges = np.concatenate([rows + [start[one], start[other]] for one, other, rows in links])
-    graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(start[-1], start[-1]))
+    pairs = np.concatenate([rows + [start[one], start[other]] for one, other, rows in links])
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(start[-1], start[-1]))
     _, label = connected_components(graph, directed=False)
     size = np.bincount(label)
     images = np.bincount(np.unique(np.column_stack([label, image]), axis=0)[:, 0], minlength=len(size))
-    kept = np.flatnonzero(((size >= 2) & (size == images))[label])
-    kept = kept[np.argsort(label[kept], kind="stable")]
-    _, point = np.unique(label[kept], return_inverse=True)
+    rows = np.flatnonzero(((size >= 2) & (size == images))[label])
+    rows = rows[np.argsort(label[rows], kind="stable")]
+    _, point = np.unique(label[rows], return_inverse=True)
     return Observations(
-        point.astype(np.int64), image[kept], line_sample[kept], np.full(len(kept), sigma_px)
+        point.astype(np.int64), image[rows], line_sample[rows], np.full(len(rows), sigma_px)
     )

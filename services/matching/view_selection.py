@@ -1,4 +1,4 @@
-"""Which views of a point look most like a scene."""
+"""The views of a point that look most like a scene."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ DAYS_OF_A_YEAR = 365.25
 
 @dataclass(frozen=True)
 class ViewDistanceScales:
-    """Differences between a view and a scene that count as much as each other.
+    """Differences between a view and a scene that have equal weight.
 
-    A view's distance from a scene is the sum of the squares of its differences in these units. What is
-    not known of one of both counts as one unit. Views and scene show the same ground, so a day of
-    the year is the same season for both, on either hemisphere.
+    The distance of a view from a scene is the sum of the squares of its differences, each divided by its
+    scale. A difference counts as one scale where one of the values is unknown. View and scene show the
+    same ground, so a day of the year is the same season for both, on either hemisphere.
 
     Attributes:
         direction_deg: angle between the lines of sight.
-        season_days: round the year.
-        sun_elevation_deg, sun_azimuth_deg: of the light.
-        sensor: distance of another sensor.
+        season_days: difference of the days of the year.
+        sun_elevation_deg, sun_azimuth_deg: differences of the direction of the sun.
+        sensor: distance of a view by another sensor.
         health: loss of health; see `types.health`.
     """
 
@@ -36,7 +36,7 @@ class ViewDistanceScales:
 
 @dataclass(frozen=True)
 class SelectedViews:
-    """Views of n points; those of point i are `row[start[i]:start[i + 1]]`, most alike first.
+    """Views of n points; those of point i are `row[start[i]:start[i + 1]]`, the nearest first.
 
     Attributes:
         row: (k,) int64, rows of `Views`.
@@ -52,72 +52,72 @@ def select_views(
     gsd_m: float,
     scene: Acquisition,
     count: int,
-    likeness: ViewDistanceScales = ViewDistanceScales(),
+    scales: ViewDistanceScales = ViewDistanceScales(),
 ) -> SelectedViews:
     """The views of every point, at one ground sampling, that look most like a scene.
 
     Args:
         points: all of them.
-        gsd_m: ground sampling of the chips wanted.
+        gsd_m: ground sampling of the chips wanted, metres.
         scene: how it was taken.
-        count: how many views of a point at most.
-        likeness: what makes a difference.
+        count: largest number of views of a point.
+        scales: of the differences.
     """
     views = points.views
     owner = np.repeat(np.arange(len(points)), np.diff(views.start))
     rows = np.flatnonzero(np.isclose(views.gsd_m, gsd_m))
-    distance = distances(views, scene, likeness)[rows]
-    kept = rank_in_group(owner[rows], -distance) < count if len(rows) else np.zeros(0, dtype=bool)
-    rows, distance = rows[kept], distance[kept]
+    distance = view_distances(views, scene, scales)[rows]
+    selected = rank_in_group(owner[rows], -distance) < count if len(rows) else np.zeros(0, dtype=bool)
+    rows, distance = rows[selected], distance[selected]
     rows = rows[np.lexsort((distance, owner[rows]))]
     start = np.searchsorted(owner[rows], np.arange(len(points) + 1))
     return SelectedViews(rows, start.astype(np.int64))
 
 
-def distances(
-    views: Views, scene: Acquisition, likeness: ViewDistanceScales = ViewDistanceScales()
+def view_distances(
+    views: Views, scene: Acquisition, scales: ViewDistanceScales = ViewDistanceScales()
 ) -> Array:
-    """How far views (m,) are from looking like a scene; 0 for one taken in the same way."""
-    direction = _unit(views.incidence_deg, views.azimuth_deg) @ _unit(
+    """Distances (m,) of views from a scene, without unit; 0 for a view taken in the same way."""
+    cosine = _unit_vectors(views.incidence_deg, views.azimuth_deg) @ _unit_vectors(
         np.array([scene.incidence_deg]), np.array([scene.azimuth_deg])
     ).reshape(3)
-    angle = np.degrees(np.arccos(np.clip(direction, -1.0, 1.0)))
-    health = (1.0 - views.health) / likeness.health
-    of_images = np.array([_of_image(image, scene, likeness) for image in views.images])
-    return np.asarray(_square(angle / likeness.direction_deg) + health**2 + of_images[views.image])
+    angle_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    health = (1.0 - views.health) / scales.health
+    of_images = np.array([_image_distance(image, scene, scales) for image in views.images])
+    return np.asarray(_square(angle_deg / scales.direction_deg) + health**2 + of_images[views.image])
 
 
-def _of_image(image: Acquisition, scene: Acquisition, likeness: ViewDistanceScales) -> float:
-    """The part of the distance that all the views cut from one image share."""
-    season = _day(image) - _day(scene)
-    turn = image.sun_azimuth_deg - scene.sun_azimuth_deg
+def _image_distance(image: Acquisition, scene: Acquisition, scales: ViewDistanceScales) -> float:
+    """The part of the distance that all views cut from one image share."""
+    days = _day_of_year(image) - _day_of_year(scene)
+    turn_deg = image.sun_azimuth_deg - scene.sun_azimuth_deg
     differences = np.array(
         [
-            _round(season, DAYS_OF_A_YEAR) / likeness.season_days,
-            (image.sun_elevation_deg - scene.sun_elevation_deg) / likeness.sun_elevation_deg,
-            _round(turn, 360.0) / likeness.sun_azimuth_deg,
-            likeness.sensor if image.sensor != scene.sensor else 0.0,
+            _on_circle(days, DAYS_OF_A_YEAR) / scales.season_days,
+            (image.sun_elevation_deg - scene.sun_elevation_deg) / scales.sun_elevation_deg,
+            _on_circle(turn_deg, 360.0) / scales.sun_azimuth_deg,
+            scales.sensor if image.sensor != scene.sensor else 0.0,
         ]
     )
     return float(_square(differences).sum())
 
 
-def _day(image: Acquisition) -> float:
+def _day_of_year(image: Acquisition) -> float:
     """Day of the year; NaN when unknown."""
     return float("nan") if image.acquired_at is None else float(image.acquired_at.timetuple().tm_yday)
 
 
-def _round(difference: float, circle: float) -> float:
-    """A difference on a circle, the short way."""
+def _on_circle(difference: float, circle: float) -> float:
+    """A difference of two positions on a circle, along the shorter arc."""
     return (difference + circle / 2.0) % circle - circle / 2.0
 
 
 def _square(differences: Array) -> Array:
-    """Squares; what is unknown counts as one unit."""
+    """Squares; 1 where a difference is unknown."""
     return np.nan_to_num(differences**2, nan=1.0)
 
 
-def _unit(incidence_deg: Array, azimuth_deg: Array) -> Array:
+def _unit_vectors(incidence_deg: Array, azimuth_deg: Array) -> Array:
     """Unit vectors (n, 3) east, north, up."""
     incidence, azimuth = np.radians(incidence_deg), np.radians(azimuth_deg)
     return np.column_stack(

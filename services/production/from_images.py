@@ -20,7 +20,7 @@ from services.matching.multi_image import (
     stored_chip,
 )
 from services.matching.predict import rank_in_group
-from services.matching.tie_points import FeatureOptions, tie_points
+from services.matching.tie_points import FeatureOptions, find_tie_points
 from services.sensors.base import SensorModel
 from services.types import (
     Array,
@@ -127,7 +127,7 @@ def produce_points(
         NotEnoughPoints: the images have too little in common.
     """
     _check(scenes)
-    ties = tie_points(scenes, options.features, part_of(progress, 0.0, 0.5))
+    ties = find_tie_points(scenes, options.features, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"

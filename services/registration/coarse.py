@@ -11,6 +11,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import a_contrario_consensus
 from services.matching.control_points import ChipSearch, MatchingOptions, match_points
+from services.matching.correlate import PeakThresholds
 from services.matching.predict import spread_over_image
 from services.registration.chip_selection import chance_of_being_shown, has_chip
 from services.registration.search import (
@@ -109,12 +110,16 @@ def search_coarsely(
     """
     search = _planned(scene, model, points, uncertainty_m, options)
     few, level_m, radius_px = points.take(search.rows), search.level_m, search.radius_px
-    correlation = replace(matching.correlation, min_score=options.min_score, max_second=1.0)
-    matching = replace(matching, correlation=correlation)
     progress(0.0, "coarse search")
     image = _image_for(scene, level_m, len(few), radius_px)
     chip_search = ChipSearch(
-        image, model, scene.acquisition, search.gsd_m, radius_px, reduction=search.reduction
+        image,
+        model,
+        scene.acquisition,
+        search.gsd_m,
+        radius_px,
+        reduction=search.reduction,
+        thresholds=PeakThresholds(options.min_score, max_second=1.0),
     )
     matches = match_points(chip_search, few, chips, matching, progress)
 

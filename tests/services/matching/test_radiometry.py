@@ -3,7 +3,7 @@
 import numpy as np
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.radiometry import cloud_mask, edges, patch_statistics
+from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
 from services.types import Array, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
@@ -24,7 +24,7 @@ def test_what_is_inverted_is_found_by_its_edges_and_not_by_its_grey_values() -> 
         patch, chip = patch_and_chip(seed, (1.3, -2.6))
         inverted = np.float32(4095.0) - patch
         assert find_chip(inverted, chip, BY_GREY).reason == "low_score"
-        peak = find_chip(edges(inverted), edges(chip), BY_EDGES)
+        peak = find_chip(gradient_image(inverted), gradient_image(chip), BY_EDGES)
         assert peak.reason == FOUND
         np.testing.assert_allclose(peak.row_col, [1.3, -2.6], atol=a_tenth_of_a_pixel)
 
@@ -34,14 +34,14 @@ def test_edges_of_other_ground_are_not_believed() -> None:
     for seed in range(100):
         patch, _ = patch_and_chip(seed, (0.0, 0.0))
         _, other = patch_and_chip(1000 + seed, (0.0, 0.0))
-        believed += find_chip(edges(patch), edges(other), BY_EDGES).reason == FOUND
+        believed += find_chip(gradient_image(patch), gradient_image(other), BY_EDGES).reason == FOUND
     assert believed == 0
 
 
 def test_edges_beside_nodata_are_unknown() -> None:
     pixels, _ = patch_and_chip(1, (0.0, 0.0))
     pixels[10, 10] = np.nan
-    unknown = ~np.isfinite(edges(pixels))
+    unknown = ~np.isfinite(gradient_image(pixels))
     assert set(zip(*np.nonzero(unknown), strict=True)) == {(8, 9), (10, 9), (9, 8), (9, 10)}
 
 

@@ -52,7 +52,7 @@ def bias_px(chip_of: Acquisition, patch_of: Acquisition, known: bool) -> Array:
     places = []
     for seed in range(12):
         chip = np.ascontiguousarray(village(seed, chip_of)[inner, inner])
-        peak = find_chip(village(seed, patch_of), chip, OPTIONS, move)
+        peak = find_chip(village(seed, patch_of), chip, OPTIONS, shadows=move)
         assert peak.reason == FOUND
         places.append(peak.row_col)
     return np.asarray(np.mean(places, axis=0))
@@ -88,7 +88,7 @@ def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
     assert move is not None
     north = CASTER_M / tan(radians(63.0)) / GSD_M
     east = CASTER_M / tan(radians(38.0)) / GSD_M
-    np.testing.assert_allclose(move.move_px, [north, east])
+    np.testing.assert_allclose(move.shift_px, [north, east])
     np.testing.assert_allclose(move.away / np.linalg.norm(move.away), [-1.0, 0.0], atol=1e-12)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from services.matching.systematic_error import (
     COMMON_SIGMA_PX,
-    LEAN_SIGMA_PX,
+    HEIGHT_SIGMA_PX,
     SHADOW_SIGMA_PX,
     common_covariance_px2,
 )
@@ -42,7 +42,7 @@ def test_views_taken_in_the_same_way_share_the_least_of_one_image() -> None:
 
 def test_another_direction_of_view_adds_along_the_parallax() -> None:
     more = shared(replace(LIKE_THE_SCENE, azimuth_deg=SOUTH)) - shared(LIKE_THE_SCENE)
-    along_px = LEAN_SIGMA_PX * 2.0 * np.tan(np.radians(20.0))
+    along_px = HEIGHT_SIGMA_PX * 2.0 * np.tan(np.radians(20.0))
     np.testing.assert_allclose(more, [[0.0, 0.0], [0.0, along_px**2]], atol=1e-12)
 
 

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.matching.view_selection import distances, select_views
+from services.matching.view_selection import select_views, view_distances
 from services.types import Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(
@@ -78,7 +78,7 @@ def test_views_are_chosen_though_no_direction_is_known() -> None:
 
 def distance_of(image: Acquisition, health: float = 1.0) -> float:
     points = point_with_views([1.0], [SCENE.incidence_deg], [SCENE.azimuth_deg], image)
-    return float(distances(replace(points.views, health=np.array([1.0, health])), SCENE)[1])
+    return float(view_distances(replace(points.views, health=np.array([1.0, health])), SCENE)[1])
 
 
 def test_a_view_taken_in_the_same_way_has_no_distance() -> None:
