@@ -52,6 +52,8 @@ def draw_chips(block_folder: Path, picture: Path, count: int = 5) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     output, *names = map(Path, sys.argv[1:])
     make_block(names or simulated_images.write_block_images(output / "images"), output / "block")
     draw_chips(output / "block", output / "chips.png")

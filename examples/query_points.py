@@ -55,6 +55,8 @@ def draw(points: geopandas.GeoDataFrame, picture: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     box, output = sys.argv[1], sys.argv[2]
     service = sys.argv[3] if len(sys.argv) > 3 else "http://127.0.0.1:8000"
     table = query_points(box, service, os.environ.get("AMERS_TOKEN"))

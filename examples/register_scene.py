@@ -50,5 +50,7 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     block, output, *images = map(Path, sys.argv[1:])
     register(images[0] if images else simulated_images.write_scene(output / "images"), block, output)
