@@ -8,13 +8,13 @@ import typer
 from app.cli.output import AsJson, show_one
 from app.cli.progress import shown_progress
 from app.errors import InputError
-from app.usecases.orthorectification import TerrainFile
 from app.usecases.production import (
     BlockIdentity,
     OrthoFiles,
     run_ortho_production,
     run_production,
 )
+from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
@@ -64,7 +64,7 @@ def run(
     )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
-        made = run_production(images, output, identity, options, sigma_m, progress)
+        made = run_production(images, output, identity, options, sigma_m=sigma_m, progress=progress)
     relative = made.relative_accuracy
     show_one(
         {

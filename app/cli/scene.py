@@ -15,11 +15,12 @@ from app.config import read_settings
 from app.db import engine
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
-from app.usecases.orthorectification import OrthoMap, TerrainFile, run_orthorectification
+from app.usecases.orthorectification import OrthoMap, run_orthorectification
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.reference_source import ReferenceFiles, this_reference
 from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
+from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
 from services.registration.on_points import RegistrationOptions
 from services.reports.document import report_document
@@ -154,7 +155,13 @@ def ortho(
     terrain = TerrainFile(dem, vertical, geoid, fill_px)
     with shown_progress() as progress:
         made = run_orthorectification(
-            scene, model, terrain, output, OrthoMap(crs, gsd_m), options, progress
+            scene,
+            terrain,
+            output,
+            model=model,
+            ortho_map=OrthoMap(crs, gsd_m),
+            options=options,
+            progress=progress,
         )
     show_one(asdict(made), as_json=as_json)
 

@@ -1,4 +1,4 @@
-"""Laying a scene on a map through its model and a terrain."""
+"""Orthorectify a scene through its model and a terrain: for the command line, and as a process."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -17,44 +17,28 @@ from app.errors import InputError
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
-from services.formats.elevation.dem import read_dem
+from app.usecases.terrain_file import TerrainFile, read_terrain
 from services.formats.images.bands import one_band
 from services.formats.images.ortho import write_cog
 from services.formats.images.raster import RasterImage
 from services.formats.images.scenes import read_scene
+from services.map_grid import MapGrid
 from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
 from services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
 REFINED_NAME = "refined_RPC.TXT"
-"""As a registration calls its refined model."""
+"""Name of the refined model among the outputs of a registration."""
 _KEPT_TYPES = ("uint8", "uint16", "int16", "float32")
 
 
 @dataclass(frozen=True)
-class TerrainFile:
-    """A terrain on the disk.
-
-    Attributes:
-        dem: heights on a map.
-        vertical: what they are counted from, when the file does not say; see `read_dem`.
-        geoid: grid file of the geoid, if PROJ has none.
-        fill_px: voids are filled from heights at most so many nodes away.
-    """
-
-    dem: Path
-    vertical: str | None = None
-    geoid: Path | None = None
-    fill_px: int = 0
-
-
-@dataclass(frozen=True)
 class OrthoMap:
-    """The map that is made.
+    """The map of an ortho-image.
 
     Attributes:
-        crs: reference system; by default the UTM zone of the centre.
-        gsd_m: ground sampling; by default that of the scene.
+        crs: coordinate reference system; by default the UTM zone of the scene's centre.
+        gsd_m: ground sampling in metres; by default that of the scene.
     """
 
     crs: str | None = None
@@ -63,14 +47,14 @@ class OrthoMap:
 
 @dataclass(frozen=True)
 class Orthorectified:
-    """What was made.
+    """An ortho-image that was written.
 
     Attributes:
         path: of the image.
-        crs: of its map.
+        crs: coordinate reference system of its map.
         lines, samples, bands: its size.
-        gsd_m: ground sampling.
-        seen: share of its pixels that show something.
+        gsd_m: ground sampling, metres.
+        seen: share of its pixels that have data.
         error_px: largest difference from the scene's model where the mapping was checked.
         vertical: how the vertical datum of the terrain is known.
     """
@@ -88,18 +72,18 @@ class Orthorectified:
 
 @dataclass(frozen=True)
 class OrthorectifyScene:
-    """What a user says to have a scene rectified.
+    """The inputs of an orthorectification.
 
     Attributes:
         scene: id of an uploaded scene.
-        dem: name of the file with the terrain that was uploaded beside its image.
-        model: name of the uploaded file with its model; by default it is found.
-        registration: job that registered the scene, whose refined model is then followed.
-        vertical: what the heights are counted from, when the file does not say.
+        dem: name of the terrain file uploaded beside the image.
+        model: name of the uploaded file with the scene's model; by default it is found by its name.
+        registration: id of the job that registered the scene; its refined model is used.
+        vertical: vertical datum of the heights, where the terrain file does not state it.
         geoid: name of an uploaded grid file of the geoid.
-        fill_px: voids are filled from heights at most so many nodes away.
-        map: that is made.
-        options: of the rectification.
+        fill_px: voids are filled from heights at most this many nodes away.
+        map: reference system and ground sampling of the ortho-image.
+        options: of the orthorectification.
     """
 
     scene: UUID
@@ -113,85 +97,96 @@ class OrthorectifyScene:
     options: OrthoOptions = field(default_factory=OrthoOptions)
 
 
-_SAME = OrthoMap()
-_USUAL = OrthoOptions()
+_DEFAULT_MAP = OrthoMap()
+_DEFAULT_OPTIONS = OrthoOptions()
 
 
 def run_orthorectification(
     image: Path,
-    model: Path | None,
     terrain: TerrainFile,
     output: Path,
-    ortho_map: OrthoMap = _SAME,
-    options: OrthoOptions = _USUAL,
+    *,
+    model: Path | None = None,
+    ortho_map: OrthoMap = _DEFAULT_MAP,
+    options: OrthoOptions = _DEFAULT_OPTIONS,
     progress: Progress = no_progress,
 ) -> Orthorectified:
-    """Write a scene as a cloud-optimised GeoTIFF on a map, with all its bands.
+    """Write a scene with all its bands as a cloud-optimised GeoTIFF on a map.
 
-    Pixels keep their type where that is 8 or 16 bits or real; else they become real.
+    Pixels of 8 or 16 bits and of 32-bit floating point keep their type; others become floating point.
 
     Args:
         image: of the scene.
-        model: file of its model, if it is not found by itself.
         terrain: the ground.
-        output: a file of that name is replaced.
-        ortho_map: that is made.
-        options: how.
-        progress: told where the work stands.
+        output: path of the ortho-image; an existing file is replaced.
+        model: file of the scene's model; None finds it by its name.
+        ortho_map: reference system and ground sampling.
+        options: of the orthorectification.
+        progress: receives the fraction done and a message.
 
     Raises:
         InputError: the scene or the terrain cannot be used.
-        ComputationError: the model cannot be followed within the tolerance.
+        ComputationError: the mapping exceeds the tolerance.
     """
     if ortho_map.gsd_m is not None and not ortho_map.gsd_m > 0.0:
-        raise InputError(f"gsd_m: {ortho_map.gsd_m:g} given, more than 0 expected")
+        raise InputError(f"gsd_m: {ortho_map.gsd_m:g} found, a length above 0 m expected")
     if output.resolve() in (image.resolve(), terrain.dem.resolve()):
-        raise InputError(f"{output}: what was delivered would be written over")
+        raise InputError(f"{output}: the output would replace an input file; choose another name")
     scene = read_scene(image, model, sigma_m=1.0)
-    first = scene.image
-    assert isinstance(first, RasterImage)
-    ground = read_dem(terrain.dem, terrain.vertical, terrain.geoid, terrain.fill_px)
-    bands = [replace(first, mix=one_band(band)) for band in _data_bands(first)]
+    raster = scene.image
+    assert isinstance(raster, RasterImage)
+    ground = read_terrain(terrain)
+    bands = [replace(raster, mix=one_band(band)) for band in _data_bands(raster)]
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
-    dtype = first.dataset.dtypes[0]
-    dtype = dtype if dtype in _KEPT_TYPES else "float32"
-    nodata = first.dataset.nodata
-    if nodata is None:
-        nodata = float("nan") if dtype == "float32" else 0.0
-    seen = _Counted()
-    windows = seen.counted(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
-    error_px = write_cog(output, grid, windows, len(bands), dtype, float(nodata))
-    share = seen.pixels / (grid.shape[0] * grid.shape[1] * len(bands))
-    gsd_m = float(abs(np.linalg.det(grid.step_xy))) ** 0.5
-    if grid.is_geographic:
-        gsd_m *= 111_320.0
-    first.close()
+    dtype, nodata = _pixel_type(raster)
+    counter = _DataPixels()
+    windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
+    error_px = write_cog(output, grid, windows, len(bands), dtype, nodata)
+    raster.close()
+    lines, samples = grid.shape
     return Orthorectified(
-        output,
-        ortho_map.crs or grid.crs,
-        *grid.shape,
-        len(bands),
-        gsd_m,
-        share,
-        error_px,
-        ground.vertical,
+        path=output,
+        crs=ortho_map.crs or grid.crs,
+        lines=lines,
+        samples=samples,
+        bands=len(bands),
+        gsd_m=_ground_sampling_m(grid),
+        seen=counter.pixels / (lines * samples * len(bands)),
+        error_px=error_px,
+        vertical=ground.vertical,
     )
 
 
+def _pixel_type(raster: RasterImage) -> tuple[str, float]:
+    """The pixel type of the ortho-image of a scene, and its value for pixels without data."""
+    dtype = raster.dataset.dtypes[0]
+    if dtype not in _KEPT_TYPES:
+        dtype = "float32"
+    nodata = raster.dataset.nodata
+    if nodata is None:
+        nodata = float("nan") if dtype == "float32" else 0.0
+    return dtype, float(nodata)
+
+
+def _ground_sampling_m(grid: MapGrid) -> float:
+    """The side of a square as large as a pixel: on a projected map in its metres, else on the ground."""
+    return grid.gsd_m if grid.is_geographic else float(abs(np.linalg.det(grid.step_xy))) ** 0.5
+
+
 @dataclass
-class _Counted:
-    """Counts the pixels that show something, on their way into the file."""
+class _DataPixels:
+    """Counts the pixels with data of windows on their way into the file."""
 
     pixels: int = 0
 
-    def counted(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
-        for done in windows:
-            self.pixels += int(np.isfinite(done.pixels).sum())
-            yield done
+    def count(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
+        for window in windows:
+            self.pixels += int(np.isfinite(window.pixels).sum())
+            yield window
 
 
 def _data_bands(image: RasterImage) -> list[int]:
-    """The bands that are not a mask of the others."""
+    """The numbers of the bands that are not an alpha band."""
     colours = [colour.name for colour in image.dataset.colorinterp]
     return [band for band, colour in enumerate(colours, start=1) if colour != "alpha"]
 
@@ -201,64 +196,68 @@ def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> 
     check_file_names(inputs, "dem", "model", "geoid")
     if inputs.registration is not None:
         if inputs.model is not None:
-            raise InputError("model and registration exclude each other")
+            raise InputError("model, registration: only one of both is expected")
         _refined_key(connection, inputs.scene, inputs.registration)
 
 
 def _refined_key(connection: Connection, scene_id: UUID, job_id: UUID) -> str:
-    """Where the storage has the refined model that a job left of a scene.
+    """The storage key of the refined model that a registration job made of a scene.
 
     Raises:
-        InputError: the job did not register the scene, or left no RPC.
+        InputError: the job did not register the scene, or made no RPC.
     """
-    found = registrations.find_by_job(connection, job_id)
-    if found is None or found.scene_id != scene_id:
+    registration = registrations.find_by_job(connection, job_id)
+    if registration is None or registration.scene_id != scene_id:
         raise InputError(f"registration: job {job_id} did not register scene {scene_id}")
-    key = found.files.get(REFINED_NAME)
+    key = registration.files.get(REFINED_NAME)
     if key is None:
-        raise InputError(f"registration: job {job_id} left no {REFINED_NAME}: no RPC fits its model")
+        raise InputError(
+            f"registration: job {job_id} made no {REFINED_NAME}, because no RPC fits its refined model"
+        )
     return key
 
 
 def _run(work: Work) -> Commit:
-    """Rectify an uploaded scene; the image is in the storage before the job says so."""
+    """Orthorectify an uploaded scene and put the ortho-image into the storage."""
     inputs: OrthorectifyScene = work.inputs
-    with work.database.transaction() as connection:
+    with work.database.snapshot() as connection:
         scene = present_scene(connection, inputs.scene)
-        asked = inputs.registration
-        refined = None if asked is None else _refined_key(connection, inputs.scene, asked)
+        refined = None
+        if inputs.registration is not None:
+            refined = _refined_key(connection, inputs.scene, inputs.registration)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
         model = image.with_name(inputs.model) if inputs.model else None
         if refined is not None:
             model = work.storage.fetch(refined, Path(folder))
-        made = run_orthorectification(
+        geoid = image.with_name(inputs.geoid) if inputs.geoid else None
+        ortho = run_orthorectification(
             image,
-            model,
-            TerrainFile(
-                image.with_name(inputs.dem),
-                inputs.vertical,
-                image.with_name(inputs.geoid) if inputs.geoid else None,
-                inputs.fill_px,
-            ),
+            TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
             Path(folder) / ORTHO_NAME,
-            inputs.map,
-            inputs.options,
-            work.progress,
+            model=model,
+            ortho_map=inputs.map,
+            options=inputs.options,
+            progress=work.progress,
         )
-        key = work.storage.put_file(f"{work.attempt_folder}/{ORTHO_NAME}", made.path).key
+        key = work.storage.put_file(f"{work.attempt_folder}/{ORTHO_NAME}", ortho.path).key
 
     def commit(connection: Connection) -> dict[str, Any]:
-        said = {"lines": made.lines, "samples": made.samples, "seen": made.seen}
-        return {**said, "error_px": made.error_px, "files": {ORTHO_NAME: key}}
+        return {
+            "lines": ortho.lines,
+            "samples": ortho.samples,
+            "seen": ortho.seen,
+            "error_px": ortho.error_px,
+            "files": {ORTHO_NAME: key},
+        }
 
     return commit
 
 
 ORTHORECTIFY = Process(
     id="orthorectify",
-    title="Rectify a scene",
-    description="Lay an uploaded scene on a map through its model and a terrain uploaded beside it.",
+    title="Orthorectify a scene",
+    description="Resample an uploaded scene to a map, by its model and a terrain uploaded beside it.",
     scope=Scope.REGISTER,
     inputs=OrthorectifyScene,
     outputs={ORTHO_NAME: "The scene on the map, a cloud-optimised GeoTIFF."},
@@ -267,7 +266,7 @@ ORTHORECTIFY = Process(
     values={
         "lines": {"type": "integer", "title": "Lines of the map, px"},
         "samples": {"type": "integer", "title": "Samples of the map, px"},
-        "seen": {"type": "number", "title": "Share of the map that the scene shows"},
+        "seen": {"type": "number", "title": "Share of the map's pixels with data"},
         "error_px": {"type": "number", "title": "Largest error of the mapping, px"},
     },
 )

@@ -1,4 +1,4 @@
-"""Making a block of points: read images or an ortho-image, call the science, write the block folder."""
+"""Make a block of points: read images or an ortho-image, call the science, write the block folder."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -6,13 +6,12 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from app.errors import InputError
-from app.usecases.orthorectification import TerrainFile
-from app.usecases.registration.reference_source import HEIGHT_SIGMA_POSTINGS
+from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
 from services.formats.block.writer import write_block
-from services.formats.elevation.dem import read_dem
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.imagery.scene import Scene
@@ -25,17 +24,17 @@ from services.production.from_ortho import (
 )
 from services.sensors.correction import fold_into_rpc
 from services.sensors.rpc import RpcModel
-from services.types import Progress, no_progress
+from services.types import Array, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
 class BlockIdentity:
-    """How a new block is called.
+    """Name, version, title and licence of a new block.
 
     Attributes:
-        id: name of the block, a letter then letters, digits, dots, dashes, underscores.
-        version: one block is one version.
-        title: for people.
+        id: a letter, then letters, digits, dots, dashes or underscores.
+        version: of the block; a changed block needs a new version.
+        title: for people; by default the id.
         license: of the points and chips, an SPDX identifier or "proprietary".
     """
 
@@ -47,16 +46,16 @@ class BlockIdentity:
 
 @dataclass(frozen=True)
 class OrthoFiles:
-    """An ortho-image on the disk, and how high its ground lies.
+    """An ortho-image in a file, and the heights of its ground.
 
     Attributes:
         image: GeoTIFF (or COG) or JPEG 2000 on a map.
-        terrain: heights of its ground; None takes `flat_m` everywhere.
-        flat_m: metres above the ellipsoid.
-        height_sigma_m: of these heights, one standard deviation; has to be given with a flat one.
-        sigma_m: accuracy of the image on the map; by default what is known of its sensor.
+        terrain: heights of the ground; None takes `flat_m` everywhere.
+        flat_m: height of flat ground, metres above the ellipsoid.
+        height_sigma_m: one standard deviation of the heights, metres; required with `flat_m`.
+        sigma_m: accuracy of the image on the map, metres; by default that of its sensor.
         bands: see `services.formats.images.bands.parse_bands`.
-        mask: image of the same ground, not zero where no point shall be.
+        mask: image of the same ground; points are avoided where it is not zero.
     """
 
     image: Path
@@ -73,18 +72,19 @@ def run_production(
     folder: Path,
     identity: BlockIdentity,
     options: ProductionOptions = ProductionOptions(),
+    *,
     sigma_m: float | None = None,
     progress: Progress = no_progress,
 ) -> Production:
-    """Make a block of points out of images and write its folder.
+    """Make a block of points from overlapping images and write its folder.
 
     Args:
-        images: two or more; what lies beside them is looked at for their models.
+        images: two or more; their models are found by the names of the files beside them.
         folder: of the block; must not exist.
-        identity: name, version and title of the block.
+        identity: of the block.
         options: of the production.
-        sigma_m: accuracy of the images' models, metres; by default what producer or sensor says.
-        progress: told where the work stands.
+        sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
+        progress: receives the fraction done and a message.
 
     Raises:
         InputError: an image cannot be used, or the folder exists.
@@ -95,14 +95,14 @@ def run_production(
         scenes = [read_scene(path, sigma_m=sigma_m) for path in images]
         for scene in scenes:
             stack.callback(scene.image.close)  # type: ignore[attr-defined]
-        production = produce_points(scenes, options, lambda f, m: progress(0.9 * f, m))
+        production = produce_points(scenes, options, part_of(progress, 0.0, 0.9))
         write_block(
             folder,
-            _metadata(identity, scenes, production, options),
+            _production_metadata(identity, scenes, production, options),
             production.points,
             production.chips,
-            _models(scenes, production),
-            progress=lambda f, m: progress(0.9 + 0.1 * f, m),
+            _adjusted_models(scenes, production),
+            progress=part_of(progress, 0.9, 0.1),
         )
     return production
 
@@ -114,56 +114,57 @@ def run_ortho_production(
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
 ) -> OrthoPoints:
-    """Make a block of points out of one ortho-image and write its folder.
+    """Make a block of points from one ortho-image and write its folder.
 
     Args:
         files: the image and its heights.
         folder: of the block; must not exist.
-        identity: name, version and title of the block.
+        identity: of the block.
         options: of the points.
-        progress: told where the work stands.
+        progress: receives the fraction done and a message.
 
     Raises:
         InputError: the image or its heights cannot be used, or the folder exists.
         ComputationError: too little of the image makes points.
     """
     _refuse_existing(folder)
-    heights = _heights(files)
+    heights = _ground_heights(files)
     bands = None if files.bands is None else parse_bands(files.bands)
     with ExitStack() as stack:
         scene = read_scene(files.image, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
         stack.callback(scene.image.close)  # type: ignore[attr-defined]
-        made = produce_ortho_points(scene, heights, options, lambda f, m: progress(0.7 * f, m))
+        production = produce_ortho_points(scene, heights, options, part_of(progress, 0.0, 0.7))
         write_block(
             folder,
-            _ortho_metadata(identity, scene, made, options),
-            made.points,
-            made.chips,
+            _ortho_metadata(identity, scene, production, options),
+            production.points,
+            production.chips,
             {},
-            progress=lambda f, m: progress(0.7 + 0.3 * f, m),
+            progress=part_of(progress, 0.7, 0.3),
         )
-    return made
+    return production
 
 
-def _heights(files: OrthoFiles) -> GroundHeights:
+def _ground_heights(files: OrthoFiles) -> GroundHeights:
     if (files.terrain is None) == (files.flat_m is None):
-        raise InputError("heights of the ground: expected either a terrain or one flat height")
+        raise InputError(
+            "heights of the ground: either a terrain (--dem) or one flat height (--height-m) is expected"
+        )
     if files.terrain is not None:
-        asked = files.terrain
-        terrain = read_dem(asked.dem, asked.vertical, asked.geoid, asked.fill_px)
+        terrain = read_terrain(files.terrain)
         sigma_m = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
         return GroundHeights(terrain, 0.0, sigma_m)
     if files.flat_m is None or files.height_sigma_m is None:
-        raise InputError("one flat height: expected its standard deviation beside it, in metres")
+        raise InputError("one flat height: its standard deviation (--height-sigma-m) is missing")
     return GroundHeights(None, files.flat_m, files.height_sigma_m)
 
 
 def _refuse_existing(folder: Path) -> None:
     if folder.exists():
-        raise InputError(f"{folder}: exists already; a block is written once")
+        raise InputError(f"{folder}: already exists; a block is written into a new folder")
 
 
-def _models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:
+def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:
     """The adjusted model of every image, by the image's name."""
     models = {}
     for scene, corrected in zip(scenes, production.adjustment.models, strict=True):
@@ -172,32 +173,21 @@ def _models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcMod
     return models
 
 
-def _metadata(
+def _production_metadata(
     identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
 ) -> BlockMetadata:
     relative, n_points = production.relative_accuracy, len(production.points)
-    days = [s.acquisition.acquired_at for s in scenes if s.acquisition.acquired_at is not None]
-    spacing_km = None if options.spacing_m is None else options.spacing_m / 1000.0
-    return BlockMetadata(
-        id=identity.id,
-        version=identity.version,
-        title=identity.title or identity.id,
+    return _metadata(
+        identity,
+        scenes,
         description=f"{n_points} ground control points with chips, from {len(scenes)} images",
-        license=identity.license,
-        extent=production.outline,
-        created=datetime.now(UTC),
+        outline=production.outline,
         specification=BlockSpecification(
             gsds_m=(options.fine_gsd_m, options.coarse_gsd_m),
             min_views=options.min_views,
-            points_per_km2=None if spacing_km is None else spacing_km**-2.0,
+            points_per_km2=_points_per_km2(options.spacing_m),
         ),
-        provenance=Provenance(
-            software="amers",
-            version=version("amers"),
-            sources=tuple(s.acquisition.image_id for s in scenes),
-            options=asdict(options),
-        ),
-        epoch=None if not days else _decimal_year(max(days)),
+        options=asdict(options),
         accuracy=(
             AccuracyFigure(
                 "relative",
@@ -218,30 +208,20 @@ def _metadata(
 
 
 def _ortho_metadata(
-    identity: BlockIdentity, scene: Scene, made: OrthoPoints, options: OrthoPointOptions
+    identity: BlockIdentity, scene: Scene, production: OrthoPoints, options: OrthoPointOptions
 ) -> BlockMetadata:
-    taken, n_points = scene.acquisition, len(made.points)
-    spacing_km = None if options.spacing_m is None else options.spacing_m / 1000.0
-    return BlockMetadata(
-        id=identity.id,
-        version=identity.version,
-        title=identity.title or identity.id,
+    n_points = len(production.points)
+    return _metadata(
+        identity,
+        [scene],
         description=f"{n_points} ground control points with chips, from one ortho-image",
-        license=identity.license,
-        extent=made.outline,
-        created=datetime.now(UTC),
+        outline=production.outline,
         specification=BlockSpecification(
-            gsds_m=made.gsds_m,
+            gsds_m=production.gsds_m,
             min_views=1,
-            points_per_km2=None if spacing_km is None else spacing_km**-2.0,
+            points_per_km2=_points_per_km2(options.spacing_m),
         ),
-        provenance=Provenance(
-            software="amers",
-            version=version("amers"),
-            sources=(taken.image_id,),
-            options=asdict(options),
-        ),
-        epoch=None if taken.acquired_at is None else _decimal_year(taken.acquired_at),
+        options=asdict(options),
         accuracy=(
             AccuracyFigure(
                 "absolute",
@@ -252,6 +232,41 @@ def _ortho_metadata(
             ),
         ),
     )
+
+
+def _metadata(
+    identity: BlockIdentity,
+    scenes: Sequence[Scene],
+    *,
+    description: str,
+    outline: Array,
+    specification: BlockSpecification,
+    options: dict[str, Any],
+    accuracy: tuple[AccuracyFigure, ...],
+) -> BlockMetadata:
+    dates = [s.acquisition.acquired_at for s in scenes if s.acquisition.acquired_at is not None]
+    return BlockMetadata(
+        id=identity.id,
+        version=identity.version,
+        title=identity.title or identity.id,
+        description=description,
+        license=identity.license,
+        extent=outline,
+        created=datetime.now(UTC),
+        specification=specification,
+        provenance=Provenance(
+            software="amers",
+            version=version("amers"),
+            sources=tuple(scene.acquisition.image_id for scene in scenes),
+            options=options,
+        ),
+        epoch=None if not dates else _decimal_year(max(dates)),
+        accuracy=accuracy,
+    )
+
+
+def _points_per_km2(spacing_m: float | None) -> float | None:
+    return None if spacing_m is None else (spacing_m / 1000.0) ** -2.0
 
 
 def _decimal_year(moment: datetime) -> float:

@@ -11,7 +11,6 @@ from app.db import references
 from app.db.engine import Connection, Database
 from app.db.references import ReferenceRow
 from app.errors import Conflict, InputError, NotFound
-from app.usecases.orthorectification import TerrainFile
 from app.usecases.registration.reference_source import (
     FindReference,
     FoundReference,
@@ -19,6 +18,7 @@ from app.usecases.registration.reference_source import (
     read_reference,
 )
 from app.usecases.server_files import file_below
+from app.usecases.terrain_file import TerrainFile
 from services.geodesy import ecef_from_lon_lat_h
 from services.imagery.scene import Scene, scene_footprint
 from services.matching.reference_image import ReferenceMatchingOptions

@@ -73,8 +73,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     views = simulate_block(world(), rng, 2, SHAPE, 1.0, BLOCK_SIGMA_M, 20.0)
     images = [as_file(view, folder) for view in views]
     options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60)
-    run_production(images, folder / "dateline", BlockIdentity("dateline"), options, BLOCK_SIGMA_M)
-    return Made(folder / "dateline", as_file(later_view(), folder))
+    run_production(
+        images, folder / "dateline", BlockIdentity("dateline"), options, sigma_m=BLOCK_SIGMA_M
+    )
+    return Made(block, as_file(later_view(), folder))
 
 
 @pytest.fixture

@@ -25,10 +25,12 @@ from app.storage import Storage
 from app.usecases.jobs import do_attempt
 from services.formats.images.raster import write_raster
 from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
+from services.geodesy import metres_per_degree
 from services.sensors.rpc import RpcModel
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
 a_pixel = 1.0
+a_thousandth = 1e-3
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -86,11 +88,25 @@ def test_a_scene_is_laid_on_a_map_by_one_command(tmp_path: Path) -> None:
     assert shown == pytest.approx(line + 1.0, abs=a_pixel)
 
 
+def test_the_ground_sampling_of_a_map_in_degrees_is_that_of_its_pixels_on_the_ground(
+    tmp_path: Path,
+) -> None:
+    scene, dem = write_inputs(tmp_path)
+    output = tmp_path / "ortho.tif"
+    made = ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "--crs", "EPSG:4326", "-o", output)
+    with rasterio.open(output) as file:
+        step_lon_deg, step_lat_deg = file.res
+        lat_deg = (file.bounds.bottom + file.bounds.top) / 2.0
+    east_m, north_m = metres_per_degree(lat_deg, 0.0)
+    pixel_m2 = step_lon_deg * east_m * step_lat_deg * north_m
+    assert made["gsd_m"] == pytest.approx(pixel_m2**0.5, rel=a_thousandth)
+
+
 def test_heights_without_a_datum_and_files_written_over_are_refused(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
     with pytest.raises(AmersError, match=r"dem\.tif.*does not say"):
         ortho(scene, "--dem", dem, "-o", tmp_path / "ortho.tif")
-    with pytest.raises(AmersError, match="written over"):
+    with pytest.raises(AmersError, match="would replace an input file"):
         ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", scene)
     with pytest.raises(AmersError, match="cubic or bilinear"):
         ortho(scene, "--dem", dem, "--kernel", "lanczos", "-o", tmp_path / "ortho.tif")

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from app.errors import InputError
-from app.usecases.orthorectification import TerrainFile
 from app.usecases.registration.control_sources import ControlSet
-from services.formats.elevation.dem import read_dem
+from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from services.formats.images.raster import map_grid_of, open_raster
 from services.imagery.scene import Scene
 from services.matching.reference_image import Reference
@@ -22,9 +21,6 @@ LOCAL_SIGMA_PX = 0.3
 """How far details of an ortho-image lie off the rest of it, one standard deviation, its own pixels."""
 COMMON_SIGMA_PX = 0.1
 """What all of them share towards another image: shadows and roofs that lean alike, its own pixels."""
-HEIGHT_SIGMA_POSTINGS = 0.1
-"""How good the heights between the nodes of a terrain are taken to be, in distances of its nodes."""
-
 NO_HEIGHT_SIGMA_M = 5000.0
 """Of heights nobody gave: land reaches from -430 to 8,850 m."""
 
@@ -108,8 +104,7 @@ def read_reference(files: ReferenceFiles) -> Reference:
     terrain = None
     height_sigma_m = NO_HEIGHT_SIGMA_M
     if files.terrain is not None:
-        asked = files.terrain
-        terrain = read_dem(asked.dem, asked.vertical, asked.geoid, asked.fill_px)
+        terrain = read_terrain(files.terrain)
         height_sigma_m = HEIGHT_SIGMA_POSTINGS * terrain.posting_m
     return Reference(
         image=image,
