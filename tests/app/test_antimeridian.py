@@ -76,7 +76,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     run_production(
         images, folder / "dateline", BlockIdentity("dateline"), options, sigma_m=BLOCK_SIGMA_M
     )
-    return Made(block, as_file(later_view(), folder))
+    return Made(folder / "dateline", as_file(later_view(), folder))
 
 
 @pytest.fixture
