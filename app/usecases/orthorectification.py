@@ -141,7 +141,7 @@ def run_orthorectification(
     dtype, nodata = _pixel_type(raster)
     counter = _DataPixels()
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
-    error_px = write_cog(output, grid, windows, len(bands), dtype, nodata)
+    error_px = write_cog(output, grid, windows, bands=len(bands), dtype=dtype, nodata=nodata)
     raster.close()
     lines, samples = grid.shape
     return Orthorectified(

@@ -104,7 +104,7 @@ def test_the_ground_sampling_of_a_map_in_degrees_is_that_of_its_pixels_on_the_gr
 
 def test_heights_without_a_datum_and_files_written_over_are_refused(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
-    with pytest.raises(AmersError, match=r"dem\.tif.*does not say"):
+    with pytest.raises(AmersError, match=r"dem\.tif.*does not state its vertical datum"):
         ortho(scene, "--dem", dem, "-o", tmp_path / "ortho.tif")
     with pytest.raises(AmersError, match="would replace an input file"):
         ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", scene)

@@ -61,7 +61,7 @@ def block(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def colour(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
     model = tmp_path_factory.mktemp("colour") / "lowres_color_image_RPC.TXT"
     model.write_text(rpc_text_of_geom((folder / "lowres_color_image.geom").read_text()))
-    return read_scene(folder / "lowres_color_image.tif", model, SIGMA_M)
+    return read_scene(folder / "lowres_color_image.tif", model, sigma_m=SIGMA_M)
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,13 @@ def write_outputs(
         The report, and the files by name.
     """
     refined = write_refined(
-        image, model, registration.model, registration.adjustment, scene.image.shape, folder, copy_image
+        image,
+        model,
+        registration.model,
+        registration.adjustment,
+        shape=scene.image.shape,
+        folder=folder,
+        copy_image=copy_image,
     )
     summary = RegistrationSummary(
         scene=image.stem,

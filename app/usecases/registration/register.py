@@ -107,7 +107,7 @@ def run_registration(
     """
     started_at = datetime.now(UTC)
     bands = None if files.bands is None else parse_bands(files.bands)
-    scene = read_scene(files.image, files.model, files.sigma_m, bands, mask=files.mask)
+    scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
     held_out = None
     if files.check_points is not None:
         held_out = read_check_points(files.check_points, files.check_heights, files.image, scene)

@@ -1,4 +1,4 @@
-"""Digital elevation models: GeoTIFF in, terrain above the ellipsoid out. No height without its datum."""
+"""Reading digital elevation models as terrain with heights above the WGS 84 ellipsoid."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,35 +15,35 @@ from services.terrain import Geoid, Terrain
 from services.types import FloatImage
 
 HEIGHTS_M = (-11_100.0, 9_000.0)
-"""From the deepest sea to above the highest mountain: what lies beyond is a void nobody declared."""
+"""Range of heights, from the deepest sea to above the highest mountain; others are undeclared voids."""
 UNDECLARED_VOID = -9999.0
-"""So many producers write for a void that no height is believed to be exactly this."""
+"""A value so common for voids that it is never taken as a height."""
 
 
 def read_dem(
     path: Path, vertical: str | None = None, geoid: Path | None = None, fill_px: int = 0
 ) -> Terrain:
-    """The terrain in a file; it stays open and is read by windows.
+    """The terrain in a file, which stays open and is read by windows.
 
     Args:
-        path: GeoTIFF (or COG), JPEG 2000 or NITF with a reference system, any.
-        vertical: what the heights are counted from, when the file does not say: "ellipsoid", "EGM96",
+        path: GeoTIFF (or COG), JPEG 2000 or NITF with any reference system.
+        vertical: vertical datum of the heights, when the file does not state it: "ellipsoid", "EGM96",
             "EGM2008" or the code of a vertical reference system.
-        geoid: grid file of that geoid; by default the one PROJ has installed.
-        fill_px: voids are filled from heights at most so many nodes away; 0 leaves them.
+        geoid: grid file of the geoid; by default the grid that PROJ has installed.
+        fill_px: largest distance in nodes from which voids are filled; 0 leaves voids.
 
     Raises:
-        FormatError: when the file cannot be used.
-        VerticalDatumError: when nobody says what the heights are counted from, the file and the caller
-            disagree, or the geoid is not at hand.
-        CoverageError: when the grid of the geoid does not reach the terrain.
+        FormatError: the file cannot be used.
+        VerticalDatumError: the vertical datum is not stated, the file and the caller contradict each
+            other, or the grid of the geoid is missing.
+        CoverageError: the grid of the geoid does not cover the terrain.
     """
     image = open_raster(path)
     try:
         grid = map_grid_of(image)
         if grid is None:
-            raise FormatError(f"{path}: expected heights on a map, found no reference system")
-        unit_m, zero, note = _vertical(image, vertical, geoid)
+            raise FormatError(f"{path}: expected heights with a map grid, found no reference system")
+        unit_m, geoid_heights, note = _vertical_datum(image, vertical, geoid)
     except (FormatError, VerticalDatumError):
         image.close()
         raise
@@ -51,22 +51,22 @@ def read_dem(
     if fill_px > 0:
         heights = FilledVoids(heights, fill_px)
         note += f"; voids filled from heights within {fill_px} nodes"
-    terrain = Terrain(grid, heights, zero, note)
-    if zero is not None:
-        _check_reach(terrain, path)
+    terrain = Terrain(grid, heights, geoid_heights, note)
+    if geoid_heights is not None:
+        _check_geoid_coverage(terrain, geoid_heights, path)
     return terrain
 
 
 @dataclass(frozen=True)
 class FilledVoids:
-    """Heights whose voids near known ones are filled.
+    """Heights with filled voids; an `ImageSource`.
 
-    Each void node gets the mean of the known nodes around it, weighted by the inverse square of their
-    distance; nodes further than the reach from any known one stay void.
+    Each void node gets the mean of the valid nodes within reach, weighted by the inverse square of
+    their distance; a node without any stays void.
 
     Attributes:
         heights: with voids as NaN.
-        reach: nodes.
+        reach: largest distance, nodes.
     """
 
     heights: ImageSource
@@ -78,7 +78,7 @@ class FilledVoids:
         return self.heights.shape
 
     def read(self, window: Window) -> FloatImage:
-        """Heights of a window; NaN beyond the grid and in voids that are out of reach."""
+        """Heights of a window; NaN outside the grid and in voids out of reach."""
         r = self.reach
         wider = Window(window.line - r, window.sample - r, window.lines + 2 * r, window.samples + 2 * r)
         pixels = self.heights.read(wider)
@@ -87,13 +87,13 @@ class FilledVoids:
         if void[inside].any():
             square = (np.arange(-r, r + 1)[:, None] ** 2 + np.arange(-r, r + 1) ** 2).astype(np.float32)
             kernel = np.where((square > 0) & (square <= r * r), 1.0 / np.maximum(square, 1.0), 0.0)
-            known = np.where(void, np.float32(0.0), np.float32(1.0))
+            valid = np.where(void, np.float32(0.0), np.float32(1.0))
             border = cv2.BORDER_CONSTANT
             level = np.float32(np.nanmean(pixels)) if not void.all() else np.float32(0.0)
             total = cv2.filter2D(
                 np.where(void, 0.0, pixels - level), cv2.CV_64F, kernel, borderType=border
             )
-            weight = cv2.filter2D(known, cv2.CV_64F, kernel, borderType=border)
+            weight = cv2.filter2D(valid, cv2.CV_64F, kernel, borderType=border)
             with np.errstate(invalid="ignore", divide="ignore"):
                 filled = np.where(weight > 1e-9, total / weight + level, np.nan)
             pixels = np.where(void, filled, pixels).astype(np.float32)
@@ -107,7 +107,7 @@ class FilledVoids:
 
 @dataclass(frozen=True)
 class _Heights:
-    """The numbers of a file as metres, voids as NaN."""
+    """The values of a file in metres, with voids as NaN."""
 
     image: RasterImage
     unit_m: float
@@ -128,38 +128,40 @@ class _Heights:
         return np.asarray(heights)
 
 
-def _vertical(
-    image: RasterImage, said: str | None, grid: Path | None
+def _vertical_datum(
+    image: RasterImage, requested: str | None, grid: Path | None
 ) -> tuple[float, Geoid | None, str]:
-    """Metres a unit, the geoid (None: the ellipsoid), and one sentence on how they are known."""
+    """Metres per unit, the geoid (None for the ellipsoid), and one sentence on their origin."""
     path = image.path
-    stated, by_file = _stated(CRS.from_wkt(image.dataset.crs.to_wkt(version="WKT2_2019")))
-    by_caller = None if said is None else vertical_crs(said)
-    if by_file and said is not None and _name(stated) != _name(by_caller):
+    of_file, file_states = _vertical_of_file(CRS.from_wkt(image.dataset.crs.to_wkt(version="WKT2_2019")))
+    of_caller = None if requested is None else vertical_crs(requested)
+    if file_states and requested is not None and _name(of_file) != _name(of_caller):
         raise VerticalDatumError(
-            f"{path}: the file counts its heights from {_name(stated)}, and {_name(by_caller)} was given"
+            f"{path}: the file states heights above {_name(of_file)}, the caller {_name(of_caller)}; "
+            "omit the vertical datum or correct it"
         )
-    if not by_file and said is None and grid is None:
+    if not file_states and requested is None and grid is None:
         raise VerticalDatumError(
-            f"{path}: the file does not say what its heights are counted from: give ellipsoid, EGM96, "
-            "EGM2008 or the code of a vertical reference system"
+            f"{path}: the file does not state its vertical datum: give ellipsoid, EGM96, EGM2008 or the "
+            "code of a vertical reference system"
         )
-    who = "the file" if by_file else "the caller"
-    zero = stated if by_file else by_caller
+    who = "the file" if file_states else "the caller"
+    vertical = of_file if file_states else of_caller
     if grid is not None:
-        if zero is None and (by_file or said is not None):
+        if vertical is None and (file_states or requested is not None):
             raise VerticalDatumError(
-                f"{path}: heights above the ellipsoid, by {who}, need no geoid: {grid.name} was given"
+                f"{path}: heights are above the ellipsoid, by {who}, and need no geoid; omit {grid.name}"
             )
-        name = "the geoid" if zero is None else zero.name
-        return _unit_m(zero, path), geoid_of_grid(grid), f"{name} by {who}, from {grid.name}"
-    if zero is None:
+        name = "the geoid" if vertical is None else vertical.name
+        return _unit_m(vertical, path), geoid_of_grid(grid), f"{name} by {who}, from {grid.name}"
+    if vertical is None:
         return 1.0, None, f"metres above the ellipsoid, by {who}"
-    return _unit_m(zero, path), geoid_of_crs(zero), f"{zero.name} by {who}, from the grids of PROJ"
+    note = f"{vertical.name} by {who}, from the grids of PROJ"
+    return _unit_m(vertical, path), geoid_of_crs(vertical), note
 
 
-def _stated(crs: CRS) -> tuple[CRS | None, bool]:
-    """The vertical reference system of a file, None for the ellipsoid; and whether it states one."""
+def _vertical_of_file(crs: CRS) -> tuple[CRS | None, bool]:
+    """The vertical reference system of a file, None for the ellipsoid; whether the file states it."""
     if crs.is_compound:
         return crs.sub_crs_list[1], True
     return None, len(crs.axis_info) == 3
@@ -170,18 +172,20 @@ def _name(vertical: CRS | None) -> str:
 
 
 def _unit_m(vertical: CRS | None, path: Path) -> float:
+    """Metres per unit of a vertical reference system."""
     if vertical is None:
         return 1.0
     axis = vertical.axis_info[0]
     if axis.direction.lower() != "up":
-        raise VerticalDatumError(f"{path}: expected heights, found depths: {vertical.name}")
+        raise VerticalDatumError(f"{path}: {vertical.name} found, which counts depths; heights expected")
     return float(axis.unit_conversion_factor)
 
 
-def _check_reach(terrain: Terrain, path: Path) -> None:
-    """A geoid of another part of the world would make every height unknown."""
+def _check_geoid_coverage(terrain: Terrain, geoid: Geoid, path: Path) -> None:
+    """Refuse a geoid of another region, with which every height would be unknown."""
     last = np.array(terrain.grid.shape) - 1.0
     corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0], [0.5, 0.5]]) * last
-    assert terrain.geoid is not None
-    if np.isnan(terrain.geoid(terrain.grid.lon_lat(corners))).all():
-        raise CoverageError(f"{path}: the grid of the geoid does not reach the terrain")
+    if np.isnan(geoid(terrain.grid.lon_lat(corners))).all():
+        raise CoverageError(
+            f"{path}: the grid of the geoid does not cover the terrain; give the geoid of this region"
+        )

@@ -1,4 +1,4 @@
-"""Geoids: how far the zero of a height lies above the ellipsoid, from the grids PROJ reads."""
+"""Geoids: heights of vertical datums above the WGS 84 ellipsoid, from grids that PROJ reads."""
 
 import warnings
 from pathlib import Path
@@ -14,22 +14,22 @@ from services.terrain import Geoid
 from services.types import Array
 
 NAMED = {"EGM84": "EPSG:5798", "EGM96": "EPSG:5773", "EGM2008": "EPSG:3855"}
-"""Vertical reference systems that are asked for by name."""
+"""Codes of vertical reference systems, by their common names."""
 
-_FURTHEST_M = 120.0
-"""No geoid is further from the ellipsoid: EGM2008 reaches from -107 to 86 m."""
+_MAX_GEOID_M = 120.0
+"""Largest height of a geoid above or below the ellipsoid: EGM2008 ranges from -107 to 86 m."""
 
 
 def geoid_of_grid(path: Path) -> Geoid:
-    """The geoid in a grid file, GTX or GeoTIFF, bilinear between its nodes.
+    """The geoid in a grid file, GTX or GeoTIFF, with bilinear interpolation.
 
     Raises:
-        VerticalDatumError: when PROJ cannot read the file, or it holds no geoid.
+        VerticalDatumError: PROJ cannot read the file, or it does not contain a geoid.
     """
     name = str(path.resolve())
     if not path.is_file() or any(letter in name for letter in '",'):
         raise VerticalDatumError(
-            f"{path}: expected the file of a geoid's grid, without , or \" in its name"
+            f'{path}: expected an existing grid file of a geoid, without , or " in its name'
         )
     pipeline = f'+proj=vgridshift +grids="{name}" +multiplier=1'
     try:
@@ -38,46 +38,49 @@ def geoid_of_grid(path: Path) -> Geoid:
             "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
         )
     except ProjError as error:
-        raise VerticalDatumError(f"{path}: PROJ reads no geoid there: {error}") from error
+        raise VerticalDatumError(f"{path}: PROJ cannot read a geoid from this file: {error}") from error
     geoid = _geoid(transformer)
     axes = np.meshgrid(np.arange(-179.5, 180.0, 1.0), np.arange(-89.5, 90.0, 1.0))
     heights = geoid(np.column_stack([axis.ravel() for axis in axes]))
-    if np.isnan(heights).all() or np.nanmax(np.abs(heights)) > _FURTHEST_M:
+    if np.isnan(heights).all() or np.nanmax(np.abs(heights)) > _MAX_GEOID_M:
         raise VerticalDatumError(
-            f"{path}: no geoid: it should have heights within {_FURTHEST_M:g} m of the ellipsoid"
+            f"{path}: no geoid found, a grid of heights within {_MAX_GEOID_M:g} m of the ellipsoid "
+            "expected"
         )
     return geoid
 
 
 def geoid_of_crs(vertical: CRS) -> Geoid:
-    """The geoid, or the other zero, of a vertical reference system, when PROJ has its grid installed.
+    """The height above the ellipsoid of the zero of a vertical reference system.
 
     Raises:
-        VerticalDatumError: when no transformation with an installed grid leads to the ellipsoid.
+        VerticalDatumError: PROJ has no transformation to the ellipsoid with an installed grid.
     """
-    whole = CompoundCRS("place and height", ["EPSG:4326", vertical])
+    compound = CompoundCRS("position and height", ["EPSG:4326", vertical])
     with warnings.catch_warnings():
-        # That the best way is not installed is told below, or does not matter.
+        # PROJ warns that the best transformation is not installed; the code below handles it.
         warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup(whole, "EPSG:4979", always_xy=True, allow_ballpark=False)
+        group = TransformerGroup(compound, "EPSG:4979", always_xy=True, allow_ballpark=False)
     if not group.transformers:
-        missing = sorted({grid.short_name for way in group.unavailable_operations for grid in way.grids})
-        hint = f": PROJ misses {' or '.join(missing)}" if missing else ""
+        missing = sorted(
+            {grid.short_name for step in group.unavailable_operations for grid in step.grids}
+        )
+        hint = f": PROJ has no {' or '.join(missing)} installed" if missing else ""
         raise VerticalDatumError(
-            f"heights in {vertical.name} cannot be turned into heights above the ellipsoid{hint}; "
+            f"heights in {vertical.name} cannot be converted to heights above the ellipsoid{hint}; "
             "give the grid file of the geoid"
         )
     return _geoid(group.transformers[0])
 
 
 def vertical_crs(name: str) -> CRS | None:
-    """A vertical reference system by its name; None for the ellipsoid.
+    """The vertical reference system with a name; None for the ellipsoid.
 
     Args:
-        name: "ellipsoid", "EGM84", "EGM96", "EGM2008", or what PROJ understands, like "EPSG:5720".
+        name: "ellipsoid", "EGM84", "EGM96", "EGM2008", or a definition for PROJ such as "EPSG:5720".
 
     Raises:
-        VerticalDatumError: when it is none of those.
+        VerticalDatumError: the name is none of these.
     """
     if name.lower() in ("ellipsoid", "wgs84", "wgs 84"):
         return None
@@ -87,7 +90,8 @@ def vertical_crs(name: str) -> CRS | None:
         crs = None
     if crs is None or not crs.is_vertical or crs.is_compound:
         raise VerticalDatumError(
-            f"{name}: expected ellipsoid, {', '.join(NAMED)} or the code of a vertical reference system"
+            f"vertical datum: {name} given; expected ellipsoid, {', '.join(NAMED)} or the code of a "
+            "vertical reference system"
         )
     return crs
 

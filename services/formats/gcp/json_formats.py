@@ -1,4 +1,4 @@
-"""Marked points as JSON: Amers and Orthority GeoJSON, and the control points of OPF 1.0 (Pix4D)."""
+"""Marked points in JSON: Amers and Orthority GeoJSON, and the control points of OPF 1.0 (Pix4D)."""
 
 import hashlib
 import json
@@ -11,25 +11,25 @@ from pyproj import CRS
 from services.errors import FormatError, InputError, VerticalDatumError
 from services.formats.gcp.marked_points import (
     MarkedPoints,
-    crs_from,
-    ground_from,
     load_json,
     marked_points,
+    parse_crs,
+    to_wgs84,
 )
 from services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"
 OPF_CORNER_PX = 0.5
-"""OPF counts from the corner of the first pixel."""
+"""OPF counts pixels from the corner of the first one."""
 OPF_EXTENSION = "AMERS_images"
-"""Where an OPF of ours keeps the names of the images, which OPF has in a list of cameras elsewhere."""
+"""Extension of OPF with the names of the images, which OPF itself stores in a separate camera list."""
 
 
 def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
-    """GeoJSON of the points of a scene: where they are, where they were found, what became of them.
+    """GeoJSON of the points of a registration: positions on the ground and in the scene, and status.
 
     Args:
-        measures: all n points the scene could show.
+        measures: of all n points within the scene.
         image: name of the scene.
         sigma_m: (n, 3) of the points, east, north, up; NaN where unknown.
     """
@@ -50,7 +50,7 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
                 "status": measure_status(measures, i),
                 "reason": str(measures.reason[i]),
                 "views": int(measures.views[i]),
-                **{name: _known(float(values[i])) for name, values in numbers.items()},
+                **{name: _finite_or_none(float(values[i])) for name, values in numbers.items()},
             },
         }
         for i, lon_lat_h in enumerate(measures.lon_lat_h)
@@ -66,7 +66,7 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
 
 
 def measured_numbers(measures: Measures) -> dict[str, Array]:
-    """What was measured of each point (n,), by the names it has in files; NaN where it was not found."""
+    """The measured values (n,) of each point, by their names in files; NaN where it was not matched."""
     return {
         "line": measures.line_sample[:, 0],
         "sample": measures.line_sample[:, 1],
@@ -80,28 +80,28 @@ def measured_numbers(measures: Measures) -> dict[str, Array]:
 
 
 def measure_status(measures: Measures, row: int) -> str:
-    """What became of a point: "active", "deactivated" or "not matched"."""
+    """The status of a point: "active", "deactivated" or "not matched"."""
     if measures.active[row]:
         return "active"
     return "deactivated" if measures.matched[row] else "not matched"
 
 
 def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
-    """Read marked points from GeoJSON: those of a registration, a list of one's own, or Orthority's.
+    """The marked points of a GeoJSON: of a registration, of a user or of Orthority.
 
-    Each feature is a Point with longitude, latitude and height. Its properties hold `line` and
+    Each feature is a Point with longitude, latitude and height. Its properties are `line` and
     `sample`, from the centre of the first pixel, or Orthority's `ji` (column, row). Optional: `id`,
     `image` or `filename`, `sigma_px`, `sigma_east_m`, `sigma_north_m`, `sigma_up_m`, `check`, and
-    `status`: a point whose status is neither missing nor "active" is not active. Features without a
-    place in the image are left out.
+    `status`: a point with a status other than "active" is not active. Features without a position in
+    the image are skipped.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when it is something else.
-        VerticalDatumError: when a point has no height.
+        FormatError: the document or a feature has another form.
+        VerticalDatumError: a point has no height.
     """
     document = load_json(text, source)
     document = document if isinstance(document, dict) else {}
@@ -113,16 +113,16 @@ def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
         _geojson_row(feature, f"{source}, feature {count}", image, str(count))
         for count, feature in enumerate(features, start=1)
     ]
-    return _gathered([row for row in rows if row is not None])
+    return _points_from_rows([row for row in rows if row is not None])
 
 
 def format_opf(points: MarkedPoints) -> str:
     """The active points and the check points as input control points of OPF 1.0, in EPSG:4979.
 
-    A camera is known by a number made from the name of its image; the names are in an extension.
+    The id of a camera is a hash of the name of its image; an extension lists the names.
 
     Raises:
-        InputError: when a sigma is unknown, which OPF does not allow.
+        InputError: a sigma is unknown, which OPF does not allow.
     """
     used = points.take(points.active | points.check)
     gcps: dict[str, dict[str, Any]] = {}
@@ -130,7 +130,7 @@ def format_opf(points: MarkedPoints) -> str:
         lon, lat, height_m = used.lon_lat_h[i].tolist()
         east_m, north_m, up_m = used.sigma_m[i].tolist()
         if not np.isfinite([east_m, north_m, up_m, used.sigma_px[i]]).all():
-            raise InputError(f"point {point}: a sigma is unknown, this format takes known ones only")
+            raise InputError(f"point {point}: a sigma is unknown; OPF needs the sigmas of every point")
         gcp = gcps.setdefault(
             point,
             {
@@ -164,23 +164,27 @@ def format_opf(points: MarkedPoints) -> str:
 
 
 def opf_camera_id(image: str) -> int:
-    """The number of an image: the first 48 bits of the SHA-256 of its name, which every reader takes."""
+    """The camera id of an image: the first 48 bits of the SHA-256 of its name.
+
+    Readers with floating-point numbers keep 48 bits exactly.
+    """
     return int.from_bytes(hashlib.sha256(image.encode()).digest()[:6], "big")
 
 
 def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
-    """Read the input control points of OPF 1.0.
+    """The marked points of the input control points of OPF 1.0.
 
-    Images are named by the extension of Amers, else by the number of their camera. Heights are those of
-    the reference system of each point: of its ellipsoid when it is two-dimensional, as OPF says.
+    The extension of Amers gives the names of the images; without it the name is the id of the camera.
+    Heights are those of the CRS of each point, or above its ellipsoid when it is two-dimensional, as OPF
+    specifies.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when it is something else.
-        VerticalDatumError: when heights need a grid that is not installed.
+        FormatError: the document or a point has another form.
+        VerticalDatumError: heights need a grid that is not installed.
     """
     document = load_json(text, source)
     if not isinstance(document, dict) or document.get("format") != OPF_FORMAT:
@@ -191,19 +195,19 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
     if not isinstance(gcps, list):
         raise FormatError(f"{source}: expected a list of gcps")
     extensions = document.get("extensions")
-    named = extensions.get(OPF_EXTENSION) if isinstance(extensions, dict) else None
-    images = named if isinstance(named, dict) else {}
+    names = extensions.get(OPF_EXTENSION) if isinstance(extensions, dict) else None
+    images = names if isinstance(names, dict) else {}
     rows = []
     for count, gcp in enumerate(gcps, start=1):
         rows += _opf_rows(gcp, images, f"{source}, gcp {count}")
-    return _gathered(rows)
+    return _points_from_rows(rows)
 
 
 Row = dict[str, Any]
-"""One mark, by the names of `MarkedPoints`."""
+"""One mark: values by the attribute names of `MarkedPoints`."""
 
 
-def _gathered(rows: list[Row]) -> MarkedPoints:
+def _points_from_rows(rows: list[Row]) -> MarkedPoints:
     columns = {name: [row[name] for row in rows] for name in rows[0]} if rows else {}
     return marked_points(
         columns.pop("id", []), columns.pop("lon_lat_h", []), columns.pop("line_sample", []), **columns
@@ -211,7 +215,7 @@ def _gathered(rows: list[Row]) -> MarkedPoints:
 
 
 def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None:
-    """One feature; None when the image does not show it."""
+    """The mark of one feature; None without a position in the image."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     properties = feature.get("properties") if isinstance(feature, dict) else None
     if not isinstance(geometry, dict) or geometry.get("type") != "Point":
@@ -219,15 +223,15 @@ def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None
     properties = properties if isinstance(properties, dict) else {}
     coordinates = geometry.get("coordinates")
     if isinstance(coordinates, list) and len(coordinates) == 2:
-        raise VerticalDatumError(f"{where}: expected longitude, latitude and height, found no height")
+        raise VerticalDatumError(f"{where}: expected longitude, latitude and height, found 2 numbers")
     lon, lat, height_m = _numbers(coordinates, 3, "coordinates", where)
-    place = properties.get("ji", [properties.get("sample"), properties.get("line")])
-    if place == [None, None]:
+    position = properties.get("ji", [properties.get("sample"), properties.get("line")])
+    if position == [None, None]:
         return None
-    sample, line = _numbers(place, 2, "line and sample", where)
-    named = feature.get("id", properties.get("id"))
+    sample, line = _numbers(position, 2, "line and sample", where)
+    point_id = feature.get("id", properties.get("id"))
     return {
-        "id": count if named is None else str(named),
+        "id": count if point_id is None else str(point_id),
         "lon_lat_h": (lon, lat, height_m),
         "line_sample": (line, sample),
         "image": str(properties.get("image") or properties.get("filename") or image),
@@ -272,17 +276,17 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
 
 def _opf_ground(location: dict[str, Any], where: str) -> tuple[list[float], list[float]]:
     """Longitude, latitude, height and the sigmas east, north, up of a geolocation."""
-    said = location.get("crs")
-    if not isinstance(said, dict) or not isinstance(said.get("definition"), str):
-        raise FormatError(f"{where}: expected a crs with its definition")
-    crs = crs_from(said["definition"], where)
+    crs_node = location.get("crs")
+    if not isinstance(crs_node, dict) or not isinstance(crs_node.get("definition"), str):
+        raise FormatError(f"{where}: expected a crs with a definition")
+    crs = parse_crs(crs_node["definition"], where)
     coordinates = np.array([_numbers(location.get("coordinates"), 3, "coordinates", where)])
     sigmas_m = _numbers(location.get("sigmas"), 3, "sigmas", where)
-    geoid_m = _optional(said, "geoid_height", where)
+    geoid_m = _optional(crs_node, "geoid_height", where)
     if crs.is_compound and not math.isnan(geoid_m):
         coordinates[:, 2] += geoid_m
         crs = crs.sub_crs_list[0]
-    ground = ground_from(coordinates, crs, "ellipsoid", where, axes_of_crs=True)[0]
+    ground = to_wgs84(coordinates, crs, "ellipsoid", where, axes_of_crs=True)[0]
     return ground.tolist(), sigmas_m if _east_first(crs) else [sigmas_m[1], sigmas_m[0], sigmas_m[2]]
 
 
@@ -291,15 +295,15 @@ def _east_first(crs: CRS) -> bool:
 
 
 def _numbers(values: Any, count: int, name: str, where: str) -> list[float]:
-    """So many finite numbers."""
+    """A list of `count` finite numbers."""
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
-        raise FormatError(f"{where}: {name} should be {count} numbers, found {str(values)[:60]}")
+        raise FormatError(f"{where}: {name}: expected {count} numbers, found {str(values)[:60]}")
     return [float(value) for value in values]
 
 
-def _optional(holder: dict[str, Any], name: str, where: str) -> float:
-    """A number that may be missing or null, NaN then."""
-    value = holder.get(name)
+def _optional(node: dict[str, Any], name: str, where: str) -> float:
+    """A number of a JSON object; NaN where it is missing or null."""
+    value = node.get(name)
     return math.nan if value is None else _numbers([value], 1, name, where)[0]
 
 
@@ -307,5 +311,5 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -1,18 +1,18 @@
-"""Ground points marked in images: what travels between the formats of the field, and datums.
+"""Ground points marked in images, and their conversion to WGS 84.
 
 | format | first pixel | ground | heights |
 |---|---|---|---|
 | Amers GeoJSON | its centre is (0, 0) | lon, lat | WGS 84 ellipsoid (RFC 7946) |
 | Orthority GeoJSON, `ji` | its centre is (0, 0) | lon, lat | WGS 84 ellipsoid |
-| ASP `.gcp` | its centre is (0, 0) | lat, lon | above a datum the caller says |
+| ASP `.gcp` | its centre is (0, 0) | lat, lon | above a datum that the caller states |
 | OPF 1.0 | its corner is (0, 0) | axes of its CRS | of its CRS, else the ellipsoid |
 | QGIS `.points` | its corner is (0, 0), lines negative | its `#CRS` | none |
-| ENVI `.pts` | its corner is (1, 1) | `projection info` | above a datum the caller says |
-| ODM `gcp_list.txt` | its centre is (0, 0) | its first line | of its system, else the caller says |
-| PCI text | its corner is (0, 0) | its first line, ours | its first line, else the caller says |
+| ENVI `.pts` | its corner is (1, 1) | `projection info` | above a datum that the caller states |
+| ODM `gcp_list.txt` | its centre is (0, 0) | its first line | of its CRS, else the caller states them |
+| PCI text | its corner is (0, 0) | a first line of ours | its first line, else the caller states them |
 
-The readers and writers of these formats convert, and nothing else does: inside, the centre of the first
-pixel is (0, 0) and heights are above the WGS 84 ellipsoid.
+Only the readers and writers of these formats convert: everywhere else the centre of the first pixel is
+(0, 0) and heights are above the WGS 84 ellipsoid.
 """
 
 import json
@@ -30,25 +30,25 @@ from services.types import Array, BoolArray
 
 WGS84_3D = CRS.from_epsg(4979)
 ELLIPSOID = "ellipsoid"
-"""What a caller says of heights that are above the ellipsoid of their reference system."""
+"""The `heights` of a caller whose heights are above the ellipsoid of their reference system."""
 
 StrArray = npt.NDArray[np.str_]
 
 
 @dataclass(frozen=True)
 class MarkedPoints:
-    """n ground points and where images show them, one row a mark.
+    """n marks: ground points and their positions in images, one row for each mark.
 
     Attributes:
-        id: (n,) str; a point seen in several images has as many rows.
-        lon_lat_h: (n, 3); the height is NaN where the file holds none.
-        sigma_m: (n, 3) of east, north, up, one standard deviation; NaN where unknown.
-        image: (n,) str, name of the image; "" where the file does not say.
+        id: (n,) str, id of the point; a point marked in several images has one row for each of them.
+        lon_lat_h: (n, 3); the height is NaN where the file has none.
+        sigma_m: (n, 3) east, north, up, one standard deviation; NaN where unknown.
+        image: (n,) str, name of the image; "" where the file has none.
         line_sample: (n, 2) pixels.
-        sigma_px: (n,) one standard deviation a coordinate; NaN where unknown.
+        sigma_px: (n,) one standard deviation of each coordinate; NaN where unknown.
         residual_px: (n, 2) observed minus computed, line and sample; NaN where unknown.
-        active: (n,) to be used.
-        check: (n,) held out of the adjustment.
+        active: (n,) whether the mark is to be used.
+        check: (n,) whether the point is a check point, held out of the adjustment.
     """
 
     id: StrArray
@@ -65,7 +65,7 @@ class MarkedPoints:
         return len(self.id)
 
     def take(self, rows: BoolArray) -> "MarkedPoints":
-        """The points of a mask (n,)."""
+        """The marks where a mask (n,) is true."""
         return MarkedPoints(**{name: values[rows] for name, values in vars(self).items()})
 
 
@@ -73,16 +73,16 @@ def marked_points(
     id: list[str],
     lon_lat_h: list[tuple[float, float, float]] | Array,
     line_sample: list[tuple[float, float]] | Array,
-    **known: Any,
+    **attributes: Any,
 ) -> MarkedPoints:
-    """Marked points with what a file does not say filled in: unknown sigmas, active, no check points.
+    """Marked points with default attributes: unknown sigmas and residuals, active, no check points.
 
     Args:
         id, lon_lat_h, line_sample: n rows.
-        known: any other attribute of `MarkedPoints`, n rows.
+        attributes: other attributes of `MarkedPoints`, n rows, that replace the defaults.
     """
     n = len(id)
-    rest: dict[str, Any] = {
+    columns: dict[str, Any] = {
         "sigma_m": np.full((n, 3), np.nan),
         "image": np.full(n, "", dtype=np.str_),
         "sigma_px": np.full(n, np.nan),
@@ -90,34 +90,33 @@ def marked_points(
         "active": np.ones(n, dtype=bool),
         "check": np.zeros(n, dtype=bool),
     }
-    shapes = {name: value.shape for name, value in rest.items()}
-    kinds = {name: value.dtype.kind for name, value in rest.items()}
-    for name, values in known.items():
-        dtype = {"U": np.str_, "b": np.bool_}.get(kinds[name], np.float64)
-        rest[name] = np.array(values, dtype=dtype).reshape(shapes[name])
+    for name, values in attributes.items():
+        default = columns[name]
+        dtype = {"U": np.str_, "b": np.bool_}.get(default.dtype.kind, np.float64)
+        columns[name] = np.array(values, dtype=dtype).reshape(default.shape)
     return MarkedPoints(
         id=np.array(id, dtype=np.str_),
         lon_lat_h=np.array(lon_lat_h, dtype=np.float64).reshape(n, 3),
         line_sample=np.array(line_sample, dtype=np.float64).reshape(n, 2),
-        **rest,
+        **columns,
     )
 
 
-def ground_from(
+def to_wgs84(
     coordinates: Array, crs: CRS, heights: str | None, source: str, axes_of_crs: bool = False
 ) -> Array:
-    """Points of any reference system as longitude, latitude and height above the WGS 84 ellipsoid.
+    """Longitude, latitude and height above the WGS 84 ellipsoid (n, 3) of points in any CRS.
 
     Args:
         coordinates: (n, 3) east or longitude first, unless `axes_of_crs`.
-        crs: of the coordinates.
-        heights: of a system without any: "ellipsoid" or a vertical reference system.
-        source: name of the file, for the messages.
-        axes_of_crs: the coordinates are in the order of the axes of their system.
+        crs: reference system of the coordinates.
+        heights: datum of the heights where `crs` has none: "ellipsoid" or a vertical reference system.
+        source: name of the file, for messages.
+        axes_of_crs: the coordinates are in the order of the axes of `crs`.
 
     Raises:
-        VerticalDatumError: when the datum of the heights is unknown, or the grid it needs is missing.
-        FormatError: when the points cannot be brought into WGS 84.
+        VerticalDatumError: the datum of the heights is unknown, or the grid it needs is not installed.
+        FormatError: the points cannot be transformed to WGS 84.
     """
     if len(crs.axis_info) < 3:
         crs = _with_heights(crs, heights, source)
@@ -131,45 +130,49 @@ def ground_from(
     except ProjError as error:
         kind = VerticalDatumError if crs.is_compound else FormatError
         raise kind(
-            f"{source}: points of {crs.name} cannot be brought to heights above the WGS 84 ellipsoid: "
-            f"{error}"
+            f"{source}: points in {crs.name} cannot be transformed to heights above the WGS 84 "
+            f"ellipsoid: {error}"
         ) from None
     return np.column_stack([y, x, z] if axes_of_crs else [x, y, z])
 
 
-def crs_from(definition: str, source: str) -> CRS:
-    """The reference system of a definition.
+def parse_crs(definition: str, source: str) -> CRS:
+    """The reference system of a definition: a code, WKT or a PROJ string.
 
     Raises:
-        FormatError: when it is none.
+        FormatError: PROJ does not understand the definition.
     """
     try:
         return CRS.from_user_input(definition)
     except CRSError:
-        raise FormatError(f"{source}: expected a reference system, found {definition[:60]!r}") from None
+        raise FormatError(
+            f"{source}: expected a reference system, such as EPSG:32633, found {definition[:60]!r}"
+        ) from None
 
 
 def _with_heights(crs: CRS, heights: str | None, source: str) -> CRS:
     if heights is None:
         raise VerticalDatumError(
-            f"{source}: the file does not say what its heights are above; say it: {ELLIPSOID!r}, or a "
-            "vertical reference system such as 'EPSG:5773' (EGM96) or 'EPSG:3855' (EGM2008)"
+            f"{source}: the file does not state the datum of its heights; give heights: {ELLIPSOID!r} "
+            "or a vertical reference system such as 'EPSG:5773' (EGM96) or 'EPSG:3855' (EGM2008)"
         )
     if heights == ELLIPSOID:
         return crs.to_3d()
-    vertical = crs_from(heights, source)
+    vertical = parse_crs(heights, source)
     if not vertical.is_vertical:
-        raise VerticalDatumError(f"{source}: {heights} is not a vertical reference system")
+        raise VerticalDatumError(
+            f"{source}: heights: {heights} given, {ELLIPSOID!r} or a vertical reference system expected"
+        )
     return CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical])
 
 
 def load_json(text: str, source: str) -> Any:
-    """A JSON document.
+    """The value of a JSON document.
 
     Raises:
-        FormatError: when it is none.
+        FormatError: the text is not JSON.
     """
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise FormatError(f"{source}: not a JSON document: {error}") from None
+        raise FormatError(f"{source}: expected a JSON document: {error}") from None

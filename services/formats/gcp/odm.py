@@ -1,7 +1,7 @@
-"""Marked points as OpenDroneMap has them: `gcp_list.txt`.
+"""Marked points in the `gcp_list.txt` of OpenDroneMap.
 
-Source: OpenDroneMap, "Ground Control Points", and `opendm/gcp.py`, which adds half a pixel before it
-counts from the middle of an image: the centre of the first pixel is (0, 0).
+Source: OpenDroneMap, "Ground Control Points", and `opendm/gcp.py`, which adds half a pixel to convert to
+positions from the image centre: the centre of the first pixel is (0, 0).
 """
 
 import math
@@ -14,23 +14,23 @@ from services.errors import FormatError
 from services.formats.gcp.marked_points import (
     ELLIPSOID,
     MarkedPoints,
-    crs_from,
-    ground_from,
     marked_points,
+    parse_crs,
+    to_wgs84,
 )
-from services.formats.gcp.text_lines import coordinate_array, format_mark, lines_of, numbers_of
+from services.formats.gcp.text_lines import content_lines, coordinate_array, format_mark, parse_numbers
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS]?)", re.IGNORECASE)
 _NAMES = ["geo_x", "geo_y", "geo_z", "im_x", "im_y"]
 _CHECK = "CHK-"
-"""What the names of check points begin with."""
+"""Prefix of the names of check points."""
 
 
 def format_gcp_list(points: MarkedPoints) -> str:
     """The active points and the check points as a `gcp_list.txt`, in longitude and latitude.
 
-    ODM takes heights as they are: here they are above the WGS 84 ellipsoid, "nan" where unknown. Blanks
-    in names, which would end them, become underscores.
+    ODM does not convert heights: here they are above the WGS 84 ellipsoid, "nan" where unknown. Spaces
+    in names become underscores, because a space separates fields.
     """
     lines = ["EPSG:4326", "# heights are metres above the WGS 84 ellipsoid"]
     used = points.take(points.active | points.check)
@@ -43,33 +43,34 @@ def format_gcp_list(points: MarkedPoints) -> str:
 
 
 def parse_gcp_list(text: str, heights: str | None = None, source: str = "gcp_list.txt") -> MarkedPoints:
-    """Read a `gcp_list.txt`: its reference system, then one mark a line, blanks or tabs between fields.
+    """The marked points of a `gcp_list.txt`: a reference system, then one mark on each line.
 
-    Points without a name are told apart by their ground coordinates, as ODM does it.
+    Points without a name are distinguished by their ground coordinates, as in ODM.
 
     Args:
-        text: contents of the file.
-        heights: above what, where the reference system has none: "ellipsoid" or a vertical one.
-        source: its name, for the messages.
+        text: contents of the file; spaces or tabs separate fields.
+        heights: datum of the heights where the reference system has none: "ellipsoid" or a vertical
+            reference system.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a line is not of that form.
-        VerticalDatumError: when nobody says what the heights are above.
+        FormatError: a line has another form.
+        VerticalDatumError: neither the file nor the caller states the datum of the heights.
     """
-    said = list(lines_of(text, "#", source))
-    if not said:
+    lines = list(content_lines(text, "#", source))
+    if not lines:
         raise FormatError(f"{source}: expected a reference system in the first line, found nothing")
-    crs = _crs(said[0][1], source)
+    crs = _crs(lines[0][1], source)
     ids, coordinates, pixels, images = [], [], [], []
     unnamed: dict[tuple[str, ...], str] = {}
-    for where, line in said[1:]:
+    for where, line in lines[1:]:
         fields = line.split()
         if len(fields) < 6:
             raise FormatError(
-                f"{where}: expected {', '.join(_NAMES)}, image_name and perhaps gcp_name, "
+                f"{where}: expected {', '.join(_NAMES)}, image_name and optionally gcp_name, "
                 f"found {len(fields)} fields"
             )
-        x, y, column, row = numbers_of(fields[:2] + fields[3:5], _NAMES[:2] + _NAMES[3:], where)
+        x, y, column, row = parse_numbers(fields[:2] + fields[3:5], _NAMES[:2] + _NAMES[3:], where)
         name = unnamed.setdefault(tuple(fields[:3]), str(len(unnamed) + 1))
         ids.append(fields[6] if len(fields) > 6 else name)
         coordinates.append((x, y, _height(fields[2], where)))
@@ -86,24 +87,24 @@ def parse_gcp_list(text: str, heights: str | None = None, source: str = "gcp_lis
 
 
 def _height(field: str, where: str) -> float:
-    return math.nan if field.lower() == "nan" else numbers_of([field], ["geo_z"], where)[0]
+    return math.nan if field.lower() == "nan" else parse_numbers([field], ["geo_z"], where)[0]
 
 
 def _ground(
     coordinates: list[tuple[float, float, float]], crs: CRS, heights: str | None, source: str
 ) -> np.ndarray:
-    """Points on the ellipsoid; those without a height keep none, and ask for no datum of it."""
-    given = coordinate_array(coordinates)
-    missing = np.isnan(given[:, 2])
-    above = ELLIPSOID if missing.all() else heights
-    ground = ground_from(np.nan_to_num(given, nan=0.0), crs, above, source)
+    """Points (n, 3) in WGS 84; points without a height have none here, and need no vertical datum."""
+    points = coordinate_array(coordinates)
+    missing = np.isnan(points[:, 2])
+    datum = ELLIPSOID if missing.all() else heights
+    ground = to_wgs84(np.nan_to_num(points, nan=0.0), crs, datum, source)
     ground[missing, 2] = np.nan
     return ground
 
 
 def _crs(line: str, source: str) -> CRS:
-    """The reference system of the first line: a code, a PROJ string, or "WGS84 UTM" with its zone."""
+    """The reference system of the first line: a code, a PROJ string, or "WGS84 UTM" with a zone."""
     utm = _UTM.fullmatch(line)
     if utm is not None and 1 <= int(utm[1]) <= 60:
         return CRS.from_epsg((32700 if utm[2].upper() == "S" else 32600) + int(utm[1]))
-    return crs_from(line, source)
+    return parse_crs(line, source)

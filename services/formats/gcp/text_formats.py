@@ -1,4 +1,4 @@
-"""Marked points as text: ASP `.gcp`, QGIS `.points`, ENVI `.pts`."""
+"""Marked points in text files: ASP `.gcp`, QGIS `.points`, ENVI `.pts`."""
 
 import csv
 import math
@@ -12,25 +12,25 @@ from services.formats.gcp.marked_points import (
     ELLIPSOID,
     WGS84_3D,
     MarkedPoints,
-    crs_from,
-    ground_from,
     marked_points,
+    parse_crs,
+    to_wgs84,
 )
 from services.formats.gcp.text_lines import (
+    content_lines,
     coordinate_array,
-    counted_ids,
     format_deg,
     format_m,
     format_mark,
     format_px,
-    lines_of,
-    numbers_of,
+    parse_numbers,
+    sequential_ids,
 )
 
 QGIS_CORNER_PX = 0.5
-"""QGIS, as GDAL, counts from the corner of the first pixel."""
+"""QGIS, like GDAL, counts pixels from the corner of the first one."""
 ENVI_CORNER_PX = 1.5
-"""ENVI calls the corner of the first pixel (1, 1): its centre is (1.5, 1.5)."""
+"""The corner of the first pixel is (1, 1) in ENVI, hence its centre (1.5, 1.5)."""
 
 _QGIS_COLUMNS = ["mapX", "mapY", "sourceX", "sourceY"]
 _ENVI_WGS84 = r"WGS[- ]?84"
@@ -41,12 +41,12 @@ _ENVI_GEOGRAPHIC = re.compile(rf"Geographic Lat/Lon\s*,\s*{_ENVI_WGS84}\b", re.I
 def format_asp_gcp(points: MarkedPoints) -> str:
     """The active points as an ASP `.gcp`, heights above the WGS 84 ellipsoid.
 
-    ASP reads the three sigmas of the ground as those of latitude, longitude and height with
-    `--use-lon-lat-height-gcp-error`, and counts pixels from the centre of the first one. Marks of one
-    point are on one line; blanks in names, which would end them, become underscores.
+    With `--use-lon-lat-height-gcp-error` ASP reads the three sigmas on the ground as those of latitude,
+    longitude and height. It counts pixels from the centre of the first one. All marks of a point are on
+    one line. Spaces in names become underscores, because a space separates fields.
 
     Raises:
-        InputError: when a sigma is unknown, which ASP does not allow.
+        InputError: a sigma is unknown, which ASP does not allow.
     """
     lines = [
         "# id lat lon height sigma_lat sigma_lon sigma_height [image column row sigma sigma] ...",
@@ -69,31 +69,31 @@ def format_asp_gcp(points: MarkedPoints) -> str:
 
 
 def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file") -> MarkedPoints:
-    """Read an ASP `.gcp`: fields divided by blanks or commas, one point a line with all its marks.
+    """The marked points of an ASP `.gcp`: one point on each line, with all its marks.
 
     Args:
-        text: contents of the file.
-        heights: above what: "ellipsoid" (of WGS 84) or a vertical reference system; ASP is told on the
-            command line, the file does not say.
-        source: its name, for the messages.
+        text: contents of the file; spaces or commas separate fields.
+        heights: datum of the heights, which the file never states: "ellipsoid" (of WGS 84) or a vertical
+            reference system.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a line is not of that form.
-        VerticalDatumError: when nobody says what the heights are above.
+        FormatError: a line has another form.
+        VerticalDatumError: the caller does not state the datum of the heights.
     """
     ids, coordinates, sigmas_m, images, pixels, sigmas_px = [], [], [], [], [], []
-    for where, line in lines_of(text, "#", source):
+    for where, line in content_lines(text, "#", source):
         fields = line.replace(",", " ").split()
         if len(fields) < 12 or (len(fields) - 7) % 5:
             raise FormatError(
-                f"{where}: expected id, lat, lon, height, 3 sigmas, then for each image its "
-                f"name, column, row and 2 sigmas, found {len(fields)} fields"
+                f"{where}: expected id, lat, lon, height, 3 sigmas, then name, column, row and 2 sigmas "
+                f"for each image, found {len(fields)} fields"
             )
-        lat, lon, height_m, north_m, east_m, up_m = numbers_of(
+        lat, lon, height_m, north_m, east_m, up_m = parse_numbers(
             fields[1:7], ["lat", "lon", "height", "sigma_lat", "sigma_lon", "sigma_height"], where
         )
         for start in range(7, len(fields), 5):
-            column, row, sigma_column, sigma_row = numbers_of(
+            column, row, sigma_column, sigma_row = parse_numbers(
                 fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
             )
             ids.append(fields[0])
@@ -102,16 +102,15 @@ def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file
             images.append(fields[start])
             pixels.append((row, column))
             sigmas_px.append(math.sqrt((sigma_column**2 + sigma_row**2) / 2.0))
-    ground = ground_from(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
-    known = {"sigma_m": sigmas_m, "image": images, "sigma_px": sigmas_px}
-    return marked_points(ids, ground, pixels, **known)
+    ground = to_wgs84(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
+    return marked_points(ids, ground, pixels, sigma_m=sigmas_m, image=images, sigma_px=sigmas_px)
 
 
 def format_qgis_points(points: MarkedPoints) -> str:
-    """The points as a QGIS `.points` of its georeferencer: 2D, longitude and latitude of WGS 84.
+    """The points as a `.points` of the QGIS georeferencer: longitude and latitude of WGS 84, no heights.
 
-    Points that are not active, and check points, are written but not enabled. `dX`, `dY` are
-    computed minus observed as QGIS has them, with lines counted upwards.
+    Inactive points and check points are written but not enabled. `dX`, `dY` are computed minus
+    observed with lines counted upwards, as in QGIS.
     """
     rows = ["mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     enabled = points.active & ~points.check
@@ -133,32 +132,32 @@ def format_qgis_points(points: MarkedPoints) -> str:
 
 
 def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
-    """Read a QGIS `.points` of a raw image; it holds no heights, no names and no sigmas.
+    """The marked points of a QGIS `.points` of a raw image, which has no heights, names or sigmas.
 
     Args:
-        text: contents of the file; without a `#CRS` its map coordinates are longitude and latitude.
-        source: its name, for the messages.
+        text: contents of the file; without `#CRS` its map coordinates are longitude and latitude.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a line is not of that form.
+        FormatError: a line has another form.
     """
-    found = re.match(r"#CRS: *(.*)", text)
-    crs = crs_from(found[1].strip(), source) if found and found[1].strip() else CRS.from_epsg(4326)
-    lines = list(lines_of(text, "#", source))
+    header = re.match(r"#CRS: *(.*)", text)
+    crs = parse_crs(header[1].strip(), source) if header and header[1].strip() else CRS.from_epsg(4326)
+    lines = list(content_lines(text, "#", source))
     if not lines or lines[0][1].split(",")[:4] != _QGIS_COLUMNS:
         raise FormatError(f"{source}: expected a line that starts with {','.join(_QGIS_COLUMNS)}")
     coordinates, pixels, active = [], [], []
     for where, line in lines[1:]:
         fields = next(csv.reader([line]))
         if len(fields) < 5:
-            raise FormatError(f"{where}: expected 5 fields or more, found {len(fields)}")
-        x, y, column, minus_row = numbers_of(fields[:4], _QGIS_COLUMNS, where)
+            raise FormatError(f"{where}: expected at least 5 fields, found {len(fields)}")
+        x, y, column, minus_row = parse_numbers(fields[:4], _QGIS_COLUMNS, where)
         coordinates.append((x, y, 0.0))
         pixels.append((-minus_row - QGIS_CORNER_PX, column - QGIS_CORNER_PX))
         active.append(fields[4].strip() != "0")
-    ground = ground_from(coordinate_array(coordinates), crs.to_2d(), ELLIPSOID, source)
+    ground = to_wgs84(coordinate_array(coordinates), crs.to_2d(), ELLIPSOID, source)
     ground[:, 2] = np.nan
-    return marked_points(counted_ids(pixels), ground, pixels, active=active)
+    return marked_points(sequential_ids(pixels), ground, pixels, active=active)
 
 
 def format_envi_pts(points: MarkedPoints) -> str:
@@ -177,49 +176,51 @@ def format_envi_pts(points: MarkedPoints) -> str:
 
 
 def parse_envi_pts(text: str, heights: str | None = None, source: str = "ENVI points") -> MarkedPoints:
-    """Read an ENVI `.pts` with elevations, in longitude and latitude or UTM of WGS 84.
+    """The marked points of an ENVI `.pts` with elevations, in longitude and latitude or UTM of WGS 84.
 
     Args:
         text: contents of the file.
-        heights: above what: "ellipsoid" or a vertical reference system; the file does not say.
-        source: its name, for the messages.
+        heights: datum of the heights, which the file never states: "ellipsoid" or a vertical reference
+            system.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a line is not of that form, or the projection is another one.
-        VerticalDatumError: when nobody says what the heights are above.
+        FormatError: a line has another form, or the projection is not supported.
+        VerticalDatumError: the caller does not state the datum of the heights.
     """
     crs = _envi_crs(text, source)
     coordinates, pixels = [], []
-    for where, line in lines_of(text, ";", source):
+    for where, line in content_lines(text, ";", source):
         fields = line.split()
         if len(fields) != 5:
             raise FormatError(
                 f"{where}: expected map x, y, elevation, image x, y, found {len(fields)} fields"
             )
-        x, y, height_m, column, row = numbers_of(
+        x, y, height_m, column, row = parse_numbers(
             fields, ["map x", "map y", "elevation", "image x", "image y"], where
         )
         coordinates.append((x, y, height_m))
         pixels.append((row - ENVI_CORNER_PX, column - ENVI_CORNER_PX))
-    ground = ground_from(coordinate_array(coordinates), crs, heights, source)
-    return marked_points(counted_ids(pixels), ground, pixels)
+    ground = to_wgs84(coordinate_array(coordinates), crs, heights, source)
+    return marked_points(sequential_ids(pixels), ground, pixels)
 
 
 def _envi_crs(text: str, source: str) -> CRS:
     info = re.search(r"^;\s*projection info\s*=\s*\{([^}\n]*)\}", text, re.MULTILINE)
-    found = info[1].strip() if info else ""
-    utm = _ENVI_UTM.match(found)
+    projection = info[1].strip() if info else ""
+    utm = _ENVI_UTM.match(projection)
     if utm is not None and 1 <= int(utm[1]) <= 60:
         return CRS.from_epsg((32600 if utm[2].lower() == "north" else 32700) + int(utm[1]))
-    if _ENVI_GEOGRAPHIC.match(found):
+    if _ENVI_GEOGRAPHIC.match(projection):
         return CRS.from_epsg(4326)
     raise FormatError(
-        f"{source}: expected a projection info of Geographic Lat/Lon or UTM with WGS-84, "
-        f"found {found[:60] or 'none'!r}"
+        f"{source}: projection info: expected Geographic Lat/Lon or UTM with WGS-84, "
+        f"found {projection[:60] or 'none'!r}"
     )
 
 
 def _rows_of_each_point(points: MarkedPoints) -> list[list[int]]:
+    """The rows of each point, in the order of first occurrence."""
     rows: dict[str, list[int]] = {}
     for i, point in enumerate(points.id.tolist()):
         rows.setdefault(point, []).append(i)
@@ -227,6 +228,8 @@ def _rows_of_each_point(points: MarkedPoints) -> list[list[int]]:
 
 
 def _positive(value: float, name: str, point: str) -> float:
+    """The value, or an InputError when it is not positive."""
     if not value > 0.0:
-        raise InputError(f"point {point}: {name} is {value:g}, this format takes known sigmas only")
+        state = "unknown" if math.isnan(value) else f"{value:g}"
+        raise InputError(f"point {point}: {name} is {state}; an ASP file needs positive sigmas")
     return float(value)

@@ -1,4 +1,4 @@
-"""Lines and numbers of files of marked points that are plain text."""
+"""Lines and numbers of marked points in text files."""
 
 from collections.abc import Iterator
 
@@ -8,11 +8,12 @@ from services.formats.sensor_models.rpc_text import parse_number
 from services.types import Array
 
 
-def lines_of(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:
-    """Lines that say something, each with its place.
+def content_lines(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:
+    """Yield each line that is neither empty nor a comment, after its place in the file.
 
     Args:
-        comment: what lines that say nothing begin with.
+        text: contents of the file.
+        comment: prefix of comments.
         source: name of the file.
     """
     for count, line in enumerate(text.splitlines(), start=1):
@@ -20,42 +21,42 @@ def lines_of(text: str, comment: str, source: str) -> Iterator[tuple[str, str]]:
             yield f"{source}, line {count}", line.strip()
 
 
-def numbers_of(fields: list[str], names: list[str], where: str) -> list[float]:
-    """Fields as numbers.
+def parse_numbers(fields: list[str], names: list[str], where: str) -> list[float]:
+    """The numbers in some fields.
 
     Raises:
-        FormatError: naming the field that is none.
+        FormatError: a field is not a number; the message names it.
     """
     return [parse_number(field, name, where) for field, name in zip(fields, names, strict=True)]
 
 
 def coordinate_array(coordinates: list[tuple[float, float, float]]) -> Array:
-    """Ground points (n, 3), none of them too."""
+    """Ground points (n, 3), also for n = 0."""
     return np.array(coordinates, dtype=np.float64).reshape(-1, 3)
 
 
-def counted_ids(rows: list[tuple[float, float]]) -> list[str]:
-    """Names of points that have none: their count from 1."""
+def sequential_ids(rows: list[tuple[float, float]]) -> list[str]:
+    """Ids "1", "2", … for points of a format without ids."""
     return [str(count) for count in range(1, len(rows) + 1)]
 
 
 def format_deg(value: float) -> str:
-    """To a tenth of a micrometre."""
+    """Degrees with 12 decimals, a tenth of a micrometre on the ground."""
     return f"{value:.12f}"
 
 
 def format_m(value: float) -> str:
-    """To a micrometre."""
+    """Metres with 6 decimals."""
     return f"{value:.6f}"
 
 
 def format_px(value: float) -> str:
-    """To a thousandth of a millionth of a pixel; never "-0"."""
+    """Pixels with 9 decimals, without a negative zero."""
     return f"{value + 0.0:.9f}"
 
 
 def format_mark(lon_lat_h: Array, line_sample: Array) -> str:
-    """Longitude, latitude, height, sample and line, with blanks between them."""
+    """Longitude, latitude, height, sample and line, separated by spaces."""
     lon, lat, height_m = lon_lat_h
     line, sample = line_sample
     ground = f"{format_deg(lon)} {format_deg(lat)} {format_m(height_m)}"

@@ -1,4 +1,4 @@
-"""Which bands of an image are looked at, and with which weights they are mixed into one."""
+"""The bands of an image that are used, and their weights in one mixed band."""
 
 import math
 import re
@@ -15,9 +15,9 @@ class BandMix:
     """A weighted mean of bands.
 
     Attributes:
-        bands: counted from one.
-        weights: positive, of each band; their sum is one.
-        reason: why these, one sentence.
+        bands: numbers of the bands, counted from 1.
+        weights: positive weight of each band; their sum is 1.
+        reason: why these bands, one sentence.
     """
 
     bands: tuple[int, ...]
@@ -25,41 +25,41 @@ class BandMix:
     reason: str
 
 
-def one_band(band: int, reason: str = "as asked for") -> BandMix:
-    """A single band."""
+def one_band(band: int, reason: str = "as requested") -> BandMix:
+    """A mix of a single band."""
     return BandMix((band,), (1.0,), reason)
 
 
 def parse_bands(text: str) -> BandMix:
-    """What a user says: "2", "1,2,3" for their mean, "3:0.3,2:0.6,1:0.1" for a weighted one.
+    """The mix of a text: "2" for one band, "1,2,3" for a mean, "3:0.3,2:0.6,1:0.1" for a weighted mean.
 
     Raises:
-        FormatError: when it is none of that, or names a band twice.
+        FormatError: the text has another form, or names a band twice.
     """
-    items = [_ITEM.fullmatch(item) for item in text.split(",")]
-    found = [(int(item[1]), float(item[2] or 1.0)) for item in items if item is not None]
-    bands = tuple(band for band, _ in found)
-    total = math.fsum(weight for _, weight in found)
-    wrong = len(found) < len(items) or 0 in bands or len(set(bands)) < len(bands)
-    if wrong or not all(0.0 < weight < math.inf for _, weight in found):
+    matches = [_ITEM.fullmatch(item) for item in text.split(",")]
+    weighted = [(int(match[1]), float(match[2] or 1.0)) for match in matches if match is not None]
+    bands = tuple(band for band, _ in weighted)
+    total = math.fsum(weight for _, weight in weighted)
+    wrong = len(weighted) < len(matches) or 0 in bands or len(set(bands)) < len(bands)
+    if wrong or not all(0.0 < weight < math.inf for _, weight in weighted):
         raise FormatError(
-            f"bands: expected numbers of bands like 1 or 1,2,3 or 3:0.3,2:0.6,1:0.1, found {text[:60]!r}"
+            f"bands: expected band numbers like 1 or 1,2,3 or 3:0.3,2:0.6,1:0.1, found {text[:60]!r}"
         )
-    return BandMix(bands, tuple(weight / total for _, weight in found), "as asked for")
+    return BandMix(bands, tuple(weight / total for _, weight in weighted), "as requested")
 
 
 def default_mix(colours: tuple[str, ...]) -> BandMix:
-    """The panchromatic band, or the mean of the visible ones.
+    """The first band of an image with one or two bands, else the mean of its visible bands.
 
-    Chips are panchromatic, and a panchromatic band sees the visible and little beyond. Where the file
-    does not say which bands are red, green and blue, the first three are taken for them, in any order.
+    Chips are panchromatic, and a panchromatic band covers the visible spectrum and little more. Where
+    the file does not name its red, green and blue bands, the first three are taken as visible.
 
     Args:
-        colours: what each band shows, by the names GDAL has for it.
+        colours: colour interpretation of each band, by GDAL's names.
     """
     if len(colours) < 3:
         return one_band(1, "the first band")
     visible = tuple(colours.index(colour) + 1 for colour in VISIBLE if colour in colours)
     if len(visible) == 3:
         return BandMix(visible, (1 / 3,) * 3, "mean of the red, green and blue bands")
-    return BandMix((1, 2, 3), (1 / 3,) * 3, "mean of the first three bands, taken for the visible")
+    return BandMix((1, 2, 3), (1 / 3,) * 3, "mean of the first three bands, taken as visible")

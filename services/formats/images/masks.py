@@ -1,4 +1,4 @@
-"""Masks: where the pixels of an image shall not be used, told by another file."""
+"""Masks: files that exclude pixels of an image."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +11,16 @@ from services.imagery.source import Window
 from services.types import FloatImage
 
 _SAME_SHAPE = 0.01
-"""Relative difference of the reductions along lines and samples up to which a mask shows the image."""
+"""Largest relative difference between the pixel size ratios of mask and image along both axes."""
 
 
 @dataclass(frozen=True)
 class MaskedImage:
-    """An image without the pixels that a mask takes away; an `ImageSource`.
+    """An image without the pixels that a mask excludes; an `ImageSource`.
 
     Attributes:
         image: the image.
-        mask: not zero where pixels shall not be used; covers the same ground, with other pixels perhaps.
+        mask: nonzero where pixels are excluded; covers the same ground, with the same or other pixels.
     """
 
     image: RasterImage
@@ -40,35 +40,35 @@ class MaskedImage:
         covered = self.mask.read(
             Window(*first, int(line[-1]) - first[0] + 1, int(sample[-1]) - first[1] + 1)
         )
-        # What a mask calls nodata it says nothing of.
-        hidden = np.nan_to_num(covered) != 0.0
-        pixels[hidden[np.ix_(line - first[0], sample - first[1])]] = np.nan
+        # Nodata in a mask excludes nothing.
+        excluded = np.nan_to_num(covered) != 0.0
+        pixels[excluded[np.ix_(line - first[0], sample - first[1])]] = np.nan
         return pixels
 
 
-def masked(image: RasterImage, mask: Path) -> MaskedImage:
-    """An image without the pixels that a mask file takes away.
+def apply_mask(image: RasterImage, mask: Path) -> MaskedImage:
+    """The image without the pixels that a mask file excludes.
 
     Args:
-        image: opened.
-        mask: GeoTIFF, JPEG 2000 or NITF of the same ground as the image, with the same or with coarser
-            pixels; not zero where pixels shall not be used.
+        image: opened image.
+        mask: GeoTIFF, JPEG 2000 or NITF of the same ground as the image, with the same or coarser
+            pixels; nonzero where pixels are excluded.
 
     Raises:
-        FormatError: when the mask cannot be used, or does not have the shape of the image.
+        FormatError: the mask cannot be read, or its shape differs from that of the image.
     """
     opened = open_raster(mask)
     by_line, by_sample = (n / m for n, m in zip(image.shape, opened.shape, strict=True))
     if abs(by_line / by_sample - 1.0) > _SAME_SHAPE:
         opened.close()
         raise FormatError(
-            f"{mask}: expected a mask of the same ground as {image.path.name}: its {opened.shape[0]} x "
-            f"{opened.shape[1]} pixels have another shape than {image.shape[0]} x {image.shape[1]}"
+            f"{mask}: {opened.shape[0]} x {opened.shape[1]} pixels found, a mask of the same ground as "
+            f"{image.path.name} with the proportions of {image.shape[0]} x {image.shape[1]} expected"
         )
     return MaskedImage(image, opened)
 
 
 def _mask_pixels(first: int, count: int, size: int, mask_size: int) -> np.ndarray:
-    """The pixel of a mask that covers each of some pixels of the image, along one axis."""
+    """The mask pixel that covers each of `count` image pixels, along one axis."""
     position = (np.arange(first, first + count) + 0.5) * mask_size / size
     return np.clip(np.floor(position).astype(np.int64), 0, mask_size - 1)

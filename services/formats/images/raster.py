@@ -1,4 +1,4 @@
-"""Images in files, opened with suspicion: few drivers, no address, no sidecar, no surprise in size."""
+"""Untrusted image files: few drivers, local files only, no sidecars, bounded sizes."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
 from services.types import FloatImage
 
-# An image that has not been rectified has a sensor model instead: nothing to warn of.
+# An image that is not rectified has a sensor model instead of a map grid.
 warnings.simplefilter("ignore", NotGeoreferencedWarning)
 
 DRIVER_OF_SIGNATURE = {
@@ -38,17 +38,17 @@ DRIVER_OF_SIGNATURE = {
     b"NITF": "NITF",
     b"NSIF": "NITF",
 }
-"""The drivers that may open a file, by its first bytes; no other driver is ever asked."""
+"""The GDAL driver of a file, by its first bytes; no other driver is used."""
 GDAL_FIRST_PIXEL = 0.5
-"""Line and sample GDAL gives to the centre of the first pixel."""
+"""Line and sample of the centre of the first pixel in GDAL."""
 MAX_PIXELS = 40_000_000_000
-"""Pixels an image may declare: twice a strip of 40,000 samples and 500,000 lines."""
+"""Largest number of pixels of an image: twice a strip of 40,000 samples and 500,000 lines."""
 MAX_EXPANSION = 5_000
-"""Bytes of pixels a byte of file may declare: Deflate reaches 1,032 on a constant image."""
+"""Largest ratio of pixel bytes to file bytes: Deflate reaches 1,032 on a constant image."""
 
-# GDAL falls back to a twentieth of the machine's memory outside the environment that says otherwise.
+# Outside of such an environment GDAL's cache grows to a twentieth of the machine's memory.
 _CACHE = {"GDAL_CACHEMAX": 64_000_000}
-OPTIONS = _CACHE | {
+GDAL_OPTIONS = _CACHE | {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_NUM_THREADS": 1,
@@ -59,11 +59,11 @@ OPTIONS = _CACHE | {
 
 @dataclass(frozen=True)
 class RasterImage:
-    """One band of an image file, or a mix of several, an `ImageSource`; for one thread at a time.
+    """One band of an image file, or a mix of several: an `ImageSource` for one thread at a time.
 
     Attributes:
-        path: the file.
-        dataset: as opened by `open_raster`.
+        path: of the file.
+        dataset: the dataset that `open_raster` opened.
         mix: the bands and their weights.
     """
 
@@ -73,7 +73,7 @@ class RasterImage:
 
     @property
     def band(self) -> int:
-        """The first of the bands."""
+        """Number of the first band."""
         return self.mix.bands[0]
 
     @property
@@ -82,10 +82,10 @@ class RasterImage:
         return self.dataset.height, self.dataset.width
 
     def read(self, window: Window) -> FloatImage:
-        """Pixels of a window, (lines, samples) float32; NaN beyond the image and where nodata.
+        """Pixels of a window, (lines, samples) float32; NaN outside the image and for nodata.
 
         Raises:
-            FormatError: when the file cannot be read there.
+            FormatError: the file cannot be read there.
         """
         out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
         line, sample = max(window.line, 0), max(window.sample, 0)
@@ -100,7 +100,7 @@ class RasterImage:
         return out
 
     def close(self) -> None:
-        """Give the file back; nothing can be read after."""
+        """Close the file; it cannot be read afterwards."""
         self.dataset.close()
 
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
@@ -117,7 +117,7 @@ class RasterImage:
         flags = self.dataset.mask_flag_enums[band - 1]
         nodata = self.dataset.nodatavals[band - 1]
         saturated = self._saturated(band)
-        with as_format_error(self.path, "its pixels"), rasterio.Env(**_CACHE):
+        with as_format_error(self.path, "readable pixels"), rasterio.Env(**_CACHE):
             pixels = self.dataset.read(band, window=window)
             out[:] = pixels
             if MaskFlags.nodata in flags:
@@ -128,9 +128,9 @@ class RasterImage:
                 out[pixels >= saturated] = np.nan
 
     def _saturated(self, band: int) -> int | None:
-        """The number that means "this or brighter"; None where white is an ordinary colour.
+        """The pixel value that means "saturated"; None for 8 bits and for floating-point pixels.
 
-        Eight bits have been stretched for the eye, and real numbers have no end.
+        Producers stretch the contrast of 8-bit images for display, so that their largest value is valid.
         """
         dtype = np.dtype(self.dataset.dtypes[band - 1])
         if dtype.kind not in "ui" or dtype.itemsize < 2:
@@ -142,22 +142,22 @@ class RasterImage:
 def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
     """Open one band, or a mix of several, of a GeoTIFF (or COG), JPEG 2000 or NITF file.
 
-    Only the file itself is looked at: no sidecar, no address, no archive, no file that names others.
-    The far corner is read, so that a truncated file is told now rather than in the middle of the work.
+    Only the file itself is opened: no sidecar, no URL, no archive, no file that refers to others. The
+    last pixel is read, so that a truncated file is refused here and not during the processing.
 
     Args:
         path: of a regular file.
-        bands: a band, counted from one, or a mix; None for what `default_mix` takes.
+        bands: number of a band, counted from 1, or a mix; None for the `default_mix`.
 
     Raises:
-        FormatError: when the file cannot be used; the message says why and what was expected.
+        FormatError: the file cannot be used; the message states the reason and what was expected.
     """
     resolved = path.resolve()
     if "://" in str(path) or str(path).startswith("/vsi") or not resolved.is_file():
-        raise FormatError(f"{path}: expected the name of an image file")
+        raise FormatError(f"{path}: expected the name of an existing image file")
     driver = _driver(path)
-    with rasterio.Env(**OPTIONS):
-        with as_format_error(path, f"the image as {driver}"):
+    with rasterio.Env(**GDAL_OPTIONS):
+        with as_format_error(path, f"a readable {driver} image"):
             dataset = rasterio.open(resolved, driver=driver)
         if bands is None:
             bands = default_mix(tuple(colour.name for colour in dataset.colorinterp))
@@ -172,10 +172,10 @@ def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
 
 
 def map_grid_of(image: RasterImage) -> MapGrid | None:
-    """Where the pixels lie on a map, when the file says so itself; None when it does not.
+    """The map grid of an image; None when the file has no reference system or no geotransform.
 
     Raises:
-        FormatError: when it says so in a way that cannot be used.
+        FormatError: the grid is degenerate, or its centre is not on the Earth.
     """
     t = image.dataset.transform
     if image.dataset.crs is None or t.is_identity:
@@ -185,38 +185,44 @@ def map_grid_of(image: RasterImage) -> MapGrid | None:
     origin_xy = np.array([t.c, t.f]) + step_xy @ [GDAL_FIRST_PIXEL, GDAL_FIRST_PIXEL]
     grid = MapGrid(crs, origin_xy, step_xy, image.shape)
     if not abs(np.linalg.det(step_xy)) > 0.0:
-        raise FormatError(f"{image.path}: its geotransform {tuple(t)[:6]} lays all pixels on a line")
+        raise FormatError(
+            f"{image.path}: geotransform: {tuple(t)[:6]} places all pixels on a line, a grid expected"
+        )
     try:
-        found = grid.lon_lat((np.array([image.shape], dtype=np.float64) - 1.0) / 2.0)
+        centre = grid.lon_lat((np.array([image.shape], dtype=np.float64) - 1.0) / 2.0)
     except ProjError as error:
-        raise FormatError(f"{image.path}: its reference system leads to no place: {error}") from error
-    if not np.isfinite(found).all():
-        raise FormatError(f"{image.path}: its centre is nowhere on the Earth in {crs[:60]}…")
+        raise FormatError(
+            f"{image.path}: its reference system cannot be transformed to WGS 84: {error}"
+        ) from error
+    if not np.isfinite(centre).all():
+        raise FormatError(f"{image.path}: its centre is not on the Earth in {crs[:60]}…")
     return grid
 
 
 def copy_with_rpc(path_in: Path, path_out: Path, model: RpcModel) -> None:
-    """A copy of a GeoTIFF, to the byte but for its RPC tags.
+    """Write a copy of a GeoTIFF that differs only in its RPC tags.
 
     Args:
-        path_in: the image as delivered; never written to.
-        path_out: the copy; a file of that name is replaced.
-        model: in pixels from the centre of the first one.
+        path_in: the delivered image, which stays unchanged.
+        path_out: the copy; an existing file is replaced.
+        model: the RPC for the tags.
 
     Raises:
-        FormatError: when the image is not a GeoTIFF, or the copy would be the image itself.
+        FormatError: the image is not a GeoTIFF, or the copy would overwrite it.
     """
     image = open_raster(path_in)
     driver = image.dataset.driver
     image.close()
     if driver != "GTiff":
-        raise FormatError(f"{path_in}: only a GeoTIFF can carry RPC tags, this is {driver}")
+        raise FormatError(f"{path_in}: {driver} found; only a GeoTIFF can be copied with new RPC tags")
     if path_out.resolve() == path_in.resolve():
-        raise FormatError(f"{path_out}: the delivered image would be written over")
+        raise FormatError(
+            f"{path_out}: the delivered image would be overwritten; give another output folder"
+        )
     shutil.copyfile(path_in, path_out)
     with (
-        as_format_error(path_out, "a GeoTIFF whose tags can be written"),
-        rasterio.Env(**OPTIONS),
+        as_format_error(path_out, "a GeoTIFF with writable tags"),
+        rasterio.Env(**GDAL_OPTIONS),
         rasterio.open(path_out.resolve(), "r+", driver="GTiff", IGNORE_COG_LAYOUT_BREAK="YES") as copy,
     ):
         copy.rpcs = gdal_rpc(model)
@@ -226,13 +232,13 @@ def write_raster(path: Path, pixels: npt.NDArray[Any], model: RpcModel | None = 
     """Write one band as a tiled, compressed GeoTIFF.
 
     Args:
-        path: a file of that name is replaced.
+        path: of the file; an existing one is replaced.
         pixels: (lines, samples) uint8, uint16 or float32.
-        model: goes into RPC tags, in pixels from the centre of the first one.
+        model: the RPC for the tags, if any.
     """
     lines, samples = pixels.shape
     with (
-        rasterio.Env(**OPTIONS),
+        rasterio.Env(**GDAL_OPTIONS),
         rasterio.open(
             path.resolve(),
             "w",
@@ -253,7 +259,7 @@ def write_raster(path: Path, pixels: npt.NDArray[Any], model: RpcModel | None = 
 
 
 def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
-    """The model as GDAL holds it; GDAL writes unknown errors as -1."""
+    """The RPC in the structure of GDAL, which writes unknown errors as -1."""
     line_off, samp_off = model.image_offset.tolist()
     line_scale, samp_scale = model.image_scale.tolist()
     long_off, lat_off, height_off = model.ground_offset.tolist()
@@ -279,6 +285,7 @@ def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
 
 
 def _driver(path: Path) -> str:
+    """The GDAL driver for a file, by its first bytes."""
     try:
         with path.open("rb") as file:
             start = file.read(12)
@@ -291,28 +298,27 @@ def _driver(path: Path) -> str:
 
 
 def _check_declaration(image: RasterImage) -> None:
-    """Refuse sizes and bands that cannot be, before anything is allocated for them."""
+    """Refuse impossible sizes and bands before memory is allocated for them."""
     dataset, path = image.dataset, image.path
     for band in image.mix.bands:
         if not 1 <= band <= dataset.count:
-            raise FormatError(f"{path}: expected a band {band}, the image has {dataset.count}")
+            raise FormatError(f"{path}: band {band} requested, the image has {dataset.count} bands")
         dtype = np.dtype(dataset.dtypes[band - 1])
         if dtype.kind not in "uif":
-            raise FormatError(f"{path}: expected whole or real pixels, found {dtype.name}")
+            raise FormatError(f"{path}: expected integer or floating-point pixels, found {dtype.name}")
     pixels, size = dataset.width * dataset.height, os.path.getsize(path)
     if pixels > MAX_PIXELS or pixels * dtype.itemsize > MAX_EXPANSION * size:
         raise FormatError(
             f"{path}: declares {dataset.height} lines of {dataset.width} samples in {size} bytes; "
-            f"at most {MAX_PIXELS} pixels and {MAX_EXPANSION} bytes of pixels a byte are read"
+            f"at most {MAX_PIXELS} pixels, and {MAX_EXPANSION} bytes of pixels for each byte of file, "
+            "are accepted"
         )
 
 
 @contextmanager
 def as_format_error(path: Path, expected: str) -> Iterator[None]:
-    """Tell the driver's errors as errors of the file."""
+    """Convert errors of the driver into a FormatError that names the file."""
     try:
         yield
     except RasterioError as error:
-        raise FormatError(
-            f"{path}: truncated or damaged, expected {expected} to be readable: {error}"
-        ) from error
+        raise FormatError(f"{path}: truncated or damaged, {expected} expected: {error}") from error

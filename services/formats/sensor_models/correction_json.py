@@ -1,7 +1,7 @@
-"""The correction of a model as a small document: what every registration leaves, whatever its model.
+"""The correction of a sensor model as a JSON document, which every registration writes.
 
-With `t = ((line, sample) - centre) / half_size`, a position by the delivered model moves by
-`parameters (1, t_line, t_sample)`. Pixels count from the centre of the first one, at (0, 0).
+With `t = ((line, sample) - centre) / half_size`, a position of the delivered model moves by
+`parameters (1, t_line, t_sample)`. The centre of the first pixel is (0, 0).
 """
 
 import json
@@ -21,14 +21,14 @@ CORRECTION_FORMAT = "amers-image-correction/1"
 def format_correction(
     correction: ImageCorrection, order: str, covariance_px2: Array, applies_to: str, carried: str
 ) -> str:
-    """A correction as a document.
+    """The JSON document of a correction.
 
     Args:
-        correction: from positions by the delivered model to true ones.
+        correction: from positions of the delivered model to true positions.
         order: "shift", "drift" or "affine".
-        covariance_px2: (6, 6) of the parameters, row by row.
-        applies_to: where the delivered model came from, in words.
-        carried: which files carry the correction and how well, in words.
+        covariance_px2: (6, 6) covariance of the parameters, row by row.
+        applies_to: one sentence on the origin of the delivered model.
+        carried: one sentence on the files that contain the correction, and their accuracy.
     """
     document = {
         "format": CORRECTION_FORMAT,
@@ -49,14 +49,14 @@ def format_correction(
 
 
 def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
-    """Read a correction.
+    """The correction of a JSON document.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when it is something else, or moves no image to another.
+        FormatError: the document has another form, or its correction folds or mirrors the image.
     """
     document = load_json(text, source)
     if not isinstance(document, dict) or document.get("format") != CORRECTION_FORMAT:
@@ -67,9 +67,11 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
         half_size=_numbers(document, "half_size_px", (2,), source),
     )
     if not (correction.half_size > 0.0).all():
-        raise FormatError(f"{source}: half_size_px should be positive")
+        raise FormatError(f"{source}: half_size_px: expected positive numbers")
     if not np.linalg.det(correction.jacobian) > 0.0:
-        raise FormatError(f"{source}: parameters_px fold or mirror the image")
+        raise FormatError(
+            f"{source}: parameters_px: expected a correction that neither folds nor mirrors the image"
+        )
     return correction
 
 
@@ -80,5 +82,5 @@ def _numbers(document: dict[str, Any], name: str, shape: tuple[int, ...], source
         values = np.empty(0)
     if values.shape != shape or not np.isfinite(values).all():
         expected = " x ".join(map(str, shape))
-        raise FormatError(f"{source}: {name} should be {expected} numbers")
+        raise FormatError(f"{source}: {name}: expected {expected} finite numbers")
     return values

@@ -1,9 +1,9 @@
 """DIMAP metadata: the RPC of SPOT 6/7, Pléiades (version 2) and Pléiades Neo (version 3).
 
-Version 2 counts pixels from (1, 1), version 3 from (0, 0): GDAL's reader and files delivered both as
-DIMAP and as GeoTIFF agree on it. Of the two models of a file only the one from the ground to the image
-is read: `Inverse_Model` in version 2, `GroundtoImage_Values` in version 3. The errors it states are
-those of the fit of the polynomials, not the accuracy of the scene, and are not read.
+Version 2 counts pixels from (1, 1), version 3 from (0, 0). GDAL's reader, and images delivered both as
+DIMAP and as GeoTIFF, confirm it. A document has two models; only the one from the ground to the image
+is read: `Inverse_Model` in version 2, `GroundtoImage_Values` in version 3. The errors in the document
+are those of the fit of the polynomials, not the accuracy of the scene, and are not read.
 """
 
 import math
@@ -22,64 +22,66 @@ from services.types import Acquisition, Array
 _PROFILES = {"PHR": "PHR", "S6": "SPOT6", "S7": "SPOT7", "PNEO": "PNEO"}
 _FOLD_TOLERANCE_PX = 1e-7
 TO_GROUND_LIMIT_PX = 0.01
-"""How far the two models of a document may be apart in the image."""
+"""Largest distance in the image between the two models of a document."""
 
 _TO_GROUND = {
     "Inverse_Model": ("Direct_Model", ("SAMP", "LINE")),
     "GroundtoImage_Values": ("ImagetoGround_Values", ("LON", "LAT")),
 }
-"""For the element of the model from the ground: that to the ground, and how it calls lon and lat."""
+"""By element of the model from the ground: element of the model to the ground, and its prefixes."""
 
 
 def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
-    """Read the RPC of a DIMAP document of version 2 or 3.
+    """The RPC of a DIMAP document of version 2 or 3.
 
-    In version 3 the first pixel is (0, 0), or (1, 1) when the validity domain says it starts there.
+    In version 3 the first pixel is (0, 0), or (1, 1) when the validity domain starts there.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when it is not such a document, or a number is missing or given twice.
+        FormatError: it is not such a document, or a number is missing or given twice.
     """
     root = _parse_xml(text, source)
     values, domain, first = _layout(root, source)
-    model = _only(root, values, source)
-    validity = _only(root, "RFM_Validity", source)
+    model = _single(root, values, source)
+    validity = _single(root, "RFM_Validity", source)
 
     def number(key: str) -> float:
         if key.startswith("ERR_"):
             return math.nan
-        place = model if "COEFF" in key else validity
-        return parse_number(_only(place, key, source).text or "", key, source)
+        parent = model if "COEFF" in key else validity
+        return parse_number(_single(parent, key, source).text or "", key, source)
 
     if domain is not None:
-        starts = _only(root, domain, source)
-        text_of = [_only(starts, name, source).text or "" for name in ("FIRST_ROW", "FIRST_COL")]
-        first_row, first_col = (parse_number(t, domain, source) for t in text_of)
+        first_texts = [
+            _single(_single(root, domain, source), name, source).text or ""
+            for name in ("FIRST_ROW", "FIRST_COL")
+        ]
+        first_row, first_col = (parse_number(text, domain, source) for text in first_texts)
         first = (float(first_row == 1.0), float(first_col == 1.0))
     return rpc_from_numbers(number, first)
 
 
 def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:
-    """A copy of a DIMAP document that carries another model.
+    """A copy of a DIMAP document with another RPC.
 
-    A model that differs from the document's own by a shift and a scale of each image coordinate (a
-    crop, a shift, a drift) is written into the image offsets and scales, which the document's two models
-    share: both stay true, and every coefficient stays as delivered. Any other model replaces the
-    coefficients from the ground to the image, and those from the image to the ground are fitted anew to
-    it; where no such fit comes within `TO_GROUND_LIMIT_PX` of it, the model to the ground, which would
-    contradict it, is removed. Validity domains and the stated errors of the fits stay as delivered. The
-    rest is copied to the letter.
+    A model that differs from that of the document by a shift and a scale of each image coordinate (a
+    crop, a shift, a drift) goes into the image offsets and scales, which both models of the document
+    share: both remain valid and all coefficients unchanged. Any other model replaces the coefficients
+    from the ground to the image, and the coefficients from the image to the ground are fitted to it;
+    where this fit is not within `TO_GROUND_LIMIT_PX`, the model to the ground is removed, because it
+    would contradict the new one. Validity domains and stated errors of the fits remain unchanged, and so
+    does every other character.
 
     Args:
-        text: the document the scene came with.
-        model: in pixels from the centre of the first one, as everywhere.
-        source: name of the document, for the messages.
+        text: the delivered document.
+        model: the RPC to write.
+        source: name of the document, for messages.
 
     Raises:
-        FormatError: when the document is not a DIMAP RPC, or would not read back as the model.
+        FormatError: the document is not a DIMAP RPC, or does not read back as the model.
     """
     own = parse_dimap_rpc(text, source)
     root = _parse_xml(text, source)
@@ -103,22 +105,26 @@ def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:
             written = _with_number(written, key, float(value))
     misfit_px = _misfit_px(parse_dimap_rpc(written, source), model)
     if not misfit_px < 1e-6:
-        raise FormatError(f"{source}: the document could not take the model, {misfit_px:.3g} px apart")
+        raise FormatError(
+            f"{source}: the model written to the document differs by {misfit_px:.3g} px when read back, "
+            "less than 1e-6 px expected"
+        )
     return written
 
 
 def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> Acquisition:
-    """How an image was taken, as far as a DIMAP document says: the product's, or less from the RPC's.
+    """Sensor, time and sun of an image from the DIMAP document of its product, or of its RPC.
 
-    The sun is that of the image's centre. Incidence and azimuth are left to the model.
+    The document of the RPC has the sensor only. The sun angles are those of the image centre. Incidence
+    and azimuth stay unknown; they follow from the model.
 
     Args:
         text: contents of the file.
         image_id: name of the image.
-        source: name of the file, for the messages.
+        source: name of the file, for messages.
 
     Raises:
-        FormatError: when it is not a DIMAP document.
+        FormatError: it is not a DIMAP document.
     """
     root = _parse_xml(text, source)
     if root.tag != "Dimap_Document":
@@ -139,7 +145,7 @@ def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> 
 
 
 def parse_imaging_time(date: str, time: str) -> datetime | None:
-    """UTC of an `IMAGING_DATE` and `IMAGING_TIME`; None when they do not say."""
+    """The UTC time of an `IMAGING_DATE` and an `IMAGING_TIME`; None when they are not a time."""
     match = re.fullmatch(r"(\d\d:\d\d:\d\d)(?:\.(\d+))?Z?", time.strip())
     if match is None:
         return None
@@ -152,17 +158,17 @@ def parse_imaging_time(date: str, time: str) -> datetime | None:
 
 
 def _parse_xml(text: str, source: str) -> ElementTree.Element:
-    """The root of a document; document types are refused, and with them entities of any kind."""
+    """The root of an XML document without a document type, hence without entities of its own."""
     if "<!DOCTYPE" in text:
-        raise FormatError(f"{source}: documents with a document type are not read")
+        raise FormatError(f"{source}: <!DOCTYPE found, a document without a document type expected")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise FormatError(f"{source}: not a well-formed XML document: {error}") from None
+        raise FormatError(f"{source}: expected a well-formed XML document: {error}") from None
 
 
 def _layout(root: ElementTree.Element, source: str) -> tuple[str, str | None, tuple[float, float]]:
-    """Element of the model, element of the domain that tells the first pixel, first pixel otherwise."""
+    """Element of the model, element of the domain with the first pixel if any, default first pixel."""
     declared = root.find("Metadata_Identification/METADATA_FORMAT")
     version = "" if declared is None else declared.get("version", "")
     if root.tag == "Dimap_Document" and version.startswith("2."):
@@ -175,47 +181,48 @@ def _layout(root: ElementTree.Element, source: str) -> tuple[str, str | None, tu
     )
 
 
-def _only(place: ElementTree.Element, name: str, source: str) -> ElementTree.Element:
-    found = place.findall(f".//{name}")
-    if len(found) != 1:
-        raise FormatError(f"{source}: expected one {name} in <{place.tag}>, found {len(found)}")
-    return found[0]
+def _single(parent: ElementTree.Element, name: str, source: str) -> ElementTree.Element:
+    elements = parent.findall(f".//{name}")
+    if len(elements) != 1:
+        raise FormatError(f"{source}: expected one {name} in <{parent.tag}>, found {len(elements)}")
+    return elements[0]
 
 
 def _file_offset(root: ElementTree.Element, source: str) -> Array:
+    """The image offset (2,) as the document has it, with its own first pixel."""
     return np.array(
         [
-            parse_number(_only(root, key, source).text or "", key, source)
+            parse_number(_single(root, key, source).text or "", key, source)
             for key in ("LINE_OFF", "SAMP_OFF")
         ]
     )
 
 
 def _image_frame(own: RpcModel, model: RpcModel) -> tuple[Array, Array] | None:
-    """Image offset and scale that turn one model into another, None when no such pair does.
+    """Image offset and scale that turn one model into another; None when there is no such pair.
 
-    Fitted on a grid of ground points: what has to hold there is `image' = gain image + constant`.
+    Fitted on a grid of ground points by `image' = gain image + constant`.
     """
     axis = np.linspace(-1.0, 1.0, 7)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     ground = own.ground_offset + grid * own.ground_scale
     before, after = own.project(ground), model.project(ground)
-    seen = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    if not seen.any():
+    valid = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    if not valid.any():
         return None
     offset, scale = np.empty(2), np.empty(2)
     for k in range(2):
-        normalised = (before[seen, k] - own.image_offset[k]) / own.image_scale[k]
+        normalised = (before[valid, k] - own.image_offset[k]) / own.image_scale[k]
         design = np.column_stack([np.ones(len(normalised)), normalised])
-        solution = np.linalg.lstsq(design, after[seen, k], rcond=None)[0]
-        if not np.abs(design @ solution - after[seen, k]).max() < _FOLD_TOLERANCE_PX:
+        solution = np.linalg.lstsq(design, after[valid, k], rcond=None)[0]
+        if not np.abs(design @ solution - after[valid, k]).max() < _FOLD_TOLERANCE_PX:
             return None
         offset[k], scale[k] = solution
     return (offset, scale) if (scale > 0).all() else None
 
 
 def _with_coefficients(text: str, values: str, model: RpcModel) -> str:
-    """The document with a new model from the ground, and one to the ground that agrees with it."""
+    """The document with the coefficients of a new model from the ground, and its inverse fit."""
     polynomials = {
         "LINE_NUM": model.line_num,
         "LINE_DEN": model.line_den,
@@ -237,15 +244,15 @@ def _with_coefficients(text: str, values: str, model: RpcModel) -> str:
 
 
 def _with_polynomials(text: str, element: str, polynomials: dict[str, Array]) -> str:
-    """The document with other coefficients in one of its elements."""
-    head, body, tail = _split(text, element)
+    """The document with new coefficients in one of its elements."""
+    head, body, tail = _split_at(text, element)
     for name, coefficients in polynomials.items():
         for i, value in enumerate(coefficients.tolist(), start=1):
             body = _with_number(body, f"{name}_COEFF_{i}", value)
     return head + body + tail
 
 
-def _split(text: str, element: str) -> tuple[str, str, str]:
+def _split_at(text: str, element: str) -> tuple[str, str, str]:
     start, end = text.find(f"<{element}"), text.find(f"</{element}>")
     return text[:start], text[start:end], text[end:]
 
@@ -255,6 +262,7 @@ def _with_number(text: str, element: str, value: float) -> str:
 
 
 def _misfit_px(a: RpcModel, b: RpcModel) -> float:
+    """Largest difference in the image between two models over the range of the second."""
     axis = np.linspace(-1.0, 1.0, 5)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     ground = b.ground_offset + grid * b.ground_scale
@@ -262,11 +270,11 @@ def _misfit_px(a: RpcModel, b: RpcModel) -> float:
 
 
 def _centre_angle(root: ElementTree.Element, name: str) -> float:
-    """An angle of the located values of the centre; NaN when there is none."""
-    for place in root.iter("Located_Geometric_Values"):
-        if place.findtext("LOCATION_TYPE", "").strip().lower() == "center":
+    """An angle of the values located at the image centre; NaN without such values."""
+    for values in root.iter("Located_Geometric_Values"):
+        if values.findtext("LOCATION_TYPE", "").strip().lower() == "center":
             try:
-                return parse_number(place.findtext(f".//{name}", ""), name, "")
+                return parse_number(values.findtext(f".//{name}", ""), name, "")
             except FormatError:
                 return math.nan
     return math.nan

@@ -1,4 +1,4 @@
-"""The refined model of a registered scene: in the convention of its own, and always as a correction."""
+"""Files with the refined model of a registered scene, in the format of the delivered model."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +14,19 @@ from services.sensors.ortho import OrthoModel, fold_into_ortho
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
 from services.sensors.rpc import RpcModel
 
-CORRECTION_NAME = "correction.json"
+CORRECTION_JSON = "correction.json"
 
 
 @dataclass(frozen=True)
 class RefinedFiles:
-    """What was written of a refined model.
+    """The files written for a refined model.
 
     Attributes:
-        files: `correction.json` first; then those that carry the correction, none when it was refused.
-        max_error_px: largest difference between the corrected model and what the files say; 0 when they
-            carry it exactly.
-        note: one sentence on which files carry the correction, and how well.
+        files: `correction.json` first, then the files that contain the corrected model; none of these
+            when no RPC is close enough to it.
+        max_error_px: largest difference between the corrected model and the model in the files; 0 when
+            they contain it exactly.
+        note: one sentence on the files with the corrected model, and their accuracy.
     """
 
     files: tuple[Path, ...]
@@ -38,6 +39,7 @@ def write_refined(
     model_path: Path | None,
     model: CorrectedModel,
     adjustment: SceneAdjustment,
+    *,
     shape: tuple[int, int],
     folder: Path,
     copy_image: bool = False,
@@ -47,24 +49,24 @@ def write_refined(
     | model of the scene | written |
     |---|---|
     | RPC of any source | `refined_RPC.TXT` |
-    | RPC tags, NITF | `STEM_RPC.TXT`: laid beside the image, GDAL prefers it to the tags |
+    | RPC tags, NITF | `STEM_RPC.TXT`, which GDAL prefers to the tags of the image beside it |
     | `_RPC.TXT`, RPB, DIMAP | the file under its own name |
-    | map grid | `IMAGE.aux.xml`: laid beside the image, GDAL prefers it to the image's own |
-    | any of a GeoTIFF | a copy of the image with new tags, only when asked for |
+    | map grid | `IMAGE.aux.xml`, which GDAL prefers to the map grid of the image beside it |
+    | any of a GeoTIFF | a copy of the image with new tags, when `copy_image` |
 
-    An RPC that would miss the corrected model by 0.01 px or more is refused: `correction.json` then goes
-    with the model as delivered.
+    An RPC that differs from the corrected model by 0.01 px or more is not written: `correction.json`
+    then applies to the delivered model.
 
     Args:
         image_path, model_path: the files of the scene.
-        model: as delivered, with its correction.
-        adjustment: the correction's order and covariance.
+        model: the delivered model with its correction.
+        adjustment: order and covariance of the correction.
         shape: lines and samples of the image.
-        folder: where to write; made when missing.
-        copy_image: also copy a GeoTIFF, its new model in its tags.
+        folder: where to write; created when missing.
+        copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
 
     Raises:
-        FormatError: when a file that was delivered would be written over.
+        FormatError: a delivered file would be overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
     copied = image_path if copy_image and _is_geotiff(image_path) else None
@@ -72,17 +74,19 @@ def write_refined(
         (folder / copied.name).unlink(missing_ok=True)
     if isinstance(model.base, OrthoModel):
         grid = fold_into_ortho(model.base, model.correction).grid
-        found = _write_grid(image_path, grid, folder, copied is not None)
+        model_files = _write_grid(image_path, grid, folder, copied is not None)
         applies_to = f"map grid of {image_path.name}"
     else:
         delivered = read_rpc(image_path, model_path) if isinstance(model.base, RpcModel) else None
-        found = _write_rpc(delivered, model, shape, folder, copied)
+        model_files = _write_rpc(delivered, model, shape, folder, copied)
         applies_to = delivered.note if delivered else f"model of {image_path.name}"
     text = format_correction(
-        model.correction, adjustment.order, adjustment.covariance, applies_to, found.note
+        model.correction, adjustment.order, adjustment.covariance, applies_to, model_files.note
     )
-    (folder / CORRECTION_NAME).write_text(text, encoding="utf-8")
-    return RefinedFiles((folder / CORRECTION_NAME, *found.files), found.max_error_px, found.note)
+    (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
+    return RefinedFiles(
+        (folder / CORRECTION_JSON, *model_files.files), model_files.max_error_px, model_files.note
+    )
 
 
 def _write_rpc(
@@ -95,8 +99,8 @@ def _write_rpc(
     refined = refined_rpc(model, shape)
     if refined.model is None:
         note = (
-            f"no RPC comes within {REFIT_LIMIT_PX:g} px of the corrected model, the nearest is "
-            f"{refined.max_error_px:.3g} px away: {CORRECTION_NAME} goes with the model as delivered"
+            f"no RPC is within {REFIT_LIMIT_PX:g} px of the corrected model (the nearest differs by "
+            f"{refined.max_error_px:.3g} px): {CORRECTION_JSON} applies to the delivered model"
         )
         return RefinedFiles((), refined.max_error_px, note)
     files = write_model(delivered, refined.model, folder, copied)

@@ -1,4 +1,4 @@
-"""The RPC of an image: where it is found, whose pixels it is in, and how a refined one is written."""
+"""The RPC of an image: finding it, converting it to the pixels of the image, writing a refined one."""
 
 import re
 from dataclasses import dataclass, replace
@@ -22,26 +22,26 @@ from services.formats.sensor_models.rpc_text import (
 from services.sensors.rpc import RpcModel, check_rpc
 
 _RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
-"""Where RPC00A has the terms of RPC00B; source: NGA STDI-0002."""
+"""Positions in RPC00A of the terms of RPC00B. Source: NGA STDI-0002."""
 
 Convention = Literal["tags", "text", "rpb", "dimap"]
 
 _MAX_TEXT_BYTES = 20_000_000
 _CROP_EVIDENCE = 2.0
-"""How many times nearer to the first pixel the range of a model has to start for a choice to be made."""
+"""How many times nearer to the first pixel the range of a model must start for an unambiguous choice."""
 
 
 @dataclass(frozen=True)
 class DeliveredModel:
-    """The model an image came with, in the pixels of that image.
+    """The sensor model delivered with an image, in the pixels of that image.
 
     Attributes:
-        model: checked, (0, 0) is the centre of the first pixel of the image.
+        model: checked by `check_rpc`; (0, 0) is the centre of the first pixel of the image.
         path: the file it was read from.
-        convention: how it was written there.
-        crop_origin: line and sample of the image's first pixel in the image the file's model is for;
-            what was taken from its image offsets.
-        note: one sentence, where the model was found and why it was shifted or not.
+        convention: format of the model in that file.
+        crop_origin: line and sample of the first pixel of the image in the image that the file models;
+            subtracted from the image offsets of the file.
+        note: one sentence: where the model was found, and why it was shifted or not.
     """
 
     model: RpcModel
@@ -56,24 +56,23 @@ def read_rpc(
 ) -> DeliveredModel:
     """The RPC of an image, in the pixels of that image.
 
-    Looked for in this order: `model_path`; the RPC tags of the GeoTIFF or the RPC00B of the NITF;
-    `STEM_RPC.TXT`, `STEM.RPB`, `STEM_RPC.XML` beside the image, and for `IMG_NAME_R1C1` the
-    `RPC_NAME.XML` of its DIMAP (capitals or not).
+    The RPC is, in this order: the file `model_path`; the RPC tags of a GeoTIFF or the RPC00B of a NITF;
+    `STEM_RPC.TXT`, `STEM.RPB` or `STEM_RPC.XML` beside the image, or for `IMG_NAME_R1C1` the
+    `RPC_NAME.XML` of its DIMAP (in upper or lower case).
 
-    A crop often keeps its place in the full scene as a geotransform of unit pixels without a reference
-    system, and its model may be the full scene's or already be in the pixels of the crop. The range the
-    model was fitted on, offset - scale to offset + scale, tells: it has to contain the image,
-    and it starts near the first pixel of the full scene. Where that is not clear an explicit
-    `crop_origin` is asked for.
+    A crop often stores its position in the full scene as a geotransform of unit pixels without a
+    reference system. Its RPC may then be for the full scene or for the crop. The range of the RPC,
+    offset - scale to offset + scale, decides: it contains the image and starts near the first pixel of
+    the image it is for. Where both are possible, `crop_origin` must be given.
 
     Args:
         path: of the image.
-        model_path: `_RPC.TXT`, `.RPB` or DIMAP file, whatever its name; found by default.
-        crop_origin: line and sample of the image's first pixel in the image the model is for;
-            (0, 0) when the model is in the pixels of the image; found out by default.
+        model_path: `_RPC.TXT`, `.RPB` or DIMAP file of any name; by default the one found.
+        crop_origin: line and sample of the first pixel of the image in the image that the RPC is for;
+            (0, 0) when the RPC is in the pixels of the image; by default decided as above.
 
     Raises:
-        FormatError: without a usable model; the message says what was looked for.
+        FormatError: there is no usable RPC; the message lists what was searched for.
     """
     image = open_raster(path)
     try:
@@ -85,34 +84,36 @@ def read_rpc(
 def write_model(
     delivered: DeliveredModel | None, model: RpcModel, folder: Path, image_path: Path | None = None
 ) -> list[Path]:
-    """Write a refined model as `refined_RPC.TXT` and in the convention of the model it refines.
+    """Write a refined model as `refined_RPC.TXT` and in the format of the delivered model.
 
-    Both are in the pixels of the image that was read: the model of a crop stays that of the crop,
-    even where the delivered one was the full scene's. A file keeps its name; RPC tags become the
-    `STEM_RPC.TXT` that GDAL prefers to them when it lies beside the image, and go into a copy of the
-    image only when `image_path` is given.
+    Both are in the pixels of the image: the refined model of a crop is that of the crop, even where the
+    delivered one is for the full scene. A file keeps its name. RPC tags become `STEM_RPC.TXT`, which
+    GDAL prefers to the tags of the image beside it.
 
     Args:
-        delivered: the model as read; None for one of another kind, which only leaves the text.
-        model: the refined one.
-        folder: where to write; made when missing.
-        image_path: the image, to have a copy of it with the refined model in its tags.
+        delivered: the delivered model; None for a model that is not an RPC, which is only written as
+            `refined_RPC.TXT`.
+        model: the refined model.
+        folder: where to write; created when missing.
+        image_path: the image, when a copy with the refined model in its tags is to be written too.
 
     Returns:
         The files written.
 
     Raises:
-        FormatError: when a file that was delivered would be written over.
+        FormatError: a delivered file would be overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True)
     texts = {"refined_RPC.TXT": format_rpc_text(model)}
     if delivered is not None:
-        texts |= _in_own_convention(delivered, model)
+        texts |= _in_delivered_format(delivered, model)
     written = []
     for name, text in texts.items():
         target = folder / name
         if delivered is not None and target.resolve() == delivered.path.resolve():
-            raise FormatError(f"{target}: the delivered model would be written over")
+            raise FormatError(
+                f"{target}: the delivered model would be overwritten; give another output folder"
+            )
         target.write_bytes(text.encode(_encoding(text)))
         written.append(target)
     if image_path is not None:
@@ -121,8 +122,8 @@ def write_model(
     return written
 
 
-def _in_own_convention(delivered: DeliveredModel, model: RpcModel) -> dict[str, str]:
-    """The file that takes the place of the delivered one, by its name."""
+def _in_delivered_format(delivered: DeliveredModel, model: RpcModel) -> dict[str, str]:
+    """The text of the file that replaces the delivered one, by its name."""
     path = delivered.path
     if delivered.convention == "rpb":
         return {path.name: format_rpb(model, rpb_satellite(read_text(path)))}
@@ -135,22 +136,22 @@ def _in_own_convention(delivered: DeliveredModel, model: RpcModel) -> dict[str, 
 def model_of_image(
     image: RasterImage, model_path: Path | None, crop_origin: tuple[float, float] | None
 ) -> DeliveredModel:
-    """`read_rpc` for an image that is open."""
+    """The RPC of an open image; see `read_rpc`."""
     if model_path is not None:
         model, path, convention = _read_model_file(model_path)
     else:
         model, path, convention = _find_model(image)
     check_rpc(model, path.name)
-    placed = _placed_at(image)
+    offset = _crop_offset(image)
     tile = re.search(r"_R(\d+)C(\d+)$", image.path.stem, re.IGNORECASE)
     if crop_origin is not None:
-        origin, reason = crop_origin, "shifted as told" if any(crop_origin) else "as told"
-    elif placed is not None:
-        origin, reason = _choose_origin(model, placed, image)
+        origin, reason = crop_origin, "shifted as requested" if any(crop_origin) else "as requested"
+    elif offset is not None:
+        origin, reason = _choose_origin(model, offset, image)
     elif tile and convention == "dimap" and (int(tile[1]), int(tile[2])) != (1, 1):
         raise FormatError(
-            f"{image.path}: a tile of an image in several files, whose RPC is for the whole: give the "
-            "place of its first pixel in the whole as crop_origin=(line, sample)"
+            f"{image.path}: the image is a tile, and its RPC is for the whole image: give the position "
+            "of its first pixel in the whole image as crop_origin=(line, sample)"
         )
     else:
         origin, reason = (0.0, 0.0), "in the pixels of the image"
@@ -160,7 +161,7 @@ def model_of_image(
 
 
 def has_rpc(image: RasterImage) -> bool:
-    """Whether an image has RPC tags, or a file beside it that is named like its RPC."""
+    """Whether an image has RPC tags, or beside it a file with the name of its RPC."""
     return bool(image.dataset.tags(ns="RPC")) or bool(_files_beside(image)[1])
 
 
@@ -171,17 +172,17 @@ def _find_model(image: RasterImage) -> tuple[RpcModel, Path, Convention]:
         if "RPC00A" in records and "RPC00B" not in records:
             tags = {**tags, **_rpc00a_coefficients(records["RPC00A"])}
         return _parse_tags(tags, image.path.name), image.path, "tags"
-    names, found = _files_beside(image)
-    if found:
-        return _read_model_file(found[0])
+    names, files = _files_beside(image)
+    if files:
+        return _read_model_file(files[0])
     raise FormatError(
-        f"{image.path}: no sensor model: the file lies on no map and has no RPC tags, and there is no "
-        f"{', '.join(names)} beside it"
+        f"{image.path}: no sensor model found: the file has neither a map grid nor RPC tags, and no "
+        f"file {', '.join(names)} lies beside it; add one of these, or give the file of the model"
     )
 
 
 def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
-    """The names an image's RPC may have, and the files beside it that have one of them."""
+    """The names that the RPC of an image may have, and the files beside the image with such a name."""
     stem = image.path.stem
     names = [f"{stem}_RPC.TXT", f"{stem}.RPB", f"{stem}_RPC.XML"]
     airbus = re.fullmatch(r"IMG_(.+?)(_R\d+C\d+)?", stem, re.IGNORECASE)
@@ -192,7 +193,7 @@ def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
 
 
 def _read_model_file(path: Path) -> tuple[RpcModel, Path, Convention]:
-    """A model file; what it holds decides, not its name."""
+    """The RPC of a model file, whose content, not its name, decides on the format."""
     text = read_text(path)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
         return parse_dimap_rpc(text, path.name), path, "dimap"
@@ -204,7 +205,7 @@ def _read_model_file(path: Path) -> tuple[RpcModel, Path, Convention]:
 def _rpc00a_coefficients(record: str) -> dict[str, str]:
     """The coefficients of an RPC00A record in the order of RPC00B.
 
-    Read from the record itself: GDAL mistakes four of the terms of the second degree.
+    Read from the record, because GDAL confuses four of the terms of the second degree.
     """
     starts = {"LINE_NUM": 81, "LINE_DEN": 321, "SAMP_NUM": 561, "SAMP_DEN": 801}
     return {
@@ -220,14 +221,14 @@ def _parse_tags(tags: dict[str, str], source: str) -> RpcModel:
             return parse_number(tags.get(key, "-1"), key, source)
         values = tags.get(f"{name}_COEFF" if index else key, "").split()
         if len(values) != (20 if index else 1):
-            raise FormatError(f"{source}: the RPC tags have no {key}")
+            raise FormatError(f"{source}: RPC tags: {key} is missing")
         return parse_number(values[int(index) - 1 if index else 0], key, source)
 
     return rpc_from_numbers(number)
 
 
-def _placed_at(image: RasterImage) -> tuple[float, float] | None:
-    """Line and sample of the first pixel in a full scene, when the image says it is a crop of one."""
+def _crop_offset(image: RasterImage) -> tuple[float, float] | None:
+    """Line and sample of the first pixel in the full scene, when the geotransform marks a crop."""
     t = image.dataset.transform
     unit = (t.a, t.b, t.d, t.e) == (1.0, 0.0, 0.0, 1.0)
     if image.dataset.crs is not None or not unit or (t.c, t.f) == (0.0, 0.0):
@@ -236,35 +237,35 @@ def _placed_at(image: RasterImage) -> tuple[float, float] | None:
 
 
 def _choose_origin(
-    model: RpcModel, placed: tuple[float, float], image: RasterImage
+    model: RpcModel, offset: tuple[float, float], image: RasterImage
 ) -> tuple[tuple[float, float], str]:
-    """Whether a model is for the full scene a crop is placed in, or for the crop."""
+    """The crop origin of a model, `offset` for the full scene or (0, 0) for the crop, and the reason."""
     start = model.image_offset - model.image_scale
     end = model.image_offset + model.image_scale
     margin = 0.1 * model.image_scale
     last = np.array(image.shape) - 1.0
     contains, distance = [], []
-    for origin in (np.zeros(2), np.array(placed)):
+    for origin in (np.zeros(2), np.array(offset)):
         contains.append(bool((origin >= start - margin).all() and (origin + last <= end + margin).all()))
-        distance.append(float(np.hypot(*(start + np.array(placed) - origin))))
+        distance.append(float(np.hypot(*(start + np.array(offset) - origin))))
     crop, full = contains
     if crop and full:
         crop = distance[0] * _CROP_EVIDENCE < distance[1]
         full = distance[1] * _CROP_EVIDENCE < distance[0]
-    where = f"line {placed[0]:g}, sample {placed[1]:g}"
+    where = f"line {offset[0]:g}, sample {offset[1]:g}"
     if crop and not full:
         return (0.0, 0.0), f"already in the pixels of the crop at {where}"
     if full and not crop:
-        return placed, f"of the full scene, shifted to the crop at {where}"
+        return offset, f"of the full scene, shifted to the crop at {where}"
     raise FormatError(
-        f"{image.path}: a crop at {where}, and its RPC, for lines {start[0]:g} to {end[0]:g} and "
-        f"samples {start[1]:g} to {end[1]:g}, may be for the crop or for the full scene: say which, "
-        f"crop_origin=(0, 0) or crop_origin=({placed[0]:g}, {placed[1]:g})"
+        f"{image.path}: a crop at {where}; its RPC, for lines {start[0]:g} to {end[0]:g} and samples "
+        f"{start[1]:g} to {end[1]:g}, may be for the crop or for the full scene: give "
+        f"crop_origin=(0, 0) or crop_origin=({offset[0]:g}, {offset[1]:g})"
     )
 
 
 def _check_coverage(model: RpcModel, image: RasterImage, path: Path) -> None:
-    """A model that cannot locate the image is not the image's."""
+    """Refuse a model that cannot locate the corners of the image."""
     lines, samples = image.shape
     corners = np.array([[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]], float)
     height_m = np.full(4, sum(model.height_range_m) / 2.0)
@@ -272,19 +273,21 @@ def _check_coverage(model: RpcModel, image: RasterImage, path: Path) -> None:
     if outside:
         raise FormatError(
             f"{path.name}: the RPC does not cover the image {image.path.name}: {outside} of its 4 "
-            "corners are outside the ground it is for"
+            "corners are outside the ground range of the RPC"
         )
 
 
 def read_text(path: Path) -> str:
-    """A small text file, UTF-8, or Latin-1 where it is not.
+    """The content of a small text file in UTF-8, or else in Latin-1.
 
     Raises:
-        FormatError: when it cannot be read, or is larger than any such file.
+        FormatError: the file cannot be read, or is larger than 20 MB.
     """
     try:
         if not path.is_file() or path.stat().st_size > _MAX_TEXT_BYTES:
-            raise FormatError(f"{path}: expected a text file of at most {_MAX_TEXT_BYTES} bytes")
+            raise FormatError(
+                f"{path}: expected an existing text file of at most {_MAX_TEXT_BYTES} bytes"
+            )
         data = path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
@@ -295,6 +298,6 @@ def read_text(path: Path) -> str:
 
 
 def _encoding(text: str) -> str:
-    """UTF-8, unless an XML document declares Latin-1."""
+    """The encoding of a text to write: UTF-8, or Latin-1 where an XML document declares it."""
     declared = re.match(r"\s*<\?xml[^>]*encoding=[\"']ISO-8859-1[\"']", text, re.IGNORECASE)
     return "latin-1" if declared else "utf-8"

@@ -1,7 +1,7 @@
 """RPC text files: GDAL's `_RPC.TXT` and DigitalGlobe's `.RPB`.
 
-Both count pixels from the centre of the first one, at (0, 0), and heights from the ellipsoid, as the
-models do. Numbers are written so that they read back exactly.
+Both have the centre of the first pixel at (0, 0) and heights above the ellipsoid, as `RpcModel` has.
+Numbers are written with the digits that reproduce them exactly.
 """
 
 import math
@@ -15,7 +15,7 @@ from services.sensors.rpc import RpcModel
 from services.types import Array
 
 Numbers = Callable[[str], float]
-"""Gives the number of a key of the GDAL convention, `LINE_OFF` or `SAMP_DEN_COEFF_20`, or raises."""
+"""Returns the number of a key in the names of GDAL, such as `LINE_OFF` or `SAMP_DEN_COEFF_20`."""
 
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({_NUMBER})(?:\s+[A-Za-z]+)?\s*")
@@ -44,79 +44,78 @@ _RPB_LISTS = {
 
 
 def parse_rpc_text(text: str, source: str = "RPC text") -> RpcModel:
-    """Read a `_RPC.TXT`: one `KEY: number` a line, units after the number allowed.
+    """The RPC of a `_RPC.TXT`: one `KEY: number` on each line, with an optional unit.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a line is not of that form, or a key is missing or given twice.
+        FormatError: a line has another form, or a key is missing or given twice.
     """
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for count, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
         match = _TEXT_LINE.fullmatch(line)
         if match is None:
             raise FormatError(f"{source}, line {count}: expected 'KEY: number', found {line[:60]!r}")
-        _add(found, match[1].upper(), match[2], source)
-    return rpc_from_numbers(_lookup(found, source))
+        _add(numbers, match[1].upper(), match[2], source)
+    return rpc_from_numbers(_lookup(numbers, source))
 
 
 def format_rpc_text(model: RpcModel) -> str:
-    """A model as a `_RPC.TXT`; the stated errors are left out when unknown."""
+    """The text of a `_RPC.TXT` with a model; unknown stated errors are omitted."""
     numbers = _numbers(model)
     return "".join(f"{key}: {value!r}\n" for key, value in numbers.items())
 
 
 def parse_rpb(text: str, source: str = "RPB") -> RpcModel:
-    """Read a DigitalGlobe `.RPB` of the RPC00B order.
+    """The RPC of a DigitalGlobe `.RPB` with coefficients in the order of RPC00B.
 
     Args:
         text: contents of the file.
-        source: its name, for the messages.
+        source: its name, for messages.
 
     Raises:
-        FormatError: when a field is missing, given twice, not a number, or the order is not RPC00B.
+        FormatError: a field is missing, given twice or not a number, or the order is not RPC00B.
     """
     order = re.search(r"\bspecId\s*=\s*\"?(\w+)", text, re.IGNORECASE)
     if order is None or order[1].upper() != "RPC00B":
-        raise FormatError(f"{source}: expected SpecId RPC00B, found {order[1] if order else 'none'}")
+        raise FormatError(f"{source}: SpecId: expected RPC00B, found {order[1] if order else 'none'}")
     key_of = {name.lower(): key for key, name in _RPB_KEYS.items()}
     key_of |= {"errbias": "ERR_BIAS", "errrand": "ERR_RAND"}
     polynomial_of = {name.lower(): key for key, name in _RPB_LISTS.items()}
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for name, values in _RPB_LIST.findall(text):
         polynomial = polynomial_of.get(name.lower())
         if polynomial is not None:
             for i, value in enumerate(values.split(","), start=1):
-                _add(found, f"{polynomial}_COEFF_{i}", value, source)
+                _add(numbers, f"{polynomial}_COEFF_{i}", value, source)
     for line in text.splitlines():
         match = _RPB_NUMBER.fullmatch(line)
         if match is not None and match[1].lower() in key_of:
-            _add(found, key_of[match[1].lower()], match[2], source)
-    return rpc_from_numbers(_lookup(found, source))
+            _add(numbers, key_of[match[1].lower()], match[2], source)
+    return rpc_from_numbers(_lookup(numbers, source))
 
 
 def rpb_satellite(text: str) -> str:
-    """The `satId` of a `.RPB`, "" when it has none."""
+    """The `satId` of a `.RPB`; "" when it has none."""
     match = re.search(r"\bsatId\s*=\s*\"?(\w+)", text, re.IGNORECASE)
     return match[1] if match else ""
 
 
-def format_rpb(model: RpcModel, satellite: str = "", band: str = "P") -> str:
-    """A model as a DigitalGlobe `.RPB`; unknown errors are written as zero.
+def format_rpb(model: RpcModel, satellite: str = "") -> str:
+    """The text of a DigitalGlobe `.RPB` with a model; unknown stated errors are written as zero.
 
     Args:
         model: the model.
-        satellite: its `satId`.
-        band: its `bandId`.
+        satellite: content of the field `satId`.
     """
     numbers = _numbers(model)
     lines = [
         f'satId = "{satellite}";',
-        f'bandId = "{band}";',
+        'bandId = "P";',
         'SpecId = "RPC00B";',
         "BEGIN_GROUP = IMAGE",
         f"\terrBias = {numbers.get('ERR_BIAS', 0.0)!r};",
@@ -130,12 +129,12 @@ def format_rpb(model: RpcModel, satellite: str = "", band: str = "P") -> str:
 
 
 def rpc_from_numbers(number: Numbers, first_pixel: tuple[float, float] = (0.0, 0.0)) -> RpcModel:
-    """The model whose numbers are known by their keys of the GDAL convention.
+    """The RPC with given numbers.
 
     Args:
-        number: from keys to numbers; raises FormatError for those it does not know. The stated errors,
-            `ERR_BIAS` and `ERR_RAND`, are asked for too and must be NaN when unknown.
-        first_pixel: line and sample the numbers give to the centre of the first pixel.
+        number: returns the number of a key, or raises FormatError when the key is missing; NaN for the
+            stated errors, `ERR_BIAS` and `ERR_RAND`, when unknown.
+        first_pixel: line and sample of the centre of the first pixel in the convention of the numbers.
     """
 
     def polynomial(name: str) -> Array:
@@ -159,40 +158,40 @@ def rpc_from_numbers(number: Numbers, first_pixel: tuple[float, float] = (0.0, 0
 
 
 def parse_number(text: str, key: str, source: str) -> float:
-    """A decimal number.
+    """The decimal number of a text.
 
     Raises:
-        FormatError: when the text is anything else, "nan" and "inf" included.
+        FormatError: the text is not a decimal number; "nan" and "inf" are not.
     """
     if re.fullmatch(_NUMBER, text.strip()) is None:
-        raise FormatError(f"{source}: {key} should be a number, found {text.strip()[:60]!r}")
+        raise FormatError(f"{source}: {key}: expected a number, found {text.strip()[:60]!r}")
     return float(text)
 
 
 def _known_error(value: float) -> float:
-    """Producers write -1 or 0 when they do not know."""
+    """The stated error; NaN for -1 or 0, which producers write when it is unknown."""
     return value if value > 0.0 else math.nan
 
 
-def _add(found: dict[str, float], key: str, text: str, source: str) -> None:
-    if key in found:
-        raise FormatError(f"{source}: {key} is given twice")
-    found[key] = parse_number(text, key, source)
+def _add(numbers: dict[str, float], key: str, text: str, source: str) -> None:
+    if key in numbers:
+        raise FormatError(f"{source}: {key} is given twice, once expected")
+    numbers[key] = parse_number(text, key, source)
 
 
-def _lookup(found: dict[str, float], source: str) -> Numbers:
+def _lookup(numbers: dict[str, float], source: str) -> Numbers:
     def number(key: str) -> float:
-        if key in found:
-            return found[key]
+        if key in numbers:
+            return numbers[key]
         if key in ("ERR_BIAS", "ERR_RAND"):
             return math.nan
-        raise FormatError(f"{source}: {key} is missing")
+        raise FormatError(f"{source}: {key} is missing, a number expected")
 
     return number
 
 
 def _numbers(model: RpcModel) -> dict[str, float]:
-    """The numbers of a model by their keys of the GDAL convention; unknown errors left out."""
+    """The numbers of a model by their keys; unknown stated errors are omitted."""
     line, sample = model.image_offset.tolist()
     line_scale, sample_scale = model.image_scale.tolist()
     lon, lat, height = model.ground_offset.tolist()

@@ -1,4 +1,4 @@
-"""Features as columns, and the files that other tools open: GeoParquet, GeoPackage, FlatGeobuf."""
+"""Tables of features, and their files for other tools: GeoParquet, GeoPackage, FlatGeobuf."""
 
 import json
 import tempfile
@@ -16,7 +16,8 @@ import pyproj
 import shapely
 
 KEYS = "keys"
-ARROW = {
+"""Column of a CSV with the paging key of each row."""
+ARROW_TYPES = {
     "bigint": pa.int64(),
     "real": pa.float32(),
     "double precision": pa.float64(),
@@ -27,7 +28,7 @@ ARROW = {
 
 @dataclass(frozen=True)
 class Column:
-    """A column of properties: its name and SQL type."""
+    """Name and SQL type of a column of properties."""
 
     name: str
     type: str
@@ -35,12 +36,12 @@ class Column:
 
 @dataclass(frozen=True)
 class FeatureTable:
-    """Features as columns.
+    """A table of features.
 
     Attributes:
         rows: properties, and WKB in the column `geometry`, longitude or east first.
-        geometry_type: as GeoPackage names it, with Z where there are heights; polygons of which one is
-            in parts, cut at 180 degrees, are all MultiPolygon.
+        geometry_type: in the terms of GeoPackage, with Z where there are heights; MultiPolygon for all
+            when one polygon has several parts, being cut at the antimeridian.
         srid: EPSG code of the coordinates.
     """
 
@@ -55,17 +56,20 @@ class FeatureTable:
 def read_feature_csv(
     text: BytesIO, columns: Sequence[Column], geometry_type: str, srid: int, limit: int
 ) -> tuple[FeatureTable, str | None]:
-    """CSV of features with a header, as columns.
+    """The table of a CSV of features with a header.
 
     Args:
         text: columns `keys`, then x, y (and h) of points or hexadecimal `wkb`, then those of `columns`.
-        limit: rows beyond are left out.
+        columns: the properties.
+        geometry_type: Point, Polygon or another type of GeoPackage, without Z.
+        srid: EPSG code of the coordinates.
+        limit: number of rows to return.
 
     Returns:
-        The features, and `keys` of the last of them when rows were left out.
+        The features, and the `keys` of the last one when the CSV has more rows.
     """
     types = {KEYS: pa.string(), "x": pa.float64(), "y": pa.float64(), "h": pa.float64()}
-    types |= {"wkb": pa.string(), **{column.name: ARROW[column.type] for column in columns}}
+    types |= {"wkb": pa.string(), **{column.name: ARROW_TYPES[column.type] for column in columns}}
     read = pa.csv.read_csv(
         text,
         convert_options=pa.csv.ConvertOptions(
@@ -87,14 +91,14 @@ def read_feature_csv(
     else:
         shapes = shapely.from_wkb(read["wkb"].to_numpy(zero_copy_only=False))
         if (shapely.get_type_id(shapes) == shapely.GeometryType.MULTIPOLYGON).any():
-            geometry_type, shapes = "MultiPolygon", _in_parts(shapes)
+            geometry_type, shapes = "MultiPolygon", _as_multipolygons(shapes)
     geometry = pa.array(shapely.to_wkb(shapes, flavor="iso"), pa.binary())
     rows = read.select([column.name for column in columns]).append_column("geometry", geometry)
     return FeatureTable(rows, geometry_type + (" Z" if has_height else ""), srid), last
 
 
-def _in_parts(polygons: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
-    """Polygons and such of several parts, all as such of several parts; None where there is none."""
+def _as_multipolygons(polygons: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
+    """Polygons and multipolygons (n,), all as multipolygons; None where the geometry is missing."""
     parts, owner = shapely.get_parts(polygons, return_index=True)
     out = np.full(len(polygons), None)
     shapely.multipolygons(parts, indices=owner, out=out)
@@ -102,7 +106,7 @@ def _in_parts(polygons: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
 
 
 def format_parquet(features: FeatureTable, layer: str) -> bytes:
-    """Features as GeoParquet 1.1, which has no name for its layer."""
+    """The bytes of a GeoParquet 1.1 with features; the format stores no layer name."""
     shapes = shapely.from_wkb(features.rows["geometry"].to_numpy(zero_copy_only=False))
     column = {
         "encoding": "WKB",
@@ -120,17 +124,17 @@ def format_parquet(features: FeatureTable, layer: str) -> bytes:
 
 
 def format_geopackage(features: FeatureTable, layer: str) -> bytes:
-    """Features as a GeoPackage with one layer."""
-    return _written(features, layer, "GPKG", "features.gpkg")
+    """The bytes of a GeoPackage with one layer of features."""
+    return _file_bytes(features, layer, "GPKG", "features.gpkg")
 
 
 def format_flatgeobuf(features: FeatureTable, layer: str) -> bytes:
-    """Features as FlatGeobuf, in the order they have, which an index in the file would change."""
-    return _written(features, layer, "FlatGeobuf", "features.fgb", SPATIAL_INDEX="NO")
+    """The bytes of a FlatGeobuf with features in their order, hence without a spatial index."""
+    return _file_bytes(features, layer, "FlatGeobuf", "features.fgb", SPATIAL_INDEX="NO")
 
 
-def _written(features: FeatureTable, layer: str, driver: str, name: str, **options: str) -> bytes:
-    import pyogrio  # with what it finds installed: 0.4 s that only these files need
+def _file_bytes(features: FeatureTable, layer: str, driver: str, name: str, **options: str) -> bytes:
+    import pyogrio  # imported here because it takes 0.4 s and only these formats need it
 
     with tempfile.TemporaryDirectory(prefix="amers-features-") as folder:
         path = Path(folder) / name

@@ -1,4 +1,4 @@
-"""What a registration did with its points, as layers of a GeoPackage for a GIS."""
+"""The points of a registration and their residuals, as layers of a GeoPackage."""
 
 from pathlib import Path
 
@@ -13,53 +13,53 @@ from services.types import Measures
 CRS_3D = "EPSG:4979"
 """Longitude, latitude, height above the WGS 84 ellipsoid."""
 
+VISIBLE_SHARE = 0.04
+
 Fields = dict[str, npt.NDArray[np.generic]]
 
 
 def write_residual_layers(path: Path, measures: Measures, image: str, exaggeration: float) -> None:
     """Write the layers `residuals` (3D lines) and `control_points` (3D points).
 
-    A line starts at the control point and goes, at its height, towards where the refined model sees the
-    measure: the residual on the ground, observed minus computed, times the exaggeration, which is an
-    attribute of each line. Only points that were found have one.
+    A line starts at the control point and follows, at its height, the residual on the ground, observed
+    minus computed, times the exaggeration, which is an attribute of each line. Only matched points have
+    a line.
 
     Args:
-        path: a file of that name is replaced.
-        measures: all n points the scene could show.
+        path: of the file; an existing one is replaced.
+        measures: of all n points within the scene.
         image: name of the scene.
-        exaggeration: how many times longer than on the ground the lines are.
+        exaggeration: ratio of the length of a line to that of its residual.
     """
     path.unlink(missing_ok=True)
     fields = _fields(measures, image)
-    found = measures.matched & np.isfinite(measures.residual_m).all(axis=1)
-    start = measures.lon_lat_h[found]
+    has_residual = measures.matched & np.isfinite(measures.residual_m).all(axis=1)
+    start = measures.lon_lat_h[has_residual]
     end = start.copy()
-    end[:, :2] += exaggeration * measures.residual_m[found] / metres_per_degree_at(start)
+    end[:, :2] += exaggeration * measures.residual_m[has_residual] / metres_per_degree_at(start)
     lines = shapely.linestrings(np.stack([start, end], axis=1))
     stretch = {"exaggeration": np.full(len(lines), exaggeration)}
-    of_found = {name: values[found] for name, values in fields.items()}
-    _write(path, "residuals", "LineString Z", lines, {**of_found, **stretch})
+    line_fields = {name: values[has_residual] for name, values in fields.items()}
+    _write(path, "residuals", "LineString Z", lines, {**line_fields, **stretch})
     _write(path, "control_points", "Point Z", shapely.points(measures.lon_lat_h), fields)
 
 
-def exaggeration_for(measures: Measures, share: float = 0.04) -> float:
-    """How many times to stretch residuals to be seen: the larger ones get a share of the scene's size.
+def exaggeration_for(measures: Measures) -> float:
+    """The exaggeration with which residuals are visible on a map of the scene.
 
-    Args:
-        measures: with their residuals.
-        share: of the diagonal of the points, for the residual that 90 % are smaller than.
+    The residual that 90 % are smaller than gets at most `VISIBLE_SHARE` of the diagonal of the points.
 
     Returns:
-        1, 2 or 5 times a power of ten.
+        1, 2 or 5 times a power of ten; at least 1.
     """
     length_m = np.hypot(*measures.residual_m[measures.active].T)
     length_m = length_m[np.isfinite(length_m)]
     if not len(length_m):
         return 1.0
-    away = measures.lon_lat_h[:, :2] - measures.lon_lat_h[0, :2]
-    away[:, 0] = (away[:, 0] + 180.0) % 360.0 - 180.0
-    extent_m = np.ptp(away, axis=0) * metres_per_degree_at(measures.lon_lat_h[:1])[0]
-    wanted = share * float(np.hypot(*extent_m)) / max(float(np.quantile(length_m, 0.9)), 1e-9)
+    offset = measures.lon_lat_h[:, :2] - measures.lon_lat_h[0, :2]
+    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+    extent_m = np.ptp(offset, axis=0) * metres_per_degree_at(measures.lon_lat_h[:1])[0]
+    wanted = VISIBLE_SHARE * float(np.hypot(*extent_m)) / max(float(np.quantile(length_m, 0.9)), 1e-9)
     if not wanted > 1.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(wanted))
@@ -67,7 +67,7 @@ def exaggeration_for(measures: Measures, share: float = 0.04) -> float:
 
 
 def _fields(measures: Measures, image: str) -> Fields:
-    """Attributes of all points."""
+    """The attributes (n,) of all points, by name."""
     n = len(measures.point_id)
     return {
         "point_id": measures.point_id,
@@ -82,7 +82,7 @@ def _fields(measures: Measures, image: str) -> Fields:
 
 
 def _write(path: Path, layer: str, kind: str, geometry: npt.NDArray[np.object_], fields: Fields) -> None:
-    import pyogrio  # with what it finds installed: 0.4 s that only these files need
+    import pyogrio  # imported here because it takes 0.4 s and only these layers need it
 
     pyogrio.raw.write(
         path,

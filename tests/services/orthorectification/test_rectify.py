@@ -199,7 +199,7 @@ def test_an_ortho_image_is_a_cloud_optimised_geotiff_with_overviews(tmp_path: Pa
     grid = choose_grid(scene(), ground)
     done = list(orthorectify(ramps(), scene().model, ground, grid))
     path = tmp_path / "ortho.tif"
-    error_px = write_cog(path, grid, done, 2, "uint16", 0.0)
+    error_px = write_cog(path, grid, done, bands=2, dtype="uint16", nodata=0.0)
     assert error_px == max(window.error_px for window in done)
     assert [file.name for file in tmp_path.iterdir()] == ["ortho.tif"]
     with rasterio.open(path) as file:

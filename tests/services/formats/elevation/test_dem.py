@@ -77,7 +77,7 @@ def test_heights_above_the_ellipsoid_are_read_as_they_are(tmp_path: Path) -> Non
 
 def test_a_file_that_does_not_say_its_datum_is_refused_until_the_caller_does(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "a.tif")
-    with pytest.raises(VerticalDatumError, match=r"a\.tif.*does not say"):
+    with pytest.raises(VerticalDatumError, match=r"a\.tif.*does not state its vertical datum"):
         read_dem(path)
     assert "by the caller" in read_dem(path, "ellipsoid").vertical
 
@@ -122,12 +122,12 @@ def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("crs", "said", "grid", "expected"),
     [
-        ("EPSG:4326+5773", "ellipsoid", False, "from EGM96 height, and the ellipsoid was given"),
-        ("EPSG:4979", "EGM96", False, "from the ellipsoid, and EGM96 height was given"),
+        ("EPSG:4326+5773", "ellipsoid", False, "above EGM96 height, the caller the ellipsoid"),
+        ("EPSG:4979", "EGM96", False, "above the ellipsoid, the caller EGM96 height"),
         ("EPSG:4979", None, True, "need no geoid"),
         ("EPSG:4326", "ellipsoid", True, "need no geoid"),
         ("EPSG:4326", "mean sea level", False, "expected ellipsoid"),
-        ("EPSG:4326+6357", None, True, "found depths"),
+        ("EPSG:4326+6357", None, True, "NAVD88 depth found, which counts depths"),
     ],
 )
 def test_contradictions_about_the_datum_are_refused(
@@ -140,7 +140,7 @@ def test_contradictions_about_the_datum_are_refused(
 
 def test_a_geoid_of_elsewhere_is_refused(tmp_path: Path) -> None:
     grid = write_geoid(tmp_path / "geoid.gtx", west=100.0)
-    with pytest.raises(CoverageError, match="does not reach"):
+    with pytest.raises(CoverageError, match="does not cover the terrain"):
         read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
 
 

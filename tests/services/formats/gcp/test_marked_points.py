@@ -230,7 +230,7 @@ def test_residuals_go_to_qgis_as_computed_minus_observed_with_lines_upwards() ->
 
 @pytest.mark.parametrize("write", [format_asp_gcp, format_opf])
 def test_a_format_that_asks_for_sigmas_is_not_given_invented_ones(write) -> None:
-    with pytest.raises(InputError, match=r"point 11: .*known"):
+    with pytest.raises(InputError, match=r"point 11: .*unknown"):
         write(replace(golden_points(), sigma_px=np.full(5, np.nan)))
 
 
@@ -273,11 +273,13 @@ def test_a_pci_text_holds_errors_of_pixels_only_when_all_are_known() -> None:
 
 @pytest.mark.parametrize("name", ["invented.gcp", "invented.pts", "invented_gcp_list.txt"])
 def test_heights_whose_datum_nobody_says_are_refused(name: str) -> None:
-    with pytest.raises(VerticalDatumError, match="does not say what its heights are above"):
+    with pytest.raises(VerticalDatumError, match="does not state the datum of its heights"):
         read_control_points(GOLDEN / name)
-    with pytest.raises(VerticalDatumError, match="EPSG:4326 is not a vertical reference system"):
+    with pytest.raises(
+        VerticalDatumError, match=r"EPSG:4326 given, .* a vertical reference system expected"
+    ):
         read_control_points(GOLDEN / name, "EPSG:4326")
-    with pytest.raises(FormatError, match="expected a reference system, found 'sea'"):
+    with pytest.raises(FormatError, match=r"expected a reference system, .* found 'sea'"):
         read_control_points(GOLDEN / name, "sea")
 
 
@@ -317,39 +319,39 @@ def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
     ("name", "was", "becomes", "says"),
     [
         ("invented.gcp", " 105.25", "", "line 2: expected id, lat"),
-        ("invented.gcp", "105.25", "high", "line 2: height should be a number, found 'high'"),
+        ("invented.gcp", "105.25", "high", "line 2: height: expected a number, found 'high'"),
         ("invented.points", "mapX", "X", "expected a line that starts with mapX,mapY"),
-        ("invented.points", "12.2912345678", "nan", "line 3: mapX should be a number, found 'nan'"),
-        ("invented.points", "EPSG:4326", "moon", "expected a reference system, found 'moon'"),
-        ("invented.pts", "WGS-84", "NAD27", "expected a projection info .* found 'Geographic"),
+        ("invented.points", "12.2912345678", "nan", "line 3: mapX: expected a number, found 'nan'"),
+        ("invented.points", "EPSG:4326", "moon", "expected a reference system, .* found 'moon'"),
+        ("invented.pts", "WGS-84", "NAD27", "projection info: expected .* found 'Geographic"),
         ("invented.pts", " 105.25", "", "line 5: expected map x, y, elevation, image x, y"),
         (
             "invented_gcp_list.txt",
             "EPSG:4326",
             "the moon",
-            "expected a reference system, found 'the moon'",
+            "expected a reference system, .* found 'the moon'",
         ),
         ("invented_gcp_list.txt", " invented.tif 11", "", "line 2: expected geo_x, .* found 5 fields"),
-        ("invented_gcp_list.txt", "105.25", "high", "line 2: geo_z should be a number, found 'high'"),
-        ("invented_pci.txt", "EPSG:4326", "moon", "expected a reference system, found 'moon'"),
+        ("invented_gcp_list.txt", "105.25", "high", "line 2: geo_z: expected a number, found 'high'"),
+        ("invented_pci.txt", "EPSG:4326", "moon", "expected a reference system, .* found 'moon'"),
         (
             "invented_pci.txt",
             "IDPLXYZ",
             "IDPLXYQ",
-            "layout should be made of ID P L .* found 'IDPLXYQeP",
+            "layout: expected some of ID P L .* found 'IDPLXYQeP",
         ),
-        ("invented_pci.txt", "IDPLXYZ", "IDPLXZZ", "each once, found 'IDPLXZZ"),
-        ("invented_pci.txt", "PLXYZ", "PLZ", "layout should have P, L, X and Y, found no X, Y"),
-        ("invented_pci.txt", " 105.25", "", "line 2: expected 9 fields, IDPLXYZePeLS, found 8"),
-        ("invented_pci.txt", "105.25", "high", "line 2: Z should be a number, found 'high'"),
-        ("invented_pci.txt", "0.11 G", "0.11 X", "line 2: S should be G, I or C, found 'X'"),
+        ("invented_pci.txt", "IDPLXYZ", "IDPLXZZ", "each at most once, found 'IDPLXZZ"),
+        ("invented_pci.txt", "PLXYZ", "PLZ", "layout: expected P, L, X and Y, found no X, Y"),
+        ("invented_pci.txt", " 105.25", "", "line 2: expected the 9 fields IDPLXYZePeLS, found 8"),
+        ("invented_pci.txt", "105.25", "high", "line 2: Z: expected a number, found 'high'"),
+        ("invented_pci.txt", "0.11 G", "0.11 X", "line 2: S: expected G, I or C, found 'X'"),
         ("invented_opf.json", '"1.0"', '"2.0"', "expected OPF 1, found version '2.0'"),
         ("invented_opf.json", "application/opf-input", "x", "expected a document of the format"),
-        ("invented_opf.json", "position_px", "place", "gcp 1: position_px should be 2 numbers"),
+        ("invented_opf.json", "position_px", "place", "gcp 1: position_px: expected 2 numbers"),
         ("invented_opf.json", "EPSG:4979", "EPSG:1", "gcp 1: expected a reference system"),
         ("invented.geojson", '"Point"', '"Line"', "feature 1: expected a Point"),
         ("invented.geojson", "FeatureCollection", "X", "expected a GeoJSON FeatureCollection"),
-        ("invented.geojson", '"line": 44', '"line": "a', "JSON|should be 2 numbers"),
+        ("invented.geojson", '"line": 44', '"line": "a', "JSON|expected 2 numbers"),
     ],
 )
 def test_a_wrong_field_is_named(tmp_path: Path, name: str, was: str, becomes: str, says: str) -> None:
@@ -369,7 +371,7 @@ def test_a_geojson_point_without_a_height_is_refused() -> None:
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_text("1,2,3")
-    with pytest.raises(FormatError, match=r"expected a name that ends in one of \.gcp, \.points"):
+    with pytest.raises(FormatError, match=r"expected a file name that ends in \.gcp, \.points"):
         read_control_points(tmp_path / "points.csv")
 
 

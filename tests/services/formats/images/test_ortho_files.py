@@ -89,7 +89,7 @@ def test_a_landsat_scene_is_as_good_as_its_tier_says_and_the_second_says_nothing
     scene = read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T1_B8.TIF"))
     assert scene.acquisition.sensor == "LC08"
     assert scene.sigma_m == pytest.approx(largest_radial_rms_m / 2.0**0.5, rel=1e-3)
-    with pytest.raises(FormatError, match="unknown sensor"):
+    with pytest.raises(FormatError, match="sensor of this ortho-image is unknown"):
         read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T2_B8.TIF"))
 
 
@@ -104,12 +104,12 @@ def test_an_image_on_no_map_and_without_a_model_is_refused_with_the_reason(tmp_p
     path = tmp_path / "a.tif"
     with rasterio.open(path, "w", driver="GTiff", height=9, width=9, count=1, dtype="uint8") as file:
         file.write(np.ones((1, 9, 9), np.uint8))
-    with pytest.raises(FormatError, match="lies on no map and has no RPC tags"):
+    with pytest.raises(FormatError, match="has neither a map grid nor RPC tags"):
         read_scene(path)
 
 
 def test_an_unusable_place_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="nowhere on the Earth"):
+    with pytest.raises(FormatError, match="its centre is not on the Earth"):
         read_scene(write(tmp_path / "far.tif", transform=Affine(10, 0, 9e9, 0, -10, 9e9)), sigma_m=1.0)
     with pytest.raises(FormatError, match="on a line"):
         read_scene(write(tmp_path / "flat.tif", transform=Affine(10, 0, 3e5, 0, 0, 5e6)), sigma_m=1.0)
@@ -158,7 +158,7 @@ def test_a_jpeg_2000_gets_a_sidecar_and_no_copy(tmp_path: Path) -> None:
     assert [file.name for file in write_refined_ortho(path, grid, tmp_path / "o")] == ["a.jp2.aux.xml"]
     with pytest.raises(FormatError, match="only a GeoTIFF"):
         write_refined_ortho(path, grid, tmp_path / "o", copy=True)
-    with pytest.raises(FormatError, match="written over"):
+    with pytest.raises(FormatError, match="would be overwritten"):
         write_refined_ortho(path, grid, tmp_path)
 
 
@@ -181,7 +181,7 @@ def test_any_other_words_for_bands_are_refused(text: str) -> None:
     try:
         mix = parse_bands(text)
     except FormatError as error:
-        assert "expected numbers of bands" in str(error)  # noqa: PT017 - either is right
+        assert "expected band numbers" in str(error)  # noqa: PT017 - either is right
     else:
         assert sum(mix.weights) == pytest.approx(1.0)
         assert min(mix.bands) >= 1
@@ -189,7 +189,7 @@ def test_any_other_words_for_bands_are_refused(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "0", "1,1", "1:0", "1:-2", "1:nan", "a", "1;2", "1:1e3"])
 def test_bands_that_cannot_be_are_refused(text: str) -> None:
-    with pytest.raises(FormatError, match="expected numbers of bands"):
+    with pytest.raises(FormatError, match="expected band numbers"):
         parse_bands(text)
 
 
@@ -201,7 +201,7 @@ def test_a_mix_is_the_weighted_mean_of_its_bands(tmp_path: Path) -> None:
     assert void.any()
     np.testing.assert_array_equal(np.isnan(mixed), void)
     np.testing.assert_allclose(mixed[~void], expected[~void], rtol=a_millionth_of_a_number)
-    with pytest.raises(FormatError, match="expected a band 5"):
+    with pytest.raises(FormatError, match="band 5 requested, the image has 4 bands"):
         read_scene(path, sigma_m=1.0, bands=parse_bands("1,5"))
 
 

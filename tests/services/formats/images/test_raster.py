@@ -83,7 +83,7 @@ def test_pixels_under_a_mask_are_nan(tmp_path: Path) -> None:
 def test_the_band_that_was_chosen_is_read(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif", np.stack([PIXELS, PIXELS + 1]))
     np.testing.assert_array_equal(open_raster(path, 2).read(Window(0, 0, *PIXELS.shape)), PIXELS + 1)
-    with pytest.raises(FormatError, match="expected a band 3, the image has 2"):
+    with pytest.raises(FormatError, match="band 3 requested, the image has 2 bands"):
         open_raster(path, 3)
 
 
@@ -111,7 +111,7 @@ def test_other_kinds_of_files_are_refused_whatever_their_name(tmp_path: Path, co
     ],
 )
 def test_addresses_archives_and_folders_are_no_images(name: str) -> None:
-    with pytest.raises(FormatError, match="expected the name of an image file"):
+    with pytest.raises(FormatError, match="expected the name of an existing image file"):
         open_raster(Path(name))
 
 
@@ -149,7 +149,7 @@ def test_a_hole_in_the_middle_is_a_format_error_when_it_is_read(tmp_path: Path) 
     data[len(data) // 2 : len(data) // 2 + 5000] = bytes(5000)
     path.write_bytes(data)
     image = open_raster(path)
-    with pytest.raises(FormatError, match=r"a\.tif: truncated or damaged, expected its pixels"):
+    with pytest.raises(FormatError, match=r"a\.tif: truncated or damaged, readable pixels expected"):
         image.read(Window(0, 0, *image.shape))
 
 
@@ -165,7 +165,7 @@ def test_a_small_file_that_declares_an_enormous_image_is_refused(tmp_path: Path)
 
 def test_complex_pixels_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif", PIXELS.astype(np.complex64))
-    with pytest.raises(FormatError, match="expected whole or real pixels, found complex64"):
+    with pytest.raises(FormatError, match="expected integer or floating-point pixels, found complex64"):
         open_raster(path)
 
 
@@ -198,11 +198,11 @@ def test_a_copy_replaces_an_older_one_but_never_the_image_itself(tmp_path: Path)
     (tmp_path / "b.tif").write_bytes(b"half a copy")
     copy_with_rpc(path, tmp_path / "b.tif", MODEL)
     assert open_raster(tmp_path / "b.tif").shape == PIXELS.shape
-    with pytest.raises(FormatError, match="the delivered image would be written over"):
+    with pytest.raises(FormatError, match="the delivered image would be overwritten"):
         copy_with_rpc(path, path, MODEL)
 
 
 def test_only_a_geotiff_takes_rpc_tags(tmp_path: Path) -> None:
     nitf = write(tmp_path / "a.ntf", driver="NITF")
-    with pytest.raises(FormatError, match="only a GeoTIFF can carry RPC tags, this is NITF"):
+    with pytest.raises(FormatError, match="NITF found; only a GeoTIFF can be copied with new RPC tags"):
         copy_with_rpc(nitf, tmp_path / "b.tif", MODEL)

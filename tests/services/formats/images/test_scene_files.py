@@ -91,7 +91,7 @@ def test_without_a_model_the_message_says_what_was_looked_for(tmp_path: Path) ->
     path = write_image(tmp_path / "IMG_a_R1C1.tif")
     with pytest.raises(
         FormatError,
-        match=r"no RPC tags, and there is no IMG_a_R1C1_RPC.TXT, .*\.RPB, .*RPC_a\.XML beside",
+        match=r"nor RPC tags, and no file IMG_a_R1C1_RPC.TXT, .*\.RPB, .*RPC_a\.XML lies beside",
     ):
         read_rpc(path)
 
@@ -125,9 +125,7 @@ def test_a_crop_is_read_right_whether_its_model_is_the_full_scene_s_or_its_own(
 def test_a_crop_whose_model_could_be_either_is_asked_about(tmp_path: Path) -> None:
     half_way = replace(FULL, image_offset=FULL.image_offset - np.array(ORIGIN) / 2.0)
     path = write_image(tmp_path / "a.tif", tagged=half_way, placed=True)
-    with pytest.raises(
-        FormatError, match=r"say which, crop_origin=\(0, 0\) or crop_origin=\(9000, 15000\)"
-    ):
+    with pytest.raises(FormatError, match=r"give crop_origin=\(0, 0\) or crop_origin=\(9000, 15000\)"):
         read_rpc(path)
     np.testing.assert_allclose(
         read_rpc(path, crop_origin=(0, 0)).model.image_offset, half_way.image_offset
@@ -141,7 +139,7 @@ def test_a_tile_of_an_image_in_several_files_has_to_say_where_it_lies(tmp_path: 
     first = write_image(tmp_path / "IMG_a_R1C1.tif")
     second = write_image(tmp_path / "IMG_a_R2C1.tif")
     assert read_rpc(first).crop_origin == (0.0, 0.0)
-    with pytest.raises(FormatError, match="a tile of an image in several files"):
+    with pytest.raises(FormatError, match="the image is a tile, and its RPC is for the whole image"):
         read_rpc(second)
     model = read_rpc(second, crop_origin=(8192.0, 0.0)).model
     np.testing.assert_allclose(model.image_offset, FULL.image_offset - [8192.0, 0.0])
@@ -270,7 +268,7 @@ def test_the_delivered_model_is_never_written_over(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif")
     (tmp_path / "a.RPB").write_text(format_rpb(CROP))
     delivered = read_rpc(path)
-    with pytest.raises(FormatError, match="the delivered model would be written over"):
+    with pytest.raises(FormatError, match="the delivered model would be overwritten"):
         write_model(delivered, refined(CROP), tmp_path)
 
 

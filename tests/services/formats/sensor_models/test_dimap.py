@@ -154,8 +154,8 @@ def test_a_document_takes_the_model_of_another_place(text: str) -> None:
         ("Dimap_Document>", "Other_Document>", "found <Other_Document>"),
         ("<LINE_OFF>", "<LINE_OFF>1</LINE_OFF><LINE_OFF>", "expected one LINE_OFF .* found 2"),
         ("LONG_SCALE>", "LON_SCALE>", "expected one LONG_SCALE .* found 0"),
-        ("<LINE_OFF>13000.5", "<LINE_OFF>inf", "LINE_OFF should be a number, found 'inf'"),
-        ("</Dimap_Document>", "", "not a well-formed XML document"),
+        ("<LINE_OFF>13000.5", "<LINE_OFF>inf", "LINE_OFF: expected a number, found 'inf'"),
+        ("</Dimap_Document>", "", "expected a well-formed XML document"),
     ],
 )
 def test_a_wrong_document_is_refused_with_a_reason(was: str, becomes: str, says: str) -> None:

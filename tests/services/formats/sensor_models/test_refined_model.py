@@ -52,10 +52,10 @@ def test_the_formula_of_the_document_is_the_one_that_is_applied() -> None:
     ("was", "becomes", "says"),
     [
         ("amers-image-correction/1", "other/1", "expected a document of the format amers-image"),
-        ("499.5", '"a"', "centre_px should be 2 numbers"),
-        ("1.5", "NaN", "parameters_px should be 2 x 3 numbers"),
-        ("500.0", "-500.0", "half_size_px should be positive"),
-        ("1.5", "-600.0", "parameters_px fold or mirror the image"),
+        ("499.5", '"a"', "centre_px: expected 2 finite numbers"),
+        ("1.5", "NaN", "parameters_px: expected 2 x 3 finite numbers"),
+        ("500.0", "-500.0", "half_size_px: expected positive numbers"),
+        ("1.5", "-600.0", "parameters_px: expected a correction that neither folds nor mirrors"),
     ],
 )
 def test_a_wrong_correction_is_refused_with_the_field(was: str, becomes: str, says: str) -> None:
@@ -121,7 +121,9 @@ def test_a_scene_on_a_map_is_delivered_as_the_place_it_has(registered, tmp_path:
     correction = replace(no_correction(shape), parameters=CORRECTION.parameters)
     model = CorrectedModel(scene.model, correction)
     adjustment = replace(registered().adjustment, correction=correction, order="affine")
-    left = write_refined(path, None, model, adjustment, shape, tmp_path / "out", copy_image=True)
+    left = write_refined(
+        path, None, model, adjustment, shape=shape, folder=tmp_path / "out", copy_image=True
+    )
     assert [file.name for file in left.files] == ["correction.json", "map.tif.aux.xml", "map.tif"]
     assert left.max_error_px == 0.0
     corner = np.array([[-0.5, -0.5]])

@@ -95,10 +95,10 @@ def test_a_wrong_line_of_the_text_is_named(was: str, becomes: str, says: str) ->
 @pytest.mark.parametrize(
     ("was", "becomes", "says"),
     [
-        ("RPC00B", "RPC00A", "expected SpecId RPC00B, found RPC00A"),
+        ("RPC00B", "RPC00A", "SpecId: expected RPC00B, found RPC00A"),
         ("\tlineOffset = 12999.5;\n", "", "LINE_OFF is missing"),
         ("\t\t\t+1.017000000000000E+00,\n", "", "SAMP_NUM_COEFF_20 is missing"),
-        ("+1.017000000000000E+00", "one", "SAMP_NUM_COEFF_2 should be a number, found 'one'"),
+        ("+1.017000000000000E+00", "one", "SAMP_NUM_COEFF_2: expected a number, found 'one'"),
     ],
 )
 def test_a_wrong_field_of_the_rpb_is_named(was: str, becomes: str, says: str) -> None:
