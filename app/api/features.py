@@ -19,7 +19,7 @@ from app.db.engine import Database
 from app.db.features.collection import Collection, Viewer
 from app.db.features.pages import Text
 from app.usecases.features import items as features
-from app.usecases.features.items import Answer
+from app.usecases.features.items import FeaturePage
 from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
 from services.formats.vector.feature_files import (
     FeatureTable,
@@ -267,14 +267,14 @@ def _pieces(page: PageRequest) -> Generator[bytes, None, None]:
     with page.database.reading() as connection:
         opening = b'{"type":"FeatureCollection","features":['
         for piece in features.stream(connection, page.query, page.secret):
-            if isinstance(piece, Answer):
+            if isinstance(piece, FeaturePage):
                 yield opening + _members(piece, _links(page, piece))
             else:
                 yield opening + piece
             opening = b""
 
 
-def _members(answer: Answer, links: list[dict[str, Any]]) -> bytes:
+def _members(answer: FeaturePage, links: list[dict[str, Any]]) -> bytes:
     """The end of a FeatureCollection after its features."""
     members = {
         "numberMatched": answer.matched.number,
@@ -285,7 +285,7 @@ def _members(answer: Answer, links: list[dict[str, Any]]) -> bytes:
     return b"]," + json.dumps(members)[1:].encode()
 
 
-def _links(page: PageRequest, answer: Answer) -> list[dict[str, Any]]:
+def _links(page: PageRequest, answer: FeaturePage) -> list[dict[str, Any]]:
     url, media_type = page.request.url, FEATURES[page.form]
     links = [{"rel": "self", "href": str(url), "type": media_type}]
     links += [
@@ -309,7 +309,7 @@ def _headers(page: PageRequest) -> dict[str, str]:
     return headers
 
 
-def _answer_headers(answer: Answer, links: list[dict[str, Any]]) -> dict[str, str]:
+def _answer_headers(answer: FeaturePage, links: list[dict[str, Any]]) -> dict[str, str]:
     """Counts, page token and links, for formats that have no place for them."""
     in_header = [link for link in links if link["rel"] in ("self", "next") and "method" not in link]
     return {

@@ -9,7 +9,7 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
 from app.db.features.collection import Collection
-from app.usecases.features.items import Answer
+from app.usecases.features.items import FeaturePage
 
 TEMPLATES = Environment(loader=PackageLoader("app.api", "templates"), autoescape=True)
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; frame-ancestors 'none'"
@@ -62,7 +62,7 @@ def features_page(
     title: str,
     found: Sequence[dict[str, Any]],
     links: Sequence[dict[str, Any]],
-    answer: Answer | None = None,
+    answer: FeaturePage | None = None,
 ) -> HTMLResponse:
     """Features as a page."""
     names = [name for name in (found[0]["properties"] if found else {})]

@@ -104,7 +104,7 @@ def tile(
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:
             return Response(status_code=304, headers=headers)
-        content = tiles.tile(connection, collection.id, z, y, x, viewer)
+        content = tiles.tile(connection, collection.id, z, y, x, viewer=viewer)
     return Response(content, media_type=MVT, headers=headers)
 
 

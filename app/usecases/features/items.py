@@ -1,4 +1,4 @@
-"""Features of every collection: pages of them, one by one."""
+"""Pages of features of every collection, and single features."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -27,18 +27,18 @@ COLLECTIONS: Mapping[str, Collection] = {
     collection.id: collection for collection in (POINTS, BLOCKS, DENSITY, HISTORY, SCENES)
 }
 LARGEST_TEXT = 2_000
-"""Features that are made into one text; more are streamed."""
+"""Largest page that is built as one text; larger pages are streamed."""
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A page.
+class FeaturePage:
+    """A page of features.
 
     Attributes:
-        body: without what stands around features.
-        returned: how many.
-        matched: how many there are on all pages.
-        next_token: where the next page begins, None on the last one.
+        body: the features, without the document around them; empty for tables and streams.
+        returned: number of features on this page.
+        matched: number of features on all pages.
+        next_token: of the next page; None on the last page.
     """
 
     body: bytes
@@ -48,92 +48,100 @@ class Answer:
 
 
 def find_collection(name: str) -> Collection:
-    """The collection of a name.
+    """The collection of this name.
 
     Raises:
         NotFound: there is none.
     """
-    found = COLLECTIONS.get(name)
-    if found is None:
-        raise NotFound(f"no collection {name:.100}: there are {', '.join(COLLECTIONS)}")
-    return found
+    collection = COLLECTIONS.get(name)
+    if collection is None:
+        raise NotFound(f"no collection {name:.100}: expected one of {', '.join(COLLECTIONS)}")
+    return collection
 
 
-def page(connection: Connection, asked: ResolvedQuery, kind: pages.Text, secret: bytes) -> Answer:
-    """A page in a format that the database makes.
+def page(connection: Connection, query: ResolvedQuery, form: pages.Text, secret: bytes) -> FeaturePage:
+    """A page in a text format that the database builds.
 
     Raises:
-        InvalidParameter: a value of the filter cannot be calculated with.
+        InvalidParameter: the database cannot evaluate the filter, such as a division by zero.
     """
     try:
-        found = pages.page(connection, asked.selection, kind, asked.after, asked.limit)
-        matched = _matched(connection, asked, found.last, found.returned)
+        text = pages.page(connection, query.selection, form, query.after, query.limit)
+        matched = _matched(connection, query, text.last, text.returned)
     except psycopg.DataError as error:
-        raise _unusable(error) from error
-    return Answer(found.body, found.returned, matched, _next(asked, found.last, matched, secret))
+        raise _invalid_filter(error) from error
+    return FeaturePage(text.body, text.returned, matched, _next(query, text.last, matched, secret))
 
 
-def table(connection: Connection, asked: ResolvedQuery, secret: bytes) -> tuple[FeatureTable, Answer]:
-    """A page as columns, for the formats that hold columns."""
-    selection = asked.selection
+def table(
+    connection: Connection, query: ResolvedQuery, secret: bytes
+) -> tuple[FeatureTable, FeaturePage]:
+    """A page as columns, for column formats.
+
+    Raises:
+        InvalidParameter: the database cannot evaluate the filter.
+    """
+    selection = query.selection
     try:
-        text = pages.copy_csv(connection, selection, asked.after, asked.limit)
+        text = pages.copy_csv(connection, selection, query.after, query.limit)
     except psycopg.DataError as error:
-        raise _unusable(error) from error
+        raise _invalid_filter(error) from error
     columns = [
         Column(item.name, "text" if item.is_time else item.type)
         for item in (selection.collection.key, *selection.properties)
     ]
-    read, last_keys = read_feature_csv(
-        text, columns, selection.collection.geometry_type, selection.crs.srid, asked.limit
+    features, last_keys = read_feature_csv(
+        text, columns, selection.collection.geometry_type, selection.crs.srid, query.limit
     )
     last = None if last_keys is None else tuple(json.loads(last_keys))
-    matched = _matched(connection, asked, last, len(read))
-    return read, Answer(b"", len(read), matched, _next(asked, last, matched, secret))
+    matched = _matched(connection, query, last, len(features))
+    next_token = _next(query, last, matched, secret)
+    return features, FeaturePage(b"", len(features), matched, next_token)
 
 
-def stream(connection: Connection, asked: ResolvedQuery, secret: bytes) -> Iterator[bytes | Answer]:
-    """The features of a large page as GeoJSON, in pieces; the last thing is the answer about them."""
+def stream(connection: Connection, query: ResolvedQuery, secret: bytes) -> Iterator[bytes | FeaturePage]:
+    """The features of a large page as GeoJSON, in pieces; the last item is the `FeaturePage`."""
     reading = Reading()
-    yield from pages.stream_geojson(connection, asked.selection, asked.after, asked.limit, reading)
-    matched = _matched(connection, asked, reading.last, reading.returned)
-    yield Answer(b"", reading.returned, matched, _next(asked, reading.last, matched, secret))
+    yield from pages.stream_geojson(connection, query.selection, query.after, query.limit, reading)
+    matched = _matched(connection, query, reading.last, reading.returned)
+    next_token = _next(query, reading.last, matched, secret)
+    yield FeaturePage(b"", reading.returned, matched, next_token)
 
 
 def find_feature(
     connection: Connection, collection: Collection, viewer: Viewer, reference: str, crs: str | None
 ) -> tuple[str, Crs]:
-    """One feature as GeoJSON text, and its reference system.
+    """One feature as GeoJSON text, and its coordinate reference system.
 
     Raises:
-        NotFound: there is no such feature, or not for this caller.
+        NotFound: there is no such feature, or the viewer may not see it.
     """
-    chosen = crs_of("crs", crs, collection) if crs else collection.storage_crs
-    selection = Selection(collection, viewer, chosen, collection.properties)
-    found = None if "\0" in reference else pages.find(connection, selection, reference)
-    if found is None:
+    chosen_crs = crs_of("crs", crs, collection) if crs else collection.storage_crs
+    selection = Selection(collection, viewer, chosen_crs, collection.properties)
+    feature = None if "\0" in reference else pages.find(connection, selection, reference)
+    if feature is None:
         raise NotFound(f"no feature {reference:.100} in {collection.id}")
-    return found, chosen
+    return feature, chosen_crs
 
 
 def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tuple[float, ...] | None:
-    """West, south, east, north of what the viewer may see of a collection, None without any."""
-    # Points lie in the outlines of their blocks, which are fewer; so do cells, to a tenth of a degree.
-    whose = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
-    return counts.extent(connection, whose, viewer if whose is collection else Viewer())
+    """West, south, east, north of the features that the viewer may see; None if there are none."""
+    # Points and cells lie in the outlines of their blocks, which are fewer: cells to 0.1 degrees.
+    bounding = BLOCKS if collection in (POINTS, DENSITY, HISTORY) else collection
+    return counts.extent(connection, bounding, viewer if bounding is collection else Viewer())
 
 
 def period(
     connection: Connection, collection: Collection, viewer: Viewer
 ) -> tuple[datetime | None, datetime | None]:
-    """The first and the last time of what the viewer may see of scenes; unknown for the others."""
+    """The first and the last time of the scenes that the viewer may see; None for other collections."""
     if collection is not SCENES:
         return None, None
     return counts.period(connection, collection, viewer)
 
 
 def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
-    """All features in a box, as anybody sees them.
+    """All features in a box that a caller without a token may see.
 
     Raises:
         InvalidParameter: the box cannot be used.
@@ -142,29 +150,29 @@ def everything_in(collection: Collection, bbox: str | None = None) -> Selection:
     return Selection(collection, Viewer(), collection.storage_crs, collection.properties, condition)
 
 
-def _matched(connection: Connection, asked: ResolvedQuery, last: Key | None, returned: int) -> Count:
-    """How many match; a first page that holds them all has counted them already."""
-    if asked.matched is not None:
-        return asked.matched
-    if last is None and asked.after is None:
-        return Count(returned, exact=True)
-    return counts.count(connection, asked.selection)
-
-
-def _next(asked: ResolvedQuery, last: Key | None, matched: Count, secret: bytes) -> str | None:
-    return None if last is None else format_token(last, matched, asked.fingerprint, secret)
-
-
-def _unusable(error: psycopg.DataError) -> InvalidParameter:
-    said = error.diag.message_primary or str(error)
-    return InvalidParameter(f"filter: {said:.200}")
-
-
 def page_secret(connection: Connection) -> bytes:
-    """What the installation signs the links to further pages with."""
+    """The secret that signs page tokens."""
     return pages.page_secret(connection)
 
 
 def csv_header(selection: Selection) -> str:
-    """The names of the columns of CSV."""
+    """The header line of CSV."""
     return serialization.csv_header(selection)
+
+
+def _matched(connection: Connection, query: ResolvedQuery, last: Key | None, returned: int) -> Count:
+    """The number of matching features; taken from the token or from a first page that has them all."""
+    if query.matched is not None:
+        return query.matched
+    if last is None and query.after is None:
+        return Count(returned, exact=True)
+    return counts.count(connection, query.selection)
+
+
+def _next(query: ResolvedQuery, last: Key | None, matched: Count, secret: bytes) -> str | None:
+    return None if last is None else format_token(last, matched, query.fingerprint, secret)
+
+
+def _invalid_filter(error: psycopg.DataError) -> InvalidParameter:
+    message = error.diag.message_primary or str(error)
+    return InvalidParameter(f"filter: the database cannot evaluate it: {message:.200}")

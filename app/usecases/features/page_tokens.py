@@ -1,4 +1,4 @@
-"""Where the next page of an answer begins, signed, so that a link leads nowhere else."""
+"""Signed tokens in the links to next pages: the last feature of the page before, and the total count."""
 
 import base64
 import hmac
@@ -10,12 +10,12 @@ from app.errors import InvalidParameter
 
 
 def format_token(last: Key, matched: Count, fingerprint: str, secret: bytes) -> str:
-    """The place after a feature in the answer to one question of one caller.
+    """The token of the page after a feature.
 
     Args:
-        last: the values that order features, of the last one on the page before.
-        matched: how many features all pages have.
-        fingerprint: of the question and the caller.
+        last: key of the last feature of the page before: its values of the sort properties.
+        matched: number of features on all pages.
+        fingerprint: of the query and the caller; the token is valid for these alone.
         secret: of the installation.
     """
     packed = json.dumps([last, matched.number, matched.exact], separators=(",", ":")).encode()
@@ -23,10 +23,10 @@ def format_token(last: Key, matched: Count, fingerprint: str, secret: bytes) -> 
 
 
 def parse_token(token: str, fingerprint: str, secret: bytes) -> tuple[Key, Count]:
-    """The place that a token means: the last feature before it, and how many features there are.
+    """The key of the last feature before a page, and the number of features on all pages.
 
     Raises:
-        InvalidParameter: it was not given for this question.
+        InvalidParameter: the token was not issued for this query and caller.
     """
     try:
         raw = base64.b64decode(token.encode("ascii"), altchars=b"-_", validate=True)
@@ -34,11 +34,13 @@ def parse_token(token: str, fingerprint: str, secret: bytes) -> tuple[Key, Count
         raw = b""
     seal, packed = raw[:16], raw[16:]
     if not hmac.compare_digest(seal, _seal(packed, fingerprint, secret)):
-        raise InvalidParameter(f"token: {token!r:.100} is not of this query; follow the link `next`")
+        raise InvalidParameter(
+            f"token: {token!r:.100} does not belong to this query; follow the link `next` of its replies"
+        )
     last, number, exact = json.loads(packed)
     return tuple(last), Count(number, exact)
 
 
 def _seal(packed: bytes, fingerprint: str, secret: bytes) -> bytes:
-    """Signs a place in the answer to one question of one caller."""
+    """The signature of a token for one query of one caller."""
     return hmac.digest(secret, fingerprint.encode() + packed, "sha256")[:16]

@@ -1,4 +1,4 @@
-"""Asking for control points: pages of a box, one point, its chips."""
+"""Control points of published blocks: those of a box, single points, and their chips."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -27,11 +27,11 @@ from services.types import Acquisition, ChipSource, ControlPoints
 StackFormat = Literal["npz", "tif"]
 ALL = 2**40
 MOST_POINTS_WITH_CHIPS = 1_000
-"""Points whose chips are sent at once: 8 views of 16 bits each are 163 MB."""
+"""Largest number of points in one reply with chips: with 8 views of 16 bits each it has 163 MB."""
 
 
 def count_points(connection: Connection, bbox: str) -> Count:
-    """How many published points a box holds: exact up to 10,000, an estimate beyond."""
+    """The number of published points in a box: exact up to 10,000, an estimate beyond."""
     return counts.count(connection, everything_in(POINTS, bbox))
 
 
@@ -56,20 +56,22 @@ def csv(connection: Connection, bbox: str) -> Iterator[bytes]:
 
 
 def points_of_ids(connection: Connection, ids: Sequence[int]) -> ControlPoints:
-    """Some published points, with their views.
+    """The published points with these ids, with their views.
 
     Raises:
-        InvalidParameter: there are too many.
-        NotFound: there is not every one of them; the first that are missing are named.
+        InvalidParameter: there are too many ids.
+        NotFound: some points do not exist; the message names the first ten of them.
     """
-    asked = sorted(set(ids))
-    if len(asked) > MOST_POINTS_WITH_CHIPS:
-        raise InvalidParameter(f"ids: {len(asked)} points, {MOST_POINTS_WITH_CHIPS} at most")
-    found = points.points_of_ids(connection, [one for one in asked if abs(one) < 2**63]).points
-    missing = sorted(set(asked) - set(found.id.tolist()))
+    requested = sorted(set(ids))
+    if len(requested) > MOST_POINTS_WITH_CHIPS:
+        raise InvalidParameter(
+            f"ids: {len(requested)} points found, at most {MOST_POINTS_WITH_CHIPS} expected"
+        )
+    published = points.points_of_ids(connection, [id_ for id_ in requested if abs(id_) < 2**63]).points
+    missing = sorted(set(requested) - set(published.id.tolist()))
     if missing:
         raise NotFound(f"no point {', '.join(map(str, missing[:10]))}{' …' * (len(missing) > 10)}")
-    return found
+    return published
 
 
 def points_of_filter(connection: Connection, query: FeatureFilter) -> ControlPoints:
@@ -89,15 +91,15 @@ def points_of_filter(connection: Connection, query: FeatureFilter) -> ControlPoi
 
 
 def stream_chips(points: ControlPoints, chips: ChipSource, form: StackFormat) -> Iterator[bytes]:
-    """All chips of points with what they show, in pieces: a NumPy archive, or a GeoTIFF of many pages.
+    """All chips of points with their metadata, in pieces: a NumPy archive, or a GeoTIFF of many pages.
 
     Raises:
-        NotFound: a GeoTIFF without any page is none.
+        NotFound: there are no points, and a GeoTIFF has at least one page.
     """
     if form == "npz":
         return stream_chips_npz(points, chips)
     if not len(points.id):
-        raise NotFound("no chips here, and no GeoTIFF without a page; ask for npz")
+        raise NotFound("no points match, and a GeoTIFF needs at least one page; request f=npz instead")
     return stream_chips_tiff(points, chips)
 
 
@@ -107,25 +109,25 @@ def find_point(connection: Connection, point_id: int) -> PointDetail:
     Raises:
         NotFound: there is no such point, or its block is not published.
     """
-    found = point_detail.find_point(connection, point_id) if abs(point_id) < 2**63 else None
-    if found is None:
+    point = point_detail.find_point(connection, point_id) if abs(point_id) < 2**63 else None
+    if point is None:
         raise NotFound(f"no point {point_id}")
-    return found
+    return point
 
 
 def read_chips(chips: ChipSource, point: PointDetail) -> LabelledChips:
-    """The chips of a point with what they show."""
+    """The chips of a point with their metadata."""
     return _labelled(chips, point, point.views)
 
 
 def read_chip(chips: ChipSource, point: PointDetail, view: int) -> LabelledChips:
-    """One chip of a point with what it shows.
+    """One chip of a point with its metadata.
 
     Raises:
         NotFound: the point has no such view.
     """
     if not 0 <= view < len(point.views):
-        raise NotFound(f"point {point.id} has views 0 to {len(point.views) - 1}, not {view}")
+        raise NotFound(f"point {point.id} has no view {view}: expected 0 to {len(point.views) - 1}")
     return _labelled(chips, point, point.views[view : view + 1])
 
 

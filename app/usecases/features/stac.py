@@ -34,7 +34,7 @@ RESULTS = {
     "control_points.geojson": "control-points",
     "residuals.gpkg": "residuals",
 }
-"""Results that go by a name of their own among the assets; the others go by that of their file."""
+"""Asset keys of results; other results have their file name as key."""
 
 Item = dict[str, Any]
 
@@ -46,9 +46,9 @@ def stac_items(connection: Connection, features: bytes, base: str) -> list[Item]
         features: GeoJSON, separated by commas; longitude first, all properties.
         base: address of the service, with a slash at its end.
     """
-    found: list[Item] = json.loads(b"[" + features + b"]")
-    files = read_scene_files(connection, [UUID(feature["id"]) for feature in found])
-    return [_item(feature, files[UUID(feature["id"])], base) for feature in found]
+    parsed: list[Item] = json.loads(b"[" + features + b"]")
+    files = read_scene_files(connection, [UUID(feature["id"]) for feature in parsed])
+    return [_item(feature, files[UUID(feature["id"])], base) for feature in parsed]
 
 
 def scene_media_type(name: str) -> str:
@@ -57,8 +57,8 @@ def scene_media_type(name: str) -> str:
 
 
 def _item(feature: Item, files: SceneFiles, base: str) -> Item:
-    here = f"{base}collections/{COLLECTION}"
-    own = f"{here}/items/{feature['id']}"
+    collection_url = f"{base}collections/{COLLECTION}"
+    item_url = f"{collection_url}/items/{feature['id']}"
     box = _bbox(feature["geometry"])
     return {
         "type": "Feature",
@@ -71,32 +71,32 @@ def _item(feature: Item, files: SceneFiles, base: str) -> Item:
         "collection": COLLECTION,
         "assets": _assets(files, base),
         "links": [
-            {"rel": "self", "href": own, "type": "application/geo+json"},
-            {"rel": "alternate", "href": f"{own}?f=html", "type": "text/html"},
-            {"rel": "parent", "href": here, "type": "application/json"},
-            {"rel": "collection", "href": here, "type": "application/json"},
+            {"rel": "self", "href": item_url, "type": "application/geo+json"},
+            {"rel": "alternate", "href": f"{item_url}?f=html", "type": "text/html"},
+            {"rel": "parent", "href": collection_url, "type": "application/json"},
+            {"rel": "collection", "href": collection_url, "type": "application/json"},
             {"rel": "root", "href": base, "type": "application/json"},
         ],
     }
 
 
-def _properties(known: dict[str, Any]) -> dict[str, Any]:
-    """What is known; a scene in its own geometry has no reference system, and says so."""
-    told = {name: value for name, value in known.items() if value is not None}
-    shape = [known["amers:lines"], known["amers:samples"]]
-    return {**told, "proj:code": None, **({} if None in shape else {"proj:shape": shape})}
+def _properties(columns: dict[str, Any]) -> dict[str, Any]:
+    """The properties that have values; `proj:code` is null because a scene lies on no map."""
+    properties = {name: value for name, value in columns.items() if value is not None}
+    shape = [columns["amers:lines"], columns["amers:samples"]]
+    return {**properties, "proj:code": None, **({} if None in shape else {"proj:shape": shape})}
 
 
 def _bbox(geometry: dict[str, Any] | None) -> list[float] | None:
     """West, south, east, north of an outline; west is greater than east across the antimeridian."""
     if geometry is None:
         return None
-    whole = geometry["type"] == "Polygon"
-    polygons = [geometry["coordinates"]] if whole else geometry["coordinates"]
+    is_single = geometry["type"] == "Polygon"
+    polygons = [geometry["coordinates"]] if is_single else geometry["coordinates"]
     lon, lat = zip(*(position for rings in polygons for position in rings[0]), strict=True)
-    # What is in parts was cut at 180 degrees.
-    west = min(lon) if whole else min(value for value in lon if value > 0.0)
-    east = max(lon) if whole else max(value for value in lon if value < 0.0)
+    # A MultiPolygon is an outline that was cut at 180 degrees.
+    west = min(lon) if is_single else min(value for value in lon if value > 0.0)
+    east = max(lon) if is_single else max(value for value in lon if value < 0.0)
     return [west, min(lat), east, max(lat)]
 
 
@@ -110,7 +110,7 @@ def _assets(files: SceneFiles, base: str) -> dict[str, dict[str, Any]]:
         title = "A file delivered beside the image."
         assets[name] = _asset(f"{scene}/{name}", scene_media_type(name), title, "metadata")
     for name in files.results:
-        title = OUTPUTS.get(name, "The refined model as the scene has it.")
+        title = OUTPUTS.get(name, "The refined model in the format of the delivered one.")
         href = f"{base}jobs/{files.job_id}/results/{name}"
         key = RESULTS.get(name, name)
         assets[key if key not in assets else f"refined-{key}"] = _asset(

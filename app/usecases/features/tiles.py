@@ -1,4 +1,4 @@
-"""Vector tiles of the collections that are looked at on a map."""
+"""Vector tiles of the collections that the map page shows."""
 
 from app.db import tiles
 from app.db.engine import Connection
@@ -10,16 +10,16 @@ MATRIX_SET = "WebMercatorQuad"
 MOST_ZOOM = 24
 
 
-def tile(connection: Connection, collection: str, z: int, y: int, x: int, viewer: Viewer) -> bytes:
-    """A Mapbox vector tile whose layer has the name of the collection; no bytes where there is nothing.
+def tile(connection: Connection, collection: str, z: int, y: int, x: int, *, viewer: Viewer) -> bytes:
+    """A Mapbox vector tile with one layer, named like the collection; empty where there is no feature.
 
     Raises:
-        NotFound: the collection has no tiles, or there is no such tile.
+        NotFound: the collection has no tiles, or the tile lies outside of the tile matrix.
     """
     refuse_untiled(collection)
     if not 0 <= z <= MOST_ZOOM or not (0 <= x < 2**z and 0 <= y < 2**z):
         raise NotFound(
-            f"no tile {z}/{y}/{x}: zooms are 0 to {MOST_ZOOM}, rows and columns 0 to 2^zoom - 1"
+            f"no tile {z}/{y}/{x}: expected zoom 0 to {MOST_ZOOM}, row and column 0 to 2^zoom - 1"
         )
     if collection == "points":
         return tiles.point_tile(connection, z, x, y)
@@ -29,7 +29,7 @@ def tile(connection: Connection, collection: str, z: int, y: int, x: int, viewer
 
 
 def version(connection: Connection) -> str:
-    """Changes whenever what tiles show does."""
+    """A text that changes whenever the content of any tile changes."""
     return tiles.version(connection)
 
 
@@ -37,7 +37,7 @@ def refuse_untiled(collection: str) -> None:
     """Refuse a collection without tiles.
 
     Raises:
-        NotFound: it has none.
+        NotFound: it has no tiles.
     """
     if collection not in TILED:
-        raise NotFound(f"no tiles of {collection}: there are tiles of {', '.join(TILED)}")
+        raise NotFound(f"no tiles of {collection}: expected one of {', '.join(TILED)}")
