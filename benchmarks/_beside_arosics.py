@@ -16,7 +16,8 @@ from benchmarks._measuring import memory_mib
 from services.formats.images.scenes import read_scene
 from services.imagery.source import Window
 from services.matching.reference_image import Reference
-from services.registration.on_reference import ReferenceOptions, register_on_reference
+from services.registration.on_reference import register_on_reference
+from services.registration.options import ReferenceOptions
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.simulation.world import make_world

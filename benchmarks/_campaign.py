@@ -12,7 +12,8 @@ from services.adjustment.intersection import move_metres
 from services.errors import AmersError
 from services.imagery.scene import Scene
 from services.quality.accuracy import CIRCULAR_CE90, accuracy, normalised_error
-from services.registration.on_points import Registration, RegistrationOptions, register_scene
+from services.registration.on_points import Registration, register_scene
+from services.registration.options import RegistrationOptions
 from services.simulation.conditions import Conditions
 from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView
@@ -175,10 +176,10 @@ def _judged(world: World, prepared: Prepared, registration: Registration, cpu_s:
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
         verdict=quality.verdict,
-        reason="; ".join(c.name for c in quality.criteria if not c.passed),
-        visible=quality.equipment.visible,
-        matched=quality.equipment.matched,
-        active=quality.equipment.active,
+        reason="; ".join(c.name for c in quality.criteria if not c.met),
+        visible=quality.point_counts.visible,
+        matched=quality.point_counts.matched,
+        active=quality.point_counts.active,
         order=registration.adjustment.order,
         ce90_before_m=ce90_m(before),
         ce90_m=ce90_m(error),

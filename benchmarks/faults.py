@@ -81,7 +81,7 @@ class Caller:
         name = f"/scenes?name=scene.tif&sigma_m={SIGMA_M}"
         scene = self._promised(self.ask("POST", name, content=image))["id"]
         self.scenes[scene] = hashlib.sha256(image).hexdigest()
-        body = {"inputs": {"scene": scene, "options": {"fine_passes": passes}}}
+        body = {"inputs": {"scene": scene, "options": {"fine_stages": passes}}}
         path = "/processes/register-scene/execution"
         job = self._promised(self.ask("POST", path, json=body, headers={"Idempotency-Key": key}))
         self.jobs[job["jobID"]] = scene

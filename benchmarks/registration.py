@@ -44,7 +44,8 @@ from services.formats.images.scenes import read_scene
 from services.geodesy import metres_per_degree
 from services.matching.control_points import MatchingOptions
 from services.quality.accuracy import accuracy
-from services.registration.on_points import Registration, RegistrationOptions, register_scene
+from services.registration.on_points import Registration, register_scene
+from services.registration.options import RegistrationOptions
 from services.sensors.correction import CorrectedModel, ImageCorrection
 from services.types import Array
 

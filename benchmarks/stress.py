@@ -29,7 +29,7 @@ from benchmarks._measuring import RESULTS, keep
 from benchmarks._stress_figure import draw_figure
 from benchmarks._trials import Trial, draw_trial, in_order_of_places, nominal_trial
 from benchmarks._worlds import NOMINAL, PLACES, block_of
-from services.registration.on_points import RegistrationOptions
+from services.registration.options import RegistrationOptions
 
 OPTIONS = RegistrationOptions(max_points=120)
 NOMINAL_OPTIONS = RegistrationOptions()

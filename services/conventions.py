@@ -26,3 +26,7 @@ Azimuths count clockwise from north; `azimuth_deg` of a view points from the gro
 
 CHIP_SIZE = 101
 CHIP_CENTRE = 50
+
+MAX_ERROR_SIGMAS = 3.0
+"""Largest error that is expected, in standard deviations. A model may be wrong by this many times its
+sigma: search radii, margins and footprints reach that far."""

@@ -212,6 +212,12 @@ class Measures:
     active: BoolArray
     reason: npt.NDArray[np.str_]
 
+    def status(self, row: int) -> str:
+        """The status of a point: "active", "deactivated" or "not matched"."""
+        if self.active[row]:
+            return "active"
+        return "deactivated" if self.matched[row] else "not matched"
+
 
 @dataclass(frozen=True)
 class ViewMeasures:

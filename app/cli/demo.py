@@ -60,14 +60,14 @@ def _private_store() -> Iterator[Settings]:
 
 
 def _record(outcome: DemoOutcome) -> Row:
-    equipment = outcome.registration.qualification.equipment
+    counts = outcome.registration.qualification.point_counts
     return {
         "points produced": outcome.produced,
         "points ingested": outcome.ingested,
         "points served in the footprint": outcome.served,
-        "points visible": equipment.visible,
-        "points matched": equipment.matched,
-        "points active": equipment.active,
+        "points visible": counts.visible,
+        "points matched": counts.matched,
+        "points active": counts.active,
         "injected error at the centre, east, north (m)": _metres(outcome.injected_m),
         "the same in the block's frame (m)": _metres(outcome.to_recover_m),
         "recovered error (m)": _metres(outcome.recovered_m),

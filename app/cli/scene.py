@@ -22,7 +22,7 @@ from app.usecases.registration.reference_source import ReferenceFiles, this_refe
 from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
-from services.registration.on_points import RegistrationOptions
+from services.registration.options import RegistrationOptions
 from services.reports.document import report_document
 from services.types import Progress
 
@@ -258,13 +258,13 @@ def _one(do: Register, files: SceneFiles, folder: Path, copy_image: bool) -> dic
         return ComputationError(
             f"{files.image}: registered, but not to be trusted: see {folder / 'report.html'}"
         )
-    equipment, correction = report["equipment"], report["correction"]
+    counts, correction = report["point_counts"], report["correction"]
     return {
         "scene": files.image,
         "verdict": report["verdict"],
-        "visible": equipment["visible"],
-        "matched": equipment["matched"],
-        "active": equipment["active"],
+        "visible": counts["visible"],
+        "matched": counts["matched"],
+        "active": counts["active"],
         "correction": correction["order"],
         "shift_px": correction["shift_px"],
         "shift_m": correction["shift_m"],

@@ -18,7 +18,8 @@ from services.formats.images.raster import write_raster
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.production.from_images import Production, ProductionOptions
 from services.quality.accuracy import Quantile, sample_quantile
-from services.registration.on_points import Registration, RegistrationOptions
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
 from services.simulation.view import (
     SimulatedView,
     ViewPlan,

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from services.adjustment.robust import MAD_TO_STD, cauchy_weights, deactivate, likeliest_variance
+from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import NotEnoughPoints
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
@@ -22,7 +23,7 @@ _FREE = {
 ORDERS: tuple[Order, ...] = ("shift", "drift", "affine")
 
 _MUCH_BETTER = 0.5
-"""Residuals this small, in units of what is declared, are no chance: points are better than declared."""
+"""Below this ratio of residuals to declared sigmas, the points are better than declared."""
 
 
 @dataclass(frozen=True)
@@ -30,20 +31,19 @@ class AdjustmentOptions:
     """How a scene is adjusted.
 
     Attributes:
-        order: of the correction; None lets cross-validation say which one is needed, and estimates drift
-            and skew as far as the measures tell them whatever it says.
-        tolerance: a measure leaves when its residual exceeds so many standard deviations.
-        min_points: fewer active measures than this are not an adjustment.
-        points_per_parameter: an order is considered from so many measures a parameter on.
-        min_spread: an order beyond the shift is considered when the measures spread over the image
-            with at least this standard deviation along each axis, in half sizes of the image (an even
-            spread has 0.58).
-        min_gain: an order replaces a simpler one when it lowers the cross-validated residual by
-            this fraction.
+        order: of the correction; None selects it by cross-validation. Drift and skew are then estimated
+            whatever the order, as far as the measures determine them.
+        tolerance: a measure is deactivated when its residual exceeds this many standard deviations.
+        min_points: smallest number of active measures.
+        points_per_parameter: measures for each parameter that an order needs to be considered.
+        min_spread: spread of the measures that an order beyond the shift needs: standard deviation along
+            each axis, in half sizes of the image (an even spread has 0.58).
+        min_gain: an order replaces a simpler one when it reduces the cross-validated residual by this
+            fraction.
         folds: of the cross-validation.
-        prior_slope_sigma_px: standard deviation of drift and skew at the edge of the image before any
-            measure is made, pixels; the measures may raise it, never lower it.
-        slope_px: the same where the order is given; None leaves them to the measures.
+        prior_slope_sigma_px: a priori standard deviation of drift and skew at the edge of the image,
+            pixels; the measures may raise it, never lower it.
+        slope_px: the same where the order is given; None leaves drift and skew to the measures.
     """
 
     order: Order | None = None
@@ -56,22 +56,50 @@ class AdjustmentOptions:
     prior_slope_sigma_px: float = 1.0
     slope_px: float | None = None
 
+    def repeating(self, adjustment: "SceneAdjustment") -> "AdjustmentOptions":
+        """Options that repeat an adjustment on other measures, with the same prior of drift and skew."""
+        if self.order is not None:
+            return self
+        return replace(self, order="affine", slope_px=adjustment.slope_px)
+
+
+@dataclass(frozen=True)
+class ControlObservations:
+    """Where n control points were seen in a scene, and the precision of points and measures.
+
+    Attributes:
+        lon_lat_h: (n, 3) the points.
+        line_sample: (n, 2) the measures; NaN where a point was not found.
+        sigma_px: (n,) of the measures.
+        covariance_m2: (n, 3, 3) of the points, east, north, up.
+        usable: (n,) measures that may be used; all finite measures when None.
+        common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to the
+            covariance of the shift. None when there is no such error.
+    """
+
+    lon_lat_h: Array
+    line_sample: Array
+    sigma_px: Array
+    covariance_m2: Array
+    usable: BoolArray | None = None
+    common_covariance_px2: Array | None = None
+
 
 @dataclass(frozen=True)
 class SceneAdjustment:
-    """A correction and how sure it is.
+    """A correction and its precision.
 
     Attributes:
         correction: of the scene's model.
-        order: the simplest that predicts held-out measures as well as any, or the one that was given.
+        order: the simplest order that predicts held-out measures as well as any, or the order given.
         validation_px: every order tried, with its cross-validated residual (rms distance, pixels).
-        slope_px: standard deviation at the edge of the image that drift and skew were expected to have.
+        slope_px: a priori standard deviation of drift and skew at the edge of the image, as used.
         covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that a given
             order leaves out.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
-        point_sigma_px: (2,) what the points' own accuracy lets expect of the active residuals, one
+        point_sigma_px: (2,) contribution of the points' own accuracy to the active residuals, one
             standard deviation of line and sample.
     """
 
@@ -96,50 +124,43 @@ class SceneAdjustment:
 def adjust_scene(
     model: SensorModel,
     shape: tuple[int, int],
-    lon_lat_h: Array,
-    line_sample: Array,
-    sigma_px: Array,
-    covariance_m2: Array,
+    observations: ControlObservations,
     options: AdjustmentOptions = AdjustmentOptions(),
-    candidates: BoolArray | None = None,
-    common_covariance_px2: Array | None = None,
+    *,
+    min_points: int | None = None,
 ) -> SceneAdjustment:
-    """Find the correction of a model that best explains where control points were seen.
+    """The correction of a model that best explains where control points were seen.
 
-    Weighted least squares on `line_sample - model.project(lon_lat_h)`. Weights come from each
-    measure's own sigma and from its point's covariance seen in the image, or from less of that where the
-    measures show their points to be much better than declared. Robust weights find a first
-    solution; then the worst measure beyond tolerance leaves, one at a time, until all agree.
+    Weighted least squares on `line_sample - model.project(lon_lat_h)`. The weight of a measure follows
+    from its sigma and from the covariance of its point, projected to the image; where the measures show
+    that the points are much better than declared, a smaller covariance is used. Robust weights give a
+    first solution. Then the worst measure beyond tolerance is deactivated, one at a time, until all
+    agree.
 
-    Drift and skew too small to be seen beside the errors of the points are still there. They are not
-    held at zero but expected to be small: how small is learned from how they come out (empirical
-    Bayes), and their covariance says what is left open.
+    Drift and skew that are too small to be seen beside the errors of the points still exist. They are
+    not fixed at zero: their a priori standard deviation is estimated from the measures (empirical
+    Bayes), and their covariance states what remains undetermined.
 
     Args:
         model: as delivered.
         shape: lines and samples of the image.
-        lon_lat_h: (n, 3) where the points are.
-        line_sample: (n, 2) where they were seen.
-        sigma_px: (n,) of the measures.
-        covariance_m2: (n, 3, 3) of the points, east, north, up.
+        observations: of the control points.
         options: thresholds.
-        candidates: (n,) measures that may be used; all that are finite when None.
-        common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to that
-            of the shift.
+        min_points: smallest number of active measures; that of the options when None.
 
     Raises:
-        NotEnoughPoints: when fewer than `min_points` measures are usable, before or after deactivation.
+        NotEnoughPoints: fewer than `min_points` measures are usable.
     """
-    misfit = line_sample - model.project(lon_lat_h)
+    line_sample, sigma_px = observations.line_sample, observations.sigma_px
+    min_points = options.min_points if min_points is None else min_points
+    misfit = line_sample - model.project(observations.lon_lat_h)
     usable = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
-    if candidates is not None:
-        usable &= candidates
-    if usable.sum() < options.min_points:
-        raise NotEnoughPoints(
-            int(usable.sum()), options.min_points, "measures with a position and a sigma"
-        )
-    derivative = np.nan_to_num(model.project_derivative(lon_lat_h))
-    covariance_px2 = derivative @ covariance_m2 @ derivative.transpose(0, 2, 1)
+    if observations.usable is not None:
+        usable &= observations.usable
+    if usable.sum() < min_points:
+        raise NotEnoughPoints(int(usable.sum()), min_points, "measures with a position and a sigma")
+    derivative = np.nan_to_num(model.project_derivative(observations.lon_lat_h))
+    covariance_px2 = derivative @ observations.covariance_m2 @ derivative.transpose(0, 2, 1)
     own = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2
     of_points = np.diagonal(covariance_px2, 0, 1, 2)
     frame = no_correction(shape)
@@ -160,16 +181,16 @@ def adjust_scene(
 
     def magnitude(active: BoolArray) -> Array:
         parameters, _ = problem.solution(active, free, slope_px)
-        # The scale of the robust start: one that followed the survivors would shrink with them.
+        # The scale is that of the robust start: a scale of the active measures would shrink with them.
         return np.asarray(problem.magnitude(parameters) / scale)
 
-    active = deactivate(magnitude, agreeing, options.tolerance, options.min_points)
+    active = deactivate(magnitude, agreeing, options.tolerance, min_points)
     sigma0 = declared.sigma0(active, free, slope_px)
     parameters, _ = problem.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
-    # Stated sigmas are not made smaller by a lucky fit, only larger by a bad one.
+    # A good fit does not reduce the stated sigmas; a bad fit increases them.
     _, covariance = declared.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
-    if common_covariance_px2 is not None:
-        covariance[np.ix_([0, 3], [0, 3])] += common_covariance_px2
+    if observations.common_covariance_px2 is not None:
+        covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
     return SceneAdjustment(
         correction=ImageCorrection(parameters, frame.centre, frame.half_size),
         order=order,
@@ -185,7 +206,7 @@ def adjust_scene(
 
 @dataclass(frozen=True)
 class _Problem:
-    """Misfits to be explained by an affine displacement; the two coordinates are independent.
+    """Misfits that an affine displacement has to explain; the two coordinates are independent.
 
     Attributes:
         t: (n, 2) positions, -1 to 1 over the image.
@@ -200,7 +221,7 @@ class _Problem:
     def with_empirical_variance(
         self, parameters: Array, active: BoolArray, of_points: Array
     ) -> "_Problem":
-        """The same with the variances that residuals much smaller than declared show."""
+        """The same problem with smaller variances, where residuals are much smaller than declared."""
         if self.scale(parameters, active) >= _MUCH_BETTER:
             return self
         variance = self.variance.copy()
@@ -209,7 +230,7 @@ class _Problem:
         return replace(self, variance=variance)
 
     def scaled_by_sigma0(self, sigma0: float) -> "_Problem":
-        """The same with variances larger by a standard deviation of unit weight above 1."""
+        """The same problem with its variances multiplied by sigma0 squared, where sigma0 exceeds 1."""
         return replace(self, variance=self.variance * max(sigma0, 1.0) ** 2)
 
     def solution(
@@ -219,7 +240,7 @@ class _Problem:
         slope_px: float = np.inf,
         weights: Array | None = None,
     ) -> tuple[Array, Array]:
-        """Parameters (2, 3), covariance (6, 6); drift and skew are expected within `slope_px`."""
+        """Parameters (2, 3) and covariance (6, 6), with an a priori sigma of drift and skew."""
         design = np.column_stack([np.ones(len(self.t)), self.t])[active]
         # Both coordinates have as many free parameters in every order: they are solved at once.
         columns = np.array([np.flatnonzero(of_one) for of_one in free])
@@ -230,21 +251,21 @@ class _Problem:
         expected = np.where(columns > 0, slope_px**-2.0, 0.0)[:, :, None] * np.eye(columns.shape[1])
         weighted = a * weight[:, None, :]
         inverse = np.linalg.pinv(weighted @ a.transpose(0, 2, 1) + expected, hermitian=True)
-        found = inverse @ (weighted @ self.misfit[active].T[:, :, None])
+        solved = inverse @ (weighted @ self.misfit[active].T[:, :, None])
         parameters = np.zeros((2, 3))
         covariance = np.zeros((6, 6))
         for k in range(2):
-            parameters[k, columns[k]] = found[k, :, 0]
+            parameters[k, columns[k]] = solved[k, :, 0]
             covariance[np.ix_(3 * k + columns[k], 3 * k + columns[k])] = inverse[k]
         return parameters, covariance
 
     def likeliest_slope_px(self, active: BoolArray, unit: float, least_px: float) -> float:
-        """Spread of drift and skew under which they are likeliest to come out as they do.
+        """The a priori sigma of drift and skew that makes their estimates most likely.
 
         Args:
             active: (n,) measures.
             unit: standard deviation of unit weight.
-            least_px: smallest spread.
+            least_px: smallest sigma.
         """
         parameters, covariance = self.solution(active, _FREE["affine"])
         slope = parameters[:, 1:].ravel()
@@ -255,12 +276,12 @@ class _Problem:
         return float(spread_px[np.argmax(likelihood)])
 
     def sigma0(self, active: BoolArray, free: BoolArray, slope_px: float) -> float:
-        """Standard deviation of unit weight; 1 where nothing is redundant."""
+        """Standard deviation of unit weight; 1 without redundancy."""
         parameters, covariance = self.solution(active, free, slope_px)
         chi2 = float((self.residual(parameters)[active] ** 2 / self.variance[active]).sum())
-        # A parameter that is known beforehand is no parameter of the measures.
-        known = np.diagonal(covariance)[[1, 2, 4, 5]].sum() / slope_px**2
-        freedom = 2 * int(active.sum()) - int(free.sum()) + known
+        # A parameter that its prior determines is not determined by the measures.
+        prior = np.diagonal(covariance)[[1, 2, 4, 5]].sum() / slope_px**2
+        freedom = 2 * int(active.sum()) - int(free.sum()) + prior
         return float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
 
     def spread(self, active: BoolArray) -> float:
@@ -272,7 +293,7 @@ class _Problem:
         return np.asarray(self.misfit - parameters[:, 0] - self.t @ parameters[:, 1:].T)
 
     def magnitude(self, parameters: Array) -> Array:
-        """(n,) the larger of both normalised residuals."""
+        """(n,) the larger of the two normalised residuals."""
         return np.asarray(np.abs(self.residual(parameters) / np.sqrt(self.variance)).max(axis=1))
 
     def scale(self, parameters: Array, active: BoolArray) -> float:
@@ -281,7 +302,7 @@ class _Problem:
         return float(MAD_TO_STD * np.median(np.abs(normalised)))
 
     def robust_solution(self, active: BoolArray, free: BoolArray) -> Array:
-        """Parameters (2, 3) by re-weighting, from the median shift on."""
+        """Parameters (2, 3) by iterative re-weighting that starts at the median shift."""
         parameters = np.zeros((2, 3))
         parameters[:, 0] = np.median(self.misfit[active], axis=0)
         for _ in range(20):
@@ -297,11 +318,12 @@ class _Problem:
 def _choose_order(
     problem: _Problem, usable: BoolArray, options: AdjustmentOptions
 ) -> tuple[Order, tuple[tuple[Order, float], ...]]:
-    """The simplest order that predicts held-out measures as well as any."""
+    """Simplest order that predicts held-out measures as well as any, and the score of each order."""
     orders = [options.order] if options.order else _considered(problem, usable, options)
-    # All orders are judged by the same measures: those that fit the richest of them.
-    richest = problem.robust_solution(usable, _FREE[orders[-1]])
-    judges = usable & (problem.magnitude(richest) <= 3.0 * max(problem.scale(richest, usable), 1e-9))
+    # All orders are compared on the same measures: those that fit the order with most parameters.
+    fullest = problem.robust_solution(usable, _FREE[orders[-1]])
+    scale = max(problem.scale(fullest, usable), 1e-9)
+    judges = usable & (problem.magnitude(fullest) <= MAX_ERROR_SIGMAS * scale)
     validation = tuple(
         (order, _validation_px(problem, usable, judges, order, options.folds)) for order in orders
     )
@@ -313,7 +335,7 @@ def _choose_order(
 
 
 def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions) -> Sequence[Order]:
-    """Orders that the number and the spread of the measures can carry."""
+    """Orders that the number and the spread of the measures can determine."""
     start = problem.robust_solution(usable, _FREE["shift"])
     agreeing = usable & (problem.magnitude(start) <= 5.0 * max(problem.scale(start, usable), 1e-9))
     count = int(agreeing.sum())
@@ -329,10 +351,10 @@ def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions
 def _validation_px(
     problem: _Problem, usable: BoolArray, judges: BoolArray, order: Order, folds: int
 ) -> float:
-    """Distance (rms, pixels) of the judging measures from where a fit without them expects them."""
+    """Distance (rms, pixels) of the judging measures from the prediction of a fit without them."""
     rows = np.flatnonzero(usable)
     folds = min(folds, len(rows))
-    # Neighbours in the image fall into different folds.
+    # Neighbours in the image go into different folds.
     rank = np.empty(len(rows), dtype=np.int64)
     rank[np.lexsort((problem.t[rows, 1], problem.t[rows, 0]))] = np.arange(len(rows))
     held_out = np.empty((len(rows), 2))

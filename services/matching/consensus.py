@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
+from services.conventions import MAX_ERROR_SIGMAS
 from services.types import Array, BoolArray
 
 MEDIAN_DISTANCE = float(np.sqrt(2.0 * np.log(2.0)))
@@ -68,7 +69,7 @@ def a_contrario_consensus(displacement: Array, tolerance: float, search_radius: 
 
 def consensus_tolerance_px(sigma_px: float) -> float:
     """Largest distance of an inlier from the consensus: three sigmas and 0.5 px for the model error."""
-    return 3.0 * sigma_px + 0.5
+    return MAX_ERROR_SIGMAS * sigma_px + 0.5
 
 
 def robust_affine_inliers(

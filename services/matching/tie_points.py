@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from services.conventions import MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window
 from services.sensors.base import SensorModel
@@ -153,7 +154,7 @@ def match_features(
     """
     low = max(one.model.height_range_m[0], other.model.height_range_m[0])
     high = min(one.model.height_range_m[1], other.model.height_range_m[1])
-    gate_px = 3.0 * float(np.hypot(one.sigma_m, other.sigma_m)) / scene_gsd_m(other)
+    gate_px = MAX_ERROR_SIGMAS * float(np.hypot(one.sigma_m, other.sigma_m)) / scene_gsd_m(other)
     band = _Band(low, high, 0.0, gate_px, gate_px)
     pairs = np.empty((0, 2), dtype=np.int64)
     for _ in range(2):

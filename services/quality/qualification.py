@@ -1,17 +1,16 @@
 """How good a registration is: figures first, then a verdict that follows from thresholds alone."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from services.adjustment.image_correction import SceneAdjustment
-from services.matching.consensus import a_contrario_consensus
+from services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
 from services.quality.accuracy import Statistics, normal_ce90, statistics
+from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
 from services.quality.stability import (
+    AdjustedScene,
     ImageResiduals,
     PredictedAccuracy,
-    Refit,
     Stability,
     measure_stability,
     predict_accuracy,
@@ -19,37 +18,38 @@ from services.quality.stability import (
 )
 from services.types import Array, Measures
 
-Verdict = Literal["good", "usable", "failed"]
-
 
 @dataclass(frozen=True)
 class QualificationOptions:
     """Thresholds and sampling of a qualification.
 
-    A registration is "good" when it passes every threshold, "usable" when it passes every `usable_*`
-    one, else "failed".
+    A registration is "good" when it meets every threshold, "usable" when it meets every `usable_*`
+    threshold, else "failed".
 
     Attributes:
-        good_active_points: fewest active points (SRP: one measure is never enough, at least 20).
+        good_active_points: smallest number of active points (SRP: one measure is never enough, at least
+            20).
         good_coverage_percent: smallest coverage of the image by active points.
-        good_active_of_matched: smallest share of matched points that the adjustment keeps.
+        good_active_of_matched: smallest ratio of active to matched points.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate, without what the points' stated accuracy and chance explain.
+            of the worse coordinate, without the part that chance and the stated accuracy of the points
+            explain.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
         good_displacement_of_points, usable_displacement_of_points, good_ce90_of_points,
-            usable_ce90_of_points: the same two as shares of the points' own CE90, where that allows
-            more: points coarser than the pixels still make a model several times better than they are
-            (SRP: corners within 0.3 m with points of 3 m).
-        good_unit_weight: largest ratio of the residuals to what the stated sigmas let expect.
-        good_second_consensus_share: largest number of deactivated points that agree on another
-            displacement, as a share of the active points: a scene has one displacement, not two.
-        usable_active_points: fewest active points.
+            usable_ce90_of_points: the limits of displacement and CE90 as shares of the CE90 of the
+            points, where these allow more than the limits in pixels. Points coarser than the pixels
+            still make a model several times better than they are (SRP: corners within 0.3 m with points
+            of 3 m).
+        good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
+        good_second_consensus_share: largest group of deactivated points that agree on another
+            displacement, as a share of the active points. A scene has one displacement, not two.
+        usable_active_points: smallest number of active points.
         coverage_cells: cells of the coverage along each side of the image.
         grid: nodes of the predicted accuracy along each side of the image.
-        draws: how often the adjustment is redone.
-        kept_share: of the active points in each draw.
+        draws: number of repeated adjustments in the stability test.
+        kept_share: share of the active points in each draw.
     """
 
     good_active_points: int = 20
@@ -76,18 +76,18 @@ class QualificationOptions:
 
 @dataclass(frozen=True)
 class PointCounts:
-    """How many points a scene was given, and what became of them.
+    """Numbers of points at the stages of a registration.
 
     Attributes:
-        visible: points the scene could show (Popini).
-        unused: of these, points that were not tried because others stand for them.
-        matched: found, and their views agree (Spatio).
-        active: used by the final adjustment (Actif).
-        active_of_matched, active_of_visible: ratios, 0 to 1; NaN over nothing.
+        visible: points that the scene could show (published as Popini).
+        not_tried: visible points that were not searched, because well-spread others represent them.
+        matched: points that were found, and whose views agree (published as Spatio).
+        active: points that the final adjustment uses (published as Actif).
+        active_of_matched, active_of_visible: ratios, 0 to 1; NaN when the divisor is zero.
     """
 
     visible: int
-    unused: int
+    not_tried: int
     matched: int
     active: int
     active_of_matched: float
@@ -96,10 +96,10 @@ class PointCounts:
 
 @dataclass(frozen=True)
 class GroundResiduals:
-    """Residuals of the active points on the ground, metres; a single scene says nothing about heights.
+    """Residuals of the active points on the ground, metres; a single scene gives no heights.
 
     Attributes:
-        east, north: of the horizontal plane through the point.
+        east, north: in the horizontal plane through the point.
         horizontal: length of the residual.
     """
 
@@ -112,10 +112,9 @@ class GroundResiduals:
 class Coverage:
     """Share of equal cells of the image that hold an active point.
 
-    Cells rather than the convex hull: a hull spanned by a few far points hides an empty middle, cells
-    show both the edge that is extrapolated and the hole that nothing checks. With five by five, 60 % are
-    15 of 25 cells: easy for 20 points that are well spread, while 20 thrown at random reach 56 % on
-    average.
+    Cells show the edge that is extrapolated and the hole that no point checks; a convex hull of a few
+    far points hides an empty middle. With five by five cells, 60 % are 15 of 25 cells: 20 well-spread
+    points reach that easily, 20 points at random places reach 56 % on average.
 
     Attributes:
         cells: (c, c) active points in each cell, rows from the first line down.
@@ -129,37 +128,22 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class Criterion:
-    """One threshold and whether it was met.
-
-    Attributes:
-        name: what is compared, with its unit.
-        value: NaN when it could not be computed; such a criterion is not met.
-        comparison: of the value with the limit.
-        limit: as given in the options.
-        needed_for: the verdict that is lost when it is not met.
-        passed: whether it was met.
-    """
-
-    name: str
-    value: float
-    comparison: Literal["at least", "at most"]
-    limit: float
-    needed_for: Literal["good", "usable"]
-    passed: bool
-
-
-@dataclass(frozen=True)
 class Qualification:
-    """Everything that says how good a registration is.
+    """The quality figures of a registration and the verdict.
 
     Attributes:
-        verdict: follows from the criteria and nothing else.
+        verdict: follows from the criteria alone.
+        criteria: the figures that have limits.
+        point_counts: visible, matched and active points.
+        image_residuals_px, ground_residuals_m: of the active points.
+        stability: the adjustment repeated without a part of its points.
+        predicted: accuracy by the covariance of the correction.
+        coverage: of the image by active points.
     """
 
     verdict: Verdict
     criteria: tuple[Criterion, ...]
-    equipment: PointCounts
+    point_counts: PointCounts
     image_residuals_px: ImageResiduals
     ground_residuals_m: GroundResiduals
     stability: Stability
@@ -168,51 +152,42 @@ class Qualification:
 
 
 def qualify(
-    measures: Measures,
-    adjustment: SceneAdjustment,
-    shape: tuple[int, int],
-    refit: Refit,
-    gsd_m: float,
+    scene: AdjustedScene,
     options: QualificationOptions,
     rng: np.random.Generator,
-    frame_sigma_m: float = float("nan"),
+    frame_sigma_m: float,
 ) -> Qualification:
-    """Say how good a registration is.
+    """The quality figures of a registration, compared with their thresholds.
 
     Args:
-        measures: all n points the scene could show, with their final residuals.
-        adjustment: the final one.
-        shape: lines and samples of the image.
-        refit: redoes the adjustment on the measures of a mask (n,).
-        gsd_m: ground sampling of the image, turns pixels into metres.
+        scene: after its final adjustment.
         options: thresholds and sampling.
         rng: draws the points that are held out.
         frame_sigma_m: systematic error of the frame of the points' blocks, one standard deviation a
             coordinate; NaN when unknown.
     """
-    equipment = count_equipment(measures)
+    measures, adjustment, shape = scene.measures, scene.adjustment, scene.shape
+    point_counts = count_points(measures)
     residuals = residuals_in_image(measures.residual_px[measures.active])
-    stability = measure_stability(
-        measures, adjustment, shape, refit, gsd_m, options.draws, options.kept_share, rng
-    )
-    predicted = predict_accuracy(adjustment, shape, gsd_m, options.grid, frame_sigma_m)
+    stability = measure_stability(scene, options.draws, options.kept_share, rng)
+    predicted = predict_accuracy(adjustment, shape, scene.gsd_m, options.grid, frame_sigma_m)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
-    std_px = unexplained_px(residuals, adjustment.point_sigma_px)
-    points_ce90_px = float(normal_ce90(np.diag(adjustment.point_sigma_px**2)[None])[0])
-    criteria = compare(equipment, std_px, stability, predicted, points_ce90_px, coverage, options)
-    criteria += (
-        _at_most("unit_weight", adjustment.sigma0, options.good_unit_weight, "good"),
-        _at_most(
-            "second_consensus_share",
-            second_consensus_share(measures),
-            options.good_second_consensus_share,
-            "good",
-        ),
+    figures = _Figures(
+        active_points=point_counts.active,
+        active_of_matched=point_counts.active_of_matched,
+        coverage_percent=coverage.percent,
+        residual_std_px=unexplained_px(residuals, adjustment.point_sigma_px),
+        displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
+        predicted_ce90_px=predicted.worst_px,
+        points_ce90_px=float(normal_ce90(np.diag(adjustment.point_sigma_px**2)[None])[0]),
+        unit_weight=adjustment.sigma0,
+        second_consensus_share=second_consensus_share(measures),
     )
+    criteria = _criteria(figures, options)
     return Qualification(
         verdict=verdict_of(criteria),
         criteria=criteria,
-        equipment=equipment,
+        point_counts=point_counts,
         image_residuals_px=residuals,
         ground_residuals_m=_residuals_on_ground(measures.residual_m[measures.active]),
         stability=stability,
@@ -221,13 +196,13 @@ def qualify(
     )
 
 
-def count_equipment(measures: Measures) -> PointCounts:
-    """Count visible, matched and active points."""
+def count_points(measures: Measures) -> PointCounts:
+    """Numbers of visible, matched and active points."""
     visible = len(measures.point_id)
     matched, active = int(measures.matched.sum()), int(measures.active.sum())
     return PointCounts(
         visible=visible,
-        unused=int((measures.reason == "not_tried").sum()),
+        not_tried=int((measures.reason == "not_tried").sum()),
         matched=matched,
         active=active,
         active_of_matched=active / matched if matched else float("nan"),
@@ -236,10 +211,11 @@ def count_equipment(measures: Measures) -> PointCounts:
 
 
 def unexplained_px(residuals: ImageResiduals, point_sigma_px: Array) -> float:
-    """Standard deviation of the worse coordinate without what the points' own accuracy explains.
+    """Standard deviation of the worse coordinate without the part that the points' accuracy explains.
 
-    Points of 3 m are no fault of a scene of 0.5 m pixels: many of them still tell its model well. Of n
-    residuals the variance is known to sqrt(2 / n): two such deviations are what chance explains.
+    Points of 3 m do not make a scene of 0.5 m pixels bad: many of them still determine its model well.
+    The variance of n residuals has a relative standard deviation of sqrt(2 / n); chance explains two of
+    these.
 
     Args:
         residuals: of the active points.
@@ -247,22 +223,24 @@ def unexplained_px(residuals: ImageResiduals, point_sigma_px: Array) -> float:
     """
     variance = np.array([residuals.y.std, residuals.x.std]) ** 2
     chance = 1.0 + 2.0 * np.sqrt(2.0 / max(residuals.x.n, 1))
-    left = np.maximum(variance - chance * point_sigma_px**2, 0.0)
-    return float(np.sqrt(left.max()))
+    unexplained = np.maximum(variance - chance * point_sigma_px**2, 0.0)
+    return float(np.sqrt(unexplained.max()))
 
 
 def second_consensus_share(measures: Measures) -> float:
-    """The largest group of deactivated points that agree on another place, over the active points.
+    """Largest group of deactivated points that agree on another displacement, over the active points.
 
-    They agree when their residuals are as near each other as those of the active points are to zero.
+    Points agree when their residuals are as near to each other as those of the active points are to
+    zero.
     """
     active = measures.residual_px[measures.active]
     if len(active) == 0:
         return float("nan")
-    apart = measures.residual_px[measures.matched & ~measures.active]
-    tolerance_px = 3.0 * float(np.sqrt((active**2).mean())) + 0.5
-    rivals = a_contrario_consensus(apart, tolerance_px, float(np.abs(apart).max(initial=tolerance_px)))
-    return int(rivals.inliers.sum()) / len(active)
+    deactivated = measures.residual_px[measures.matched & ~measures.active]
+    tolerance_px = consensus_tolerance_px(float(np.sqrt((active**2).mean())))
+    largest_px = float(np.abs(deactivated).max(initial=tolerance_px))
+    second = a_contrario_consensus(deactivated, tolerance_px, largest_px)
+    return int(second.inliers.sum()) / len(active)
 
 
 def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
@@ -272,61 +250,57 @@ def _residuals_on_ground(residual_m: Array) -> GroundResiduals:
 
 
 def image_coverage(line_sample: Array, shape: tuple[int, int], cells: int) -> Coverage:
-    """Count the active points (n, 2) in `cells` x `cells` equal parts of the image."""
+    """Numbers of active points (n, 2) in `cells` x `cells` equal parts of the image."""
     edges = [np.linspace(-0.5, size - 0.5, cells + 1) for size in shape]
     counts, _, _ = np.histogram2d(line_sample[:, 0], line_sample[:, 1], bins=edges)
     occupied = int(np.count_nonzero(counts))
     return Coverage(counts, occupied, 100.0 * occupied / cells**2)
 
 
-def compare(
-    equipment: PointCounts,
-    std_px: float,
-    stability: Stability,
-    predicted: PredictedAccuracy,
-    points_ce90_px: float,
-    coverage: Coverage,
-    options: QualificationOptions,
-) -> tuple[Criterion, ...]:
-    """Hold the figures against the thresholds."""
-    o = options
-    good_px = max(o.good_ce90_px, o.good_ce90_of_points * points_ce90_px)
-    usable_px = max(o.usable_ce90_px, o.usable_ce90_of_points * points_ce90_px)
-    good_moved_px = max(o.good_displacement_px, o.good_displacement_of_points * points_ce90_px)
-    usable_moved_px = max(o.usable_displacement_px, o.usable_displacement_of_points * points_ce90_px)
-    moved_px = max((place.median_px for place in stability.displacements), default=float("nan"))
-    good = (
-        _at_least("active_points", equipment.active, options.good_active_points, "good"),
-        _at_least("coverage_percent", coverage.percent, options.good_coverage_percent, "good"),
-        _at_least(
-            "active_of_matched", equipment.active_of_matched, options.good_active_of_matched, "good"
+@dataclass(frozen=True)
+class _Figures:
+    """The figures that have limits; each bears the name of its criterion.
+
+    Attributes:
+        points_ce90_px: CE90 of the points' own accuracy; it raises the limits of displacement and CE90.
+    """
+
+    active_points: int
+    active_of_matched: float
+    coverage_percent: float
+    residual_std_px: float
+    displacement_px: float
+    predicted_ce90_px: float
+    points_ce90_px: float
+    unit_weight: float
+    second_consensus_share: float
+
+
+def _criteria(figures: _Figures, options: QualificationOptions) -> tuple[Criterion, ...]:
+    """The figures compared with the thresholds."""
+    f, o = figures, options
+    good_ce90_px = max(o.good_ce90_px, o.good_ce90_of_points * f.points_ce90_px)
+    usable_ce90_px = max(o.usable_ce90_px, o.usable_ce90_of_points * f.points_ce90_px)
+    good_displacement_px = max(o.good_displacement_px, o.good_displacement_of_points * f.points_ce90_px)
+    usable_displacement_px = max(
+        o.usable_displacement_px, o.usable_displacement_of_points * f.points_ce90_px
+    )
+    return (
+        at_least("active_points", f.active_points, o.good_active_points, "good"),
+        at_least("coverage_percent", f.coverage_percent, o.good_coverage_percent, "good"),
+        at_least("active_of_matched", f.active_of_matched, o.good_active_of_matched, "good"),
+        at_most("residual_std_px", f.residual_std_px, o.good_residual_std_px, "good"),
+        at_most("displacement_px", f.displacement_px, good_displacement_px, "good"),
+        at_most("predicted_ce90_px", f.predicted_ce90_px, good_ce90_px, "good"),
+        at_least("active_points", f.active_points, o.usable_active_points, "usable"),
+        at_most("residual_std_px", f.residual_std_px, o.usable_residual_std_px, "usable"),
+        at_most("displacement_px", f.displacement_px, usable_displacement_px, "usable"),
+        at_most("predicted_ce90_px", f.predicted_ce90_px, usable_ce90_px, "usable"),
+        at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"),
+        at_most(
+            "second_consensus_share",
+            f.second_consensus_share,
+            o.good_second_consensus_share,
+            "good",
         ),
-        _at_most("residual_std_px", std_px, options.good_residual_std_px, "good"),
-        _at_most("displacement_px", moved_px, good_moved_px, "good"),
-        _at_most("predicted_ce90_px", predicted.worst_px, good_px, "good"),
     )
-    usable = (
-        _at_least("active_points", equipment.active, options.usable_active_points, "usable"),
-        _at_most("residual_std_px", std_px, options.usable_residual_std_px, "usable"),
-        _at_most("displacement_px", moved_px, usable_moved_px, "usable"),
-        _at_most("predicted_ce90_px", predicted.worst_px, usable_px, "usable"),
-    )
-    return good + usable
-
-
-def _at_least(name: str, value: float, limit: float, needed_for: Literal["good", "usable"]) -> Criterion:
-    """A criterion met from the limit on; NaN never meets it."""
-    return Criterion(name, float(value), "at least", float(limit), needed_for, bool(value >= limit))
-
-
-def _at_most(name: str, value: float, limit: float, needed_for: Literal["good", "usable"]) -> Criterion:
-    """A criterion met up to the limit; NaN never meets it."""
-    return Criterion(name, float(value), "at most", float(limit), needed_for, bool(value <= limit))
-
-
-def verdict_of(criteria: tuple[Criterion, ...]) -> Verdict:
-    """The best verdict none of whose criteria failed."""
-    lost = {criterion.needed_for for criterion in criteria if not criterion.passed}
-    if "usable" in lost:
-        return "failed"
-    return "usable" if "good" in lost else "good"

@@ -1,4 +1,4 @@
-"""How sure a correction is: redone with fewer points, and by its own covariance."""
+"""How reliable a correction is: repeated with fewer points, and by its own covariance."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +10,26 @@ from services.errors import ComputationError
 from services.quality.accuracy import CIRCULAR_CE90, Statistics, normal_ce90, statistics
 from services.types import Array, BoolArray, Measures
 
-Refit = Callable[[BoolArray], SceneAdjustment]
 PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
+
+
+@dataclass(frozen=True)
+class AdjustedScene:
+    """A scene after its final adjustment.
+
+    Attributes:
+        measures: all n points that the scene could show, with their final residuals.
+        adjustment: of all active points.
+        shape: lines and samples of the image.
+        gsd_m: ground sampling of the image; it converts pixels to metres.
+        refit: repeats the adjustment on the measures of a mask (n,).
+    """
+
+    measures: Measures
+    adjustment: SceneAdjustment
+    shape: tuple[int, int]
+    gsd_m: float
+    refit: Callable[[BoolArray], SceneAdjustment]
 
 
 @dataclass(frozen=True)
@@ -31,12 +49,13 @@ class ImageResiduals:
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far one place of the image moves between the full solution and those of fewer points.
+    """Displacement of one place of the image between the full solution and solutions with fewer points.
 
     Attributes:
         place: "top left", "top right", "bottom right", "bottom left" or "centre".
         median_px, max_px, median_m, max_m: length, over the draws.
-        x_m, y_m: along samples and lines in the first draw: one redone adjustment, as it is published.
+        x_m, y_m: along samples and lines in the first draw: one repeated adjustment, as in the published
+            tables.
     """
 
     place: str
@@ -50,16 +69,16 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Stability:
-    """The adjustment redone without a part of its points. Shows stability, not absolute accuracy.
+    """The adjustment repeated without a part of its points. It shows stability, not absolute accuracy.
 
     Attributes:
-        kept_share: of the active points in each draw.
-        draws: adjustments that succeeded.
-        failed_draws: adjustments that gave no solution.
-        held_out_per_draw: points held out of each draw.
+        kept_share: share of the active points in each draw.
+        draws: number of adjustments that succeeded.
+        failed_draws: number of adjustments that gave no solution.
+        held_out_per_draw: number of points held out of each draw.
         displacements: of the four corners and the centre; empty when no draw succeeded.
         held_out_px: residuals of the points held out, all draws together; a point counts once in each
-            draw it was held out of.
+            draw that it was held out of.
         held_out_m: the same on the ground, by the ground sampling of the image.
         note: why there is no figure; "" otherwise.
     """
@@ -76,9 +95,9 @@ class Stability:
 
 @dataclass(frozen=True)
 class PredictedAccuracy:
-    """What the covariance of the correction says about positions all over the image.
+    """Accuracy all over the image, predicted by the covariance of the correction.
 
-    It covers the random part of the measures. What all points of a block have in common does not show in
+    It covers the random part of the measures. An error that all points of a block share is not part of
     it: that is `frame_ce90_m`.
 
     Attributes:
@@ -107,51 +126,41 @@ def residuals_in_image(residual: Array) -> ImageResiduals:
 
 
 def measure_stability(
-    measures: Measures,
-    adjustment: SceneAdjustment,
-    shape: tuple[int, int],
-    refit: Refit,
-    gsd_m: float,
-    draws: int,
-    kept_share: float,
-    rng: np.random.Generator,
+    scene: AdjustedScene, draws: int, kept_share: float, rng: np.random.Generator
 ) -> Stability:
-    """Redo the adjustment with a part of the active points, several times.
+    """Displacements and residuals when the adjustment is repeated on random parts of the active points.
 
     Args:
-        measures: all n points the scene could show.
-        adjustment: of all active points.
-        shape: lines and samples of the image.
-        refit: redoes the adjustment on the measures of a mask (n,).
-        gsd_m: ground sampling of the image.
-        draws: how often.
-        kept_share: of the active points in each draw.
+        scene: after its final adjustment.
+        draws: number of repetitions.
+        kept_share: share of the active points in each draw.
         rng: draws the points that are held out.
     """
+    measures, correction = scene.measures, scene.adjustment.correction
     active = np.flatnonzero(measures.active)
     held_count = len(active) - round(kept_share * len(active))
-    places = image_places(shape)
-    moved, held_out = [], []
+    places = image_places(scene.shape)
+    displacements, held_out = [], []
     for _ in range(draws if held_count else 0):
         held = rng.permutation(active)[:held_count]
-        kept = measures.active.copy()
-        kept[held] = False
+        used = measures.active.copy()
+        used[held] = False
         try:
-            correction = refit(kept).correction
+            repeated = scene.refit(used).correction
         except ComputationError:
             continue
-        moved.append(correction.apply(places) - adjustment.correction.apply(places))
-        held_out.append(measures.line_sample[held] - correction.apply(measures.predicted[held]))
+        displacements.append(repeated.apply(places) - correction.apply(places))
+        held_out.append(measures.line_sample[held] - repeated.apply(measures.predicted[held]))
     residual = np.concatenate(held_out) if held_out else np.empty((0, 2))
     return Stability(
         kept_share=kept_share,
-        draws=len(moved),
-        failed_draws=(draws if held_count else 0) - len(moved),
+        draws=len(displacements),
+        failed_draws=(draws if held_count else 0) - len(displacements),
         held_out_per_draw=held_count,
-        displacements=_displacements(np.array(moved), gsd_m) if moved else (),
+        displacements=_displacements(np.array(displacements), scene.gsd_m) if displacements else (),
         held_out_px=residuals_in_image(residual),
-        held_out_m=residuals_in_image(residual * gsd_m),
-        note="" if moved else _why_no_stability(len(active), held_count),
+        held_out_m=residuals_in_image(residual * scene.gsd_m),
+        note="" if displacements else _why_no_stability(len(active), held_count),
     )
 
 
@@ -164,7 +173,7 @@ def image_places(shape: tuple[int, int]) -> Array:
 
 
 def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
-    """Lengths over the draws, and the first, of displacements (d, 5, 2) in line and sample."""
+    """Lengths over the draws, and the first draw, of displacements (d, 5, 2) in line and sample."""
     length_px = np.linalg.norm(moved_px, axis=2)
     median, largest = np.median(length_px, axis=0), length_px.max(axis=0)
     return tuple(
@@ -182,7 +191,7 @@ def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
 
 
 def _why_no_stability(active: int, held_count: int) -> str:
-    """Why no draw gave a solution."""
+    """The reason why no draw gave a solution."""
     if held_count == 0:
         return f"{active} active points leave none to hold out"
     return f"{active - held_count} of {active} active points gave no solution in any draw"
@@ -195,7 +204,7 @@ def predict_accuracy(
     grid: int,
     frame_sigma_m: float = float("nan"),
 ) -> PredictedAccuracy:
-    """Propagate the covariance of the correction to a grid over the image.
+    """The covariance of the correction, propagated to a grid over the image.
 
     Args:
         adjustment: with its covariance.

@@ -1,29 +1,32 @@
-"""SCENE IN -> REGISTERED MODEL OUT: predict, match, agree, adjust, qualify. Start reading here."""
+"""SCENE IN -> REGISTERED MODEL OUT: predict, match, adjust, qualify. Start reading here."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment
-from services.errors import InputError
-from services.imagery.scene import Scene, scene_gsd_m
+from services.adjustment.image_correction import SceneAdjustment
+from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
-from services.matching.control_points import ChipSearch, MatchingOptions, PointMatches, match_points
-from services.quality.qualification import Qualification, QualificationOptions, qualify
+from services.matching.control_points import ChipSearch, match_points
+from services.quality.qualification import Qualification, qualify
+from services.quality.stability import AdjustedScene
 from services.registration.chip_selection import fine_gsd_m
-from services.registration.coarse import CoarseOptions, search_coarsely
+from services.registration.coarse import needs_coarse_search, search_coarsely
+from services.registration.context import PointContext, Prediction, RegistrationContext
+from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
-from services.registration.point_selection import points_to_try, start_uncertainty_m, visible_points
+from services.registration.point_selection import initial_prediction, points_to_try, visible_points
 from services.registration.search import (
+    Search,
     SearchStage,
-    adjust_matches,
-    model_uncertainty_m,
+    adjust_search,
+    predict,
     search_radius_px,
     select_inliers,
-    summarised,
+    summarise,
 )
-from services.sensors.correction import CorrectedModel, no_correction
+from services.sensors.correction import CorrectedModel
 from services.types import (
     BoolArray,
     ChipSource,
@@ -33,34 +36,7 @@ from services.types import (
     Progress,
     ViewMeasures,
     no_progress,
-    part_of,
 )
-
-
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """How a scene is registered.
-
-    Attributes:
-        max_points: how many points are tried at most, well spread over the image; 0 for all.
-        fine_passes: how many times the finest chips are searched, each time through the last model.
-        seed: of the random draws of the stability test.
-        coarse, matching, adjustment, qualification: of the stages.
-    """
-
-    max_points: int = 500
-    fine_passes: int = 2
-    seed: int = 0
-    coarse: CoarseOptions = field(default_factory=CoarseOptions)
-    matching: MatchingOptions = field(default_factory=MatchingOptions)
-    adjustment: AdjustmentOptions = field(default_factory=lambda: AdjustmentOptions(min_points=6))
-    qualification: QualificationOptions = field(default_factory=QualificationOptions)
-
-    def __post_init__(self) -> None:
-        """Refuse what no registration can be made with."""
-        for name, least in (("max_points", 0), ("fine_passes", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: {getattr(self, name)} given, {least} or more expected")
 
 
 @dataclass(frozen=True)
@@ -70,17 +46,17 @@ class Registration:
     Attributes:
         model: the scene's model with its correction.
         adjustment: the correction, its covariance, the residuals.
-        measures: one row for every point the scene could show.
-        views: what the last search did with the views of these points.
-        passes: the searches, in order.
-        qualification: how good it is.
+        measures: one row for every point that the scene could show.
+        views: results of the views of these points in the last search.
+        search_stages: summaries of the searches, in order.
+        qualification: quality figures and verdict.
     """
 
     model: CorrectedModel
     adjustment: SceneAdjustment
     measures: Measures
     views: ViewMeasures
-    passes: tuple[SearchStage, ...]
+    search_stages: tuple[SearchStage, ...]
     qualification: Qualification
 
 
@@ -89,6 +65,7 @@ def register_scene(
     points: ControlPoints,
     chips: ChipSource,
     options: RegistrationOptions = RegistrationOptions(),
+    *,
     progress: Progress = no_progress,
     frame_sigma_m: float = math.nan,
 ) -> Registration:
@@ -96,11 +73,11 @@ def register_scene(
 
     Args:
         scene: its model may be wrong by three times `scene.sigma_m`.
-        points: those of its footprint; others are left aside.
+        points: those of its footprint; points outside the scene are left aside.
         chips: of the points.
-        options: thresholds.
-        progress: told where the work stands.
-        frame_sigma_m: how well the frame of the points is known on the Earth, one standard deviation a
+        options: of all stages.
+        progress: receives the fraction done and the work under way.
+        frame_sigma_m: accuracy of the frame of the points on the Earth, one standard deviation a
             coordinate; it is reported beside the accuracy in that frame, never mixed into it.
 
     Raises:
@@ -108,100 +85,76 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
     """
-    visible = visible_points(scene, points)
-    shown = points.take(visible)
-    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
-    uncertainty_m = start_uncertainty_m(scene, shown)
-    fine_m = fine_gsd_m(scene, shown, uncertainty_m)
-    passes: list[SearchStage] = []
-
-    if 3.0 * uncertainty_m.max() / fine_m > options.coarse.max_fine_radius_px:
-        model, uncertainty_m, done = search_coarsely(
-            scene,
-            model,
-            shown,
-            chips,
-            uncertainty_m,
-            options.coarse,
-            options.matching,
-            options.adjustment,
-            part_of(progress, 0.0, 0.3),
-        )
-        passes.append(done)
-    image = CachedImage(scene.image)
-    for number in range(options.fine_passes):
-        chosen = points_to_try(scene, model, shown, uncertainty_m, options.max_points)
-        tried = shown.take(chosen)
-        radius_px = search_radius_px(uncertainty_m[chosen], fine_m, options.coarse.max_search_px)
-        part = part_of(progress, 0.3 + 0.6 * number / options.fine_passes, 0.6 / options.fine_passes)
-        search = ChipSearch(image, model, scene.acquisition, fine_m, radius_px)
-        matches = match_points(search, tried, chips, options.matching, part)
-        agreeing = select_inliers(
-            model, tried, matches, radius_px * fine_m, options.adjustment.min_points
-        )
-        adjustment = adjust_matches(scene, tried, matches, agreeing, options.adjustment)
-        passes.append(summarised("fine", fine_m, radius_px, matches, agreeing))
-        model = CorrectedModel(scene.model, adjustment.correction)
-        uncertainty_m = model_uncertainty_m(model, shown, adjustment)
-
-    progress(0.95, "qualifying the result")
-    registration = build_registration(
-        scene,
-        points,
-        (visible, visible[chosen]),
-        matches,
-        adjustment,
-        tuple(passes),
-        options,
-        frame_sigma_m,
+    points = points.take(visible_points(scene, points))
+    prediction = initial_prediction(scene, points)
+    context = PointContext(
+        scene=scene,
+        options=options,
+        progress=progress,
+        frame_sigma_m=frame_sigma_m,
+        points=points,
+        chips=chips,
+        image=CachedImage(scene.image),
+        fine_gsd_m=fine_gsd_m(scene, points, prediction),
     )
-    progress(1.0, "registered")
-    return registration
+    stages: list[SearchStage] = []
+    if needs_coarse_search(context, prediction):
+        prediction, stage = search_coarsely(context.part(0.0, 0.3), prediction)
+        stages.append(stage)
+    share = 0.6 / options.fine_stages
+    for number in range(options.fine_stages):
+        rows = points_to_try(scene, points, prediction, options.max_points)
+        search = _search(context.part(0.3 + 0.6 * number / options.fine_stages, share), prediction, rows)
+        adjustment = adjust_search(scene, search, options.adjustment)
+        prediction = predict(scene, points, adjustment)
+        stages.append(search.stage)
+    return build_registration(context, points, search, adjustment, tuple(stages))
+
+
+def _search(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
+    """A search of the points of some rows with the fine chips, within the error of the prediction."""
+    options, gsd_m = context.options, context.fine_gsd_m
+    points = context.points.take(rows)
+    radius_px = search_radius_px(prediction.uncertainty_m[rows], gsd_m, options.coarse.max_search_px)
+    chip_search = ChipSearch(
+        context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px
+    )
+    matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
+    min_points = options.adjustment.min_points
+    inliers = select_inliers(prediction.model, points, matches, radius_px * gsd_m, min_points)
+    stage = summarise("fine", gsd_m, radius_px, matches, inliers)
+    return Search(points, rows, matches, inliers, stage)
 
 
 def build_registration(
-    scene: Scene,
+    context: RegistrationContext,
     points: ControlPoints,
-    rows: tuple[IntArray, IntArray],
-    matches: PointMatches,
+    search: Search,
     adjustment: SceneAdjustment,
-    passes: tuple[SearchStage, ...],
-    options: RegistrationOptions,
-    frame_sigma_m: float,
+    stages: tuple[SearchStage, ...],
 ) -> Registration:
-    """A registration from its last search and adjustment, with all that says how good it is.
+    """The registration that the last search and its adjustment give, with its quality.
 
     Args:
-        scene: as delivered.
-        points: control points.
-        rows: of the points that the scene may show, and of those that were tried; ascending.
-        matches: of the points tried.
-        adjustment: of the points tried.
-        passes: the searches, in order.
-        options: of the adjustment and the qualification, and the seed of the draws.
-        frame_sigma_m: see `register_scene`.
+        context: of the registration.
+        points: all points that the scene may show.
+        search: the last search of a part of them.
+        adjustment: on this search.
+        stages: summaries of all searches, in order.
     """
-    visible, chosen = rows
-    tried = points.take(chosen)
-    measures = point_results(scene, points, rows, matches, adjustment)
-    row_of_tried = np.searchsorted(visible, chosen)
+    context.progress(0.95, "qualifying the result")
+    scene, options = context.scene, context.options
+    measures = point_results(scene, points, search, adjustment)
+    repetition = options.adjustment.repeating(adjustment)
 
-    def refit(held: BoolArray) -> SceneAdjustment:
-        fixed = options.adjustment
-        if fixed.order is None:
-            fixed = replace(fixed, order="affine", slope_px=adjustment.slope_px)
-        return adjust_matches(scene, tried, matches, held[row_of_tried], fixed)
+    def refit(used: BoolArray) -> SceneAdjustment:
+        return adjust_search(scene, search, repetition, usable=used[search.rows])
 
-    qualification = qualify(
-        measures,
-        adjustment,
-        scene.image.shape,
-        refit,
-        scene_gsd_m(scene),
-        options.qualification,
-        np.random.default_rng(options.seed),
-        frame_sigma_m,
-    )
+    adjusted = AdjustedScene(measures, adjustment, scene.image.shape, context.gsd_m, refit)
+    rng = np.random.default_rng(options.seed)
+    qualification = qualify(adjusted, options.qualification, rng, context.frame_sigma_m)
     model = CorrectedModel(scene.model, adjustment.correction)
-    views = replace(matches.view_measures, point=row_of_tried[matches.view_measures.point])
-    return Registration(model, adjustment, measures, views, passes, qualification)
+    view_measures = search.matches.view_measures
+    views = replace(view_measures, point=search.rows[view_measures.point])
+    context.progress(1.0, "registered")
+    return Registration(model, adjustment, measures, views, stages, qualification)

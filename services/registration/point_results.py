@@ -1,42 +1,34 @@
-"""What became of every point that a scene could show: found or not, where, and why not."""
+"""The result of every point that a scene could show: position and residual, or why it has none."""
 
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene
-from services.matching.control_points import PointMatches
+from services.registration.search import Search
 from services.sensors.correction import CorrectedModel
-from services.types import Array, ControlPoints, IntArray, Measures
+from services.types import Array, ControlPoints, Measures
 
 
 def point_results(
-    scene: Scene,
-    points: ControlPoints,
-    rows_of: tuple[IntArray, IntArray],
-    matches: PointMatches,
-    adjustment: SceneAdjustment,
+    scene: Scene, points: ControlPoints, search: Search, adjustment: SceneAdjustment
 ) -> Measures:
-    """One row for every visible point; those that were not tried say so.
+    """One row for every visible point; the reason of a point that was not searched is "not_tried".
 
     Args:
         scene: as delivered.
-        points: control points.
-        rows_of: of the points that the scene may show, and of those that were tried; ascending.
-        matches: of the points tried.
-        adjustment: of the points tried.
+        points: all n points that the scene may show.
+        search: the last search of a part of them.
+        adjustment: on this search.
     """
-    visible, chosen = rows_of
-    n = len(visible)
-    rows = np.searchsorted(visible, chosen)
+    n, rows, matches = len(points), search.rows, search.matches
 
     def scattered(values: Array, width: int = 0) -> Array:
         out = np.full((n, width) if width else n, np.nan)
         out[rows] = values
         return out
 
-    derivative = CorrectedModel(scene.model, adjustment.correction).project_derivative(
-        points.lon_lat_h[chosen]
-    )
+    model = CorrectedModel(scene.model, adjustment.correction)
+    derivative = model.project_derivative(search.points.lon_lat_h)
     residual_m = np.asarray(
         np.linalg.solve(derivative[:, :, :2], adjustment.residual_px[:, :, None])[:, :, 0], np.float64
     )
@@ -53,9 +45,9 @@ def point_results(
     by_gradient = np.zeros(n, dtype=bool)
     by_gradient[rows] = matches.by_gradient
     return Measures(
-        point_id=points.id[visible],
-        lon_lat_h=points.lon_lat_h[visible],
-        predicted=scene.model.project(points.lon_lat_h[visible]),
+        point_id=points.id,
+        lon_lat_h=points.lon_lat_h,
+        predicted=scene.model.project(points.lon_lat_h),
         line_sample=scattered(matches.line_sample, 2),
         sigma_px=scattered(matches.sigma_px),
         score=scattered(matches.score),

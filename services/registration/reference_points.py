@@ -1,4 +1,4 @@
-"""Places of a reference image that scenes were found by, as control points with chips cut from it."""
+"""Places of a reference image as control points, with chips cut from the reference."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from services.matching.reference_image import Reference
 from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
 
 
-def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
-    """Places on the ground (n, 3) as control points, whose one chip is cut from the reference.
+def reference_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
+    """Places on the ground (n, 3) as control points, each with one chip cut from the reference.
 
     `ReferenceChips` reads the chips.
     """
@@ -41,7 +41,7 @@ def homologous_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
 
 @dataclass(frozen=True)
 class ReferenceChips:
-    """Chips of homologous points, cut from the reference when they are asked for.
+    """Chips of reference points, cut from the reference when they are read.
 
     Attributes:
         reference: what they are cut from.
@@ -52,15 +52,15 @@ class ReferenceChips:
     lon_lat_h: Array
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
-        """Chips (count, 101, 101) uint16, each stretched over all values; 0 is nodata."""
+        """Chips (count, 101, 101) uint16, each stretched over the whole range; 0 is nodata."""
         return np.stack([self._chip(ground) for ground in self.lon_lat_h[row : row + count]])
 
     def _chip(self, ground: Array) -> ChipArray:
         gsd_m = image_gsd_m(self.reference.model, ground)
         pixels = render_chip(self.reference.image, self.reference.model, ground, gsd_m)
-        seen = np.isfinite(pixels)
-        if not seen.any():
+        valid = np.isfinite(pixels)
+        if not valid.any():
             return np.zeros(pixels.shape, dtype=np.uint16)
-        low, high = float(pixels[seen].min()), float(pixels[seen].max())
+        low, high = float(pixels[valid].min()), float(pixels[valid].max())
         stretched = 1.0 + (pixels - low) * (65534.0 / max(high - low, 1e-12))
-        return np.where(seen, stretched, 0.0).astype(np.uint16)
+        return np.where(valid, stretched, 0.0).astype(np.uint16)

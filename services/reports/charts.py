@@ -1,4 +1,4 @@
-"""The charts of a report: what became of the points, how residuals are spread and what they follow."""
+"""The charts of a report: points by stage and reason, residuals against position and height."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,17 +19,17 @@ from services.reports.drawing import (
     shortened,
     style,
 )
-from services.reports.report import count_reasons
-from services.reports.summary import RegistrationSummary
-from services.reports.tables import number, reason_words
+from services.reports.numbers import number
+from services.reports.report import RegistrationReport
 from services.types import Array
 
 
-def residual_histograms(summary: RegistrationSummary) -> Figure:
+def residual_histograms(report: RegistrationReport) -> Figure:
     """Distribution of the residuals of the active points in x, y and xy."""
     figure = Figure(figsize=(WIDTH_IN, 2.3), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
-    line, sample = summary.measures.residual_px[summary.measures.active].T
+    measures = report.figure_data.measures
+    line, sample = measures.residual_px[measures.active].T
     for axes, name, values in zip(
         panels, ("x (sample)", "y (line)", "xy"), (sample, line, np.hypot(line, sample)), strict=True
     ):
@@ -42,27 +42,28 @@ def residual_histograms(summary: RegistrationSummary) -> Figure:
         reach = max(float(np.abs(finite).max()), 0.01)
         bins = np.linspace(0.0 if name == "xy" else -reach, reach, 17)
         axes.hist(finite, bins=bins, color=ACTIVE, alpha=0.85)
-        found = statistics(finite)
-        axes.axvline(found.mean, color=INK, linewidth=1.0)
-        axes.set_title(f"{number(found.mean, 3)} ± {number(found.std, 3)}", color=INK, fontsize=TEXT_PT)
+        moments = statistics(finite)
+        axes.axvline(moments.mean, color=INK, linewidth=1.0)
+        axes.set_title(
+            f"{number(moments.mean, 3)} ± {number(moments.std, 3)}", color=INK, fontsize=TEXT_PT
+        )
     panels[0].set_ylabel("points")
     panels[0].yaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
-def funnel(summary: RegistrationSummary) -> Figure:
-    """From visible to matched to active points, with what was lost on the way and why."""
-    equipment = summary.qualification.equipment
-    reasons = count_reasons(summary.measures)
-    bars: list[tuple[str, int, int, str]] = [("visible", 0, equipment.visible, QUIET)]
-    left = equipment.visible
+def funnel(report: RegistrationReport) -> Figure:
+    """Visible, matched and active points, with the points lost between them by reason."""
+    counts = report.point_counts
+    bars: list[tuple[str, int, int, str]] = [("visible", 0, counts.visible, QUIET)]
+    remaining = counts.visible
     for stage, total, colour in (
-        ("not matched", equipment.matched, MATCHED),
-        ("deactivated", equipment.active, ACTIVE),
+        ("not matched", counts.matched, MATCHED),
+        ("deactivated", counts.active, ACTIVE),
     ):
-        for reason in (r for r in reasons if r.stage == stage):
-            left -= reason.count
-            bars.append((shortened(reason_words(reason.reason)), left, reason.count, NOT_MATCHED))
+        for reason in (r for r in report.reasons if r.stage == stage):
+            remaining -= reason.count
+            bars.append((shortened(reason.label), remaining, reason.count, NOT_MATCHED))
         bars.append(("matched" if stage == "not matched" else "active", 0, total, colour))
     figure, axes = plain_axes(height_in=0.5 + 0.26 * len(bars))
     for row, (_, start, width, colour) in enumerate(bars):
@@ -78,17 +79,17 @@ def funnel(summary: RegistrationSummary) -> Figure:
         )
     axes.set_yticks(range(len(bars)), [name for name, *_ in bars])
     axes.invert_yaxis()
-    axes.set_xlim(0, max(equipment.visible, 1) * 1.12)
+    axes.set_xlim(0, max(counts.visible, 1) * 1.12)
     axes.set_xlabel("points")
     return figure
 
 
-def residuals_along(summary: RegistrationSummary) -> Figure:
-    """Residuals of the active points against line and sample: what drift and jitter leave."""
+def residuals_along(report: RegistrationReport) -> Figure:
+    """Residuals of the active points against line and sample: drift and jitter show here."""
     figure = Figure(figsize=(WIDTH_IN, 3.8), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", sharey="row")
-    active = summary.measures.active
-    residual, place = summary.measures.residual_px[active], summary.measures.line_sample[active]
+    measures = report.figure_data.measures
+    residual, place = measures.residual_px[measures.active], measures.line_sample[measures.active]
     for k, residual_name in enumerate(("y (line)", "x (sample)")):
         for j, place_name in enumerate(("line", "sample")):
             axes = panels[k, j]
@@ -104,7 +105,7 @@ def residuals_along(summary: RegistrationSummary) -> Figure:
                 rasterized=len(place) > MANY_POINTS,
             )
             axes.plot(*_running_median(place[:, j], residual[:, k]), color=DEACTIVATED, linewidth=1.4)
-            axes.set_xlim(0, summary.shape[j])
+            axes.set_xlim(0, report.scene.shape[j])
             axes.locator_params(axis="x", nbins=4)
             if k == 1:
                 axes.set_xlabel(place_name)
@@ -113,12 +114,12 @@ def residuals_along(summary: RegistrationSummary) -> Figure:
     return figure
 
 
-def residuals_by_height(summary: RegistrationSummary) -> Figure:
+def residuals_by_height(report: RegistrationReport) -> Figure:
     """Residuals of the active points on the ground against their height, along and across the view."""
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    measures = summary.measures
-    azimuth = np.radians(summary.acquisition.azimuth_deg)
+    measures = report.figure_data.measures
+    azimuth = np.radians(report.scene.acquisition.azimuth_deg)
     names = ("along the view", "across the view") if np.isfinite(azimuth) else ("north", "east")
     north_first = np.nan_to_num(azimuth)
     away = np.array([-np.sin(north_first), -np.cos(north_first)])
@@ -148,10 +149,10 @@ def residuals_by_height(summary: RegistrationSummary) -> Figure:
 
 
 def _running_median(position: Array, value: Array) -> tuple[Array, Array]:
-    """Medians of equal parts of the points in order of position; empty with too few or one position.
+    """Medians of equal parts of the points in order of position; empty for too few or one position.
 
-    Four parts at least and 40 at most, of a dozen points where there are so many: few points show a
-    slope, many show what oscillates, and neither shows noise for it.
+    There are 4 to 40 parts, of a dozen points each where there are enough: few points show a slope, many
+    show an oscillation, and the median hides the noise of single points.
     """
     finite = np.isfinite(position) & np.isfinite(value)
     n = int(finite.sum())

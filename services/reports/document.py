@@ -1,21 +1,21 @@
 """`report.json`: the report as a document, and the JSON Schema that describes it.
 
-Both follow the dataclasses of the report: a field is a member of the same name, what could not be
-computed is null, and the descriptions are those of the docstrings.
+Both follow the dataclasses of the report: a field is a member of the same name, a value that could not
+be computed is null, and the descriptions are those of the docstrings.
 """
 
 import inspect
 import json
 import math
 import types
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from datetime import datetime
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from services.docstrings import attribute_descriptions
-from services.reports.report import REPORT_FORMAT, RegistrationReport
+from services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
 
@@ -27,11 +27,16 @@ def format_report(report: RegistrationReport) -> str:
 
 def report_document(report: RegistrationReport) -> dict[str, Any]:
     """The report as plain JSON values; numbers that are not finite become null."""
-    return {field.name: _plain(getattr(report, field.name)) for field in fields(report)}
+    return {field.name: _plain(getattr(report, field.name)) for field in _members(RegistrationReport)}
+
+
+def _members(kind: type) -> list[Field[Any]]:
+    """The fields of a dataclass that are members of the document."""
+    return [field for field in fields(kind) if field.metadata != NOT_IN_JSON]
 
 
 def _plain(value: Any) -> Json:
-    """Any value a report holds as JSON."""
+    """Any value of a report as JSON."""
     if is_dataclass(value):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -69,10 +74,10 @@ def report_schema() -> dict[str, Any]:
 
 
 def _object_schema(kind: type, definitions: dict[str, Any]) -> dict[str, Any]:
-    """Schema of a dataclass; those inside it are added to the definitions."""
+    """Schema of a dataclass; schemas of the dataclasses inside it are added to the definitions."""
     hints, described = get_type_hints(kind), attribute_descriptions(kind)
     properties = {}
-    for field in fields(kind):
+    for field in _members(kind):
         schema = _value_schema(hints[field.name], definitions)
         if field.name in described:
             schema = {"description": described[field.name], **schema}
@@ -93,7 +98,6 @@ _SCALARS: dict[Any, dict[str, Any]] = {
     str: {"type": "string"},
     datetime: {"type": "string", "format": "date-time"},
     type(None): {"type": "null"},
-    Any: {"type": "object"},
 }
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from services.reports.summary import Quicklook, RegistrationSummary
+from services.reports.figure_data import Quicklook
+from services.reports.report import RegistrationReport
 
 INK, QUIET = "#0a0b0c", "#0a0b0d"
 _PAGE_COLOURS = {INK: "var(--ink)", QUIET: "var(--quiet)"}
@@ -23,18 +24,18 @@ TEXT_PT = 10.0
 MANY_POINTS = 1500
 
 
-def svg(draw: Callable[[RegistrationSummary], Figure], summary: RegistrationSummary) -> str:
+def svg(draw: Callable[[RegistrationReport], Figure], report: RegistrationReport) -> str:
     """A figure as markup for a page: no address, no fixed size, colours and fonts of the page.
 
     Args:
         draw: one of `services.reports.figures.FIGURES`.
-        summary: what it draws.
+        report: gives what is drawn.
     """
     name = draw.__name__
     text = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure = draw(summary)
+        figure = draw(report)
         figure.patch.set_alpha(0.0)
         figure.savefig(
             text, format="svg", dpi=120, metadata=nothing, bbox_inches="tight", pad_inches=0.03
@@ -78,10 +79,10 @@ def image_height_in(shape: tuple[int, int]) -> float:
     return float(np.clip(WIDTH_IN * shape[0] / shape[1], 1.5, 7.5)) + 0.5
 
 
-def image_axes(summary: RegistrationSummary, darkness: float) -> tuple[Figure, Axes]:
+def image_axes(report: RegistrationReport, darkness: float) -> tuple[Figure, Axes]:
     """Axes in pixels of the image, over its quicklook."""
-    figure, axes = plain_axes(image_height_in(summary.shape))
-    lines, samples = summary.shape
+    figure, axes = plain_axes(image_height_in(report.scene.shape))
+    lines, samples = report.scene.shape
     axes.set_xlim(-0.5, samples - 0.5)
     axes.set_ylim(lines - 0.5, -0.5)
     axes.set_aspect("equal")
@@ -89,8 +90,8 @@ def image_axes(summary: RegistrationSummary, darkness: float) -> tuple[Figure, A
     axes.set_yticks([])
     axes.spines[:].set_visible(True)
     axes.spines[:].set_color(QUIET)
-    if summary.quicklook is not None:
-        _show_quicklook(axes, summary.quicklook, darkness)
+    if report.figure_data.quicklook is not None:
+        _show_quicklook(axes, report.figure_data.quicklook, darkness)
     return figure, axes
 
 

@@ -13,4 +13,4 @@ FIGURES = (
     residuals_by_height,
     predicted_map,
 )
-"""Each draws one figure of a summary; the page has them by their names."""
+"""Each draws one figure of a report; the page refers to them by their names."""

@@ -1,4 +1,4 @@
-"""The report as one HTML file that asks nothing of the network."""
+"""The report as one HTML file that needs no network."""
 
 import base64
 from collections.abc import Iterator
@@ -10,19 +10,14 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from services.quality.qualification import Criterion
+from services.quality.criteria import Criterion
+from services.reports.figure_data import ChipPair
+from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
 from services.reports.published import published_tables
 from services.reports.report import RegistrationReport
-from services.reports.summary import ChipPair, RegistrationSummary
-from services.reports.tables import ABSENT, criterion_way, criterion_words, number, percent, quantile
 from services.types import Array, ChipArray
 
 PAIRS_PER_GROUP = 4
-_VERDICTS = {
-    "good": "every criterion is met",
-    "usable": "fit for use, but not every criterion of a good registration is met",
-    "failed": "not to be used: a criterion that any registration must meet is not met",
-}
 
 
 @dataclass(frozen=True)
@@ -38,32 +33,25 @@ class GalleryGroup:
     pairs: tuple[ChipPair, ...]
 
 
-def format_html(report: RegistrationReport, summary: RegistrationSummary) -> str:
-    """The report as a self-contained page for screen, phone and paper.
-
-    Args:
-        report: the figures.
-        summary: what the report was made from; its arrays are drawn.
-    """
+def format_html(report: RegistrationReport) -> str:
+    """The report as a self-contained page for screen, phone and paper."""
     from services.reports.drawing import svg  # matplotlib: half a second that only a page needs
     from services.reports.figures import FIGURES
 
     page = _environment().get_template("registration.html")
     return page.render(
         report=report,
-        verdict_words=_VERDICTS[report.verdict],
         unmet=unmet_criteria(report),
-        figures={draw.__name__: Markup(svg(draw, summary)) for draw in FIGURES},
-        gallery=choose_pairs(summary.gallery),
+        figures={draw.__name__: Markup(svg(draw, report)) for draw in FIGURES},
+        gallery=choose_pairs(report.figure_data.gallery),
         published=published_tables(report),
-        unused=unused_points(summary),
-        options=list(flat_options(report.options)),
+        options=list(flat_options(report.run.options)),
         centre=_centre_words(report.scene.footprint_lon_lat),
     )
 
 
 def _environment() -> Environment:
-    """Templates that escape everything and refuse unknown names."""
+    """Templates that escape all values and raise an error for unknown names."""
     environment = Environment(
         loader=PackageLoader("services.reports", "."),
         autoescape=True,
@@ -76,8 +64,8 @@ def _environment() -> Environment:
         angle=lambda value: ABSENT if value != value else f"{value:.1f}°",
         percent=percent,
         quantile=quantile,
-        words=criterion_words,
-        way=criterion_way,
+        criterion_value=criterion_value,
+        criterion_limit=criterion_limit,
         margin=margin_words,
         chip=chip_uri,
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
@@ -86,14 +74,9 @@ def _environment() -> Environment:
 
 
 def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
-    """Criteria that are not met, those that cost the most first."""
-    unmet = [criterion for criterion in report.criteria if not criterion.passed]
+    """Criteria that are not met, those that make a registration unfit for use first."""
+    unmet = [criterion for criterion in report.criteria if not criterion.met]
     return sorted(unmet, key=lambda criterion: criterion.needed_for == "good")
-
-
-def unused_points(summary: RegistrationSummary) -> int:
-    """Points the scene could show that were not even looked for: others stand for them."""
-    return int((summary.measures.reason == "not_tried").sum())
 
 
 def choose_pairs(
@@ -119,18 +102,18 @@ def choose_pairs(
 def chip_uri(chip: ChipArray) -> str:
     """A chip as an image inside the page, stretched from its 1st to its 99th percentile."""
     values = chip.astype(np.float32)
-    known = np.isfinite(values) & (values != 0.0)
+    valid = np.isfinite(values) & (values != 0.0)
     grey = np.zeros(values.shape, dtype=np.uint8)
-    if known.any():
-        low, high = np.percentile(values[known], [1.0, 99.0])
-        stretched = (values[known] - low) / max(float(high - low), 1e-6) * 255.0
-        grey[known] = np.clip(stretched, 0.0, 255.0).astype(np.uint8)
+    if valid.any():
+        low, high = np.percentile(values[valid], [1.0, 99.0])
+        stretched = (values[valid] - low) / max(float(high - low), 1e-6) * 255.0
+        grey[valid] = np.clip(stretched, 0.0, 255.0).astype(np.uint8)
     _, encoded = cv2.imencode(".png", grey)
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
 
 
 def margin_words(criterion: Criterion) -> str:
-    """Distance from a value to its limit in percent of the limit, positive where it is met."""
+    """Distance from value to limit in percent of the limit, positive where the criterion is met."""
     if criterion.limit == 0.0 or not np.isfinite(criterion.value):
         return ABSENT
     distance = (criterion.value - criterion.limit) / criterion.limit
@@ -148,7 +131,7 @@ def flat_options(options: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _centre_words(footprint: Array) -> str:
-    """Latitude and longitude of the middle of the scene, for people."""
+    """Latitude and longitude of the middle of the scene."""
     if not len(footprint):
         return ABSENT
     lon, lat = footprint.mean(axis=0)

@@ -1,7 +1,7 @@
-"""The tables that are published for scenes registered on SRP, in their columns and by their definitions.
+"""The tables published for scenes registered on SRP, with their columns and definitions.
 
-Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment), 3 and 5 (residuals), 6
-(displacement of corners and centre with 80 % of the points) and 7 (points held out).
+Source: Space Reference Points on Africa (2021): tables 2 and 4 (equipment, here: point counts), 3 and 5
+(residuals), 6 (displacement of corners and centre with 80 % of the points) and 7 (points held out).
 """
 
 import math
@@ -17,11 +17,11 @@ class PublishedTable:
     """A table of one row.
 
     Attributes:
-        title: what it shows, with its unit.
-        columns: as published.
-        values: NaN where a single scene has none.
+        title: plain words for its content, with the unit.
+        columns: heads as published.
+        values: NaN where a single scene gives none.
         decimals: of each value.
-        note: what the figures are and what they do not show.
+        note: the definitions, in plain words, and the limits of the figures.
     """
 
     title: str
@@ -34,7 +34,7 @@ class PublishedTable:
 def published_tables(report: RegistrationReport) -> tuple[PublishedTable, ...]:
     """The five tables of one scene."""
     return (
-        _equipment(report),
+        _point_counts(report),
         _image_residuals(report),
         _ground_residuals(report),
         _displacements(report),
@@ -42,21 +42,22 @@ def published_tables(report: RegistrationReport) -> tuple[PublishedTable, ...]:
     )
 
 
-def _equipment(report: RegistrationReport) -> PublishedTable:
-    found = report.equipment
+def _point_counts(report: RegistrationReport) -> PublishedTable:
+    counts = report.point_counts
     return PublishedTable(
-        "Equipment",
+        'Point counts (published as "Equipment")',
         ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app"),
         (
-            100.0 * found.active_of_matched,
-            100.0 * found.active_of_visible,
-            found.active,
-            found.matched,
-            found.visible,
+            100.0 * counts.active_of_matched,
+            100.0 * counts.active_of_visible,
+            counts.active,
+            counts.matched,
+            counts.visible,
         ),
         (1, 1, 0, 0, 0),
-        "Popini: points the scene could show. Spatio: matched. Actif: kept by the adjustment. "
-        "Pct_app: Actif / Spatio. Pct_app-ini: Actif / Popini, which counts points left unused too.",
+        "Popini: visible points, which the scene could show. Spatio: matched points. Actif: active "
+        "points, which the final adjustment uses. Pct_app: Actif / Spatio. Pct_app-ini: Actif / Popini; "
+        "Popini includes the points that were not tried.",
     )
 
 
@@ -84,9 +85,9 @@ def _ground_residuals(report: RegistrationReport) -> PublishedTable:
         ("dx_amer", "dy_amer", "ectx_amer", "ecty_amer", "dZ_amer", "ectZ_amer"),
         (east.mean, north.mean, east.std, north.std, ABSENT, ABSENT),
         (2,) * 6,
-        "The image residuals carried to the ground at each point's height, east and north. In the "
-        "published tables points move too, within a block of images; one scene keeps them where they "
-        "are and says nothing of Z.",
+        "Image residuals converted to the ground at the height of each point, east and north. In the "
+        "published tables the points move too, within a block of images. A single scene keeps them "
+        "fixed and gives no figure for Z.",
     )
 
 
@@ -101,8 +102,8 @@ def _displacements(report: RegistrationReport) -> PublishedTable:
         (*(2,) * 10, 1),
         report.stability.note
         or "Corners clockwise from the first line and sample, then the centre, along samples (X) and "
-        "lines (Y), in the first draw. It shows how well the solution repeats, not how right it is: an "
-        "error that all points share moves nothing.",
+        "lines (Y), in the first draw. The table shows stability, not absolute accuracy: an error that "
+        "all points share moves nothing.",
     )
 
 
@@ -114,6 +115,6 @@ def _held_out(report: RegistrationReport) -> PublishedTable:
         (report.stability.held_out_per_draw, x.mean, x.std, y.mean, y.std)
         + (math.hypot(x.mean, y.mean), math.hypot(x.std, y.std), report.scene.acquisition.incidence_deg),
         (0, *(2,) * 6, 1),
-        f"POP points in each of {report.stability.draws} draws, the figures over all of them. They come "
-        "from the same base as the points that were used: a control that is nearly independent.",
+        f"POP points in each of {report.stability.draws} draws; the figures cover all draws. The points "
+        "held out come from the same base as the points used, so the control is nearly independent.",
     )

@@ -36,13 +36,13 @@ def assert_registered(folder: Path, world: FlatWorld) -> None:
     """The folder holds a report that keeps its schema and a model that is right."""
     report = json.loads((folder / "report.json").read_text())
     validate(report, report_schema())
-    assert report["blocks"] == [{"id": "flat", "version": "1"}]
+    assert report["run"]["blocks"] == [{"id": "flat", "version": "1"}]
     refined = read_rpc(world.image, folder / "refined_RPC.TXT").model
     assert largest_error_px(refined, world.true_model) < A_TENTH_OF_A_PIXEL
-    assert_exchanged(folder, report["equipment"]["active"])
+    assert_exchanged(folder, report["point_counts"]["active"])
     points = json.loads((folder / "control_points.geojson").read_text())["features"]
     active = [point for point in points if point["properties"]["status"] == "active"]
-    assert len(active) == report["equipment"]["active"]
+    assert len(active) == report["point_counts"]["active"]
     assert "<html" in (folder / "report.html").read_text()
 
 

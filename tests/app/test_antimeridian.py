@@ -27,7 +27,7 @@ from services.formats.block.check import check_block
 from services.formats.images.raster import write_raster
 from services.imagery.scene import scene_footprint
 from services.production.from_images import ProductionOptions
-from services.registration.on_points import RegistrationOptions
+from services.registration.options import RegistrationOptions
 from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from services.simulation.world import World, make_world
 

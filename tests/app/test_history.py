@@ -24,7 +24,8 @@ from app.usecases.history import record_measures
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
 from services.formats.block.check import check_block
-from services.registration.on_points import Registration, RegistrationOptions
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
 from services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 

@@ -69,7 +69,7 @@ def test_a_request_for_work_becomes_a_job_in_the_queue(
     ("inputs", "named"),
     [
         ({}, "scene"),
-        ({"scene": str(uuid4()), "options": {"fine_passes": 0}}, "fine_passes"),
+        ({"scene": str(uuid4()), "options": {"fine_stages": 0}}, "fine_stages"),
         ({"scene": "abc"}, "scene"),
         ({"scene": None}, "scene"),
         ({"options": {"max_points": "many"}}, "options.max_points"),

@@ -31,7 +31,7 @@ from app.usecases.registration.register import RegisteredScene, SceneFiles, run_
 from services.errors import CoverageError
 from services.imagery.source import ArrayImage, sample_image
 from services.map_grid import MapGrid, xy_of_lon_lat
-from services.registration.on_points import RegistrationOptions
+from services.registration.options import RegistrationOptions
 from services.types import FloatImage
 from tests.app.buckets import running_bucket
 from tests.app.workers import ended, running_worker

@@ -15,7 +15,7 @@ from app.storage import Storage
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import SceneFiles, run_registration
 from services.formats.sensor_models.rpc_files import read_rpc
-from services.registration.on_points import RegistrationOptions
+from services.registration.options import RegistrationOptions
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
@@ -127,7 +127,10 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
             "select count(*) as tried, count(*) filter (where active) as active from measure"
         ).fetchone()
         used = connection.execute("select block_versions, options from registration").fetchone()
-    assert counts == {"tried": report["equipment"]["visible"], "active": report["equipment"]["active"]}
+    assert counts == {
+        "tried": report["point_counts"]["visible"],
+        "active": report["point_counts"]["active"],
+    }
     assert used is not None
     assert used["block_versions"] == [{"id": "flat", "version": "1"}]
     assert used["options"]["max_points"] == 30

@@ -57,7 +57,7 @@ def test_a_scene_is_registered_on_a_reference_without_any_database(
     assert said["verdict"] == "good"
     assert np.abs(np.array(said["shift_px"]) - SHIFT_PX).max() < SHIFT_ALLOWED_PX
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["blocks"] == [{"id": "reference.tif", "version": "reference image"}]
+    assert report["run"]["blocks"] == [{"id": "reference.tif", "version": "reference image"}]
     assert {"report.html", "correction.json", "control_points.geojson"} <= {
         path.name for path in tmp_path.iterdir()
     }

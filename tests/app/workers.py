@@ -130,7 +130,7 @@ def scene_to_register(
     )
 
     def ask(passes: int) -> str:
-        inputs = {"scene": upload.json()["id"], "options": {"fine_passes": passes}}
+        inputs = {"scene": upload.json()["id"], "options": {"fine_stages": passes}}
         body = {"inputs": inputs}
         reply = client.post("/processes/register-scene/execution", json=body, headers=headers)
         return str(reply.headers["location"])

@@ -118,7 +118,7 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
     )
     std_px = np.sqrt(np.trace(found.adjustment.covariance_at(ties[0]), axis1=1, axis2=2) / 2.0)
     print(
-        f"{among.sum()} ties among {found.qualification.equipment.active} points: "
+        f"{among.sum()} ties among {found.qualification.point_counts.active} points: "
         f"{np.median(delivered_px[among]):.3f} px as delivered, "
         f"{np.median(registered_px[among]):.3f} px registered; {(~among).sum()} ties beyond: "
         f"{np.median(registered_px[~among]):.3f} px, expected {np.median(std_px[~among]):.3f} px; "
@@ -129,7 +129,7 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
     assert np.quantile(registered_px[among], 0.9) < three_tenths_of_a_pixel
     assert np.median(registered_px[~among]) < 3.0 * np.median(std_px[~among])
     assert found.qualification.verdict in ("good", "usable")
-    assert found.passes[-1].chip_gsd_m == 0.5  # chips of 1 m are there for few points
+    assert found.search_stages[-1].chip_gsd_m == 0.5  # chips of 1 m are there for few points
 
     # Taken at the same moment: how high the ground lies hardly matters.
     higher = differences_px(found.model, left, ties, height_m + 1.0)

@@ -167,7 +167,7 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     expect(page.get_by_role("link", name="Open the report")).to_be_visible()
     report = report_of(page, service, secret)
     figures = page.locator("dl.facts").inner_text()
-    found = report["equipment"]
+    found = report["point_counts"]
     assert f"{found['visible']}, {found['matched']}, {found['active']}" in figures
     assert page.locator(".badge").first.inner_text() == report["verdict"]
     assert page.locator("tbody tr").count() == len(report["criteria"])

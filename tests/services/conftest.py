@@ -6,7 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.adjustment.image_correction import (
+    AdjustmentOptions,
+    ControlObservations,
+    SceneAdjustment,
+    adjust_scene,
+)
+from services.quality.stability import AdjustedScene
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import Array, BoolArray, Measures
 
@@ -48,6 +54,10 @@ class Registered:
     shape: tuple[int, int] = SHAPE
     gsd_m: float = GSD_M
 
+    def adjusted(self, refit: Callable[[BoolArray], SceneAdjustment] | None = None) -> AdjustedScene:
+        """The scene as its quality is judged, with its own way to redo the adjustment or another."""
+        return AdjustedScene(self.measures, self.adjustment, self.shape, self.gsd_m, refit or self.refit)
+
 
 def register(
     n: int = 60, noise_px: float = 0.2, lost: int = 8, wrong: int = 4, extent: float = 1.0, seed: int = 0
@@ -69,17 +79,11 @@ def register(
     seen[:lost] = np.nan
     seen[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(6.0, 15.0, (wrong, 2))
 
-    def refit(candidates: BoolArray) -> SceneAdjustment:
-        return adjust_scene(
-            model,
-            SHAPE,
-            lon_lat_h,
-            seen,
-            np.full(n, noise_px),
-            np.zeros((n, 3, 3)),
-            AdjustmentOptions(order="drift"),
-            candidates,
+    def refit(usable: BoolArray) -> SceneAdjustment:
+        observations = ControlObservations(
+            lon_lat_h, seen, np.full(n, noise_px), np.zeros((n, 3, 3)), usable
         )
+        return adjust_scene(model, SHAPE, observations, AdjustmentOptions(order="drift"))
 
     matched = np.isfinite(seen).all(axis=1)
     adjustment = refit(matched)

@@ -13,7 +13,8 @@ from benchmarks._trials import Trial, draw_trial, nominal_trial
 from benchmarks._worlds import Block, Place, block_of
 from benchmarks.stress import by_factor, read_outcomes, summary
 from services.imagery.source import Window
-from services.registration.on_points import Registration, RegistrationOptions, register_scene
+from services.registration.on_points import Registration, register_scene
+from services.registration.options import RegistrationOptions
 
 pytestmark = pytest.mark.long
 

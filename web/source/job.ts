@@ -14,10 +14,10 @@ interface Spread {
 }
 interface Report {
   verdict: Verdict;
-  criteria: { name: string; value: number | null; comparison: string; limit: number; needed_for: string; passed: boolean }[];
+  criteria: { name: string; value: number | null; comparison: string; limit: number; needed_for: string; met: boolean }[];
   scene: { name: string; gsd_m: number; footprint_lon_lat: [number, number][] };
   correction: { order: string; words: string[]; shift_m: number };
-  equipment: { visible: number; matched: number; active: number };
+  point_counts: { visible: number; matched: number; active: number };
   reasons: { stage: string; reason: string; count: number }[];
   image_residuals_px: Record<"x" | "y" | "xy", Spread>;
   ground_residuals_m: Record<"east" | "north" | "horizontal", Spread>;
@@ -127,11 +127,11 @@ function toBlock({ number }: Record<string, unknown>): HTMLElement | null {
 }
 
 function summary(report: Report, exaggeration: number): HTMLElement[] {
-  const { equipment, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
+  const { point_counts: counts, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
   return [
     h("p", {}, badge(report.verdict), " ", h("span", { class: "quiet" }, report.correction.words.join("; "))),
     facts({
-      "Points visible, matched, active": `${figure(equipment.visible)}, ${figure(equipment.matched)}, ${figure(equipment.active)}`,
+      "Points visible, matched, active": `${figure(counts.visible)}, ${figure(counts.matched)}, ${figure(counts.active)}`,
       "Residual in the image, rms": `${figure(px.xy.rms, "px")} (x ${figure(px.x.rms)}, y ${figure(px.y.rms)})`,
       "Residual on the ground, rms": figure(ground.horizontal.rms, "m"),
       "Predicted CE90, worst place": `${figure(predicted.worst_px, "px")}, ${figure(predicted.worst_m, "m")}`,
@@ -160,7 +160,7 @@ const CRITERIA: Record<string, [words: string, unit?: string]> = {
   check_points: ["Check points over what is expected"],
 };
 
-function criterion({ name, value, comparison, limit, needed_for, passed }: Report["criteria"][number]): HTMLElement {
+function criterion({ name, value, comparison, limit, needed_for, met }: Report["criteria"][number]): HTMLElement {
   const [words, unit] = CRITERIA[name] ?? [name.replaceAll("_", " ")];
   return h(
     "tr",
@@ -168,7 +168,7 @@ function criterion({ name, value, comparison, limit, needed_for, passed }: Repor
     h("th", { scope: "row" }, words),
     h("td", {}, figure(value, unit)),
     h("td", {}, `${comparison} ${figure(limit, unit)}`),
-    h("td", { class: passed ? "" : "missed" }, passed ? "yes" : `no, not ${needed_for}`),
+    h("td", { class: met ? "" : "missed" }, met ? "yes" : `no, not ${needed_for}`),
   );
 }
 

@@ -10,7 +10,7 @@ from app.db.points import control_points
 from app.storage import Storage, StoredChips
 from services.formats.block.check import check_block
 from services.formats.block.reader import FolderChips
-from services.reports.summary import BlockUsed
+from services.reports.report import BlockUsed
 from services.types import Array, ChipSource, ControlPoints
 
 

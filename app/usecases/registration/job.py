@@ -19,8 +19,8 @@ from app.usecases.scene_inputs import check_file_names, check_scene, present_sce
 from app.usecases.scenes import local_image
 from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
-from services.registration.on_points import RegistrationOptions
-from services.reports.summary import Method as ReportedMethod
+from services.registration.options import RegistrationOptions
+from services.reports.report import Method as ReportedMethod
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _run(work: Work) -> Commit:
         scenes.set_footprint(connection, inputs.scene, made.footprint)
         taken, shape = made.scene.acquisition, made.scene.image.shape
         scenes.describe(connection, inputs.scene, taken, shape, gsd_m)
-        return {"verdict": made.report.verdict, "method": made.report.method, "files": keys}
+        return {"verdict": made.report.verdict, "method": made.report.run.method, "files": keys}
 
     return commit
 

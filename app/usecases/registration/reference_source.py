@@ -10,10 +10,11 @@ from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_t
 from services.formats.images.raster import map_grid_of, open_raster
 from services.imagery.scene import Scene
 from services.matching.reference_image import Reference
-from services.registration.on_points import Registration, RegistrationOptions
-from services.registration.on_reference import ReferenceOptions, register_on_reference
-from services.registration.reference_points import ReferenceChips, homologous_points
-from services.reports.summary import BlockUsed
+from services.registration.on_points import Registration
+from services.registration.on_reference import register_on_reference
+from services.registration.options import RegistrationOptions
+from services.registration.reference_points import ReferenceChips, reference_points
+from services.reports.report import BlockUsed
 from services.sensors.ortho import OrthoModel
 from services.types import Array, Progress
 
@@ -75,17 +76,17 @@ def register_on(
     """Register a scene on a reference.
 
     Returns:
-        The registration, and its homologous points as control points.
+        The registration, and its places on the reference as control points.
     """
-    held = read_reference(found.files)
-    of_reference = ReferenceOptions(
-        seed=options.seed, adjustment=options.adjustment, qualification=options.qualification
+    reference = read_reference(found.files)
+    registration = register_on_reference(
+        scene, reference, options, progress=progress, earlier_places=found.known
     )
-    registration = register_on_reference(scene, held, of_reference, progress, found.known)
     lon_lat_h = registration.measures.lon_lat_h
-    points, chips = homologous_points(lon_lat_h, held), ReferenceChips(held, lon_lat_h)
+    points = reference_points(lon_lat_h, reference)
+    chips = ReferenceChips(reference, lon_lat_h)
     used = BlockUsed(found.name, "reference image")
-    return registration, ControlSet(points, chips, (used,), held.frame_sigma_m)
+    return registration, ControlSet(points, chips, (used,), reference.frame_sigma_m)
 
 
 def read_reference(files: ReferenceFiles) -> Reference:

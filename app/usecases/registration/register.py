@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 from uuid import UUID
@@ -18,23 +19,25 @@ from app.usecases.registration.check_points import read_check_points
 from app.usecases.registration.control_sources import ControlSet, FindPoints
 from app.usecases.registration.deliverables import write_outputs
 from app.usecases.registration.reference_source import FindReference, FoundReference, register_on
+from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import CoverageError
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.refined_model import write_refined
 from services.imagery.scene import Scene, scene_footprint
-from services.quality.check_points import CheckPoints, check_model, qualified_by
-from services.registration.on_points import Registration, RegistrationOptions, register_scene
+from services.quality.check_points import CheckPoints, check_model, with_check_points
+from services.registration.on_points import Registration, register_scene
+from services.registration.options import RegistrationOptions
+from services.reports.build import build_report, scene_record
 from services.reports.document import report_document
-from services.reports.report import RegistrationReport
-from services.reports.summary import Check
+from services.reports.figure_data import figure_data
+from services.reports.report import Check, RefinedModelRecord, RegistrationReport, RunRecord
 from services.types import Array, Progress, no_progress
 
 Method = Literal["auto", "points", "reference"]
 """What a scene is registered on: control points, a reference image, or that where there is no point."""
 
 METRES_PER_DEGREE = 111_320.0
-REACH_SIGMAS = 3.0
-"""A model may be wrong by this many of its standard deviations; points are looked for that far out."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def run_registration(
     if files.check_points is not None:
         held_out = read_check_points(files.check_points, files.check_heights, files.image, scene)
     footprint = scene_footprint(scene)
-    outline = _grown(footprint, REACH_SIGMAS * scene.sigma_m)
+    outline = _grown(footprint, MAX_ERROR_SIGMAS * scene.sigma_m)
     registration, found, reference = _registered(
         scene,
         outline,
@@ -126,22 +129,33 @@ def run_registration(
         registration, check = _checked(registration, held_out, found, options, files.check_points.name)
         checks = (check,)
     progress(0.9, "writing the report")
-    report, paths = write_outputs(
-        folder,
+    refined = write_refined(
         files.image,
         files.model,
-        scene,
-        found.points,
-        found.chips,
-        found.blocks,
-        registration,
-        options,
-        started_at,
-        copy_image,
-        "control points" if reference is None else "reference image",
-        checks,
+        registration.model,
+        registration.adjustment,
+        shape=scene.image.shape,
+        folder=folder,
+        copy_image=copy_image,
     )
-    return RegisteredScene(scene, registration, reference, report, footprint, paths)
+    report = build_report(
+        registration,
+        scene_record(scene, files.image.stem),
+        RunRecord(
+            software_version=version("amers"),
+            started_at=started_at,
+            finished_at=datetime.now(UTC),
+            method="control points" if reference is None else "reference image",
+            blocks=found.blocks,
+            options=options,
+        ),
+        RefinedModelRecord(refined.max_error_px, refined.note),
+        figure_data(scene, found.points, found.chips, registration),
+        checks=checks,
+    )
+    paths = write_outputs(folder, report, files.image.name, found.points)
+    written = {path.name: path for path in (*paths, *refined.files)}
+    return RegisteredScene(scene, registration, reference, report, footprint, written)
 
 
 def _registered(
@@ -159,7 +173,12 @@ def _registered(
         found = find_points(outline)
         try:
             registration = register_scene(
-                scene, found.points, found.chips, options, progress, found.frame_sigma_m
+                scene,
+                found.points,
+                found.chips,
+                options,
+                progress=progress,
+                frame_sigma_m=found.frame_sigma_m,
             )
             return registration, found, None
         except CoverageError as error:
@@ -177,10 +196,10 @@ def _checked(
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:
-    """A registration whose qualification knows what independent points say of it."""
+    """The registration, qualified with check points too, and its accuracy at these points."""
     checked = check_model(registration.model, registration.adjustment, points, found.frame_sigma_m)
     limit = options.qualification.good_unit_weight
-    qualification = qualified_by(registration.qualification, checked, limit)
+    qualification = with_check_points(registration.qualification, checked, limit)
     check = Check(
         f"independent check points of {name}",
         checked.accuracy,
@@ -209,8 +228,8 @@ def record(
         connection,
         job_id=job_id,
         scene_id=scene_id,
-        block_versions=report["blocks"],
-        options=report["options"],
+        block_versions=report["run"]["blocks"],
+        options=report["run"]["options"],
         report=report,
         verdict=registered.registration.qualification.verdict,
         files=keys or {},

@@ -47,7 +47,7 @@ def format_measures(measures: Measures, image: str, sigma_m: Array) -> str:
             "id": int(measures.point_id[i]),
             "geometry": {"type": "Point", "coordinates": [float(v) for v in lon_lat_h]},
             "properties": {
-                "status": measure_status(measures, i),
+                "status": measures.status(i),
                 "reason": str(measures.reason[i]),
                 "views": int(measures.views[i]),
                 **{name: _finite_or_none(float(values[i])) for name, values in numbers.items()},
@@ -77,13 +77,6 @@ def measured_numbers(measures: Measures) -> dict[str, Array]:
         "residual_east_m": measures.residual_m[:, 0],
         "residual_north_m": measures.residual_m[:, 1],
     }
-
-
-def measure_status(measures: Measures, row: int) -> str:
-    """The status of a point: "active", "deactivated" or "not matched"."""
-    if measures.active[row]:
-        return "active"
-    return "deactivated" if measures.matched[row] else "not matched"
 
 
 def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:

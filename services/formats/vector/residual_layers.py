@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.formats.gcp.json_formats import measure_status, measured_numbers
+from services.formats.gcp.json_formats import measured_numbers
 from services.geodesy import metres_per_degree_at
 from services.types import Measures
 
@@ -72,7 +72,7 @@ def _fields(measures: Measures, image: str) -> Fields:
     return {
         "point_id": measures.point_id,
         "image": np.full(n, image, dtype=object),
-        "status": np.array([measure_status(measures, i) for i in range(n)], dtype=object),
+        "status": np.array([measures.status(i) for i in range(n)], dtype=object),
         "reason": measures.reason.astype(object),
         "views": measures.views,
         **measured_numbers(measures),

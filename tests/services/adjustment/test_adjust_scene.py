@@ -5,7 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import AdjustmentOptions, Order, SceneAdjustment, adjust_scene
+from services.adjustment.image_correction import (
+    AdjustmentOptions,
+    ControlObservations,
+    Order,
+    SceneAdjustment,
+    adjust_scene,
+)
 from services.errors import NotEnoughPoints
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
@@ -34,18 +40,12 @@ class Seen:
     truth: ImageCorrection
 
     def adjust(
-        self, options: AdjustmentOptions = DEFAULTS, candidates: BoolArray | None = None
+        self, options: AdjustmentOptions = DEFAULTS, usable: BoolArray | None = None
     ) -> SceneAdjustment:
-        return adjust_scene(
-            FlatModel(),
-            SHAPE,
-            self.lon_lat_h,
-            self.line_sample,
-            self.sigma_px,
-            self.covariance_m2,
-            options,
-            candidates,
+        observations = ControlObservations(
+            self.lon_lat_h, self.line_sample, self.sigma_px, self.covariance_m2, usable
         )
+        return adjust_scene(FlatModel(), SHAPE, observations, options)
 
 
 def seen(parameters: Array, rng: np.random.Generator, n: int = 40, noise_px: float = NOISE_PX) -> Seen:
@@ -171,7 +171,7 @@ def test_measures_without_a_position_and_those_held_out_are_not_used() -> None:
     line_sample = points.line_sample.copy()
     line_sample[:5] = np.nan
     line_sample[30:] += 50.0
-    found = replace(points, line_sample=line_sample).adjust(candidates=np.arange(40) < 30)
+    found = replace(points, line_sample=line_sample).adjust(usable=np.arange(40) < 30)
     assert not found.active[:5].any()
     assert not found.active[30:].any()
     np.testing.assert_allclose(found.correction.parameters[:, 0], [12.0, -7.0], atol=3.0 * NOISE_PX)
@@ -271,7 +271,7 @@ def test_what_could_not_be_tested_is_not_taken_for_known():
     rng = np.random.default_rng(8)
     points = seen(np.array([[3.0, 1.0, 0.0], [-2.0, 0.0, 1.0]]), rng, 400)
     near = (points.line_sample < np.array(SHAPE) * 0.3).all(axis=1)
-    found = points.adjust(candidates=near)
+    found = points.adjust(usable=near)
     assert found.order != "affine"
     corners = np.array([[0.0, 0.0], np.array(SHAPE) - 1.0])
     error = found.correction.apply(corners) - points.truth.apply(corners)

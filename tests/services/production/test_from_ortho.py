@@ -94,7 +94,7 @@ def test_the_same_land_moved_is_found_where_it_was_moved_to() -> None:
     middle = np.full((1, 2), (SIDE - 1) / 2.0)
     shift_px = (found.model.correction.apply(middle) - middle)[0]
     np.testing.assert_allclose(shift_px, MOVED_PX, atol=a_hundredth_of_a_pixel)
-    assert found.qualification.equipment.active >= 20
+    assert found.qualification.point_counts.active >= 20
 
 
 def test_missing_pixels_and_unknown_heights_get_no_point() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError
-from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, qualified_by
+from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, with_check_points
 from services.quality.qualification import QualificationOptions, qualify
 from services.sensors.correction import CorrectedModel
 from tests.services.conftest import GSD_M, SHAPE, FlatModel, Registered
@@ -50,22 +50,15 @@ def test_the_accuracy_on_the_ground_is_that_of_the_marks_seen_through_the_model(
 
 def test_points_that_contradict_a_registration_take_its_verdict_of_good_away(registered):
     scene = registered()
-    good = qualify(
-        scene.measures,
-        scene.adjustment,
-        scene.shape,
-        scene.refit,
-        scene.gsd_m,
-        QualificationOptions(),
-        np.random.default_rng(3),
-    )
+    rng = np.random.default_rng(3)
+    good = qualify(scene.adjusted(), QualificationOptions(), rng, frame_sigma_m=float("nan"))
     assert good.verdict == "good"
-    agreeing = qualified_by(good, checked(scene, check_points(scene, 40, 0.3)), LIMIT)
+    agreeing = with_check_points(good, checked(scene, check_points(scene, 40, 0.3)), LIMIT)
     assert agreeing.verdict == "good"
     moved = checked(scene, check_points(scene, 40, 0.3, (2.0, 0.0)))
-    contradicted = qualified_by(good, moved, LIMIT)
+    contradicted = with_check_points(good, moved, LIMIT)
     assert contradicted.verdict == "usable"
-    (criterion,) = [c for c in contradicted.criteria if not c.passed]
+    (criterion,) = [c for c in contradicted.criteria if not c.met]
     assert criterion.name == "check_points"
     assert criterion.value > LIMIT
 

@@ -7,13 +7,13 @@ import pytest
 
 from services.errors import NotEnoughPoints
 from services.quality.accuracy import CIRCULAR_CE90
+from services.quality.criteria import verdict_of
 from services.quality.qualification import (
     QualificationOptions,
-    count_equipment,
+    count_points,
     image_coverage,
     qualify,
     second_consensus_share,
-    verdict_of,
 )
 from services.quality.stability import predict_accuracy
 
@@ -21,24 +21,15 @@ a_millionth_px = 1e-6
 DEFAULT = QualificationOptions()
 
 
-def qualified(scene, options=DEFAULT, **changes):
+def qualified(scene, options=DEFAULT, refit=None):
     """The qualification of a synthetic registration."""
-    refit = changes.pop("refit", scene.refit)
-    return qualify(
-        scene.measures,
-        scene.adjustment,
-        scene.shape,
-        refit,
-        scene.gsd_m,
-        options,
-        np.random.default_rng(3),
-        **changes,
-    )
+    rng = np.random.default_rng(3)
+    return qualify(scene.adjusted(refit), options, rng, frame_sigma_m=float("nan"))
 
 
 def failed(qualification):
     """Names of the criteria that were not met, with what they are needed for."""
-    return {(c.name, c.needed_for) for c in qualification.criteria if not c.passed}
+    return {(c.name, c.needed_for) for c in qualification.criteria if not c.met}
 
 
 def test_a_clean_registration_is_good(registered):
@@ -47,18 +38,18 @@ def test_a_clean_registration_is_good(registered):
     assert failed(found) == set()
 
 
-def test_the_equipment_counts_visible_matched_and_active_points(registered):
-    equipment = count_equipment(registered(n=60, lost=8, wrong=4).measures)
-    assert (equipment.visible, equipment.matched) == (60, 52)
-    assert 46 <= equipment.active <= 48
-    assert equipment.active_of_matched == equipment.active / 52
-    assert equipment.active_of_visible == equipment.active / 60
+def test_visible_matched_and_active_points_are_counted(registered):
+    counts = count_points(registered(n=60, lost=8, wrong=4).measures)
+    assert (counts.visible, counts.matched) == (60, 52)
+    assert 46 <= counts.active <= 48
+    assert counts.active_of_matched == counts.active / 52
+    assert counts.active_of_visible == counts.active / 60
 
 
 def test_ratios_over_nothing_are_not_invented(registered):
     measures = registered().measures
     nothing = replace(measures, matched=np.zeros(60, bool), active=np.zeros(60, bool))
-    assert np.isnan(count_equipment(nothing).active_of_matched)
+    assert np.isnan(count_points(nothing).active_of_matched)
 
 
 def test_residuals_of_the_image_are_x_along_samples_and_y_along_lines(registered):
@@ -207,28 +198,28 @@ def test_points_coarser_than_the_pixels_allow_a_share_of_their_own_accuracy(regi
     for sigma_px, lost in ((3.0, set()), (1.0, {"residual_std_px"})):
         known = replace(scene.adjustment, point_sigma_px=np.full(2, sigma_px))
         criteria = qualified(replace(scene, adjustment=known)).criteria
-        assert lost == {c.name for c in criteria if not c.passed and c.name == "residual_std_px"}
+        assert lost == {c.name for c in criteria if not c.met and c.name == "residual_std_px"}
         limit = {c.needed_for: c.limit for c in criteria if c.name == "predicted_ce90_px"}
         assert limit["good"] == pytest.approx(max(1.0, 0.25 * CIRCULAR_CE90 * sigma_px))
         assert limit["usable"] == pytest.approx(max(3.0, 0.5 * CIRCULAR_CE90 * sigma_px))
 
 
-def test_two_stories_told_by_many_points_are_not_good(registered):
+def test_two_consensuses_of_many_points_are_not_good(registered):
     scene = registered(n=60, lost=0, wrong=0)
     residual_px, active = scene.measures.residual_px.copy(), scene.measures.active.copy()
     residual_px[:25] += [8.0, -3.0]
     active[:25] = False
-    told = replace(scene.measures, residual_px=residual_px, active=active)
-    assert second_consensus_share(told) == pytest.approx(25 / active.sum())
-    assert ("second_consensus_share", "good") in failed(qualified(replace(scene, measures=told)))
+    two = replace(scene.measures, residual_px=residual_px, active=active)
+    assert second_consensus_share(two) == pytest.approx(25 / active.sum())
+    assert ("second_consensus_share", "good") in failed(qualified(replace(scene, measures=two)))
     residual_px[:25] += np.random.default_rng(1).uniform(-60.0, 60.0, (25, 2))
-    assert second_consensus_share(replace(told, residual_px=residual_px)) < 0.2
+    assert second_consensus_share(replace(two, residual_px=residual_px)) < 0.2
 
 
 def test_nineteen_active_points_are_never_good(registered):
     scene = registered(n=19, lost=0, wrong=0)
     found = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
-    assert found.equipment.active <= 19
+    assert found.point_counts.active <= 19
     assert ("active_points", "good") in failed(found)
     assert found.verdict == "usable"
 

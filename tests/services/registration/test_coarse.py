@@ -9,9 +9,11 @@ from services.conventions import CHIP_CENTRE
 from services.errors import InputError, NoConsensus
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
-from services.registration.chip_selection import chance_of_being_shown, fine_gsd_m, has_chip
-from services.registration.coarse import CoarseOptions
-from services.registration.on_points import Registration, RegistrationOptions, register_scene
+from services.registration.chip_selection import fine_gsd_m, has_chip, visibility_probability
+from services.registration.context import Prediction
+from services.registration.on_points import Registration, register_scene
+from services.registration.options import CoarseOptions, RegistrationOptions
+from services.sensors.correction import CorrectedModel, no_correction
 from services.simulation.view import SimulatedView, plan_geometry
 from services.types import Array, ControlPoints
 from tests.services.simulated import block, plan, spoiled_view, world
@@ -43,9 +45,9 @@ def left_over_px(found: Registration) -> Array:
 @pytest.mark.parametrize("max_search_px", [400, 100], ids=["with whole chips", "with degraded chips"])
 def test_a_scene_wrong_by_half_its_size_is_found(max_search_px: int) -> None:
     found = registered(CoarseOptions(max_search_px=max_search_px))
-    first = found.passes[0]
+    first = found.search_stages[0]
     assert first.name == "coarse"
-    assert first.move_m == pytest.approx(np.hypot(*HALF_THE_SCENE_M), abs=20.0)
+    assert first.displacement_rms_m == pytest.approx(np.hypot(*HALF_THE_SCENE_M), abs=20.0)
     assert first.search_radius_m >= 3.0 * SIGMA_M
     assert first.search_radius_m <= max_search_px * first.chip_gsd_m
     assert left_over_px(found).max() < a_pixel
@@ -59,10 +61,16 @@ def test_a_scene_farther_off_than_it_says_is_refused_with_its_counts() -> None:
 
 def empty_scene(lines: int, gsd_m: float, sigma_m: float) -> Scene:
     """A scene of the middle of the world of which only the geometry counts."""
-    asked = plan(shape=(lines, lines), gsd_m=gsd_m)
-    geometry = plan_geometry(world(), asked, np.random.default_rng(0))
+    of_the_middle = plan(shape=(lines, lines), gsd_m=gsd_m)
+    geometry = plan_geometry(world(), of_the_middle, np.random.default_rng(0))
     blank = ArrayImage(np.zeros((lines, lines), dtype=np.float32))
     return Scene(blank, geometry.delivered, geometry.acquisition, sigma_m)
+
+
+def known_to(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
+    """The delivered model's prediction of points, with a standard deviation."""
+    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
+    return Prediction(model, np.full(len(points), sigma_m))
 
 
 def with_coarse_chips() -> ControlPoints:
@@ -70,16 +78,17 @@ def with_coarse_chips() -> ControlPoints:
     return points.take(np.flatnonzero(has_chip(points, 4.0)))
 
 
-def test_the_chance_of_being_shown_is_that_of_many_draws() -> None:
+def test_the_probability_of_being_shown_is_that_of_many_draws() -> None:
     points, scene, sigma_m = block()[0], empty_scene(700, 1.0, 120.0), 120.0
     line_sample = scene.model.project(points.lon_lat_h)
-    chance = chance_of_being_shown(scene, points, line_sample, 1.0, np.full(len(points), sigma_m))
+    prediction = known_to(sigma_m, scene, points)
+    probability = visibility_probability(scene, points, prediction, 1.0)
     derivative = np.abs(scene.model.project_derivative(points.lon_lat_h[:1])[0, :, :2])
     reach_px = CHIP_CENTRE * derivative.sum(axis=1)
     drawn = np.random.default_rng(1).normal(0.0, sigma_m, (5000, 1, 2)) + line_sample
     shown = ((drawn >= reach_px) & (drawn <= 699.0 - reach_px)).all(axis=2).mean(axis=0)
-    np.testing.assert_allclose(chance, shown, atol=of_many_draws)
-    assert chance.max() > 0.8
+    np.testing.assert_allclose(probability, shown, atol=of_many_draws)
+    assert probability.max() > 0.8
 
 
 @pytest.mark.parametrize(
@@ -92,7 +101,7 @@ def test_chips_are_as_coarse_as_the_scene_where_it_shows_them(
 ) -> None:
     points = with_coarse_chips()
     scene = empty_scene(lines, gsd_m, 5.0)
-    assert fine_gsd_m(scene, points, np.full(len(points), 5.0)) == expected_m
+    assert fine_gsd_m(scene, points, known_to(5.0, scene, points)) == expected_m
 
 
 def test_coarse_chips_of_few_points_are_left_for_the_finer_ones_of_all() -> None:
@@ -101,7 +110,7 @@ def test_coarse_chips_of_few_points_are_left_for_the_finer_ones_of_all() -> None
     without = np.flatnonzero(~has_chip(points, 4.0))
     scene = empty_scene(700, 4.0, 5.0)
     mixed = points.take(np.sort(np.concatenate([few, without])))
-    assert fine_gsd_m(scene, mixed, np.full(len(mixed), 5.0)) == 1.0
+    assert fine_gsd_m(scene, mixed, known_to(5.0, scene, mixed)) == 1.0
 
 
 @pytest.mark.parametrize("name", ["points", "max_search_px", "max_reduction"])

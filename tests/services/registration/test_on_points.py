@@ -131,7 +131,7 @@ def test_measures_hold_together(name: str) -> None:
 
 
 @names
-def test_every_view_that_was_tried_is_told(name: str) -> None:
+def test_every_view_that_was_tried_is_reported(name: str) -> None:
     found = registration(name)
     measures, views = found.measures, found.views
     assert (np.diff(views.point) >= 0).all()
@@ -172,20 +172,21 @@ def test_residuals_of_active_points_are_small_and_without_bias(name: str) -> Non
     assert np.abs(residual_px.mean(axis=0)).max() < a_quarter_of_a_pixel / 2.0
 
 
-def test_passes_begin_far_and_end_near() -> None:
-    passes = registration(FIRST).passes
-    assert [p.name for p in passes] == ["coarse", "fine", "fine"]
-    assert passes[0].search_radius_m > 40.0
-    assert passes[0].move_m > 30.0
-    assert passes[1].search_radius_m < 10.0
-    assert passes[-1].move_m < 1.0
-    for one in passes:
-        assert one.tried >= one.matched >= one.agreeing > 0
+def test_searches_begin_far_and_end_near() -> None:
+    stages = registration(FIRST).search_stages
+    assert [stage.name for stage in stages] == ["coarse", "fine", "fine"]
+    assert stages[0].search_radius_m > 40.0
+    assert stages[0].displacement_rms_m > 30.0
+    assert stages[1].search_radius_m < 10.0
+    assert stages[-1].displacement_rms_m < 1.0
+    for stage in stages:
+        assert stage.tried >= stage.matched >= stage.inliers > 0
 
 
 def test_a_scene_that_is_nearly_right_needs_no_coarse_search() -> None:
     scene = view_of("5 m east, 4 m south").as_scene(5.0)
-    assert [p.name for p in register_scene(scene, *block()).passes] == ["fine", "fine"]
+    stages = register_scene(scene, *block()).search_stages
+    assert [stage.name for stage in stages] == ["fine", "fine"]
 
 
 def test_the_same_scene_is_registered_the_same() -> None:
@@ -271,8 +272,8 @@ def test_a_promise_far_better_than_the_model_is_not_kept_in_silence(sigma_m: flo
 
 
 def test_progress_only_grows_and_arrives() -> None:
-    told: list[float] = []
+    fractions: list[float] = []
     scene = view_of("5 m east, 4 m south").as_scene(5.0)
-    register_scene(scene, *block(), progress=lambda fraction, message: told.append(fraction))
-    assert told[-1] == 1.0
-    assert (np.diff(told) >= -1e-9).all()
+    register_scene(scene, *block(), progress=lambda fraction, message: fractions.append(fraction))
+    assert fractions[-1] == 1.0
+    assert (np.diff(fractions) >= -1e-9).all()

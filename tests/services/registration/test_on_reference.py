@@ -11,7 +11,8 @@ from services.imagery.source import ArrayImage, Window, sample_image
 from services.map_grid import MapGrid, utm_of
 from services.matching.reference_image import Reference, ReferenceMatchingOptions
 from services.registration.on_points import Registration
-from services.registration.on_reference import ReferenceOptions, register_on_reference
+from services.registration.on_reference import register_on_reference
+from services.registration.options import ReferenceOptions, RegistrationOptions
 from services.sensors.ortho import OrthoModel
 from services.simulation.view import true_ground
 from services.terrain import Terrain
@@ -20,7 +21,8 @@ from tests.services.simulated import block_views, spoiled_view, world
 REFERENCE_GSD_M = 1.0
 POSTING_M = 5.0
 SIGMA_M = 25.0
-OPTIONS = ReferenceOptions(places=300)
+REFERENCE_OPTIONS = ReferenceOptions(places=300)
+OPTIONS = RegistrationOptions(reference=REFERENCE_OPTIONS)
 ERROR_ALLOWED_PX = 0.1
 """Of the model, root mean square: roofs lean differently in the reference and in the scene."""
 MAP_ALLOWED_PX = 0.1
@@ -90,19 +92,19 @@ def test_the_stated_accuracy_covers_the_error() -> None:
 
 
 def test_levels_go_down_to_full_resolution_and_their_searches_shrink() -> None:
-    passes = registered().passes
-    assert {one.name for one in passes} == {"reference"}
-    gsd_m = [one.chip_gsd_m for one in passes]
+    stages = registered().search_stages
+    assert {stage.name for stage in stages} == {"reference"}
+    gsd_m = [stage.chip_gsd_m for stage in stages]
     assert gsd_m == sorted(gsd_m, reverse=True)
     assert gsd_m[0] > 1.5 * gsd_m[-1]
-    assert passes[-1].search_radius_m < passes[0].search_radius_m / 4.0
-    assert passes[-1].move_m < 2.0 * gsd_m[-1]
+    assert stages[-1].search_radius_m < stages[0].search_radius_m / 4.0
+    assert stages[-1].displacement_rms_m < 2.0 * gsd_m[-1]
 
 
 def test_few_places_lead_to_the_finest_level_where_all_are_searched() -> None:
-    first, *_, last = registered().passes
-    assert first.tried <= OPTIONS.leading_places
-    assert last.tried > 2 * OPTIONS.leading_places
+    first, *_, last = registered().search_stages
+    assert first.tried <= REFERENCE_OPTIONS.leading_places
+    assert last.tried > 2 * REFERENCE_OPTIONS.leading_places
 
 
 def test_all_places_lead_where_few_of_the_few_are_to_be_seen() -> None:
@@ -110,26 +112,27 @@ def test_all_places_lead_where_few_of_the_few_are_to_be_seen() -> None:
     hidden[:, hidden.shape[1] * 2 // 5 :] = np.nan
     scene = spoiled_view().as_scene(SIGMA_M)
     found = register_on_reference(scene, replace(reference(), image=ArrayImage(hidden)), OPTIONS)
-    assert found.passes[0].tried > OPTIONS.leading_places
+    assert found.search_stages[0].tried > REFERENCE_OPTIONS.leading_places
 
 
 def test_the_last_search_is_one_that_hardly_moves_the_image() -> None:
-    options = replace(OPTIONS, fine_passes=5)
+    options = replace(OPTIONS, reference=replace(REFERENCE_OPTIONS, fine_stages=5))
     scene = spoiled_view().as_scene(SIGMA_M)
     settled = register_on_reference(scene, reference(), options)
-    finest = [one for one in settled.passes if one.tried == settled.passes[-1].tried]
-    assert len(finest) < options.fine_passes
+    stages = settled.search_stages
+    finest = [stage for stage in stages if stage.tried == stages[-1].tried]
+    assert len(finest) < options.reference.fine_stages
     error = error_px(settled)
     assert np.sqrt((error**2).sum(axis=1).mean()) < ERROR_ALLOWED_PX
 
 
 def test_places_found_before_are_the_first_to_be_searched_again() -> None:
     measures = registered().measures
-    known = measures.lon_lat_h[measures.active][::7]
+    earlier = measures.lon_lat_h[measures.active][::7]
     again = register_on_reference(
-        spoiled_view().as_scene(SIGMA_M), reference(), OPTIONS, known=known
+        spoiled_view().as_scene(SIGMA_M), reference(), OPTIONS, earlier_places=earlier
     ).measures
-    distance_deg = np.abs(known[:, None, :2] - again.lon_lat_h[None, :, :2]).max(axis=2).min(axis=1)
+    distance_deg = np.abs(earlier[:, None, :2] - again.lon_lat_h[None, :, :2]).max(axis=2).min(axis=1)
     one_pixel_deg = 1.0 / 70_000.0
     assert np.mean(distance_deg < one_pixel_deg) > 0.8
 

@@ -11,8 +11,9 @@ from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
 from services.matching.chip_extent import MIN_VISIBLE_SIDE
-from services.registration.point_selection import points_to_try, start_uncertainty_m, visible_points
-from services.sensors.base import SensorModel
+from services.registration.context import Prediction
+from services.registration.point_selection import initial_prediction, points_to_try, visible_points
+from services.sensors.correction import CorrectedModel, no_correction
 from services.simulation.view import plan_geometry
 from services.types import Array, BoolArray, ControlPoints
 from tests.services.simulated import block, plan, world
@@ -36,15 +37,21 @@ def enough_shown(scene: Scene, line_sample: Array) -> BoolArray:
     return np.asarray(((line_sample > reach_px) & (line_sample < SIZE_PX - reach_px)).all(axis=1))
 
 
-def tried(scene: Scene, model: SensorModel, points: ControlPoints, sigma_m: float) -> ControlPoints:
-    rows = points_to_try(scene, model, points, np.full(len(points), sigma_m), FEW)
+def known_to(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
+    """The delivered model's prediction of points, with a standard deviation."""
+    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
+    return Prediction(model, np.full(len(points), sigma_m))
+
+
+def tried(scene: Scene, points: ControlPoints, sigma_m: float) -> ControlPoints:
+    rows = points_to_try(scene, points, known_to(sigma_m, scene, points), FEW)
     assert (np.diff(rows) > 0).all()
     return points.take(rows)
 
 
 def test_of_a_scene_that_is_known_well_only_points_are_tried_that_it_shows() -> None:
     scene, points = small_scene(), block()[0]
-    chosen = tried(scene, scene.model, points, 0.5)
+    chosen = tried(scene, points, 0.5)
     assert len(chosen) == FEW
     assert enough_shown(scene, scene.model.project(chosen.lon_lat_h)).all()
 
@@ -56,17 +63,17 @@ def test_the_better_the_model_is_known_the_more_of_the_points_tried_are_shown() 
     shifted = replace(
         points, lon_lat_h=move_metres(points.lon_lat_h, np.tile([90.0, -60.0, 0.0], (len(points), 1)))
     )
-    before = points_to_try(scene, scene.model, shifted, np.full(len(points), SIGMA_M), FEW)
-    after = points_to_try(scene, scene.model, points, np.full(len(points), 0.5), FEW)
+    before = points_to_try(scene, shifted, known_to(SIGMA_M, scene, shifted), FEW)
+    after = points_to_try(scene, points, known_to(0.5, scene, points), FEW)
     shown = [enough_shown(scene, true_place(points.lon_lat_h[rows])).sum() for rows in (before, after)]
     assert shown[0] < shown[1] == FEW
 
 
-def test_where_there_are_few_points_or_all_are_asked_for_all_are_tried() -> None:
+def test_where_there_are_few_points_or_all_are_requested_all_are_tried() -> None:
     scene, points = small_scene(), block()[0]
-    uncertainty_m = start_uncertainty_m(scene, points)
+    prediction = initial_prediction(scene, points)
     for count in (len(points), 0):
-        rows = points_to_try(scene, scene.model, points, uncertainty_m, count)
+        rows = points_to_try(scene, points, prediction, count)
         np.testing.assert_array_equal(rows, np.arange(len(points)))
 
 

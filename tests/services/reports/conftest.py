@@ -1,7 +1,7 @@
-"""Summaries of registrations whose truth is known."""
+"""Reports of registrations whose truth is known."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -9,19 +9,56 @@ import pytest
 
 from services.quality.accuracy import accuracy
 from services.quality.qualification import QualificationOptions, qualify
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
 from services.registration.search import SearchStage
-from services.reports.report import RegistrationReport, build_report
-from services.reports.summary import BlockUsed, Check, ChipPair, Quicklook, RegistrationSummary
-from services.types import Acquisition, FloatImage
+from services.reports.build import build_report
+from services.reports.figure_data import ChipPair, FigureData, Quicklook
+from services.reports.report import (
+    BlockUsed,
+    Check,
+    RefinedModelRecord,
+    RegistrationReport,
+    RunRecord,
+    SceneRecord,
+)
+from services.sensors.correction import CorrectedModel
+from services.types import Acquisition, FloatImage, Measures, ViewMeasures
+from tests.services.conftest import FlatModel
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options inside options, as a registration has them."""
+class Material:
+    """What a report is built from."""
 
-    max_views: int = 6
-    min_score: float = 0.8
-    qualification: QualificationOptions = field(default_factory=QualificationOptions)
+    registration: Registration
+    scene: SceneRecord
+    run: RunRecord
+    refined_model: RefinedModelRecord
+    figure_data: FigureData
+    checks: tuple[Check, ...]
+
+    @property
+    def measures(self) -> Measures:
+        return self.registration.measures
+
+    def report(self) -> RegistrationReport:
+        return build_report(
+            self.registration,
+            self.scene,
+            self.run,
+            self.refined_model,
+            self.figure_data,
+            checks=self.checks,
+        )
+
+    def with_measures(self, measures: Measures) -> "Material":
+        """The same with other measures, under the same qualification."""
+        return replace(
+            self,
+            registration=replace(self.registration, measures=measures),
+            figure_data=replace(self.figure_data, measures=measures),
+        )
 
 
 def landscape(shape: tuple[int, int], seed: int) -> FloatImage:
@@ -42,7 +79,7 @@ def chip_pair(k: int) -> ChipPair:
         point_id=k,
         gsd_m=0.5,
         chip=np.clip(chip, 1, 4000).astype(np.uint16),
-        found=(1.4 * chip + noise).astype(np.float32),
+        scene=(1.4 * chip + noise).astype(np.float32),
         score=0.98 - 0.02 * k,
         residual_px=np.array([0.1, -0.2]) if k < 12 else np.full(2, np.nan),
         status="active" if k < 12 else "score under 0.8",
@@ -50,48 +87,54 @@ def chip_pair(k: int) -> ChipPair:
 
 
 @pytest.fixture
-def summarised(registered) -> Callable[..., RegistrationSummary]:
-    """Makes the summary of a registration; takes what `register` takes, and `name`."""
+def material(registered) -> Callable[..., Material]:
+    """Makes what a report is built from; takes what `register` takes, and `name`."""
 
-    def make(name: str = "IMG_PHR1A_201201", pairs: int = 16, **of_registration) -> RegistrationSummary:
+    def make(name: str = "IMG_PHR1A_201201", pairs: int = 16, **of_registration) -> Material:
         scene = registered(**of_registration)
         lines, samples = scene.shape
         corner = np.array([samples, -lines]) * scene.gsd_m / 111_320.0
-        return RegistrationSummary(
-            scene=name,
-            acquisition=Acquisition(
-                "IMG_1", "PHR1A", datetime(2012, 1, 5, 10, 42, tzinfo=UTC), 12.3, 190.0, 24.5, 165.0
-            ),
-            shape=scene.shape,
-            gsd_m=scene.gsd_m,
-            model_kind="RPC",
-            sigma_m=10.0,
-            footprint=np.array([[0.0, 0.0], [0.0, corner[1]], corner, [corner[0], 0.0]]),
-            blocks=(BlockUsed("calanques", "1"),),
-            options=Options(),
-            passes=(
+        rng = np.random.default_rng(1)
+        none = np.empty(0, dtype=np.int64)
+        registration = Registration(
+            model=CorrectedModel(FlatModel(), scene.adjustment.correction),
+            adjustment=scene.adjustment,
+            measures=scene.measures,
+            views=ViewMeasures(none, none, np.empty(0), none.astype(bool), none.astype(str)),
+            search_stages=(
                 SearchStage("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
                 SearchStage("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
             ),
-            order_reason="drift: lowest cross-validated residual",
-            measures=scene.measures,
-            adjustment=scene.adjustment,
-            qualification=qualify(
-                scene.measures,
-                scene.adjustment,
-                scene.shape,
-                scene.refit,
-                scene.gsd_m,
-                QualificationOptions(),
-                np.random.default_rng(1),
-                frame_sigma_m=1.5,
+            qualification=qualify(scene.adjusted(), QualificationOptions(), rng, frame_sigma_m=1.5),
+        )
+        return Material(
+            registration=registration,
+            scene=SceneRecord(
+                name=name,
+                acquisition=Acquisition(
+                    "IMG_1", "PHR1A", datetime(2012, 1, 5, 10, 42, tzinfo=UTC), 12.3, 190.0, 24.5, 165.0
+                ),
+                lines=lines,
+                samples=samples,
+                gsd_m=scene.gsd_m,
+                model="RPC",
+                sigma_m=10.0,
+                footprint_lon_lat=np.array([[0.0, 0.0], [0.0, corner[1]], corner, [corner[0], 0.0]]),
             ),
-            quicklook=Quicklook(landscape((400, 500), seed=9), 10.0),
-            gallery=tuple(chip_pair(k) for k in range(pairs)),
-            refit_error_px=0.0004,
-            software_version="0.1.0",
-            started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
-            finished_at=datetime(2026, 1, 2, 3, 5, 5, tzinfo=UTC),
+            run=RunRecord(
+                software_version="0.1.0",
+                started_at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+                finished_at=datetime(2026, 1, 2, 3, 5, 5, tzinfo=UTC),
+                method="control points",
+                blocks=(BlockUsed("calanques", "1"),),
+                options=RegistrationOptions(),
+            ),
+            refined_model=RefinedModelRecord(0.0004, "refined_RPC.TXT carries the correction"),
+            figure_data=FigureData(
+                measures=scene.measures,
+                quicklook=Quicklook(landscape((400, 500), seed=9), 10.0),
+                gallery=tuple(chip_pair(k) for k in range(pairs)),
+            ),
             checks=(
                 Check("simulated truth", accuracy(np.random.default_rng(4).normal(0, 0.1, (25, 2)))),
             ),
@@ -101,6 +144,6 @@ def summarised(registered) -> Callable[..., RegistrationSummary]:
 
 
 @pytest.fixture
-def report(summarised) -> RegistrationReport:
+def report(material) -> RegistrationReport:
     """The report of a clean registration."""
-    return build_report(summarised())
+    return material().report()

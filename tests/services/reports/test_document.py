@@ -8,7 +8,7 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from services.reports.document import format_report, report_document, report_schema
-from services.reports.report import build_report, count_reasons
+from services.reports.reasons import count_reasons
 
 
 def refuse(constant):
@@ -27,8 +27,8 @@ def validate(document):
     "of_registration",
     [{}, {"n": 120, "extent": 0.5}, {"n": 5, "lost": 1, "wrong": 0}, {"pairs": 0}],
 )
-def test_a_report_follows_its_schema(summarised, of_registration):
-    validate(parsed(build_report(summarised(**of_registration))))
+def test_a_report_follows_its_schema(material, of_registration):
+    validate(parsed(material(**of_registration).report()))
 
 
 def test_the_schema_is_a_schema():
@@ -47,8 +47,8 @@ def test_the_schema_describes_every_member_of_the_report():
         lambda d: d.pop("verdict"),
         lambda d: d.update(verdict="excellent"),
         lambda d: d.update(extra=1),
-        lambda d: d["equipment"].update(active="47"),
-        lambda d: d["criteria"][0].update(passed="yes"),
+        lambda d: d["point_counts"].update(active="47"),
+        lambda d: d["criteria"][0].update(met="yes"),
         lambda d: d["correction"].update(parameters_px=None),
     ],
 )
@@ -59,40 +59,45 @@ def test_the_schema_refuses_what_a_report_cannot_say(report, spoil):
         validate(document)
 
 
-def test_the_figures_are_those_of_the_registration(summarised):
-    summary = summarised()
-    document = parsed(build_report(summary))
-    measures, found = summary.measures, summary.qualification
-    assert document["equipment"]["active"] == int(measures.active.sum())
+def test_the_figures_are_those_of_the_registration(material):
+    made = material()
+    document = parsed(made.report())
+    measures, found = made.measures, made.registration.qualification
+    assert document["point_counts"]["active"] == int(measures.active.sum())
     assert document["image_residuals_px"]["x"]["std"] == found.image_residuals_px.x.std
-    assert document["correction"]["parameters_px"] == summary.adjustment.correction.parameters.tolist()
+    assert (
+        document["correction"]["parameters_px"]
+        == made.registration.adjustment.correction.parameters.tolist()
+    )
     assert document["correction"]["std_px"][0][1] == pytest.approx(
-        np.sqrt(summary.adjustment.covariance[1, 1])
+        np.sqrt(made.registration.adjustment.covariance[1, 1])
     )
     assert document["correction"]["shift_m"] == pytest.approx(0.5 * np.hypot(12.0, 7.0), rel=0.02)
     assert document["verdict"] == "good"
-    assert document["started_at"] == "2026-01-02T03:04:05+00:00"
-    assert document["options"]["qualification"]["good_active_points"] == 20
+    assert document["run"]["started_at"] == "2026-01-02T03:04:05+00:00"
+    assert document["run"]["options"]["qualification"]["good_active_points"] == 20
     assert "z" not in document["image_residuals_px"]
     assert set(document["ground_residuals_m"]) == {"east", "north", "horizontal"}
 
 
-def test_what_could_not_be_computed_is_null(summarised):
-    summary = summarised(n=5, lost=1, wrong=0)
-    document = parsed(build_report(replace(summary, refit_error_px=float("nan"), started_at=None)))
-    assert document["correction"]["refit_error_px"] is None
+def test_what_could_not_be_computed_is_null(material):
+    made = material(n=5, lost=1, wrong=0)
+    refined_model = replace(made.refined_model, max_error_px=float("nan"))
+    run = replace(made.run, started_at=None)
+    document = parsed(replace(made, refined_model=refined_model, run=run).report())
+    assert document["refined_model"]["max_error_px"] is None
     assert document["stability"]["held_out_px"]["x"]["mean"] is None
-    assert document["started_at"] is None
+    assert document["run"]["started_at"] is None
     validate(document)
 
 
-def test_every_point_that_is_not_active_is_counted_under_one_reason(summarised):
-    summary = summarised()
-    reasons = count_reasons(summary.measures)
+def test_every_point_that_is_not_active_is_counted_under_one_reason(material):
+    made = material()
+    reasons = count_reasons(made.measures)
     unmatched = sum(r.count for r in reasons if r.stage == "not matched")
     deactivated = sum(r.count for r in reasons if r.stage == "deactivated")
-    assert unmatched == (~summary.measures.matched).sum() == 8
-    assert deactivated == (summary.measures.matched & ~summary.measures.active).sum() >= 4
+    assert unmatched == (~made.measures.matched).sum() == 8
+    assert deactivated == (made.measures.matched & ~made.measures.active).sum() >= 4
     assert {r.reason for r in reasons} == {
         "score under 0.8",
         "second peak too close",
@@ -100,8 +105,8 @@ def test_every_point_that_is_not_active_is_counted_under_one_reason(summarised):
     }
 
 
-def test_a_missing_reason_is_said_to_be_missing(summarised):
-    measures = summarised().measures
+def test_a_missing_reason_is_reported_as_missing(material):
+    measures = material().measures
     nameless = replace(measures, reason=np.full(len(measures.reason), ""))
     assert {r.reason for r in count_reasons(nameless)} == {"no reason given"}
 
@@ -128,17 +133,33 @@ def test_a_missing_reason_is_said_to_be_missing(summarised):
         ),
     ],
 )
-def test_the_correction_is_told_in_words(summarised, order, sentences):
-    summary = summarised()
-    correction = replace(
-        summary.adjustment.correction, parameters=np.array([[12.0, 1.5, -0.3], [-7.0, 0.2, 0.5]])
-    )
-    adjustment = replace(summary.adjustment, correction=correction, order=order)
-    words = build_report(replace(summary, adjustment=adjustment)).correction.words
+def test_the_correction_is_stated_in_sentences(material, order, sentences):
+    made = material()
+    before = made.registration.adjustment
+    correction = replace(before.correction, parameters=np.array([[12.0, 1.5, -0.3], [-7.0, 0.2, 0.5]]))
+    adjustment = replace(before, correction=correction, order=order)
+    registration = replace(made.registration, adjustment=adjustment)
+    words = replace(made, registration=registration).report().correction.words
     assert list(words) == sentences
 
 
-def test_a_value_that_no_reader_would_understand_is_refused(summarised):
-    summary = replace(summarised(), blocks=(object(),))
+def test_a_value_that_no_reader_would_understand_is_refused(material):
+    made = material()
+    unknown = replace(made, run=replace(made.run, blocks=(object(),)))
     with pytest.raises(TypeError, match="cannot hold a object"):
-        report_document(build_report(summary))
+        report_document(unknown.report())
+
+
+def test_a_reader_needs_no_other_source_for_words(report):
+    document = parsed(report)
+    for criterion in document["criteria"]:
+        assert criterion["label"]
+        assert criterion["calculation"].endswith(".")
+        assert {"unit", "decimals", "met"} <= set(criterion)
+    assert all(reason["label"] for reason in document["reasons"])
+    assert document["verdict_explanation"] == "Every criterion is met."
+
+
+def test_what_only_the_figures_draw_is_not_part_of_the_document(report):
+    assert "figure_data" not in parsed(report)
+    assert "figure_data" not in report_schema()["properties"]

@@ -7,14 +7,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from services.quality.qualification import Criterion
+from services.quality.criteria import Criterion
+from services.registration.options import RegistrationOptions
 from services.reports.charts import funnel
 from services.reports.drawing import round_number, svg
+from services.reports.figure_data import Quicklook
 from services.reports.figures import FIGURES
 from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
 from services.reports.maps import residual_map
-from services.reports.report import build_report
-from services.reports.summary import Quicklook
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -46,40 +46,42 @@ class Page(HTMLParser):
         self.texts.append(data.strip())
 
 
-def page(summary):
-    return format_html(build_report(summary), summary)
+def page(made):
+    return format_html(made.report())
 
 
-def without_points(summary):
-    """The summary of a registration that saw no point at all."""
-    measures = summary.measures
+def without_points(made):
+    """A registration that saw no point at all."""
+    measures = made.measures
     none = np.zeros(0, dtype=int)
     empty = replace(
         measures, **{name: getattr(measures, name)[none] for name in measures.__dataclass_fields__}
     )
-    return replace(summary, measures=empty, quicklook=None, gallery=(), footprint=np.empty((0, 2)))
-
-
-def nothing_active(summary):
-    """The summary of a registration whose measures were all deactivated, scores unknown."""
-    measures = summary.measures
-    n = len(measures.score)
+    made = made.with_measures(empty)
     return replace(
-        summary,
-        measures=replace(measures, active=np.zeros(n, bool), score=np.full(n, np.nan)),
-        quicklook=Quicklook(np.full((20, 25), np.nan, dtype=np.float32), 200.0),
+        made,
+        figure_data=replace(made.figure_data, quicklook=None, gallery=()),
+        scene=replace(made.scene, footprint_lon_lat=np.empty((0, 2))),
     )
 
 
-def one_active(summary):
-    """The summary of a registration with a single active point."""
-    active = np.zeros(len(summary.measures.score), bool)
+def nothing_active(made):
+    """A registration whose measures were all deactivated, scores unknown."""
+    n = len(made.measures.score)
+    made = made.with_measures(replace(made.measures, active=np.zeros(n, bool), score=np.full(n, np.nan)))
+    quicklook = Quicklook(np.full((20, 25), np.nan, dtype=np.float32), 200.0)
+    return replace(made, figure_data=replace(made.figure_data, quicklook=quicklook))
+
+
+def one_active(made):
+    """A registration with a single active point."""
+    active = np.zeros(len(made.measures.score), bool)
     active[-1] = True
-    return replace(summary, measures=replace(summary.measures, active=active))
+    return made.with_measures(replace(made.measures, active=active))
 
 
-def test_the_page_asks_nothing_of_the_network(summarised):
-    markup = page(summarised())
+def test_the_page_asks_nothing_of_the_network(material):
+    markup = page(material())
     assert "://" not in markup
     assert "@import" not in markup
     found = Page(markup)
@@ -90,26 +92,26 @@ def test_the_page_asks_nothing_of_the_network(summarised):
     assert found.tags.isdisjoint({"script", "link", "iframe", "object", "embed"})
 
 
-def test_the_verdict_comes_first_with_the_numbers_that_cost_it(summarised):
-    summary = summarised(n=12, lost=0, wrong=0)
-    texts = [text for text in Page(page(summary)).texts if text]
-    verdict = texts.index(summary.qualification.verdict)
-    active = int(summary.measures.active.sum())
+def test_the_verdict_comes_first_with_the_numbers_that_cost_it(material):
+    made = material(n=12, lost=0, wrong=0)
+    texts = [text for text in Page(page(made)).texts if text]
+    verdict = texts.index(made.registration.qualification.verdict)
+    active = int(made.measures.active.sum())
     assert verdict < texts.index(f"Active points: {active}") < texts.index("The scene")
 
 
-def test_a_good_page_lists_no_unmet_criterion(summarised):
-    markup = page(summarised())
+def test_a_good_page_lists_no_unmet_criterion(material):
+    markup = page(material())
     assert 'class="unmet"' not in markup
-    assert "every criterion is met" in markup
+    assert "Every criterion is met." in markup
 
 
-def test_the_page_shows_the_figures_of_the_report(summarised):
-    summary = summarised()
-    found = build_report(summary)
-    texts = Page(page(summary)).texts
+def test_the_page_shows_the_figures_of_the_report(material):
+    made = material()
+    found = made.report()
+    texts = Page(page(made)).texts
     for shown in (
-        str(found.equipment.active),
+        str(found.point_counts.active),
         f"{found.coverage.percent:.0f} %",
         f"{found.predicted.worst_m:.2f} m",
         f"{found.image_residuals_px.x.std:.3f}",
@@ -118,94 +120,88 @@ def test_the_page_shows_the_figures_of_the_report(summarised):
         assert shown in texts
 
 
-def test_hostile_names_are_shown_and_not_run(summarised):
-    summary = summarised(name=HOSTILE)
-    measures = summary.measures
+def test_hostile_names_are_shown_and_not_run(material):
+    made = material(name=HOSTILE)
+    measures = made.measures
     reason = np.where(measures.active, "", HOSTILE)
-    pairs = tuple(replace(pair, status=HOSTILE) for pair in summary.gallery)
-    acquisition = replace(summary.acquisition, sensor=HOSTILE)
-    checks = tuple(replace(check, against=HOSTILE) for check in summary.checks)
-    found = Page(
-        page(
-            replace(
-                summary,
-                measures=replace(measures, reason=reason),
-                gallery=pairs,
-                acquisition=acquisition,
-                checks=checks,
-                order_reason=HOSTILE,
-                software_version=HOSTILE,
-                model_kind=HOSTILE,
-            )
-        )
-    )
+    pairs = tuple(replace(pair, status=HOSTILE) for pair in made.figure_data.gallery)
+    acquisition = replace(made.scene.acquisition, sensor=HOSTILE)
+    checks = tuple(replace(check, against=HOSTILE) for check in made.checks)
+    made = made.with_measures(replace(measures, reason=reason))
+    report = replace(
+        made,
+        scene=replace(made.scene, acquisition=acquisition, model=HOSTILE),
+        run=replace(made.run, software_version=HOSTILE),
+        figure_data=replace(made.figure_data, gallery=pairs),
+        checks=checks,
+    ).report()
+    report = replace(report, correction=replace(report.correction, order_reason=HOSTILE))
+    found = Page(format_html(report))
     assert "script" not in found.tags
     assert HOSTILE in found.texts
 
 
 @pytest.mark.parametrize("poor", [without_points, nothing_active, one_active])
-def test_a_page_is_made_of_any_registration(summarised, poor):
-    found = Page(page(poor(summarised())))
+def test_a_page_is_made_of_any_registration(material, poor):
+    found = Page(page(poor(material())))
     assert "Registration report" in found.texts
     assert [name for name, _ in found.attributes].count("aria-label") == len(FIGURES) + 2
 
 
-def test_a_page_of_thousands_of_points_stays_light(summarised):
+def test_a_page_of_thousands_of_points_stays_light(material):
     """A large scene has 1,800 points (SPOT 6/7); a mail takes 10 MB."""
     megabyte = 1_000_000
-    assert len(page(summarised(n=1800, lost=100, wrong=60))) < 3 * megabyte
+    assert len(page(material(n=1800, lost=100, wrong=60))) < 3 * megabyte
 
 
-def test_the_same_registration_gives_the_same_figure(summarised):
-    assert svg(residual_map, summarised()) == svg(residual_map, summarised())
+def test_the_same_registration_gives_the_same_figure(material):
+    assert svg(residual_map, material().report()) == svg(residual_map, material().report())
 
 
-def test_figures_on_one_page_share_no_identifier(summarised):
-    summary = summarised()
-    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, summary))) for draw in FIGURES]
+def test_figures_on_one_page_share_no_identifier(report):
+    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, report))) for draw in FIGURES]
     assert sum(map(len, seen)) == len(set.union(*seen))
 
 
-def test_the_residual_arrows_point_where_the_residuals_do(summarised):
+def test_the_residual_arrows_point_where_the_residuals_do(material):
     """A residual of +1 px in line points down the page, of +1 px in sample to the right."""
-    summary = summarised()
+    made = material()
     residual = np.tile([1.0, 2.0], (60, 1))
-    measures = replace(summary.measures, residual_px=residual)
-    axes = residual_map(replace(summary, measures=measures)).axes[0]
+    measures = replace(made.measures, residual_px=residual)
+    axes = residual_map(made.with_measures(measures).report()).axes[0]
     arrows = axes.collections[0]
     assert axes.yaxis_inverted()
     assert (arrows.U > 0).all()
     np.testing.assert_allclose(arrows.U, 2.0 * arrows.V)
 
 
-def test_the_funnel_ends_where_the_equipment_says(summarised):
-    summary = summarised()
-    axes = funnel(summary).axes[0]
+def test_the_funnel_ends_at_the_point_counts(report):
+    axes = funnel(report).axes[0]
     widths = dict(zip([label.get_text() for label in axes.get_yticklabels()], axes.patches, strict=True))
-    equipment = summary.qualification.equipment
-    assert widths["visible"].get_width() == equipment.visible
-    assert widths["matched"].get_width() == equipment.matched
-    assert widths["active"].get_width() == equipment.active
-    assert widths["beyond 2.7 sigma"].get_x() == equipment.active
+    counts = report.point_counts
+    assert widths["visible"].get_width() == counts.visible
+    assert widths["matched"].get_width() == counts.matched
+    assert widths["active"].get_width() == counts.active
+    assert widths["beyond 2.7 sigma"].get_x() == counts.active
 
 
-def test_the_gallery_shows_best_middle_and_worst_and_no_pair_twice(summarised):
-    pairs = summarised(pairs=21).gallery
+def test_the_gallery_shows_best_middle_and_worst_and_no_pair_twice(material):
+    pairs = material(pairs=21).figure_data.gallery
     groups = choose_pairs(pairs[::-1])
     shown = [pair.point_id for group in groups for pair in group.pairs]
     assert [len(group.pairs) for group in groups] == [4, 4, 4]
     assert shown == [0, 1, 2, 3, 8, 9, 10, 11, 17, 18, 19, 20]
 
 
-def test_a_pair_without_a_score_is_the_worst(summarised):
-    pairs = summarised(pairs=20).gallery
+def test_a_pair_without_a_score_is_the_worst(material):
+    pairs = material(pairs=20).figure_data.gallery
     unknown = replace(pairs[0], score=float("nan"))
     assert choose_pairs((unknown, *pairs[1:]))[-1].pairs[-1] is unknown
 
 
-def test_an_empty_gallery_takes_no_room(summarised):
+def test_an_empty_gallery_takes_no_room(material):
     assert choose_pairs(()) == ()
-    assert "Chips and what was found" not in page(summarised(pairs=0))
+    assert "Chips and the scene" not in page(material(pairs=0))
 
 
 @pytest.mark.parametrize("chip", [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan)])
@@ -225,12 +221,24 @@ def test_a_chip_without_data_is_still_an_image(chip):
     ],
 )
 def test_a_margin_is_positive_where_the_criterion_is_met(value, comparison, limit, words):
-    assert margin_words(Criterion("x", value, comparison, limit, "good", True)) == words
+    criterion = Criterion(
+        name="x",
+        label="X",
+        value=value,
+        comparison=comparison,
+        limit=limit,
+        unit="",
+        decimals=2,
+        needed_for="good",
+        met=True,
+        calculation="",
+    )
+    assert margin_words(criterion) == words
 
 
-def test_options_inside_options_are_listed_by_dotted_names(summarised):
-    listed = dict(flat_options(summarised().options))
-    assert listed["min_score"] == "0.8"
+def test_options_inside_options_are_listed_by_dotted_names():
+    listed = dict(flat_options(RegistrationOptions(max_points=80)))
+    assert listed["max_points"] == "80"
     assert listed["qualification.good_active_points"] == "20"
 
 

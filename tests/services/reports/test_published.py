@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from services.reports.published import published_tables
-from services.reports.report import build_report
 
 
 def values(table):
@@ -14,21 +13,21 @@ def values(table):
 
 
 def test_the_tables_have_the_published_columns(report):
-    equipment, image, ground, moved, held_out = published_tables(report)
-    assert equipment.columns == ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app")
+    point_counts, image, ground, moved, held_out = published_tables(report)
+    assert point_counts.columns == ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app")
     assert image.columns == ("dx_app", "dy_app", "dxy_app", "ectx_app", "ecty_app", "ectxy_app")
     assert ground.columns[-2:] == ("dZ_amer", "ectZ_amer")
     assert " ".join(moved.columns).startswith("dX0 dY0 dX1 dY1 dX2 dY2 dX3 dY3 dXc dYc")
     assert held_out.columns[:3] == ("POP", "dX_moy", "dX_ect")
-    for table in (equipment, image, ground, moved, held_out):
+    for table in (point_counts, image, ground, moved, held_out):
         assert len(table.columns) == len(table.values) == len(table.decimals)
 
 
-def test_a_published_row_comes_out_of_its_own_counts_and_components(summarised):
+def test_a_published_row_comes_out_of_its_own_counts_and_components(material):
     """S7PX--2017021834832683CP: 494 of 526 of 997; P1BPX-2019080641037699CP: -2.9, 1.3, 3.4, 2.0."""
-    report = build_report(summarised())
+    report = material().report()
     counts = replace(
-        report.equipment,
+        report.point_counts,
         visible=997,
         matched=526,
         active=494,
@@ -41,11 +40,11 @@ def test_a_published_row_comes_out_of_its_own_counts_and_components(summarised):
         x=replace(residuals.x, mean=-5.8, std=6.8),
         y=replace(residuals.y, mean=2.6, std=4.0),
     )
-    equipment, image, *_ = published_tables(
-        replace(report, equipment=counts, image_residuals_px=residuals)
+    point_counts, image, *_ = published_tables(
+        replace(report, point_counts=counts, image_residuals_px=residuals)
     )
     published_percent = (93.9, 49.5)
-    assert equipment.values[:2] == pytest.approx(published_percent, abs=0.05)
+    assert point_counts.values[:2] == pytest.approx(published_percent, abs=0.05)
     assert report.scene.gsd_m == 0.5
     published_m = (-2.9, 1.3, 3.2, 3.4, 2.0, 3.9)
     assert image.values == pytest.approx(published_m, abs=0.05)
@@ -61,8 +60,8 @@ def test_displacements_are_those_of_one_draw_with_their_signs(report):
     assert moved["Incidence (°)"] == report.scene.acquisition.incidence_deg
 
 
-def test_a_scene_without_draws_has_dashes_and_the_reason(summarised):
-    report = build_report(summarised(n=5, lost=1, wrong=0))
+def test_a_scene_without_draws_has_dashes_and_the_reason(material):
+    report = material(n=5, lost=1, wrong=0).report()
     table = published_tables(report)[3]
     assert all(math.isnan(value) for value in table.values[:10])
     assert table.note == report.stability.note != ""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from services.quality.accuracy import sample_quantile
-from services.reports.report import build_report
-from services.reports.tables import format_tables, number, quantile
+from services.reports.numbers import number, quantile
+from services.reports.tables import format_tables
 
 
 def row(text, start):
@@ -19,10 +19,10 @@ def row(text, start):
     raise AssertionError(f"no row {start!r} in\n{text}")
 
 
-def test_the_equipment_table_has_the_published_columns_and_the_counts(summarised):
-    summary = summarised(name="scene A")
-    active = int(summary.measures.active.sum())
-    text = format_tables(build_report(summary))
+def test_the_table_of_point_counts_has_the_published_columns_and_the_counts(material):
+    made = material(name="scene A")
+    active = int(made.measures.active.sum())
+    text = format_tables(made.report())
     assert row(text, "Scene")[1:] == ["Popini", "Spatio", "Actif", "Actif/Spatio", "Actif/Popini"]
     assert row(text, "scene A")[1:] == [
         "60",
@@ -33,10 +33,10 @@ def test_the_equipment_table_has_the_published_columns_and_the_counts(summarised
     ]
 
 
-def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(summarised):
-    summary = summarised()
-    residual = summary.measures.residual_px[summary.measures.active]
-    text = format_tables(build_report(summary))
+def test_the_residual_table_says_mean_and_deviation_of_each_coordinate(material):
+    made = material()
+    residual = made.measures.residual_px[made.measures.active]
+    text = format_tables(made.report())
     assert row(text, "x (sample)")[1] == str(len(residual))
     assert row(text, "x (sample)")[3] == f"{residual[:, 1].std(ddof=1):.3f}"
     assert row(text, "y (line)")[3] == f"{residual[:, 0].std(ddof=1):.3f}"
@@ -51,8 +51,8 @@ def test_the_stability_table_says_what_it_does_not_show(report):
     assert "top left" in text
 
 
-def test_an_unmet_criterion_stands_out_with_its_value_and_limit(summarised):
-    text = format_tables(build_report(summarised(n=12, lost=0, wrong=0)))
+def test_an_unmet_criterion_stands_out_with_its_value_and_limit(material):
+    text = format_tables(material(n=12, lost=0, wrong=0).report())
     assert row(text, "Active points")[2:] == ["at least 20", "good", "NO"]
     assert int(row(text, "Active points")[1]) <= 12
     assert "Verdict: usable" in text or "Verdict: failed" in text

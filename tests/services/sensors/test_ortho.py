@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.adjustment.image_correction import AdjustmentOptions, adjust_scene
+from services.adjustment.image_correction import AdjustmentOptions, ControlObservations, adjust_scene
 from services.imagery.scene import view_direction
 from services.map_grid import MapGrid
 from services.sensors.correction import CorrectedModel, ImageCorrection
@@ -58,9 +58,8 @@ def test_wrong_heights_of_points_do_not_reach_the_adjustment_of_an_ortho_image()
     seen = CORRECTION.apply(pixels()) + rng.normal(0.0, 0.1, (100, 2))
     covariance = np.tile(np.diag([1.0, 1.0, 1e6]), (100, 1, 1))
     ground[:, 2] += rng.normal(0.0, 1000.0, 100)
-    found = adjust_scene(
-        MODEL, SHAPE, ground, seen, np.full(100, 0.1), covariance, AdjustmentOptions(order="affine")
-    )
+    observations = ControlObservations(ground, seen, np.full(100, 0.1), covariance)
+    found = adjust_scene(MODEL, SHAPE, observations, AdjustmentOptions(order="affine"))
     assert found.active.sum() > 90
     # Points of 1 m on pixels of 10 m: 0.1 px, beside 0.1 px of the measures.
     std_px = np.sqrt(np.diag(found.covariance).reshape(2, 3))

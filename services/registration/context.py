@@ -1,0 +1,68 @@
+"""What the stages of a registration share: the context of the work, and the current prediction."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+from services.imagery.scene import Scene, scene_gsd_m
+from services.imagery.source import CachedImage
+from services.registration.options import RegistrationOptions
+from services.sensors.correction import CorrectedModel
+from services.types import Array, ChipSource, ControlPoints, Progress, part_of
+
+
+@dataclass(frozen=True)
+class RegistrationContext:
+    """What a registration works on; every stage receives it.
+
+    Attributes:
+        scene: as delivered.
+        options: of all stages.
+        progress: receives the fraction done and the work under way.
+        frame_sigma_m: accuracy of the frame of the control on the Earth, one standard deviation a
+            coordinate; NaN when unknown.
+    """
+
+    scene: Scene
+    options: RegistrationOptions
+    progress: Progress
+    frame_sigma_m: float
+
+    @cached_property
+    def gsd_m(self) -> float:
+        """Ground sampling at the centre of the scene, metres."""
+        return scene_gsd_m(self.scene)
+
+    def part(self, start: float, share: float) -> Self:
+        """The same context for a part of the work, whose progress runs from `start` over `share`."""
+        return replace(self, progress=part_of(self.progress, start, share))
+
+
+@dataclass(frozen=True)
+class PointContext(RegistrationContext):
+    """What a registration on control points works on.
+
+    Attributes:
+        points: all n points that the scene may show.
+        chips: of these points.
+        image: the pixels of the scene; what one stage reads is kept for the next.
+        fine_gsd_m: ground sampling of the chips of the fine searches.
+    """
+
+    points: ControlPoints
+    chips: ChipSource
+    image: CachedImage
+    fine_gsd_m: float
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where a model expects points, and how precisely.
+
+    Attributes:
+        model: of the scene, as corrected so far.
+        uncertainty_m: (n,) standard deviation of the expected positions, metres.
+    """
+
+    model: CorrectedModel
+    uncertainty_m: Array

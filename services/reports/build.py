@@ -1,0 +1,134 @@
+"""The report of a registration, made from the registration and the facts around it."""
+
+import numpy as np
+
+from services.adjustment.image_correction import Order, SceneAdjustment
+from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
+from services.quality.criteria import VERDICT_EXPLANATIONS
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
+from services.reports.figure_data import FigureData
+from services.reports.reasons import count_reasons
+from services.reports.report import (
+    REPORT_FORMAT,
+    Check,
+    CorrectionRecord,
+    OrderScore,
+    RefinedModelRecord,
+    RegistrationReport,
+    RunRecord,
+    SceneRecord,
+)
+from services.sensors.ortho import OrthoModel
+
+
+def build_report(
+    registration: Registration,
+    scene: SceneRecord,
+    run: RunRecord,
+    refined_model: RefinedModelRecord,
+    figure_data: FigureData,
+    *,
+    checks: tuple[Check, ...] = (),
+) -> RegistrationReport:
+    """The report of a registration.
+
+    Args:
+        registration: gives the figures.
+        scene: what was registered.
+        run: how and when.
+        refined_model: the files that carry the correction.
+        figure_data: what the figures of the page draw.
+        checks: accuracy at points that had no part in the registration.
+    """
+    qualification = registration.qualification
+    return RegistrationReport(
+        format=REPORT_FORMAT,
+        run=run,
+        verdict=qualification.verdict,
+        verdict_explanation=VERDICT_EXPLANATIONS[qualification.verdict],
+        criteria=qualification.criteria,
+        scene=scene,
+        correction=_correction_record(registration.adjustment, run.options, scene.gsd_m),
+        refined_model=refined_model,
+        search_stages=registration.search_stages,
+        point_counts=qualification.point_counts,
+        reasons=count_reasons(registration.measures),
+        image_residuals_px=qualification.image_residuals_px,
+        ground_residuals_m=qualification.ground_residuals_m,
+        stability=qualification.stability,
+        predicted=qualification.predicted,
+        coverage=qualification.coverage,
+        checks=checks,
+        figure_data=figure_data,
+    )
+
+
+def scene_record(scene: Scene, name: str) -> SceneRecord:
+    """The facts of a report about a scene, under a name for people."""
+    lines, samples = scene.image.shape
+    return SceneRecord(
+        name=name,
+        acquisition=scene.acquisition,
+        lines=lines,
+        samples=samples,
+        gsd_m=scene_gsd_m(scene),
+        model="map grid" if isinstance(scene.model, OrthoModel) else "RPC",
+        sigma_m=scene.sigma_m,
+        footprint_lon_lat=scene_footprint(scene),
+    )
+
+
+def _correction_record(
+    adjustment: SceneAdjustment, options: RegistrationOptions, gsd_m: float
+) -> CorrectionRecord:
+    """The correction with its precision."""
+    correction = adjustment.correction
+    shift_px = correction.parameters[:, 0]
+    variance = np.clip(np.diagonal(adjustment.covariance), 0.0, None)
+    return CorrectionRecord(
+        order=adjustment.order,
+        order_reason=_order_reason(adjustment, options.adjustment.order),
+        order_scores=tuple(OrderScore(*score) for score in adjustment.validation_px),
+        parameters_px=correction.parameters,
+        std_px=np.sqrt(variance).reshape(2, 3),
+        centre_px=correction.centre,
+        half_size_px=correction.half_size,
+        shift_px=shift_px,
+        shift_m=float(np.hypot(*shift_px) * gsd_m),
+        words=correction_in_words(adjustment, gsd_m),
+        sigma0=adjustment.sigma0,
+    )
+
+
+def _order_reason(adjustment: SceneAdjustment, requested: Order | None) -> str:
+    """The order of a correction and why it was chosen, as one sentence."""
+    if requested is not None:
+        return f"{adjustment.order}, as requested"
+    if len(adjustment.validation_px) == 1:
+        return f"{adjustment.order}: the points are too few or too close together for a higher order"
+    scores = ", ".join(f"{order} {value_px:.2f} px" for order, value_px in adjustment.validation_px)
+    return f"{adjustment.order}: rms residual of points left out of the fit: {scores}"
+
+
+def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str, ...]:
+    """One sentence for each part of the correction that was free.
+
+    Args:
+        adjustment: with the correction.
+        gsd_m: ground sampling of the image; it converts pixels to metres.
+    """
+    parameters = adjustment.correction.parameters
+    parts: tuple[tuple[str, float, float], ...] = (("shift", *parameters[:, 0]),)
+    if adjustment.order == "drift":
+        parts += (("drift at the last line and sample", parameters[0, 1], parameters[1, 2]),)
+    elif adjustment.order == "affine":
+        parts += (
+            ("drift along the lines, at the last line", *parameters[:, 1]),
+            ("drift along the samples, at the last sample", *parameters[:, 2]),
+        )
+    return tuple(
+        f"{name}: {line:+.2f} px in line, {sample:+.2f} px in sample"
+        f" ({np.hypot(line, sample) * gsd_m:.2f} m)"
+        for name, line, sample in parts
+    )
