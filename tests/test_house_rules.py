@@ -1,5 +1,6 @@
 """What holds the house together: imports, the tour, and documents that name everything there is."""
 
+import json
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from app.config import Settings
 
 ROOT = Path(__file__).parent.parent
 HEAVY = {"numba", "scipy", "cv2", "rasterio", "matplotlib", "pyarrow", "fastapi"}
+STORE = {"sqlalchemy", "geoalchemy2", "psycopg", "numpy", "shapely"}
 README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
 TOUR = (
@@ -121,17 +123,26 @@ def test_a_command_is_documented_and_explains_itself(words):
     assert command.help
 
 
-def test_a_command_starts_without_what_only_others_need():
+def loaded_by(*arguments: str) -> set[str]:
+    """The modules that `amers` with these arguments imports."""
     program = (
-        "import atexit, sys; from app.cli.main import main\n"
-        f"atexit.register(lambda: print({HEAVY} & set(sys.modules)))\n"
-        "sys.argv = ['amers', 'token', '--help']\n"
+        "import atexit, json, sys; from app.cli.main import main\n"
+        "atexit.register(lambda: print(json.dumps(list(sys.modules))))\n"
+        f"sys.argv = {['amers', *arguments]}\n"
         "main()"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    assert done.stdout.splitlines()[-1] == "set()", done.stdout + done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_a_command_starts_without_what_only_others_need():
+    assert HEAVY & loaded_by("token", "--help") == set()
+
+
+def test_the_help_starts_without_the_store_and_the_science():
+    assert (HEAVY | STORE) & loaded_by("--help") == set()
 
 
 def test_only_the_settings_read_the_environment():

@@ -1,6 +1,6 @@
-"""The command `amers`: noun, then verb; a group of commands is one file, registered here by one line.
+"""The command `amers`: noun, then verb. Each group of commands is one module, registered here by a line.
 
-Exit codes: 0 done, 2 the input cannot be used, 3 the scene could not be registered, 1 anything else.
+Exit codes: 0 success, 2 unusable input, 3 the scene could not be registered, 1 any other failure.
 """
 
 import signal
@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from app.errors import AmersError, ComputationError
@@ -20,39 +20,53 @@ EXIT_REFUSED = 2
 EXIT_NOT_REGISTERED = 3
 EXIT_INTERRUPTED = 130
 
-NAMES = (
-    "block",
-    "points",
-    "scene",
-    "reference",
-    "production",
-    "db",
-    "token",
-    "demo",
-    "serve",
-    "worker",
-    "audit",
-)
-"""Groups of commands, and commands, each in the module of its name."""
+COMMANDS = {
+    "block": "Blocks of control points: ingest, publish, withdraw, export.",
+    "points": "Control points of published blocks: query, suspend, reinstate.",
+    "scene": "Register and orthorectify scenes.",
+    "reference": "Reference images, for scenes on ground without control points.",
+    "production": "Make new blocks of points from images.",
+    "db": "The database and its schema: upgrade, status, backup, restore.",
+    "token": "Tokens of the callers of the API.",
+    "demo": "Run the whole work on a simulated world.",
+    "serve": "Run the API and one worker.",
+    "worker": "Run a worker without the API.",
+    "audit": "Show the record of changes.",
+}
+"""Groups of commands and single commands with their help, each in the module of its name."""
 
 
 class Commands(UserDict[str, Any]):
-    """The commands by name; the file of one is read when it is asked for: some bring all the science."""
+    """The commands by name. The module of a command is imported on first use: some import much."""
 
     def __getitem__(self, name: str) -> Any:
         if self.data[name] is None:
             module = import_module(f"app.cli.{name}")
-            self.data[name] = get_group(module.app) if hasattr(module, "app") else _single(module, name)
-            self.data[name].name = name
+            command = get_group(module.app) if hasattr(module, "app") else _single(module, name)
+            command.name, command.short_help = name, COMMANDS[name]
+            self.data[name] = command
         return self.data[name]
 
 
 class Amers(TyperGroup):
-    """The group of all commands."""
+    """The group of all commands, whose help needs none of their modules."""
 
-    def __init__(self, **more: Any) -> None:
-        super().__init__(**more)
-        self.commands = Commands(dict.fromkeys(NAMES))
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = Commands(dict.fromkeys(COMMANDS))
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names of all commands."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The name and the help of a command, for lists of commands."""
+        return TyperCommand(cmd_name, help=COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command to run, and the rest of the arguments."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, self.commands[name] if name in COMMANDS else command, rest
 
 
 app = typer.Typer(
@@ -69,10 +83,10 @@ def amers() -> None:
 
 
 def main() -> None:
-    """Run one command; an error that the user can understand is one line, not a trace."""
+    """Run one command; an `AmersError` is printed as one line, without a traceback."""
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:
-            signal.signal(number, _leave)
+            signal.signal(number, _exit)
     try:
         app()
     except AmersError as error:
@@ -83,14 +97,14 @@ def main() -> None:
 
 
 def _single(module: Any, name: str) -> Any:
-    """A command that is no group: the function of its name."""
+    """The command of a module without a group: its function of the same name."""
     one = typer.Typer(add_completion=False)
     one.command(name)(getattr(module, name))
     return get_command(one)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    """Ends by an exception, so that what was opened is closed: the private database, a worker."""
+def _exit(number: int, frame: FrameType | None) -> None:
+    """End by an exception, so that contexts close what they opened: the private database, a worker."""
     raise SystemExit(128 + number)
 
 
