@@ -10,18 +10,22 @@ from app.usecases import operations
 
 
 def audit(
-    limit: Annotated[int, typer.Option(help="Most changes shown.")] = 50,
-    kind: Annotated[str | None, typer.Option(help="token, block, scene or job.")] = None,
+    *,
+    limit: Annotated[int, typer.Option(help="Largest number of changes to show, 1 to 1000.")] = 50,
+    kind: Annotated[
+        str | None,
+        typer.Option(help="Only this kind: token, block, scene, job, point or reference_image."),
+    ] = None,
     subject: Annotated[
-        str | None, typer.Option(help="Id of one of them; ID@VERSION of a block.")
+        str | None, typer.Option(help="Only the thing with this id; ID@VERSION for a block.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the last changes of tokens, blocks, scenes and jobs, the newest first."""
+    """Show the last changes of tokens, blocks, scenes, jobs and points, the newest first."""
     with transaction() as connection:
-        found = operations.list_changes(connection, limit, kind=kind, subject=subject)
+        changes = operations.list_changes(connection, limit, kind=kind, subject=subject)
     if as_json:
-        show([vars(change) for change in found], as_json=True)
+        show([vars(change) for change in changes], as_json=True)
         return
     show(
         [
@@ -32,7 +36,7 @@ def audit(
                 "before": change.before,
                 "after": change.after,
             }
-            for change in found
+            for change in changes
         ],
         as_json=False,
     )

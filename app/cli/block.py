@@ -1,4 +1,4 @@
-"""`amers block`: productions of points, from a folder to a publication."""
+"""`amers block`: blocks of points, from a folder to the publication."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,9 @@ from app.usecases.blocks.export import ExportBlock, select_points, write_selecte
 from app.usecases.blocks.lifecycle import Published
 from services.quality.block import BlockQuality, Distribution, quality_document
 
-app = typer.Typer(help="Productions of points.", no_args_is_help=True)
+app = typer.Typer(
+    help="Blocks of control points: ingest, publish, withdraw, export.", no_args_is_help=True
+)
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 
@@ -25,11 +27,14 @@ Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or 
 @app.command()
 def ingest(
     path: Annotated[Path, typer.Argument(help="Folder of the block.")],
-    publish: Annotated[bool, typer.Option("--publish", help="Make it visible at once.")] = False,
-    priority: Annotated[int, typer.Option(help="Over the same place the greater one wins.")] = 0,
+    *,
+    publish: Annotated[bool, typer.Option("--publish", help="Publish the block at once.")] = False,
+    priority: Annotated[
+        int, typer.Option(help="Where blocks overlap, points of the greater priority are served.")
+    ] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Check a block entirely and load it, staged."""
+    """Check a block folder completely and load it into the store, staged."""
     settings = read_settings()
     storage = open_storage(settings)
     with transaction(settings) as connection:
@@ -48,8 +53,8 @@ def ingest(
 def list_blocks(as_json: AsJson = False) -> None:
     """List all blocks, the newest first."""
     with transaction() as connection:
-        found = lifecycle.list_blocks(connection)
-    show([_record(block) for block in found], as_json=as_json)
+        blocks = lifecycle.list_blocks(connection)
+    show([_record(block) for block in blocks], as_json=as_json)
 
 
 @app.command("show")
@@ -62,23 +67,23 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
 
 @app.command()
 def quality(reference: Reference, as_json: AsJson = False) -> None:
-    """Show the quality figures of a block; with --json also the density of every cell."""
+    """Show the quality figures of a block; --json adds the density of every cell."""
     with transaction() as connection:
         report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
     if as_json:
-        stated = [vars(figure) for figure in report.accuracy]
-        print_json({**quality_document(report.quality), "accuracy": stated})
+        accuracy = [vars(figure) for figure in report.accuracy]
+        print_json({**quality_document(report.quality), "accuracy": accuracy})
         return
-    stated_lines = {
+    accuracy_lines = {
         f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
         for figure in report.accuracy
     }
-    show_one({**_figures(report.quality), **stated_lines}, as_json=False)
+    show_one({**_figures(report.quality), **accuracy_lines}, as_json=False)
 
 
 @app.command()
 def publish(reference: Reference, as_json: AsJson = False) -> None:
-    """Make a block visible, and the version of it that was visible before no longer."""
+    """Publish a block, and withdraw the version of it that was published before."""
     with transaction() as connection:
         published = lifecycle.publish_block(connection, reference)
     show_one(_published(published), as_json=as_json)
@@ -86,7 +91,7 @@ def publish(reference: Reference, as_json: AsJson = False) -> None:
 
 @app.command()
 def restore(reference: Reference, as_json: AsJson = False) -> None:
-    """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
+    """Publish a withdrawn or superseded block again, in place of its published version."""
     with transaction() as connection:
         published = lifecycle.restore_block(connection, reference)
     show_one(_published(published), as_json=as_json)
@@ -95,10 +100,10 @@ def restore(reference: Reference, as_json: AsJson = False) -> None:
 @app.command()
 def prioritise(
     reference: Reference,
-    priority: Annotated[int, typer.Argument(help="-1000 to 1000; 0 unless said otherwise.")],
+    priority: Annotated[int, typer.Argument(help="-1000 to 1000; new blocks have 0.")],
     as_json: AsJson = False,
 ) -> None:
-    """Let a block win or lose against other blocks over the same place."""
+    """Set which of overlapping blocks is served: points of the block with the greater priority."""
     with transaction() as connection:
         block = lifecycle.prioritise_block(connection, reference, priority)
     show_one(_record(block), as_json=as_json)
@@ -106,14 +111,17 @@ def prioritise(
 
 @app.command()
 def export(
-    bbox: Annotated[str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses 180.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to make.")],
-    name: Annotated[str, typer.Option("--id", help="Name of the new block.")] = "extract",
+    *,
+    bbox: Annotated[
+        str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    name: Annotated[str, typer.Option("--id", help="Id of the new block.")] = "extract",
     version: Annotated[str, typer.Option(help="Version of the new block.")] = "1",
     title: Annotated[str, typer.Option(help="Title of the new block.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Write the points that are served in a box, with their chips, into a new block folder."""
+    """Write the served points of a box, with their chips, into a new block folder."""
     try:
         west, south, east, north = (float(part) for part in bbox.split(","))
     except ValueError:
@@ -133,17 +141,17 @@ def export(
 
 @app.command()
 def withdraw(reference: Reference, as_json: AsJson = False) -> None:
-    """Make a block invisible; it can be published again."""
+    """Withdraw a published block; it can be restored."""
     with transaction() as connection:
         block = lifecycle.withdraw_block(connection, reference)
     show_one(_record(block), as_json=as_json)
 
 
 def _published(published: Published) -> Row:
-    old = published.superseded
+    superseded = published.superseded
     return {
         **_record(published.block),
-        "superseded": None if old is None else f"{old.id}@{old.version}",
+        "superseded": None if superseded is None else f"{superseded.id}@{superseded.version}",
     }
 
 
@@ -169,14 +177,14 @@ def _figures(quality: BlockQuality) -> Row:
         "density": f"{quality.points_per_km2:.3f} points/km2",
         "cells with 1 / 2 km2": f"{100.0 * quality.share_reaching_half:.1f} %",
         "cells with 1 / 4 km2": f"{100.0 * quality.share_reaching_quarter:.1f} %",
-        "images a point": _five(quality.images_per_point, ".1f"),
-        "chips a point": _five(quality.views_per_point, ".1f"),
-        "sigma horizontal, m": _five(quality.sigma_horizontal_m, ".2f"),
-        "sigma up, m": _five(quality.sigma_up_m, ".2f"),
+        "images per point": _distribution(quality.images_per_point, ".1f"),
+        "chips per point": _distribution(quality.views_per_point, ".1f"),
+        "sigma horizontal, m": _distribution(quality.sigma_horizontal_m, ".2f"),
+        "sigma up, m": _distribution(quality.sigma_up_m, ".2f"),
     }
 
 
-def _five(values: Distribution, form: str) -> str:
+def _distribution(values: Distribution, form: str) -> str:
     return (
         f"median {values.median:{form}}, mean {values.mean:{form}}, 90 % below {values.p90:{form}}, "
         f"from {values.minimum:{form}} to {values.maximum:{form}}"

@@ -12,12 +12,14 @@ from app.db import engine
 from app.db.cluster import backup as archive
 from app.db.cluster import embedded
 
-app = typer.Typer(help="The database and its schema.", no_args_is_help=True)
+app = typer.Typer(
+    help="The database and its schema: upgrade, status, backup, restore.", no_args_is_help=True
+)
 
 
 @app.command()
 def upgrade(as_json: AsJson = False) -> None:
-    """Bring the schema up to date."""
+    """Upgrade the schema of the database to the version that this Amers needs."""
     with embedded.database(read_settings()) as dsn:
         before = engine.status(dsn)
         engine.upgrade(dsn)
@@ -27,26 +29,26 @@ def upgrade(as_json: AsJson = False) -> None:
 
 @app.command()
 def status(as_json: AsJson = False) -> None:
-    """Say which schema the database has and which one this Amers needs."""
+    """Show the schema version of the database and the one that this Amers needs."""
     settings = read_settings()
     with embedded.database(settings) as dsn:
-        found = engine.status(dsn)
+        schema = engine.status(dsn)
     record = {
         "database": "private cluster" if settings.database_url is None else "AMERS_DATABASE_URL",
         "data_folder": settings.data_folder,
-        "revision": found.found,
-        "needed": found.needed,
-        "current": found.current,
+        "revision": schema.found,
+        "needed": schema.needed,
+        "current": schema.current,
     }
     show_one(record, as_json=as_json)
 
 
 @app.command()
 def backup(
-    file: Annotated[Path, typer.Argument(help="The archive to write; it must not exist.")],
+    file: Annotated[Path, typer.Argument(help="Archive to write; it must not exist.")],
     as_json: AsJson = False,
 ) -> None:
-    """Write the database into an archive; copy the storage folder after it."""
+    """Write the database into an archive; copy the storage folder afterwards."""
     settings = read_settings()
     with embedded.database(settings) as dsn:
         archive.dump(dsn, file)
@@ -60,12 +62,12 @@ def backup(
 
 @app.command()
 def restore(
-    file: Annotated[Path, typer.Argument(help="An archive that `amers db backup` wrote.")],
+    file: Annotated[Path, typer.Argument(help="An archive written by `amers db backup`.")],
     as_json: AsJson = False,
 ) -> None:
-    """Read an archive into an empty database, and bring its schema up to date."""
+    """Restore an archive into an empty database, and upgrade its schema."""
     with embedded.database(read_settings()) as dsn:
         archive.restore(dsn, file)
         engine.upgrade(dsn)
-        found = engine.status(dsn)
-    show_one({"archive": file, "revision": found.found}, as_json=as_json)
+        schema = engine.status(dsn)
+    show_one({"archive": file, "revision": schema.found}, as_json=as_json)

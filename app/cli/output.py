@@ -1,4 +1,4 @@
-"""What a command prints: JSON when asked for, a table on a terminal, plain lines elsewhere."""
+"""Output of commands: JSON with --json, a table on a terminal, tab-separated lines elsewhere."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ Row = Mapping[str, object]
 
 
 def show(rows: Sequence[Row], *, as_json: bool) -> None:
-    """Print records that have the same fields: a JSON array, a table, or tab-separated lines."""
+    """Print records with the same fields as a JSON array, a table or tab-separated lines."""
     if as_json:
         print_json(rows)
     elif sys.stdout.isatty():
@@ -33,7 +33,7 @@ def show(rows: Sequence[Row], *, as_json: bool) -> None:
 
 
 def show_one(record: Row, *, as_json: bool) -> None:
-    """Print one record: a JSON object, or one line a field."""
+    """Print one record as a JSON object, or as one line per field."""
     if as_json:
         print_json(record)
         return
@@ -43,12 +43,12 @@ def show_one(record: Row, *, as_json: bool) -> None:
 
 
 def print_json(value: object) -> None:
-    """Print a value as JSON; dataclasses become objects, dates ISO 8601."""
-    typer.echo(json.dumps(value, indent=2, default=_plain, allow_nan=False))
+    """Print a value as JSON; dataclasses become objects, times ISO 8601."""
+    typer.echo(json.dumps(value, indent=2, default=_as_json, allow_nan=False))
 
 
 def as_text(value: object) -> str:
-    """A value as people read it."""
+    """A value as text for people."""
     if value is None:
         return "-"
     if isinstance(value, datetime):
@@ -58,7 +58,7 @@ def as_text(value: object) -> str:
     return str(value)
 
 
-def _plain(value: object) -> Any:
+def _as_json(value: object) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     conversions: dict[type, Callable[[Any], Any]] = {

@@ -15,40 +15,40 @@ from app.usecases import history
 from app.usecases.features import points
 from app.usecases.features.query import parse_bbox
 
-app = typer.Typer(help="Control points of published blocks.", no_args_is_help=True)
+app = typer.Typer(
+    help="Control points of published blocks: query, suspend, reinstate.", no_args_is_help=True
+)
 
 
 class PointFormat(StrEnum):
-    """What points are written as."""
+    """Formats of written points."""
 
     GEOJSON = "geojson"
     CSV = "csv"
 
 
-@app.callback()
-def group() -> None:
-    """Control points of published blocks."""
-
-
 @app.command()
 def query(
+    *,
     bbox: Annotated[
         str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
     ],
-    form: Annotated[PointFormat, typer.Option("--format", help="What to write.")] = PointFormat.GEOJSON,
+    form: Annotated[
+        PointFormat, typer.Option("--format", help="Format of the points.")
+    ] = PointFormat.GEOJSON,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="File; standard output if not given.")
+        Path | None, typer.Option("-o", "--output", help="File to write; by default standard output.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write all points of a box; --json tells their number instead of writing to standard output."""
+    """Write all points of a box; --json without --output prints only their number."""
     parse_bbox(bbox)
     with transaction() as connection:
         if as_json and output is None:
             count = points.count_points(connection, bbox)
             print_json({"points": count.number, "exact": count.exact, "file": None})
             return
-        with _written(output) as file:
+        with _output_file(output) as file:
             pieces = (
                 points.geojson(connection, bbox)
                 if form is PointFormat.GEOJSON
@@ -61,44 +61,46 @@ def query(
 
 @app.command()
 def suspensions(
+    *,
     suspended: Annotated[
-        bool, typer.Option("--suspended", help="Those that are suspended, not those proposed.")
+        bool, typer.Option("--suspended", help="List suspended points instead of proposed ones.")
     ] = False,
-    limit: Annotated[int, typer.Option(help="Most points shown.")] = 100,
+    limit: Annotated[int, typer.Option(help="Largest number of points to show.")] = 100,
     as_json: AsJson = False,
 ) -> None:
-    """List the points that fail where others serve, the worst first: proposed for suspension."""
+    """List the points proposed for suspension because they fail in many scenes, the worst first."""
     with transaction() as connection:
-        found = history.list_histories(connection, "suspended" if suspended else "proposed", limit)
-    show([vars(point) for point in found], as_json=as_json)
+        histories = history.list_histories(connection, "suspended" if suspended else "proposed", limit)
+    show([vars(point) for point in histories], as_json=as_json)
 
 
 @app.command()
 def suspend(
-    point: Annotated[int, typer.Argument(help="Identifier of the point.")],
-    because: Annotated[str, typer.Option(help="Why; it is recorded.")],
+    point: Annotated[int, typer.Argument(help="Id of the point.")],
+    *,
+    because: Annotated[str, typer.Option(help="Reason; it is recorded.")],
     as_json: AsJson = False,
 ) -> None:
-    """Serve a point no longer, neither to registrations nor to readers."""
+    """Suspend a point: neither registrations nor readers get it any more."""
     with transaction() as connection:
-        found = history.suspend_point(connection, point, because)
-    show_one(vars(found), as_json=as_json)
+        suspended = history.suspend_point(connection, point, because)
+    show_one(vars(suspended), as_json=as_json)
 
 
 @app.command()
 def reinstate(
-    point: Annotated[int, typer.Argument(help="Identifier of the point.")],
+    point: Annotated[int, typer.Argument(help="Id of the point.")],
     as_json: AsJson = False,
 ) -> None:
-    """Serve a suspended point again; its history begins anew."""
+    """Serve a suspended point again; its history starts again from nothing."""
     with transaction() as connection:
-        found = history.reinstate_point(connection, point)
-    show_one(vars(found), as_json=as_json)
+        reinstated = history.reinstate_point(connection, point)
+    show_one(vars(reinstated), as_json=as_json)
 
 
 @contextmanager
-def _written(path: Path | None) -> Iterator[BinaryIO]:
-    """A file that is there when it is complete, or standard output."""
+def _output_file(path: Path | None) -> Iterator[BinaryIO]:
+    """A file that appears under its name once it is complete, or standard output."""
     if path is None:
         yield sys.stdout.buffer
         sys.stdout.buffer.flush()

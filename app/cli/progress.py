@@ -1,4 +1,4 @@
-"""How commands show long work, on standard error: a bar on a terminal, else a line for every tenth."""
+"""Progress of commands on standard error: a bar on a terminal, elsewhere a line for every tenth."""
 
 import sys
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from services.types import Progress
 
 @contextmanager
 def shown_progress() -> Iterator[Progress]:
-    """Progress that people can follow."""
+    """A `Progress` that shows on standard error."""
     if not sys.stderr.isatty():
         yield _lines()
         return
@@ -29,13 +29,13 @@ def shown_progress() -> Iterator[Progress]:
 
 
 def _lines() -> Progress:
-    told = -1
+    last_tenth = -1
 
     def report(fraction: float, message: str) -> None:
-        nonlocal told
+        nonlocal last_tenth
         tenth = int(fraction * 10.0)
-        if tenth > told:
-            told = tenth
+        if tenth > last_tenth:
+            last_tenth = tenth
             typer.echo(f"{10 * tenth:3d} % {message}", err=True)
 
     return report

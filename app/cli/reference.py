@@ -1,4 +1,4 @@
-"""`amers reference`: images that scenes are registered on where there are no points."""
+"""`amers reference`: reference images, for scenes on ground without control points."""
 
 from typing import Annotated
 
@@ -11,29 +11,32 @@ from app.db.references import ReferenceRow
 from app.usecases import references
 from app.usecases.references import NewReference
 
-app = typer.Typer(help="Reference images, for scenes where there are no points.", no_args_is_help=True)
-
-
-@app.callback()
-def group() -> None:
-    """Reference images, for scenes where there are no points."""
+app = typer.Typer(
+    help="Reference images, for scenes on ground without control points.", no_args_is_help=True
+)
 
 
 @app.command()
 def add(
-    image: Annotated[str, typer.Argument(help="Ortho-image, path below AMERS_REFERENCE_FOLDER.")],
-    name: Annotated[str, typer.Option(help="By which people know it.")],
-    dem: Annotated[str | None, typer.Option(help="Heights of the same place, there too.")] = None,
-    vertical: Annotated[
-        str | None, typer.Option(help="What the heights are counted from: ellipsoid, EGM96, EPSG:…")
+    image: Annotated[str, typer.Argument(help="Ortho-image: path below AMERS_REFERENCE_FOLDER.")],
+    *,
+    name: Annotated[str, typer.Option(help="Unique name of the reference.")],
+    dem: Annotated[
+        str | None, typer.Option(help="Heights of the same ground: path below the same folder.")
     ] = None,
-    geoid: Annotated[str | None, typer.Option(help="Grid file of the geoid, there too.")] = None,
+    vertical: Annotated[
+        str | None, typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EPSG:…")
+    ] = None,
+    geoid: Annotated[
+        str | None, typer.Option(help="Grid file of the geoid: path below the same folder.")
+    ] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="How well it lies on the Earth, metres.", min=0.001)
+        float | None,
+        typer.Option(help="Accuracy of the image on the Earth, one sigma, metres.", min=0.001),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Let scenes be registered on a reference image."""
+    """Add a reference image that scenes can be registered on."""
     settings = read_settings()
     new = NewReference(name, image, dem, vertical, geoid, sigma_m)
     with transaction(settings) as connection:
@@ -45,13 +48,13 @@ def add(
 def list_references(as_json: AsJson = False) -> None:
     """List the reference images, by name."""
     with transaction() as connection:
-        found = references.list_references(connection)
-    show([_record(row) for row in found], as_json=as_json)
+        rows = references.list_references(connection)
+    show([_record(row) for row in rows], as_json=as_json)
 
 
 @app.command()
-def remove(name: Annotated[str, typer.Argument(help="Of the reference.")]) -> None:
-    """Use a reference image no longer; its files stay where they are."""
+def remove(name: Annotated[str, typer.Argument(help="Name of the reference.")]) -> None:
+    """Remove a reference image from the installation; its files stay in their folder."""
     with transaction() as connection:
         references.remove_reference(connection, name)
     typer.echo(f"removed {name}")

@@ -28,15 +28,16 @@ FIRST_PAUSE_S = 1.0
 LONGEST_PAUSE_S = 60.0
 STOP_SECONDS = 20.0
 DRAIN_SECONDS = 30
-"""Requests under way when the service is told to end have so long to be answered."""
+"""Time that requests under way have to finish when the service stops."""
 WATCH_S = 2.0
 
 log = logging.getLogger(__name__)
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Where to listen; AMERS_HOST if not given.")] = None,
-    port: Annotated[int | None, typer.Option(help="Where to listen; AMERS_PORT if not given.")] = None,
+    *,
+    host: Annotated[str | None, typer.Option(help="Address to listen on; default AMERS_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; default AMERS_PORT.")] = None,
     worker: Annotated[bool, typer.Option(help="Run a worker beside the API.")] = True,
 ) -> None:
     """Run the API and one worker, until Ctrl-C."""
@@ -45,7 +46,7 @@ def serve(
     with embedded.database(settings) as dsn:
         engine.ensure_schema(dsn, upgradable=settings.database_url is None)
         command = (sys.executable, "-c", WORKER, "worker", str(os.getpid()))
-        with watched(settings), companion(command if worker else None):
+        with database_watched(settings), companion(command if worker else None):
             uvicorn.run(
                 "app.main:create_app",
                 factory=True,
@@ -59,8 +60,8 @@ def serve(
 
 
 @contextmanager
-def watched(settings: Settings) -> Iterator[None]:
-    """Starts the private database again whenever it was killed."""
+def database_watched(settings: Settings) -> Iterator[None]:
+    """Restart the private database whenever it was killed, until the end of the context."""
     stop = threading.Event()
 
     def watch() -> None:
@@ -68,7 +69,7 @@ def watched(settings: Settings) -> Iterator[None]:
             try:
                 embedded.revive(settings)
             except Exception as error:
-                log.error("the database could not be started again: %s", error)
+                log.error("the private database could not be restarted: %s", error)
 
     watcher = threading.Thread(target=watch, name="database-watcher", daemon=True)
     watcher.start()
@@ -81,7 +82,7 @@ def watched(settings: Settings) -> Iterator[None]:
 
 @contextmanager
 def companion(command: tuple[str, ...] | None) -> Iterator[None]:
-    """Run a command beside this one: started again when it dies, stopped at the end of the context."""
+    """Run a command beside this one: restart it when it dies, stop it at the end of the context."""
     if command is None:
         yield
         return
@@ -98,7 +99,7 @@ def companion(command: tuple[str, ...] | None) -> Iterator[None]:
 
 
 def _keep_running(command: tuple[str, ...], stop: threading.Event) -> None:
-    """A command that dies at once, again and again, is started less and less often."""
+    """Run a command until `stop`; the pause before a restart doubles when it dies soon."""
     pause_s = FIRST_PAUSE_S
     while not stop.is_set():
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
@@ -106,12 +107,14 @@ def _keep_running(command: tuple[str, ...], stop: threading.Event) -> None:
         if stop.is_set():
             break
         pause_s = FIRST_PAUSE_S if lived_s > LONGEST_PAUSE_S else min(2 * pause_s, LONGEST_PAUSE_S)
-        log.error("the worker ended (%d), next one in %.0f s", process.returncode, pause_s)
+        log.error(
+            "the worker ended with exit code %d and is restarted in %.0f s", process.returncode, pause_s
+        )
         stop.wait(pause_s)
 
 
 def _wait(process: "subprocess.Popen[bytes]", stop: threading.Event) -> float:
-    """Wait for the process to end, or end it when asked to; returns the seconds it lived, at least."""
+    """Wait until the process ends, or end it on `stop`; returns how many seconds it lived."""
     lived_s = 0.0
     while process.poll() is None and not stop.wait(0.2):
         lived_s += 0.2

@@ -1,4 +1,4 @@
-"""How commands reach the store: one command is one transaction, committed at its end."""
+"""Access of commands to the store: one command is one transaction, committed at its end."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from app.db.engine import Connection
 
 @contextmanager
 def transaction(settings: Settings | None = None) -> Iterator[Connection]:
-    """A transaction on the installation's database; the private one is started and upgraded.
+    """A transaction on the installation's database; the private one is started and upgraded first.
 
     Raises:
         InputError: the database cannot be used; the message says what to do.

@@ -1,4 +1,4 @@
-"""`amers token`: who may call the API."""
+"""`amers token`: tokens of the callers of the API."""
 
 from typing import Annotated
 
@@ -9,28 +9,29 @@ from app.cli.store import transaction
 from app.db.tokens import Token
 from app.usecases import tokens
 
-app = typer.Typer(help="Who may call the API.", no_args_is_help=True)
+app = typer.Typer(help="Tokens of the callers of the API.", no_args_is_help=True)
 
 
 @app.command()
 def create(
-    name: Annotated[str, typer.Argument(help="What the token is called, for people.")],
+    name: Annotated[str, typer.Argument(help="Name of the token, for people.")],
+    *,
     scope: Annotated[
-        list[str], typer.Option(help="read, register, monitor or admin; may be given several times.")
+        list[str], typer.Option(help="read, register, monitor or admin; repeat for several scopes.")
     ],
     days: Annotated[
-        int | None, typer.Option(help="How long it is valid; for ever if not given.")
+        int | None, typer.Option(help="Days until the token expires; by default it does not.")
     ] = None,
     upload_quota_bytes: Annotated[
         int | None,
-        typer.Option(help="What its scenes may take at once; as the settings say if not given."),
+        typer.Option(help="Bytes that its scenes may take; by default that of the settings."),
     ] = None,
     job_quota: Annotated[
-        int | None, typer.Option(help="Its open jobs at once; as the settings say if not given.")
+        int | None, typer.Option(help="Jobs that may be open at once; by default that of the settings.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a token and print its secret, this once."""
+    """Create a token and print its secret, which is shown only now."""
     with transaction() as connection:
         new = tokens.create_token(
             connection,
@@ -44,7 +45,7 @@ def create(
     if as_json:
         show_one(record, as_json=True)
         return
-    typer.echo("Keep this secret; it is not shown again.", err=True)
+    typer.echo("Keep this secret: it is not shown again.", err=True)
     typer.echo(new.secret)
 
 
@@ -52,16 +53,16 @@ def create(
 def list_tokens(as_json: AsJson = False) -> None:
     """List all tokens, the newest first."""
     with transaction() as connection:
-        found = tokens.list_tokens(connection)
-    show([_record(token) for token in found], as_json=as_json)
+        all_tokens = tokens.list_tokens(connection)
+    show([_record(token) for token in all_tokens], as_json=as_json)
 
 
 @app.command()
 def revoke(
-    name_or_id: Annotated[str, typer.Argument(help="Id of the token, or its name if no other has it.")],
+    name_or_id: Annotated[str, typer.Argument(help="Id of the token, or its name if it is unique.")],
     as_json: AsJson = False,
 ) -> None:
-    """Refuse a token from now on."""
+    """Revoke a token: requests with its secret are refused."""
     with transaction() as connection:
         revoked = tokens.revoke_token(connection, name_or_id)
     show_one(_record(revoked), as_json=as_json)

@@ -1,4 +1,4 @@
-"""`amers worker`: a worker alone."""
+"""`amers worker`: a worker without the API."""
 
 from app import logs
 from app.config import read_settings
