@@ -1,1 +1,1 @@
-"""The door for people: the map page."""
+"""The entry point for people: the map page."""

@@ -41,7 +41,7 @@ LEFT_BY_JOBS += ("scenes", "blocks", "uploads")
 
 
 @dataclass(frozen=True)
-class Besieged:
+class Installation:
     """A running application with points, scenes and secrets.
 
     Attributes:
@@ -109,7 +109,7 @@ class Besieged:
 
 
 @contextmanager
-def besieged(dsn: str, folder: Path, world: FlatWorld) -> Iterator[Besieged]:
+def hostile_installation(dsn: str, folder: Path, world: FlatWorld) -> Iterator[Installation]:
     """A started installation: a published and a staged block, scenes of two owners, a canary."""
     outside = folder / "outside"
     outside.mkdir()
@@ -147,7 +147,7 @@ def besieged(dsn: str, folder: Path, world: FlatWorld) -> Iterator[Besieged]:
     headers |= {"nobody": {}, "revoked": _bearer(revoked.secret), "expired": _bearer(expired.secret)}
     app = create_app(settings)
     with TestClient(app, raise_server_exceptions=False) as client:
-        yield Besieged(
+        yield Installation(
             client, app.state.database, settings, headers, _names(client, headers, world), outside
         )
 

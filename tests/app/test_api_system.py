@@ -17,11 +17,11 @@ DOORS = {"read": Reader, "register": Registrar, "admin": Admin}
 
 @pytest.fixture
 def app(settings):
-    """The application with doors of the tests' own beside those it has."""
+    """The application with endpoints of the tests beside its own."""
     app = create_app(settings)
     for name, caller in DOORS.items():
-        app.add_api_route(f"/door/{name}", door(caller))
-    app.add_api_route("/door/points", door(PointsReader))
+        app.add_api_route(f"/probe/{name}", probe(caller))
+    app.add_api_route("/probe/points", probe(PointsReader))
 
     @app.get("/number/{number}")
     def number(number: int, database: DatabaseDep) -> int:
@@ -52,7 +52,7 @@ def app(settings):
     return app
 
 
-def door(caller: type) -> object:
+def probe(caller: type) -> object:
     def enter(caller: caller) -> str:
         return caller.name if caller else "anybody"
 
@@ -100,7 +100,7 @@ def test_the_description_of_the_api_is_openapi_3_1(client):
     assert client.get("/api").json()["openapi"].startswith("3.1")
 
 
-@pytest.mark.parametrize("path", ["/door/read", "/door/register", "/door/admin", "/door/points"])
+@pytest.mark.parametrize("path", ["/probe/read", "/probe/register", "/probe/admin", "/probe/points"])
 def test_a_door_is_closed_to_callers_without_a_token(client, path):
     reply = client.get(path)
     refused(reply, 401)
@@ -108,7 +108,7 @@ def test_a_door_is_closed_to_callers_without_a_token(client, path):
 
 
 @pytest.mark.parametrize("header", ["Bearer wrong", "Bearer ", "Basic dTpw", "nonsense", "Bearer \x00"])
-@pytest.mark.parametrize("path", ["/door/read", "/door/points"])
+@pytest.mark.parametrize("path", ["/probe/read", "/probe/points"])
 def test_a_wrong_token_is_refused_and_never_taken_for_none(client, settings, path, header):
     public = TestClient(client.app)
     client.app.state.settings = settings.model_copy(update={"public_points": True})
@@ -126,7 +126,7 @@ def test_a_wrong_token_is_refused_and_never_taken_for_none(client, settings, pat
 def test_a_token_opens_the_doors_of_its_scope(client, bearer, scope, opened):
     headers = bearer(scope)
     for name in (*DOORS, "points"):
-        reply = client.get(f"/door/{name}", headers=headers)
+        reply = client.get(f"/probe/{name}", headers=headers)
         if name in opened:
             assert reply.json() == f"a token to {scope}"
         else:
@@ -134,10 +134,10 @@ def test_a_token_opens_the_doors_of_its_scope(client, bearer, scope, opened):
 
 
 def test_points_are_open_to_anybody_only_where_the_setting_says_so(client, settings):
-    refused(client.get("/door/points"), 401)
+    refused(client.get("/probe/points"), 401)
     client.app.state.settings = settings.model_copy(update={"public_points": True})
-    assert client.get("/door/points").json() == "anybody"
-    refused(client.get("/door/read"), 401)
+    assert client.get("/probe/points").json() == "anybody"
+    refused(client.get("/probe/read"), 401)
 
 
 def test_a_wrong_parameter_is_named(client):

@@ -1,4 +1,4 @@
-"""Files that are damaged, absurd or hostile: refused at the door or by the job, with the reason."""
+"""Files that are damaged, absurd or hostile: refused by the API or by the job, with the reason."""
 
 import hashlib
 import io
@@ -18,7 +18,13 @@ from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_arch
 from tests.app.bad_requests import QUESTIONS
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import FlatWorld, make_flat_world
-from tests.app.hostile_installation import CANARY, LEFT_BY_JOBS, Besieged, besieged, told
+from tests.app.hostile_installation import (
+    CANARY,
+    LEFT_BY_JOBS,
+    Installation,
+    hostile_installation,
+    told,
+)
 from tests.factories import make_block
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -31,21 +37,21 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 
 @pytest.fixture(scope="module")
-def store(cluster, world, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Besieged]:
+def store(cluster, world, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installation]:
     """One installation for all cases: what they leave are files of scenes and jobs that failed."""
-    folder = tmp_path_factory.mktemp("besieged")
-    with fresh_database(cluster, TEMPLATE) as dsn, besieged(dsn, folder, world) as store:
+    folder = tmp_path_factory.mktemp("hostile_installation")
+    with fresh_database(cluster, TEMPLATE) as dsn, hostile_installation(dsn, folder, world) as store:
         yield store
 
 
-def refused(store: Besieged, reply: httpx.Response, says: str) -> None:
+def refused(store: Installation, reply: httpx.Response, says: str) -> None:
     """A clear 4xx that tells nothing of this machine."""
     assert 400 <= reply.status_code < 500, f"{reply.status_code} {reply.text[:300]}"
     assert says in reply.json()["detail"], reply.json()
     keeps_secrets(store, told(reply))
 
 
-def failed(store: Besieged, job: dict[str, Any], says: str) -> None:
+def failed(store: Installation, job: dict[str, Any], says: str) -> None:
     """A job that failed for good with its reason."""
     assert job["status"] == "failed", job
     assert says in json.dumps(job["error"]), job["error"]
@@ -53,14 +59,14 @@ def failed(store: Besieged, job: dict[str, Any], says: str) -> None:
     keeps_secrets(store, json.dumps(job))
 
 
-def keeps_secrets(store: Besieged, text: str) -> None:
+def keeps_secrets(store: Installation, text: str) -> None:
     assert CANARY not in text
     assert "Traceback" not in text
     assert str(store.settings.data_folder) not in text
     assert "/tmp/" not in text, text
 
 
-def sent(store: Besieged, content: bytes, who: str, **metadata: str) -> httpx.Response:
+def sent(store: Installation, content: bytes, who: str, **metadata: str) -> httpx.Response:
     """The reply to the only piece of an upload by tus."""
     said = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = store.headers[who] | TUS
@@ -75,7 +81,9 @@ def sent(store: Besieged, content: bytes, who: str, **metadata: str) -> httpx.Re
 
 
 @pytest.mark.parametrize("case", [*IMAGES, *MODELS], ids=lambda case: case.name)
-def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(store: Besieged, world, case: BadScene):
+def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(
+    store: Installation, world, case: BadScene
+):
     before = store.digest(LEFT_BY_JOBS)
     me, outside = store.headers["register"], str(store.outside)
     image = case.image(world)
@@ -96,7 +104,9 @@ def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(store: Besieged
 
 
 @pytest.mark.parametrize(("name", "says", "content"), ARCHIVES, ids=[case[0] for case in ARCHIVES])
-def test_a_bad_archive_is_refused_and_forgotten(store: Besieged, name: str, says: str, content: bytes):
+def test_a_bad_archive_is_refused_and_forgotten(
+    store: Installation, name: str, says: str, content: bytes
+):
     before = store.digest()
     refused(store, sent(store, content, "register", filename="delivery.zip"), says)
     assert store.digest() == before
@@ -302,7 +312,9 @@ def block(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.mark.parametrize(("name", "says", "spoil"), BLOCKS, ids=[f"block {case[0]}" for case in BLOCKS])
-def test_a_bad_block_is_refused_by_its_job_with_the_reason(store: Besieged, block, name, says, spoil):
+def test_a_bad_block_is_refused_by_its_job_with_the_reason(
+    store: Installation, block, name, says, spoil
+):
     before = store.digest(LEFT_BY_JOBS)
     uploaded = sent(store, folder_archive(block, spoil), "admin", filename="b.zip", purpose="block")
     assert uploaded.status_code == 204, uploaded.text
@@ -316,7 +328,7 @@ def test_a_bad_block_is_refused_by_its_job_with_the_reason(store: Besieged, bloc
 @pytest.mark.parametrize(
     "path", ["way-out", "way-out/block", "../outside", "/etc", "nowhere", "a\0b", "", "."], ids=repr
 )
-def test_a_folder_that_is_not_to_be_ingested_is_refused(store: Besieged, path: str):
+def test_a_folder_that_is_not_to_be_ingested_is_refused(store: Installation, path: str):
     before = store.digest(LEFT_BY_JOBS)
     asked = store.client.post("/blocks", json={"path": path}, headers=store.headers["admin"])
     if asked.status_code == 201:
@@ -326,7 +338,7 @@ def test_a_folder_that_is_not_to_be_ingested_is_refused(store: Besieged, path: s
     assert store.digest(LEFT_BY_JOBS) == before
 
 
-def test_the_pattern_of_the_bad_blocks_is_good(store: Besieged, block):
+def test_the_pattern_of_the_bad_blocks_is_good(store: Installation, block):
     uploaded = sent(store, folder_archive(block, signed), "admin", filename="b.zip", purpose="block")
     asked = store.client.post(
         "/blocks", json={"upload": uploaded.headers["amers-upload"]}, headers=store.headers["admin"]

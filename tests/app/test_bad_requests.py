@@ -13,23 +13,23 @@ from tests.app.bad_deliveries import DELIVERIES
 from tests.app.bad_requests import JSON, QUESTIONS, Bad
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import make_flat_world
-from tests.app.hostile_installation import CANARY, Besieged, besieged, told
+from tests.app.hostile_installation import CANARY, Installation, hostile_installation, told
 
 CASES = [*QUESTIONS, *DELIVERIES]
 
 
 @pytest.fixture(scope="module")
-def store(cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Besieged]:
+def store(cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installation]:
     """One installation for all cases: they change nothing."""
-    folder = tmp_path_factory.mktemp("besieged")
+    folder = tmp_path_factory.mktemp("hostile_installation")
     with (
         fresh_database(cluster, TEMPLATE) as dsn,
-        besieged(dsn, folder, make_flat_world(folder / "world", size=600)) as store,
+        hostile_installation(dsn, folder, make_flat_world(folder / "world", size=600)) as store,
     ):
         yield store
 
 
-def replied(store: Besieged, case: Bad) -> httpx.Response:
+def replied(store: Installation, case: Bad) -> httpx.Response:
     """The reply to a case, with the ids of the installation in it."""
     headers = {name: store.filled(value).encode("latin-1") for name, value in case.headers.items()}
     if case.metadata:
@@ -53,7 +53,7 @@ def replied(store: Besieged, case: Bad) -> httpx.Response:
 
 
 @pytest.fixture
-def untouched(store: Besieged) -> Iterator[None]:
+def untouched(store: Installation) -> Iterator[None]:
     """All rows and files are the same after a test."""
     before = store.known_digest()
     yield
@@ -61,7 +61,7 @@ def untouched(store: Besieged) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_bad_request_is_refused_clearly_and_changes_nothing(store: Besieged, untouched, case: Bad):
+def test_a_bad_request_is_refused_clearly_and_changes_nothing(store: Installation, untouched, case: Bad):
     reply = replied(store, case)
     assert 400 <= reply.status_code < 500, f"{reply.status_code} {reply.text[:500]}"
     assert case.status in (None, reply.status_code), f"{reply.status_code} {reply.text[:500]}"
@@ -97,7 +97,9 @@ FUZZED = (
     ),
 )
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_body_of_any_bytes_or_any_json_is_refused(store: Besieged, untouched, target, content: bytes):
+def test_a_body_of_any_bytes_or_any_json_is_refused(
+    store: Installation, untouched, target, content: bytes
+):
     method, path, who = target
     reply = store.client.request(method, path, content=content, headers={**store.headers[who], **JSON})
     assert 400 <= reply.status_code < 500 or (path.endswith("search") and reply.status_code == 200)
@@ -106,7 +108,7 @@ def test_a_body_of_any_bytes_or_any_json_is_refused(store: Besieged, untouched, 
 @given(text=st.text(max_size=60) | st.text("saliency<>=() 'and or not%_0123456789.e-+*/", max_size=60))
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_filter_of_any_text_is_answered_or_refused_and_nothing_else(
-    store: Besieged, untouched, text: str
+    store: Installation, untouched, text: str
 ):
     body = {"filter": text, "filter-lang": "cql2-text", "limit": 1}
     reply = store.client.post("/collections/points/search", json=body, headers=store.headers["read"])

@@ -1,4 +1,4 @@
-"""A small siege: processes killed at random moments. The large one is `python -m benchmarks.faults`."""
+"""Processes killed at random moments, a small run of the benchmark `python -m benchmarks.faults`."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ SEED = 7
 
 
 def test_whoever_is_killed_whenever_every_job_ends_once_and_nothing_is_half(open_folder: Path):
-    folder = open_folder / "siege"
+    folder = open_folder / "faults"
     folder.mkdir(mode=0o755)
     outcome = besiege(folder, REGISTRATIONS, INGESTIONS, SEED, KILL_EVERY_S)
     assert outcome["wrong"] == [], outcome
