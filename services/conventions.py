@@ -1,4 +1,4 @@
-"""Axes, units, signs and pixel origin of everything inside `services`. Read this page first.
+"""Axes, units, signs and pixel origin of all data inside `services`. Read this module first.
 
 **Image.** A position is `line_sample`, (n, 2) float64 pixels. (0, 0) is the *centre* of the first
 pixel; lines grow downwards, samples to the right. The pixel `image[i, j]` covers lines
@@ -6,7 +6,7 @@ pixel; lines grow downwards, samples to the right. The pixel `image[i, j]` cover
 corner, DIMAP v2 from one) are converted in `services.formats` and nowhere else.
 
 **Ground.** A position is `lon_lat_h`, (n, 3): degrees, degrees, metres above the WGS 84 ellipsoid.
-Heights above a geoid are named `orthometric_height_m` and converted before they enter.
+Heights above a geoid are named `orthometric_height_m`.
 `ecef` is (n, 3) metres, Earth-centred and Earth-fixed; `east_north_up` is (n, 3) metres in the frame
 tangent to the ellipsoid at a named origin.
 
@@ -17,15 +17,18 @@ known height, `intersect` from the rays of several images to one ground point.
 `(r, c)` of a chip with ground sampling `g` lies at east `(c - CHIP_CENTRE) g` and north
 `(CHIP_CENTRE - r) g` metres of the point, along the axes of the point's own east-north-up frame.
 
-**Statistics.** `sigma_*` is assumed before, `std_*` is found after; both are one standard deviation.
-A residual is observed minus computed. Angles are in degrees in data and in radians inside formulas.
-Azimuths count clockwise from north; `azimuth_deg` of a view points from the ground to the sensor.
+**Statistics.** `sigma_*` is known a priori, `std_*` is estimated a posteriori; both are one standard
+deviation. A residual is observed minus computed. Angles are in degrees in data and in radians inside
+formulas. Azimuths count clockwise from north; `azimuth_deg` of a view points from the ground to the
+sensor.
 
-**Missing values** are NaN in float arrays, with a status beside them where the reason matters.
+**Missing values** are NaN in float arrays, with a separate status where the reason matters.
 """
 
 CHIP_SIZE = 101
+"""Lines and samples of a chip."""
 CHIP_CENTRE = 50
+"""Row and column of the point in its chip."""
 
 MAX_ERROR_SIGMAS = 3.0
 """Largest error that is expected, in standard deviations. A model may be wrong by this many times its

@@ -1,33 +1,33 @@
-"""The error tree: what a user can mend, and what the data would not allow.
+"""The tree of errors: input that a user can correct, and data that allow no trustworthy result.
 
 AmersError
-├── InputError              the input cannot be used; the user can mend it
-│   ├── FormatError         a file or a document does not say what it should
-│   ├── CoverageError       two things that must overlap do not
+├── InputError              the input cannot be used; the user can correct it
+│   ├── FormatError         the content of a file or a document is missing or wrong
+│   ├── CoverageError       two data sets that must overlap do not
 │   └── VerticalDatumError  heights whose datum is unknown or not supported
-└── ComputationError        the input was understood, but no trustworthy result came out of it
+└── ComputationError        the input is valid, but gives no trustworthy result
     ├── NotEnoughPoints
     ├── NoConsensus
     └── NoConvergence
 
-Every message gives the numbers that explain it.
+Every message states the values found and expected.
 """
 
 
 class AmersError(Exception):
-    """Base of all errors that are shown to the user as they are."""
+    """Base of all errors whose message is shown to the user."""
 
 
 class InputError(AmersError):
-    """The input cannot be used; the message says what was expected."""
+    """The input cannot be used; the message states what was expected."""
 
 
 class FormatError(InputError):
-    """A file or document does not say what it should."""
+    """The content of a file or a document is missing or wrong."""
 
 
 class CoverageError(InputError):
-    """Two things that must overlap do not."""
+    """Two data sets that must overlap do not."""
 
 
 class VerticalDatumError(InputError):
@@ -35,15 +35,15 @@ class VerticalDatumError(InputError):
 
 
 class ComputationError(AmersError):
-    """The input was understood, but no trustworthy result came out of it."""
+    """The input is valid, but gives no trustworthy result."""
 
 
 class NotEnoughPoints(ComputationError):
     """Too few usable points.
 
     Attributes:
-        found: how many were usable.
-        needed: how many the computation needs.
+        found: number of usable points.
+        needed: number of points that the computation needs.
     """
 
     def __init__(self, found: int, needed: int, explanation: str = "") -> None:
@@ -58,4 +58,4 @@ class NoConsensus(ComputationError):
 
 
 class NoConvergence(ComputationError):
-    """An iteration did not settle."""
+    """An iteration did not converge."""

@@ -1,7 +1,6 @@
-"""Longitude, latitude and height to Earth-centred and local cartesian axes, and back.
+"""Conversions between geodetic, Earth-centred and local cartesian coordinates on WGS 84.
 
-The scalar functions are compiled and meant to be called from other kernels; the array functions are
-for everybody else.
+The scalar functions are compiled for calls from other kernels; all other code uses the array functions.
 """
 
 import math
@@ -16,12 +15,13 @@ WGS84_F = 1.0 / 298.257223563
 WGS84_E2 = WGS84_F * (2.0 - WGS84_F)
 WGS84_B = WGS84_A * (1.0 - WGS84_F)
 _MARGIN_DEG = 1e-6
+"""Margin of `box_around`, a tenth of a metre."""
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)
 
 
 @njit(cache=True)
 def geodetic_to_ecef(lon_deg: float, lat_deg: float, h: float) -> tuple[float, float, float]:
-    """ECEF metres of one geodetic position."""
+    """ECEF position in metres of one geodetic position."""
     lon = math.radians(lon_deg)
     lat = math.radians(lat_deg)
     sin_lat = math.sin(lat)
@@ -38,7 +38,7 @@ def geodetic_to_ecef(lon_deg: float, lat_deg: float, h: float) -> tuple[float, f
 def ecef_to_geodetic(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Geodetic position of one ECEF point.
 
-    Source: Bowring (1976), iterated twice: below a nanometre within 1,000 km of the ellipsoid.
+    Source: Bowring (1976) with two iterations; error below 1 nm within 1,000 km of the ellipsoid.
     """
     p = math.hypot(x, y)
     tan_u = z * WGS84_A / (p * WGS84_B) if p > 0.0 else math.inf
@@ -58,7 +58,7 @@ def ecef_to_geodetic(x: float, y: float, z: float) -> tuple[float, float, float]
 
 @njit(cache=True)
 def metres_per_degree(lat_deg: float, h: float) -> tuple[float, float]:
-    """Length of one degree of longitude and of latitude at a height, metres."""
+    """Length in metres of one degree of longitude and of one degree of latitude, at a height."""
     sin_lat = math.sin(math.radians(lat_deg))
     w2 = 1.0 - WGS84_E2 * sin_lat * sin_lat
     n = WGS84_A / math.sqrt(w2)
@@ -69,7 +69,7 @@ def metres_per_degree(lat_deg: float, h: float) -> tuple[float, float]:
 
 @njit(cache=True)
 def metres_per_degree_at(lon_lat_h: Array) -> Array:
-    """`metres_per_degree` (n, 2) at positions (n, 3)."""
+    """Length in metres of one degree of longitude and of latitude (n, 2) at positions (n, 3)."""
     out = np.empty((len(lon_lat_h), 2))
     for i in range(len(lon_lat_h)):
         out[i] = metres_per_degree(lon_lat_h[i, 1], lon_lat_h[i, 2])
@@ -92,31 +92,41 @@ def _to_geodetic(ecef: Array) -> Array:
     return out
 
 
+def longitudes_near(lon_deg: Array, near_deg: float) -> Array:
+    """Longitudes (n,) plus full turns, so that they lie within 180 degrees of a given longitude."""
+    return np.asarray(near_deg + (lon_deg - near_deg + 180.0) % 360.0 - 180.0)
+
+
+def wrapped_degrees(difference_deg: Array) -> Array:
+    """Differences of longitudes (n,) the short way round, -180 to 180 degrees."""
+    return np.asarray((difference_deg + 180.0) % 360.0 - 180.0)
+
+
 def continuous(lon_lat: Array) -> Array:
-    """Positions (n, 2 or 3) whose longitudes do not jump at 180 degrees, half a turn round the first."""
+    """Positions (n, 2 or 3) with longitudes within 180 degrees of the first, hence without a jump."""
     out = np.array(lon_lat, dtype=np.float64)
-    out[:, 0] = lon_lat[0, 0] + (lon_lat[:, 0] - lon_lat[0, 0] + 180.0) % 360.0 - 180.0
+    out[:, 0] = longitudes_near(out[:, 0], out[0, 0])
     return out
 
 
 def box_around(lon_lat: Array) -> Array:
-    """Outline (4, 2) of a box that holds positions (n, 2 or 3), a tenth of a metre larger than needed.
+    """Outline (4, 2) of the bounding box of positions (n, 2 or 3), with a margin of a tenth of a metre.
 
     Counter-clockwise, not closed, longitudes continuous.
     """
-    held = continuous(lon_lat)[:, :2]
-    west, south = held.min(axis=0) - _MARGIN_DEG
-    east, north = held.max(axis=0) + _MARGIN_DEG
+    points = continuous(lon_lat)[:, :2]
+    west, south = points.min(axis=0) - _MARGIN_DEG
+    east, north = points.max(axis=0) + _MARGIN_DEG
     return np.array([[west, south], [east, south], [east, north], [west, north]])
 
 
 def ecef_from_lon_lat_h(lon_lat_h: Array) -> Array:
-    """ECEF metres (n, 3) of geodetic positions (n, 3)."""
+    """ECEF positions (n, 3) in metres of geodetic positions (n, 3)."""
     return _to_ecef(np.ascontiguousarray(lon_lat_h, dtype=np.float64))
 
 
 def lon_lat_h_from_ecef(ecef: Array) -> Array:
-    """Geodetic positions (n, 3) of ECEF metres (n, 3)."""
+    """Geodetic positions (n, 3) of ECEF positions (n, 3) in metres."""
     return _to_geodetic(np.ascontiguousarray(ecef, dtype=np.float64))
 
 
@@ -134,14 +144,14 @@ def ecef_from_east_north_up(origin_lon_lat_h: Array) -> Array:
 
 
 def east_north_up(lon_lat_h: Array, origin_lon_lat_h: Array) -> Array:
-    """Positions (n, 3) in the frame tangent at an origin (3,), metres."""
+    """Positions (n, 3) in metres in the east-north-up frame at an origin (3,)."""
     origin = ecef_from_lon_lat_h(origin_lon_lat_h[None, :])
     rotation = ecef_from_east_north_up(origin_lon_lat_h)
     return (ecef_from_lon_lat_h(lon_lat_h) - origin) @ rotation
 
 
 def lon_lat_h_from_east_north_up(enu: Array, origin_lon_lat_h: Array) -> Array:
-    """Geodetic positions (n, 3) of points (n, 3) given in the frame tangent at an origin (3,)."""
+    """Geodetic positions (n, 3) of points (n, 3) in the east-north-up frame at an origin (3,)."""
     origin = ecef_from_lon_lat_h(origin_lon_lat_h[None, :])
     rotation = ecef_from_east_north_up(origin_lon_lat_h)
     return lon_lat_h_from_ecef(origin + enu @ rotation.T)
@@ -149,7 +159,7 @@ def lon_lat_h_from_east_north_up(enu: Array, origin_lon_lat_h: Array) -> Array:
 
 @njit(cache=True)
 def move_metres(lon_lat_h: Array, enu: Array) -> Array:
-    """Ground points (n, 3) moved by some metres east, north and up (n, 3); exact for small moves."""
+    """Ground points (n, 3) moved by metres east, north and up (n, 3); exact for small moves."""
     out = np.empty_like(lon_lat_h)
     for i in range(len(lon_lat_h)):
         east, north = metres_per_degree(lon_lat_h[i, 1], lon_lat_h[i, 2])

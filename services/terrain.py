@@ -1,4 +1,4 @@
-"""The ground as heights on a grid, and where a line of sight meets it."""
+"""Terrain as a grid of heights, and the intersection of lines of sight with it."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from services.errors import CoverageError
-from services.geodesy import metres_per_degree, metres_per_degree_at
+from services.geodesy import metres_per_degree, metres_per_degree_at, wrapped_degrees
 from services.imagery.source import ArrayImage, ImageSource, Window
 from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
@@ -18,22 +18,22 @@ Geoid = Callable[[Array], Array]
 """Height (n,) of a geoid above the ellipsoid at longitudes and latitudes (n, 2), metres."""
 
 _TILE = 2048
-"""Side of the pieces a grid is read in, cells."""
-_HELD_CELLS = 32_000_000
-"""Cells a piece of ground may have to be held in memory: 128 MB."""
-_MEET_TOLERANCE_M = 1e-4
-_MOST_LEVELS = 5000
+"""Side of the windows in which a grid is read, cells."""
+_MAX_CELLS_IN_MEMORY = 32_000_000
+"""Largest part of a terrain that is kept in memory: 128 MB."""
+_INTERSECTION_TOLERANCE_M = 1e-4
+_MAX_LEVELS = 5000
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """Heights of the ground on a map grid, read by pieces; bilinear between the nodes.
+    """Heights of the ground on a map grid, read by windows; bilinear between the nodes.
 
     Attributes:
-        grid: where the nodes are.
-        heights: metres above the geoid, or above the ellipsoid when there is none; NaN in voids.
-        geoid: what the heights are counted from; None for the ellipsoid.
-        vertical: how the vertical datum is known, one sentence.
+        grid: positions of the nodes.
+        heights: metres above the geoid, or above the ellipsoid without one; NaN in voids.
+        geoid: vertical datum of the heights; None for the ellipsoid.
+        vertical: origin of the vertical datum, one sentence.
     """
 
     grid: MapGrid
@@ -43,14 +43,14 @@ class Terrain:
 
     @property
     def posting_m(self) -> float:
-        """Distance of the nodes at the centre of the grid: side of the square as large as a cell."""
+        """Distance of the nodes in metres: side of a square with the area of the central cell."""
         return self.grid.gsd_m
 
     def height_m(self, lon_lat: Array) -> Array:
         """Height (n,) at longitudes and latitudes (n, 2), metres above the ellipsoid.
 
-        NaN outside the grid and beside voids. A cell reaches half a step around its node: there the
-        outermost heights hold.
+        NaN outside the grid and next to voids. A cell extends half a step around its node; beyond the
+        outermost nodes the height is constant.
         """
         position = self.grid.line_sample(np.asarray(lon_lat, dtype=np.float64)[:, :2])
         height_m = np.full(len(position), np.nan)
@@ -58,15 +58,15 @@ class Terrain:
             pixels = self.heights.read(window)
             first = np.array([window.line, window.sample], dtype=np.float64)
             height_m[rows] = bilinear_heights(pixels, position[rows] - first)
-        known = np.flatnonzero(np.isfinite(height_m))
-        if self.geoid is not None and len(known):
-            height_m[known] += self.geoid(lon_lat[known, :2])
+        valid = np.flatnonzero(np.isfinite(height_m))
+        if self.geoid is not None and len(valid):
+            height_m[valid] += self.geoid(lon_lat[valid, :2])
         return height_m
 
     def slope(self, lon_lat: Array) -> Array:
-        """Slope (n, 2) of the ground, metres up per metre east and north; NaN as `height_m`.
+        """Slope (n, 2) of the ground, metres up per metre east and north; NaN where `height_m` is.
 
-        Differences over one posting, which is what the grid knows.
+        Computed from differences over one posting, the resolution of the grid.
         """
         half_m = self.posting_m / 2.0
         metres = metres_per_degree_at(np.column_stack([lon_lat[:, :2], np.zeros(len(lon_lat))]))
@@ -79,10 +79,10 @@ class Terrain:
         return out
 
     def around(self, lon_lat: Array) -> "Terrain":
-        """The part of the ground that holds some places (n, 2), in memory when it is not too large.
+        """The part of the terrain that contains some positions (n, 2), in memory unless it is too large.
 
         Raises:
-            CoverageError: no place lies on the grid.
+            CoverageError: no position lies on the grid.
         """
         position = self.grid.line_sample(lon_lat)
         position = position[np.isfinite(position).all(axis=1)]
@@ -91,21 +91,24 @@ class Terrain:
             low = np.maximum(np.floor(position.min(axis=0)).astype(np.int64) - 1, 0)
             high = np.minimum(np.ceil(position.max(axis=0)).astype(np.int64) + 1, last)
         if not len(position) or (high < low).any():
-            raise CoverageError("the terrain does not reach the place: none of it lies on its grid")
+            raise CoverageError(
+                "the terrain does not cover the requested ground: none of it lies on the grid; "
+                "give a terrain of this region"
+            )
         lines, samples = (int(size) for size in high - low + 1)
         window = Window(int(low[0]), int(low[1]), lines, samples)
-        heights: ImageSource = _Part(self.heights, window)
-        if lines * samples <= _HELD_CELLS:
+        heights: ImageSource = _CroppedImage(self.heights, window)
+        if lines * samples <= _MAX_CELLS_IN_MEMORY:
             heights = ArrayImage(self.heights.read(window))
         origin_xy = self.grid.xy(low[None, :].astype(np.float64))[0]
         grid = replace(self.grid, origin_xy=origin_xy, shape=(lines, samples))
         return replace(self, grid=grid, heights=heights)
 
     def range_m(self) -> tuple[float, float]:
-        """Lowest and highest ground, metres above the ellipsoid; a bound where there is a geoid.
+        """Lowest and highest ground, metres above the ellipsoid; bounds of them where there is a geoid.
 
         Raises:
-            CoverageError: the grid has no height at all.
+            CoverageError: the grid has voids only.
         """
         low, high = math.inf, -math.inf
         for window in _tiles((0, 0), self.grid.shape):
@@ -114,19 +117,22 @@ class Terrain:
             if len(finite):
                 low, high = min(low, float(finite.min())), max(high, float(finite.max()))
         if low > high:
-            raise CoverageError("the terrain has no height here: it is void")
+            raise CoverageError(
+                "the terrain has only voids here, heights expected; fill the voids or give another "
+                "terrain"
+            )
         if self.geoid is None:
             return low, high
         axes = [np.linspace(0.0, size - 1.0, 33) for size in self.grid.shape]
-        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        undulation = self.geoid(self.grid.lon_lat(places))
-        # Between the places looked at the geoid rises and falls by less than it does among them.
+        samples = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        undulation = self.geoid(self.grid.lon_lat(samples))
+        # Between these samples the geoid varies by less than an eighth of its range over all of them.
         lowest, highest = float(np.nanmin(undulation)), float(np.nanmax(undulation))
         margin = (highest - lowest) / 8.0 + 0.1
         return low + lowest - margin, high + highest + margin
 
     def _pieces(self, position: Array) -> Iterator[tuple[Window, IntArray]]:
-        """Windows of the grid and the rows of the positions each of them serves."""
+        """Yield windows of the grid, each with the rows of the positions that it contains."""
         rows = np.flatnonzero(self.grid.contains(position))
         if not len(rows):
             return
@@ -142,8 +148,8 @@ class Terrain:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """A window of an image as an image."""
+class _CroppedImage:
+    """A window of an image, as an `ImageSource`."""
 
     whole: ImageSource
     window: Window
@@ -158,11 +164,12 @@ class _Part:
 
 
 def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
-    """Where the lines of sight of image positions meet the ground first, seen from the sensor.
+    """First intersection (n, 3) of the lines of sight of image positions with the terrain.
 
-    Each line is followed from above the highest ground down, in steps that move it by no more than a
-    posting over the ground, until it is below the ground; the crossing is then found by regula falsi
-    (Illinois). So the visible side of a ridge is found, also where fixed-point steps would jump.
+    The heights along each line are searched from above the highest ground downwards, in steps over
+    which the line moves by at most one posting, until the line is below the ground. Regula falsi
+    (Illinois variant) then finds the crossing. The search finds the visible side of a ridge, also where
+    a fixed-point iteration would jump.
 
     Args:
         model: of the image.
@@ -170,13 +177,13 @@ def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) 
         terrain: the ground.
 
     Returns:
-        (n, 3) lon, lat, height; NaN where the line meets no known ground.
+        (n, 3) lon, lat, height; NaN where the line meets a void or no ground.
 
     Raises:
         CoverageError: no line comes near the grid.
     """
-    low_m, high_m = terrain.around(_both_ends(model, line_sample, model.height_range_m)).range_m()
-    ends = _both_ends(model, line_sample, (low_m, high_m))
+    low_m, high_m = terrain.around(_ray_ends(model, line_sample, model.height_range_m)).range_m()
+    ends = _ray_ends(model, line_sample, (low_m, high_m))
     ground = terrain.around(ends)
     low_m, high_m = ground.range_m()
     levels = _levels(ends, low_m, high_m, ground.posting_m)
@@ -191,49 +198,49 @@ def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) 
         above[falling] = level
         if not len(falling):
             break
-    found = np.flatnonzero(np.isfinite(below))
+    rows = np.flatnonzero(np.isfinite(below))
     height_m = np.full(len(line_sample), np.nan)
-    height_m[found] = _crossing(model, line_sample[found], above[found], below[found], ground)
+    height_m[rows] = _crossing(model, line_sample[rows], above[rows], below[rows], ground)
     return model.locate(line_sample, height_m)
 
 
-def _both_ends(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
-    """Places (2n, 2) of the lines of sight at two heights."""
+def _ray_ends(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
+    """Longitudes and latitudes (2n, 2) of lines of sight at two heights."""
     return np.concatenate(
         [model.locate(line_sample, np.full(len(line_sample), h))[:, :2] for h in heights_m]
     )
 
 
 def _levels(ends: Array, low_m: float, high_m: float, posting_m: float) -> Array:
-    """Heights from above the highest to below the lowest ground; a step moves no line by a posting."""
+    """Heights from above the highest to below the lowest ground, at most a posting apart on any line."""
     low, high = np.split(ends, 2)
     east, north = metres_per_degree(float(np.nanmean(low[:, 1])), high_m)
-    apart = low - high
-    apart[:, 0] = (apart[:, 0] + 180.0) % 360.0 - 180.0
-    moved_m = float(np.nanmax(np.hypot(apart[:, 0] * east, apart[:, 1] * north)))
-    count = int(np.clip(math.ceil(moved_m / posting_m), 1, _MOST_LEVELS))
+    shift = low - high
+    shift[:, 0] = wrapped_degrees(shift[:, 0])
+    moved_m = float(np.nanmax(np.hypot(shift[:, 0] * east, shift[:, 1] * north)))
+    count = int(np.clip(math.ceil(moved_m / posting_m), 1, _MAX_LEVELS))
     return np.linspace(high_m + 1.0, low_m - 1.0, count + 2)
 
 
 def _gap(model: SensorModel, line_sample: Array, height_m: Array, terrain: Terrain) -> Array:
-    """How far (n,) the ground lies above the lines of sight at some heights; NaN where unknown."""
-    place = model.locate(line_sample, height_m)[:, :2]
-    gap = np.full(len(place), np.nan)
-    known = np.isfinite(place).all(axis=1)
-    gap[known] = terrain.height_m(place[known]) - height_m[known]
+    """Height (n,) of the ground above the lines of sight at given heights; NaN where unknown."""
+    lon_lat = model.locate(line_sample, height_m)[:, :2]
+    gap = np.full(len(lon_lat), np.nan)
+    valid = np.isfinite(lon_lat).all(axis=1)
+    gap[valid] = terrain.height_m(lon_lat[valid]) - height_m[valid]
     return gap
 
 
 def _crossing(
     model: SensorModel, line_sample: Array, above: Array, below: Array, terrain: Terrain
 ) -> Array:
-    """Height (n,) where lines meet the ground, above it at one height and below it at another."""
+    """Height (n,) where lines of sight cross the ground, between a height above it and one below it."""
     gap_above = _gap(model, line_sample, above, terrain)
     gap_below = _gap(model, line_sample, below, terrain)
-    # A line that came out of a void has met the ground at an unknown place.
+    # A line above a void crosses the ground at an unknown position.
     height = np.where(np.isfinite(gap_above), below, np.nan)
     for _ in range(60):
-        open_: BoolArray = np.isfinite(height) & (np.abs(above - below) > _MEET_TOLERANCE_M)
+        open_: BoolArray = np.isfinite(height) & (np.abs(above - below) > _INTERSECTION_TOLERANCE_M)
         if not open_.any():
             break
         weight = gap_above / np.where(gap_above == gap_below, 1.0, gap_above - gap_below)
@@ -241,7 +248,7 @@ def _crossing(
         gap = np.full(len(height), np.nan)
         gap[open_] = _gap(model, line_sample[open_], height[open_], terrain)
         height = np.where(open_ & ~np.isfinite(gap), np.nan, height)
-        settled = open_ & (np.abs(gap) < _MEET_TOLERANCE_M)
+        settled = open_ & (np.abs(gap) < _INTERSECTION_TOLERANCE_M)
         under = open_ & (gap >= 0.0)
         over = open_ & (gap < 0.0)
         gap_above = np.where(under, gap_above / 2.0, np.where(over, gap, gap_above))
@@ -253,9 +260,9 @@ def _crossing(
 
 @njit(cache=True)
 def bilinear_heights(heights: FloatImage, line_sample: Array) -> Array:
-    """Heights (n,) between the nodes of a grid at positions (n, 2).
+    """Bilinear heights (n,) of a grid at positions (n, 2).
 
-    NaN more than half a step outside, and where a node that counts is NaN.
+    NaN more than half a step outside the grid, and where a node with a nonzero weight is NaN.
     """
     lines, samples = heights.shape
     out = np.empty(len(line_sample))

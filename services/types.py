@@ -1,4 +1,4 @@
-"""What travels between the services: frozen dataclasses of arrays."""
+"""Data that pass between the services: frozen dataclasses of arrays."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -15,32 +15,33 @@ ChipArray = npt.NDArray[Any]
 
 
 class Progress(Protocol):
-    """How a long computation tells where it stands."""
+    """A function to which a long computation reports its progress."""
 
     def __call__(self, fraction: float, message: str) -> None:
-        """Report the fraction done (0 to 1) and, in a few words, the work under way."""
+        """Report the completed fraction (0 to 1) and a short description of the current step."""
         ...
 
 
 def no_progress(fraction: float, message: str) -> None:
-    """Progress that nobody watches."""
+    """Ignore the progress."""
 
 
 def part_of(progress: Progress, start: float, share: float) -> Progress:
-    """Progress of a part, as progress of the whole."""
+    """The progress function of a part that starts at `start` and is a `share` of the whole."""
     return lambda fraction, message: progress(start + share * fraction, message)
 
 
 @dataclass(frozen=True)
 class Acquisition:
-    """How and when an image was taken.
+    """Sensor, time and geometry of the acquisition of an image.
 
     Attributes:
         image_id: name of the image, unique within a block.
         sensor: platform or instrument, "" when unknown.
         acquired_at: UTC, None when unknown.
-        incidence_deg: angle between the vertical and the line of sight at the ground, at the centre.
-        azimuth_deg: from the ground to the sensor, clockwise from north.
+        incidence_deg: angle at the ground between the vertical and the line of sight of the image
+            centre; NaN when unknown.
+        azimuth_deg: direction from the ground to the sensor, clockwise from north; NaN when unknown.
         sun_elevation_deg, sun_azimuth_deg: at the centre of the image; NaN when unknown.
     """
 
@@ -55,17 +56,17 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class Views:
-    """The views of n points, flattened: those of point i are rows `start[i]` to `start[i + 1]`.
+    """The m views of n points: those of point i are the rows `start[i]` to `start[i + 1]`.
 
-    Within a point they are ordered as its chips are: finest ground sampling first.
+    The views of a point have the order of its chips: finest ground sampling first.
 
     Attributes:
         start: (n + 1,) int64.
-        gsd_m: (m,) ground sampling of each chip, metres.
+        gsd_m: (m,) ground sampling distance of each chip, metres.
         image: (m,) int64, rows of `images`.
         incidence_deg, azimuth_deg: (m,) direction from the point to the sensor.
-        health: (m,) how often the view agreed with the measure of its point where it was tried, as
-            `health` has it; 1 without a history.
+        health: (m,) `health` of the view: how often it agrees with the measure of its point; 1 without a
+            history.
         images: the images the chips were cut from.
     """
 
@@ -80,19 +81,19 @@ class Views:
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """n control points and where their chips lie.
+    """n control points, their views and the positions of their chips in files.
 
     Attributes:
         id: (n,) int64, unique.
         lon_lat_h: (n, 3).
         covariance_m2: (n, 3, 3) of east, north, up, relative to the frame of the point's block.
-        saliency: (n,) 0 to 1, how well the point's chip can be located.
-        health: (n,) how often the point was active at the end where it was tried, as `health` has it;
-            1 without a history.
+        saliency: (n,) 0 to 1, how precisely the chip of the point can be located.
+        health: (n,) `health` of the point: how often it is active in the final adjustment; 1 without a
+            history.
         views: the views of the points.
         chip_file: (n,) int64, rows of `chip_files`.
-        chip_row: (n,) int64, row of the point's first chip in its file; its views follow.
-        chip_files: names by which a `ChipSource` knows the files.
+        chip_row: (n,) int64, row of the first chip of the point in its file; the others follow it.
+        chip_files: names of the files in their `ChipSource`.
     """
 
     id: IntArray
@@ -112,14 +113,14 @@ class ControlPoints:
         """The points of the given rows, in that order."""
         counts = np.diff(self.views.start)[rows]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        kept = np.repeat(self.views.start[:-1][rows] - start[:-1], counts) + np.arange(start[-1])
+        view_rows = np.repeat(self.views.start[:-1][rows] - start[:-1], counts) + np.arange(start[-1])
         views = Views(
             start=start,
-            gsd_m=self.views.gsd_m[kept],
-            image=self.views.image[kept],
-            incidence_deg=self.views.incidence_deg[kept],
-            azimuth_deg=self.views.azimuth_deg[kept],
-            health=self.views.health[kept],
+            gsd_m=self.views.gsd_m[view_rows],
+            image=self.views.image[view_rows],
+            incidence_deg=self.views.incidence_deg[view_rows],
+            azimuth_deg=self.views.azimuth_deg[view_rows],
+            health=self.views.health[view_rows],
             images=self.views.images,
         )
         return ControlPoints(
@@ -136,27 +137,28 @@ class ControlPoints:
 
 
 HEALTH_PRIOR_TRIES = 5.0
-"""Successful tries every point and view begins with: one failure says little, ten say much."""
+"""Successful tries added to every point and view, so that a single failure changes little."""
 
 
 def health(expected: Array | IntArray, succeeded: Array | IntArray) -> Array:
-    """How often points or views served, against how often others served where they were tried.
+    """Success rate (n,) of points or views, relative to the others in the same registrations.
 
-    Five successes are added to both: 1 without a history, 0.83 after one failure where all others
-    served, 0.5 after five; half as much is lost where only half of the others served. Never above 1.
+    Five successes are added to both counts: health is 1 without a history, 0.83 after one failure where
+    all others succeed, 0.5 after five. A failure where only half of the others succeed counts half.
+    Health never exceeds 1.
 
     Args:
-        expected: (n,) sum, over the registrations that tried it, of the share of all they tried that
-            served.
-        succeeded: (n,) registrations in which a point stayed active, or a view agreed with its point's
-            measure.
+        expected: (n,) sum, over the registrations that tried the point or view, of the share of all
+            tried points or views that succeeded.
+        succeeded: (n,) number of registrations in which the point stayed active, or the view agreed
+            with the measure of its point.
     """
     ratio = (succeeded + HEALTH_PRIOR_TRIES) / (expected + HEALTH_PRIOR_TRIES)
     return np.asarray(np.minimum(ratio, 1.0))
 
 
 class ChipSource(Protocol):
-    """Where chips are read from: a block folder or the storage of the service."""
+    """A source of chips: a block folder or the storage of the service."""
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
         """Consecutive chips of one file.
@@ -168,7 +170,7 @@ class ChipSource(Protocol):
 
 
 def point_chips(points: ControlPoints, chips: ChipSource, row: int) -> ChipArray:
-    """All the chips of one point, in the order of its views.
+    """All chips of one point, in the order of its views.
 
     Returns:
         (views, 101, 101) uint8 or uint16; 0 is nodata.
@@ -179,22 +181,24 @@ def point_chips(points: ControlPoints, chips: ChipSource, row: int) -> ChipArray
 
 @dataclass(frozen=True)
 class Measures:
-    """What a registration did with each of n points that its scene could show.
+    """The results of a registration for each of the n points within its scene.
 
     Attributes:
         point_id: (n,) int64.
         lon_lat_h: (n, 3).
         predicted: (n, 2) line, sample by the model before registration.
-        line_sample: (n, 2) where the point was found; NaN where it was not.
-        sigma_px: (n,) one standard deviation a coordinate, pixels of the scene; NaN where not found.
-        score: (n,) best correlation seen; NaN where none was computed.
-        views: (n,) int64, how many views of the point agree on the measure.
-        by_gradient: (n,) found by the edges of the chips only: the radiometry has changed.
-        residual_px: (n, 2) found minus computed by the refined model, line and sample; NaN where not
-            found.
+        line_sample: (n, 2) measured position; NaN where the point was not found.
+        sigma_px: (n,) one standard deviation of each coordinate, pixels of the scene; NaN where the
+            point was not found.
+        score: (n,) best correlation; NaN where none was computed.
+        views: (n,) int64, number of views of the point that agree on the measure.
+        by_gradient: (n,) whether the point was found by the gradients of its chips only, which happens
+            when the radiometry has changed.
+        residual_px: (n, 2) measured minus computed by the refined model, line and sample; NaN where the
+            point was not found.
         residual_m: (n, 2) the same on the ground, east and north.
-        matched: (n,) found, and views agree.
-        active: (n,) used by the final adjustment; a subset of `matched`.
+        matched: (n,) whether the point was found and its views agree.
+        active: (n,) whether the final adjustment used the point; a subset of `matched`.
         reason: (n,) str, why a point is not active; "" for active points.
     """
 
@@ -221,13 +225,14 @@ class Measures:
 
 @dataclass(frozen=True)
 class ViewMeasures:
-    """What a registration did with each of k views that it tried.
+    """The results of a registration for each of the k views that it tried.
 
     Attributes:
         point: (k,) int64, rows of the registration's `Measures`; ascending.
         view: (k,) int64, number of the view within its point.
         score: (k,) best correlation; NaN where none was computed.
-        agreed: (k,) found where the measure of the point is, to the tolerance of the views.
+        agreed: (k,) whether the view was found at the measure of its point, within the tolerance of the
+            views.
         reason: (k,) str, why the view was not found; "" where it was.
     """
 
@@ -240,13 +245,13 @@ class ViewMeasures:
 
 @dataclass(frozen=True)
 class Observations:
-    """m image positions of points seen in several images.
+    """m observations of points in several images.
 
     Attributes:
-        point: (m,) int64, rows of whatever holds the points; ascending.
-        image: (m,) int64, rows of whatever holds the images.
+        point: (m,) int64, rows of the caller's points; ascending.
+        image: (m,) int64, rows of the caller's images.
         line_sample: (m, 2) pixels.
-        sigma_px: (m,) one standard deviation a coordinate.
+        sigma_px: (m,) one standard deviation of each coordinate.
     """
 
     point: IntArray

@@ -60,7 +60,7 @@ def test_a_grid_read_by_pieces_gives_the_same_heights(monkeypatch: pytest.Monkey
     lon_lat = GRID.lon_lat(places(margin=-2.0))
     whole, whole_range_m = terrain().height_m(lon_lat), terrain().range_m()
     monkeypatch.setattr(terrain_module, "_TILE", 64)
-    monkeypatch.setattr(terrain_module, "_HELD_CELLS", 1000)
+    monkeypatch.setattr(terrain_module, "_MAX_CELLS_IN_MEMORY", 1000)
     np.testing.assert_array_equal(terrain().height_m(lon_lat), whole)
     assert terrain().range_m() == whole_range_m
     np.testing.assert_allclose(terrain().around(lon_lat[:9]).height_m(lon_lat[:9]), whole[:9])
@@ -142,7 +142,7 @@ def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_ends_nowhere() ->
     known = np.isfinite(met[:, 2])
     assert 0.3 < known.mean() < 0.7
     far = replace(GRID, origin_xy=GRID.origin_xy + 1e5)
-    with pytest.raises(CoverageError, match="does not reach"):
+    with pytest.raises(CoverageError, match="does not cover"):
         intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
 
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import shapely
 
 from services.formats.gcp.json_formats import measured_numbers
-from services.geodesy import metres_per_degree_at
+from services.geodesy import metres_per_degree_at, wrapped_degrees
 from services.types import Measures
 
 CRS_3D = "EPSG:4979"
@@ -57,7 +57,7 @@ def exaggeration_for(measures: Measures) -> float:
     if not len(length_m):
         return 1.0
     offset = measures.lon_lat_h[:, :2] - measures.lon_lat_h[0, :2]
-    offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+    offset[:, 0] = wrapped_degrees(offset[:, 0])
     extent_m = np.ptp(offset, axis=0) * metres_per_degree_at(measures.lon_lat_h[:1])[0]
     wanted = VISIBLE_SHARE * float(np.hypot(*extent_m)) / max(float(np.quantile(length_m, 0.9)), 1e-9)
     if not wanted > 1.0:

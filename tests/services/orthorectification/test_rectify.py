@@ -190,7 +190,7 @@ def test_flat_ground_hides_nothing() -> None:
 
 def test_terrain_of_elsewhere_is_refused() -> None:
     far = replace(terrain(), grid=replace(DEM, origin_xy=np.array([50.0, 10.0])))
-    with pytest.raises(CoverageError, match="does not reach"):
+    with pytest.raises(CoverageError, match="does not cover"):
         choose_grid(scene(), far)
 
 
