@@ -2,7 +2,7 @@
 
 import psycopg
 from alembic import context
-from sqlalchemy import create_engine
+from sqlalchemy import create_engine, func, select
 from sqlalchemy.pool import NullPool
 
 UPGRADE_LOCK = 0x616D657273  # "amers"
@@ -11,6 +11,6 @@ dsn = context.config.attributes["dsn"]
 engine = create_engine("postgresql+psycopg://", creator=lambda: psycopg.connect(dsn), poolclass=NullPool)
 
 with engine.begin() as connection:
-    connection.exec_driver_sql(f"select pg_advisory_xact_lock({UPGRADE_LOCK})")
+    connection.execute(select(func.pg_advisory_xact_lock(UPGRADE_LOCK)))
     context.configure(connection=connection, transactional_ddl=True)
     context.run_migrations()

@@ -9,7 +9,6 @@ Errors of the database reach callers as the driver raises them, such as `psycopg
 """
 
 import logging
-import select
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -17,11 +16,22 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from select import POLLIN, poll
 from typing import Any
 
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
-from sqlalchemy import Engine, ExceptionContext, NullPool, QueuePool, create_engine, event, exc
+from sqlalchemy import (
+    Engine,
+    ExceptionContext,
+    NullPool,
+    QueuePool,
+    create_engine,
+    event,
+    exc,
+    func,
+    select,
+)
 from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
 from app import request_context
@@ -198,6 +208,11 @@ def set_origin(connection: Connection) -> None:
     )
 
 
+def limit_lock_wait(connection: Connection, seconds: float) -> None:
+    """Let statements fail that wait longer for a lock, until the end of the transaction."""
+    connection.execute(select(func.set_config("lock_timeout", f"{seconds:g}s", True)))
+
+
 def status(dsn: str) -> SchemaStatus:
     """The version of a database's schema beside the one this Amers needs."""
     with _reachable(dsn) as connection:
@@ -339,8 +354,8 @@ def _check(
         InvalidatePoolError: there is none; the pool opens new connections in place of all its old ones.
     """
     try:
-        line = select.poll()
-        line.register(connection.fileno(), select.POLLIN)
+        line = poll()
+        line.register(connection.fileno(), POLLIN)
         if line.poll(0):
             connection.execute("")
             connection.rollback()

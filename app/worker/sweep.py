@@ -13,7 +13,7 @@ import psycopg
 
 from app.config import Settings
 from app.db import scenes, uptime
-from app.db.engine import Database
+from app.db.engine import Database, limit_lock_wait
 from app.db.jobs import attempts, jobs, queue
 from app.request_context import Origin, working_for
 from app.storage import Storage
@@ -100,7 +100,7 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
     removed += remove_unnamed_files(database, storage)
     removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s, UPLOAD_PREFIX)
     with database.transaction() as connection:
-        connection.execute(f"set local lock_timeout = '{LONGEST_WAIT_S}s'")
+        limit_lock_wait(connection, LONGEST_WAIT_S)
         removed += remove_unnamed_chips(connection, storage)
         removed += remove_expired_archives(connection, storage)
     for name in removed:

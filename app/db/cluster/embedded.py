@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import psycopg
-from psycopg import sql
 from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
@@ -29,6 +28,7 @@ from app.errors import InputError
 
 ROLE = "amers"
 DATABASE = "amers"
+CREATE_DATABASE = "create database amers"
 SOCKET_NAME = ".s.PGSQL.5432"
 LONGEST_SOCKET_PATH = 107
 START_SECONDS = 120.0
@@ -198,7 +198,7 @@ class Cluster:
                 "select from pg_database where datname = %s", [DATABASE]
             ).fetchone()
             if known is None:
-                connection.execute(sql.SQL("create database {}").format(sql.Identifier(DATABASE)))
+                connection.execute(CREATE_DATABASE)
 
     def _initialise(self, user: ServerUser) -> None:
         unfinished = self.folder / "data.unfinished"
