@@ -7,13 +7,13 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
-
-import httpx
-import jwt
+from typing import TYPE_CHECKING, Any
 
 from app.config import Settings
 from app.errors import NotAllowed
+
+if TYPE_CHECKING:
+    import jwt
 
 ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "EdDSA")
 """Signatures by a private key. None that anybody could make who knows the public one."""
@@ -66,6 +66,10 @@ class Issuer:
         Raises:
             NotAllowed: it is not one of this issuer for us, it has expired, or it maps to no scope.
         """
+        # Only a service with an issuer needs these libraries, which take a sixth of a second to import.
+        import httpx
+        import jwt
+
         try:
             key = self._key(jwt.get_unverified_header(token).get("kid"))
             claims: dict[str, Any] = jwt.decode(
@@ -88,8 +92,10 @@ class Issuer:
         name = str(claims.get("preferred_username") or claims.get("name") or claims["sub"])
         return Identity(f"{self._issuer}|{claims['sub']}", name[:200], scopes)
 
-    def _key(self, key_id: str | None) -> jwt.PyJWK:
+    def _key(self, key_id: str | None) -> "jwt.PyJWK":
         """The key of that id; keys are fetched anew when they are old or an id is unknown."""
+        import jwt
+
         with self._lock:
             age_s = time.monotonic() - self._seen_at
             if age_s > KEYS_LIVE_S or (key_id not in self._keys and age_s > LEAST_PAUSE_S):
@@ -99,7 +105,10 @@ class Issuer:
                 raise jwt.InvalidKeyError(f"no key {key_id!r:.80}")
             return self._keys[key_id]
 
-    def _fetch(self) -> dict[str | None, jwt.PyJWK]:
+    def _fetch(self) -> "dict[str | None, jwt.PyJWK]":
+        import httpx
+        import jwt
+
         url = self._keys_url
         if url is None:
             found = httpx.get(

@@ -1,13 +1,17 @@
 """The queue that workers take jobs from; a second entry of the same job does no harm."""
 
+from functools import cache
+from typing import TYPE_CHECKING
 from uuid import UUID
 
-import procrastinate
 from sqlalchemy import func, select, update
 
 from app.db.engine import Connection, driver
 from app.db.schema import clock, job
 from app.db.statements import named
+
+if TYPE_CHECKING:
+    import procrastinate
 
 QUEUE = "amers"
 TASK = "amers:job"
@@ -18,13 +22,10 @@ FORGOTTEN_JOBS = named("jobs.sql", "forgotten_jobs")
 PRUNE_SILENT_WORKERS = named("jobs.sql", "prune_silent_workers")
 DELETE_DEAD_ENTRIES = named("jobs.sql", "delete_dead_entries")
 
-queue = procrastinate.App(connector=procrastinate.SyncPsycopgConnector())
-"""Writes queue entries through the connection of the caller's transaction; it is never opened."""
-
 
 def enqueue(connection: Connection, job_id: UUID, delay_s: float = 0.0) -> None:
     """Put a job into the queue, in the transaction of its row; a job with two entries is done once."""
-    queue.configure_task(
+    _queue().configure_task(
         TASK,
         queue=QUEUE,
         schedule_in={"milliseconds": int(1000 * delay_s)} if delay_s else None,
@@ -50,3 +51,12 @@ def forget_dead_entries(connection: Connection, silent_s: float) -> None:
 def may_sweep(connection: Connection) -> bool:
     """Whether nobody else sweeps; true until the end of the transaction."""
     return bool(connection.scalar(select(func.pg_try_advisory_xact_lock(SWEEP_LOCK))))
+
+
+@cache
+def _queue() -> "procrastinate.App":
+    """Writes queue entries through the connection of the caller's transaction; it is never opened."""
+    # Imported by the first job: readers of the store start without it.
+    import procrastinate
+
+    return procrastinate.App(connector=procrastinate.SyncPsycopgConnector())
