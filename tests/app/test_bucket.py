@@ -100,7 +100,7 @@ def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path
     with pytest.raises(FormatError, match="50 chips"):
         stored.read(first.key, 49, 2)
     storage.put("chips/none.npy", [b"none"])
-    with pytest.raises(FormatError, match="not a NumPy file"):
+    with pytest.raises(FormatError, match="cannot be read as a NumPy array"):
         stored.read("chips/none.npy", 0, 1)
 
 

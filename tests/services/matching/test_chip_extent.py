@@ -8,6 +8,8 @@ from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.types import FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
+pytestmark = pytest.mark.long
+
 HALF, RADIUS_PX = 50, 6
 SIDE = 2 * (HALF + RADIUS_PX) + 1
 a_twentieth_of_a_pixel = 0.05

@@ -4,12 +4,15 @@ from dataclasses import replace
 from math import radians, tan
 
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.matching.shadows import CASTER_M, shadow_shift, shadow_vector, shadow_weights
 from services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
+
+pytestmark = pytest.mark.long
 
 SOUTH, WEST = 180.0, 270.0
 JUNE = Acquisition("june", "", None, 5.0, 0.0, 63.0, SOUTH)

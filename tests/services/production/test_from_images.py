@@ -17,6 +17,8 @@ from services.types import Array, Observations
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, SHAPE, block_views, plan, production, world
 from tests.services.ties import difference_m
 
+pytestmark = pytest.mark.long
+
 a_centimetre = 0.01
 a_tenth_of_a_pixel = 0.1
 refined_limit_px = 0.3

@@ -18,6 +18,8 @@ from services.simulation.view import true_ground
 from services.terrain import Terrain
 from tests.services.simulated import block_views, spoiled_view, world
 
+pytestmark = pytest.mark.long
+
 REFERENCE_GSD_M = 1.0
 POSTING_M = 5.0
 SIGMA_M = 25.0
