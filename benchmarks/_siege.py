@@ -160,7 +160,7 @@ class Siege:
     def token(self) -> str:
         """The secret of an administrator."""
         with self.cluster.lease() as dsn, connect(dsn) as connection:
-            return create_token(connection, "besieged", ["admin"]).secret
+            return create_token(connection, "faults", ["admin"]).secret
 
     def open_fire(self) -> None:
         """Begin to kill."""

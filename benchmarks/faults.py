@@ -136,7 +136,7 @@ def besiege(
                     passes = random.Random(seed + number).randint(1, MOST_PASSES)
                     caller.register(image, passes, f"task {number}")
                 else:
-                    name = f"besieged-{number}"
+                    name = f"faults-{number}"
                     box = (5.2 + number, 43.2, 5.3 + number, 43.3)
                     into = siege.ingest_folder / name
                     make_block(
@@ -243,7 +243,7 @@ def wrong_blocks(connection: Connection, jobs: list[dict[str, Any]]) -> list[str
                 where p.block_number = b.number) as views,
                (select count(*) from image i where i.block_number = b.number) as images,
                (select count(*) from chip_file c where c.block_number = b.number) as files
-           from block b where b.id like 'besieged-%'"""
+           from block b where b.id like 'faults-%'"""
     ).fetchall()
     whole = {
         "state": "published",

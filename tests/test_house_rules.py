@@ -29,6 +29,29 @@ TOUR = (
 )
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
 FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web"
+OLD_WORDS = (
+    r"\bdoors?\b",
+    r"homologous",
+    r"\.passes\b|\bfine_passes\b|services[./]passes",
+    r"\bmeasures_of\b|services[./]measures\b",
+    r"\b(chip|point)_choice\b",
+    r"\bmatching[./](middle|features|points|chips|dense)\b",
+    r"\bshared_error\b",
+    r"\blooks_of\b",
+    r"\bsteady_weights\b",
+    r"\bmin_edge_score\b",
+    r"\bvotes?\b",
+    r"\brival",
+    r"\bclass Equipment|\bcount_equipment\b|\.equipment\b|\"equipment\"",
+    r"\bas_they_scatter\b|\bless_sure\b",
+    r"\buntested_px\b",
+    r"\b(FoundPoints|Question|Asked)\b(?! for)",
+    r"usecases[./](ground_control|questions|cleaning)\b",
+    r"\bjob_course\b|\bservice_time\b|\bn_superseded\b",
+    r"\bapi[./](watch|documents|replies|origin)\b",
+    r"\b(besieged|block_doors)\b",
+)
+"""Words that the glossary has replaced; see `docs/glossary.md` for those in use."""
 EXAMPLES_OF_NAMES = {"match_count", "reported_sigma_m"}
 NAMELESS = {"utils", "helpers", "common", "manager", "base_service"}
 LONGEST_FILE = 500
@@ -107,6 +130,18 @@ def test_every_name_that_a_document_uses_exists_in_the_code():
         code = " ".join(re.findall(r"`([^`\n]+)`", document.read_text()))
         names = set(re.findall(r"(?<![\w/.-])[a-z]+(?:_[a-z0-9]+)+(?!\w)", code))
         assert names - words - EXAMPLES_OF_NAMES == set(), document
+
+
+@pytest.mark.parametrize("word", OLD_WORDS)
+def test_a_word_that_was_replaced_is_gone(word):
+    places = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in (*sources(), *DOCUMENTS)
+        if path not in {Path(__file__), ROOT / "CHANGELOG.md"}
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if re.search(word, line)
+    ]
+    assert places == []
 
 
 @pytest.mark.parametrize("name", Settings.model_fields)
