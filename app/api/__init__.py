@@ -1,1 +1,1 @@
-"""The HTTP entry point: one router per resource."""
+"""The HTTP entry point: one router for each resource."""

@@ -1,21 +1,23 @@
-"""Blocks: the quality of each, and their life for an administrator."""
+"""Blocks: the quality of each, and the life of a block for administrators."""
 
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Header, Request, Response
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.body import body_chunks
-from app.api.deps import (
-    Admin,
-    DatabaseDep,
-    PointsReader,
-    SettingsDep,
-    StorageDep,
-    UploadTurn,
-)
+from app.api.body import BINARY_BODY, announced_length, body_chunks
+from app.api.deps import Admin, DatabaseDep, InstallationDep, PointsReader, SettingsDep, UploadTurn
 from app.api.jobs import job_url, status_info
+from app.api.models.blocks import (
+    AccuracyRecord,
+    BlockQuality,
+    BlockRecord,
+    ChangedBlock,
+    PublishedBlock,
+    UploadedBlock,
+)
+from app.api.models.jobs import StatusInfo
 from app.auth import is_administrator
 from app.db.blocks import Block
 from app.db.engine import Connection
@@ -24,7 +26,6 @@ from app.usecases import jobs
 from app.usecases.blocks import lifecycle, uploads
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.lifecycle import Published
-from app.usecases.installation import Installation
 from app.usecases.jobs import JobRequest
 from app.usecases.scenes import SentFile
 from services.quality.block import quality_document
@@ -33,34 +34,24 @@ router = APIRouter(tags=["blocks"])
 
 
 class BlockToIngest(BaseModel):
-    """A block to ingest: on the server, or uploaded before.
-
-    Attributes:
-        path: of its folder, below AMERS_INGEST_FOLDER.
-        upload: of an archive, as its upload replied.
-        publish: whether it becomes visible at once.
-        priority: of blocks over one place, the points of the greater one are served.
-    """
+    """A block to ingest: a folder on the server, or an uploaded archive."""
 
     model_config = ConfigDict(extra="forbid")
 
-    path: str | None = None
-    upload: UUID | None = None
-    publish: bool = False
-    priority: int = 0
+    path: str | None = Field(default=None, description="Path of the folder below AMERS_INGEST_FOLDER.")
+    upload: UUID | None = Field(default=None, description="Id from the reply to the upload.")
+    publish: bool = Field(default=False, description="Whether to publish the block after its ingestion.")
+    priority: int = Field(
+        default=0, description="Where blocks overlap, the points of the highest priority are served."
+    )
 
 
 class Priority(BaseModel):
-    """How a block stands against others over the same place."""
+    """The priority of a block among blocks that it overlaps."""
 
     model_config = ConfigDict(extra="forbid")
 
     priority: int
-
-
-BINARY_BODY = {
-    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
-}
 
 
 @router.put(
@@ -70,23 +61,16 @@ BINARY_BODY = {
     openapi_extra={"requestBody": BINARY_BODY},
 )
 def upload_block(
-    name: str,
-    request: Request,
-    database: DatabaseDep,
-    storage: StorageDep,
-    settings: SettingsDep,
-    caller: Admin,
-) -> dict[str, str]:
-    """Upload a zip or tar of a block; the reply says how `POST /blocks` names it."""
-    length = request.headers.get("content-length", "")
-    announced = int(length) if length.isdigit() else None
-    sent = SentFile(name, body_chunks(request), announced)
-    upload_id = uploads.receive_block(Installation(database, storage, settings), caller, sent)
-    return {"upload": str(upload_id)}
+    *, name: str, request: Request, installation: InstallationDep, caller: Admin
+) -> UploadedBlock:
+    """Upload a zip or tar archive of a block; send the `upload` of the reply to `POST /blocks`."""
+    sent = SentFile(name, body_chunks(request), announced_length(request))
+    return UploadedBlock(upload=uploads.receive_block(installation, caller, sent))
 
 
 @router.post("/blocks", status_code=201)
 def ingest(
+    *,
     body: BlockToIngest,
     request: Request,
     response: Response,
@@ -94,10 +78,10 @@ def ingest(
     settings: SettingsDep,
     caller: Admin,
     idempotency_key: Annotated[str | None, Header()] = None,
-) -> dict[str, Any]:
-    """Have a block checked and loaded, staged or published; the reply is a job to watch.
+) -> StatusInfo:
+    """Check and load a block, which is then staged or published; the reply is the job.
 
-    The same as an execution of the process `ingest-block`.
+    This is an execution of the process `ingest-block`.
     """
     inputs = body.model_dump(mode="json", exclude_none=True)
     with database.transaction() as connection:
@@ -108,59 +92,57 @@ def ingest(
 
 
 @router.get("/blocks/{reference}/quality")
-def quality(reference: str, database: DatabaseDep, caller: PointsReader) -> dict[str, Any]:
-    """The quality figures of a block; `cells` list west, south, area in km2, number of points.
+def quality(*, reference: str, database: DatabaseDep, caller: PointsReader) -> BlockQuality:
+    """Return the quality of a block: density, views, stated deviations.
 
-    `accuracy` is what the producer of the block measured, and against what.
+    `accuracy` has the figures that the producer of the block measured, with their references.
     """
     with database.reading() as connection:
-        block = _visible(connection, reference, caller)
-        report = lifecycle.block_report(connection, block)
-    return {**quality_document(report.quality), "accuracy": [vars(f) for f in report.accuracy]}
+        report = lifecycle.block_report(connection, _visible_block(connection, reference, caller))
+    accuracy = [AccuracyRecord.model_validate(figure) for figure in report.accuracy]
+    return BlockQuality(**quality_document(report.quality), accuracy=accuracy)
 
 
 @router.post("/blocks/{reference}/publish")
-def publish(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Make a block visible, and the version of it that was visible before no longer."""
+def publish(*, reference: str, database: DatabaseDep, caller: Admin) -> PublishedBlock:
+    """Publish a block; the published version of the same block is superseded."""
     with database.transaction() as connection:
         return _published(lifecycle.publish_block(connection, reference))
 
 
 @router.post("/blocks/{reference}/restore")
-def restore(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Make a block visible again that was withdrawn or superseded, in place of its visible version."""
+def restore(*, reference: str, database: DatabaseDep, caller: Admin) -> PublishedBlock:
+    """Publish a block again that was withdrawn or superseded; its published version is superseded."""
     with database.transaction() as connection:
         return _published(lifecycle.restore_block(connection, reference))
 
 
 @router.patch("/blocks/{reference}")
-def prioritise(reference: str, body: Priority, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Let a block win or lose against other blocks over the same place."""
+def prioritise(*, reference: str, body: Priority, database: DatabaseDep, caller: Admin) -> ChangedBlock:
+    """Set the priority of a block among blocks that it overlaps."""
     with database.transaction() as connection:
-        return {"block": _properties(lifecycle.prioritise_block(connection, reference, body.priority))}
+        block = lifecycle.prioritise_block(connection, reference, body.priority)
+    return ChangedBlock(block=BlockRecord.model_validate(block))
 
 
 @router.post("/blocks/{reference}/withdraw")
-def withdraw(reference: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Make a block invisible; it can be published again."""
+def withdraw(*, reference: str, database: DatabaseDep, caller: Admin) -> ChangedBlock:
+    """Withdraw a block: its points are not served until it is published again."""
     with database.transaction() as connection:
-        return {"block": _properties(lifecycle.withdraw_block(connection, reference))}
+        block = lifecycle.withdraw_block(connection, reference)
+    return ChangedBlock(block=BlockRecord.model_validate(block))
 
 
-def _published(published: Published) -> dict[str, Any]:
+def _published(published: Published) -> PublishedBlock:
     superseded = published.superseded
-    return {
-        "block": _properties(published.block),
-        "superseded": None if superseded is None else _properties(superseded),
-    }
+    return PublishedBlock(
+        block=BlockRecord.model_validate(published.block),
+        superseded=None if superseded is None else BlockRecord.model_validate(superseded),
+    )
 
 
-def _visible(connection: Connection, reference: str, caller: Token | None) -> Block:
-    """The block a caller may see: any for an administrator, the published one for others."""
+def _visible_block(connection: Connection, reference: str, caller: Token | None) -> Block:
+    """The block that a caller may see: any for an administrator, a published one for others."""
     if is_administrator(caller):
         return lifecycle.find_block(connection, reference)
     return lifecycle.find_published(connection, reference)
-
-
-def _properties(block: Block) -> dict[str, Any]:
-    return {name: value for name, value in vars(block).items() if name != "outline"}

@@ -1,14 +1,22 @@
-"""The collections of the service and what can be asked of each, as OGC API - Features has it."""
+"""The collections of the service, and the schemas of their properties (OGC API - Features)."""
 
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import JSONResponse
 
 from app.api import stac
 from app.api.deps import DatabaseDep, PointsReader, SettingsDep
 from app.api.features import CollectionDep, Format, ViewerDep, viewer_of
-from app.api.json_schemas import document_of, geometry_schema, property_schema
+from app.api.json_schemas import geometry_schema, property_schema
+from app.api.models.base import Link
+from app.api.models.documents import (
+    CollectionDescription,
+    Collections,
+    Extent,
+    JsonSchema,
+    SpatialExtent,
+    TemporalExtent,
+)
 from app.api.negotiation import (
     DOCUMENTS,
     FEATURES,
@@ -16,12 +24,16 @@ from app.api.negotiation import (
     HTML,
     JSON,
     SCHEMA_JSON,
+    SchemaResponse,
     chosen_format,
+    described,
+    json_reply,
     refuse_unknown,
 )
-from app.api.pages import Cell, document_page, drawn
+from app.api.pages import Cell, Page, document_page, drawn
 from app.db.engine import Connection
 from app.db.features.collection import Collection, Viewer
+from app.db.features.crs import CRS84
 from app.errors import NotAllowed
 from app.usecases.features import items
 from app.usecases.features.tiles import TILED
@@ -29,80 +41,84 @@ from app.usecases.features.tiles import TILED
 router = APIRouter(tags=["collections"])
 
 REL = "http://www.opengis.net/def/rel/ogc/1.0"
+WORLD = (-180.0, -90.0, 180.0, 90.0)
 
 
-@router.get("/collections", response_class=Response, responses=document_of("Collections"))
+@router.get("/collections", response_class=Response, responses=described(Collections, HTML))
 def collections(
+    *,
     request: Request,
     database: DatabaseDep,
     caller: PointsReader,
     settings: SettingsDep,
     f: Format = None,
 ) -> Response:
-    """The collections the caller may see."""
+    """List the collections that the caller may read."""
     refuse_unknown(request, {"f"})
-    seen = []
+    readable = []
     for collection in items.COLLECTIONS.values():
         try:
-            seen.append((collection, viewer_of(collection, caller, settings)))
+            readable.append((collection, viewer_of(collection, caller, settings)))
         except NotAllowed:
             continue
-    with database.reading() as connection:
-        described = [describe(request, connection, *one) for one in seen]
-    document = {"links": _self_links(request, "collections"), "collections": described}
+    links = _self_links(request, "collections")
     if chosen_format(request, DOCUMENTS, f) == "json":
-        return JSONResponse(document)
+        with database.reading() as connection:
+            listed = [describe(request, connection, *pair) for pair in readable]
+        return json_reply(Collections(links=links, collections=listed))
     rows = [
         [
             Cell(collection.title, f"{request.base_url}collections/{collection.id}?f=html"),
             Cell(collection.description),
         ]
-        for collection, _ in seen
+        for collection, _ in readable
     ]
-    return document_page(
-        request, "Collections", "", document["links"], ("collection", "what it holds"), rows
-    )
+    columns = ("collection", "description")
+    return document_page(request, Page("Collections", links=links, columns=columns, rows=rows))
 
 
-@router.get("/collections/{collection}", response_class=Response, responses=document_of("Collection"))
+@router.get(
+    "/collections/{collection}",
+    response_class=Response,
+    responses=described(CollectionDescription, HTML),
+)
 def one_collection(
+    *,
     request: Request,
     collection: CollectionDep,
     viewer: ViewerDep,
     database: DatabaseDep,
     f: Format = None,
 ) -> Response:
-    """One collection."""
+    """Return one collection."""
     refuse_unknown(request, {"f"})
     with database.reading() as connection:
         document = describe(request, connection, collection, viewer)
     if chosen_format(request, DOCUMENTS, f) == "json":
-        return JSONResponse(document)
-    box = document.get("extent", {}).get("spatial", {}).get("bbox", [None])[0]
-    rows = [
-        [Cell(item.name), Cell(item.title), Cell(item.type), Cell(item.unit)]
-        for item in collection.queryables.values()
-    ]
-    return document_page(
-        request,
+        return json_reply(document)
+    page = Page(
         collection.title,
         collection.description,
-        document["links"],
-        ("property", "what it is", "type", "unit"),
-        rows,
-        drawn([] if box is None else [_rectangle(box)]),
+        document.links,
+        columns=("property", "title", "type", "unit"),
+        rows=[
+            [Cell(item.name), Cell(item.title), Cell(item.type), Cell(item.unit)]
+            for item in collection.queryables.values()
+        ],
+        drawing=drawn([_rectangle(document.extent.spatial.bbox[0])]),
     )
+    return document_page(request, page)
 
 
 @router.get(
     "/collections/{collection}/queryables",
-    response_class=Response,
-    responses=document_of("JsonSchema", SCHEMA_JSON),
+    response_class=SchemaResponse,
+    responses=described(JsonSchema, HTML),
 )
 def queryables(
-    request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
+    *, request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
-    """What a filter may name, as a JSON Schema."""
+    """Return the properties that a filter may name, as a JSON Schema."""
     members = {item.name: property_schema(item) for item in collection.queryables.values()}
     members["geometry"] = geometry_schema(collection)
     return _schema_reply(request, collection, "queryables", members, f)
@@ -110,24 +126,26 @@ def queryables(
 
 @router.get(
     "/collections/{collection}/sortables",
-    response_class=Response,
-    responses=document_of("JsonSchema", SCHEMA_JSON),
+    response_class=SchemaResponse,
+    responses=described(JsonSchema, HTML),
 )
 def sortables(
-    request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
+    *, request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
-    """What features can be sorted by, as a JSON Schema."""
+    """Return the properties that features can be sorted by, as a JSON Schema."""
     members = {item.name: property_schema(item) for item in collection.queryables.values()}
     return _schema_reply(request, collection, "sortables", members, f)
 
 
 @router.get(
     "/collections/{collection}/schema",
-    response_class=Response,
-    responses=document_of("JsonSchema", SCHEMA_JSON),
+    response_class=SchemaResponse,
+    responses=described(JsonSchema, HTML),
 )
-def schema(request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None) -> Response:
-    """The properties of a feature, as a JSON Schema with the roles of OGC API - Features - Part 5."""
+def schema(
+    *, request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
+) -> Response:
+    """Return the properties of a feature and their roles (OGC API - Features - Part 5) as a JSON Schema."""
     members: dict[str, Any] = {}
     for item in collection.queryables.values():
         members[item.name] = property_schema(item)
@@ -143,58 +161,59 @@ def schema(request: Request, collection: CollectionDep, viewer: ViewerDep, f: Fo
 
 def describe(
     request: Request, connection: Connection, collection: Collection, viewer: Viewer
-) -> dict[str, Any]:
-    """A collection as OGC API - Features describes it."""
+) -> CollectionDescription:
+    """A collection as OGC API - Features and STAC describe it."""
     box = items.extent(connection, collection, viewer)
-    # STAC calls for an extent even where nothing is.
-    spatial = {"bbox": [box or WORLD], "crs": _CRS84}
     period = items.period(connection, collection, viewer)
-    temporal = {"interval": [[None if time is None else time.isoformat() for time in period]]}
-    path = f"collections/{collection.id}"
-    here = f"{request.base_url}{path}"
+    return CollectionDescription(
+        **stac.COLLECTION_MEMBERS,
+        id=collection.id,
+        title=collection.title,
+        description=collection.description,
+        item_type="feature",
+        crs=[crs.uri for crs in collection.crs],
+        storage_crs=collection.storage_crs.uri,
+        extent=Extent(
+            # STAC requires an extent even for a collection without features.
+            spatial=SpatialExtent(bbox=[list(box or WORLD)], crs=CRS84.uri),
+            temporal=TemporalExtent(
+                interval=[[None if time is None else time.isoformat() for time in period]]
+            ),
+        ),
+        links=_collection_links(request, collection),
+    )
+
+
+def _collection_links(request: Request, collection: Collection) -> list[Link]:
+    base, path = str(request.base_url), f"collections/{collection.id}"
+    here = f"{base}{path}"
     links = [
         *_self_links(request, path),
+        # STAC clients append ids to the first of these links: it needs to be without a query.
+        Link(rel="items", href=f"{here}/items", type=GEOJSON, title="Items, json"),
         *(
-            # Clients of STAC append ids to the first of them.
-            {
-                "rel": "items",
-                "href": f"{here}/items" if name == "json" else f"{here}/items?f={name}",
-                "type": kind,
-                "title": f"Items, {name}",
-            }
-            for name, kind in {"json": GEOJSON, **FEATURES}.items()
+            Link(rel="items", href=f"{here}/items?f={name}", type=media_type, title=f"Items, {name}")
+            for name, media_type in FEATURES.items()
+            if name != "json"
         ),
-        {"rel": "root", "href": str(request.base_url), "type": JSON},
-        {"rel": "parent", "href": str(request.base_url), "type": JSON},
-        {"rel": "describedby", "href": f"{here}/schema", "type": SCHEMA_JSON},
-        {"rel": f"{REL}/schema", "href": f"{here}/schema", "type": SCHEMA_JSON},
-        {"rel": f"{REL}/queryables", "href": f"{here}/queryables", "type": SCHEMA_JSON},
-        {"rel": f"{REL}/sortables", "href": f"{here}/sortables", "type": SCHEMA_JSON},
+        Link(rel="root", href=base, type=JSON),
+        Link(rel="parent", href=base, type=JSON),
+        Link(rel="describedby", href=f"{here}/schema", type=SCHEMA_JSON),
+        *(
+            Link(rel=f"{REL}/{name}", href=f"{here}/{name}", type=SCHEMA_JSON)
+            for name in ("schema", "queryables", "sortables")
+        ),
     ]
     if collection.id in TILED:
-        links.append({"rel": f"{REL}/tilesets-vector", "href": f"{here}/tiles", "type": JSON})
-    return {
-        "id": collection.id,
-        "title": collection.title,
-        "description": collection.description,
-        "itemType": "feature",
-        "crs": [crs.uri for crs in collection.crs],
-        "storageCrs": collection.storage_crs.uri,
-        **stac.COLLECTION_MEMBERS,
-        "extent": {"spatial": spatial, "temporal": temporal},
-        "links": links,
-    }
+        links.append(Link(rel=f"{REL}/tilesets-vector", href=f"{here}/tiles", type=JSON))
+    return links
 
 
-WORLD = (-180.0, -90.0, 180.0, 90.0)
-_CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
-
-
-def _self_links(request: Request, path: str) -> list[dict[str, str]]:
+def _self_links(request: Request, path: str) -> list[Link]:
     href = f"{request.base_url}{path}"
     return [
-        {"rel": "self", "href": href, "type": JSON, "title": "this document"},
-        {"rel": "alternate", "href": f"{href}?f=html", "type": HTML, "title": "this document"},
+        Link(rel="self", href=href, type=JSON, title="this document"),
+        Link(rel="alternate", href=f"{href}?f=html", type=HTML, title="this document"),
     ]
 
 
@@ -204,22 +223,29 @@ def _schema_reply(
     refuse_unknown(request, {"f"})
     path = f"collections/{collection.id}/{name}"
     if chosen_format(request, {"json": SCHEMA_JSON, "html": HTML}, f) == "html":
-        rows = [
-            [Cell(key), Cell(value.get("title", "")), Cell(value.get("type", value.get("format", "")))]
-            for key, value in members.items()
-        ]
-        links = _self_links(request, path)
-        title = f"{collection.title}: {name}"
-        return document_page(request, title, "", links, ("property", "what it is", "type"), rows)
-    document = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"{request.base_url}{path}",
-        "type": "object",
-        "title": collection.title,
-        "properties": members,
-        "additionalProperties": False,
-    }
-    return JSONResponse(document, media_type=SCHEMA_JSON)
+        page = Page(
+            f"{collection.title}: {name}",
+            links=_self_links(request, path),
+            columns=("property", "title", "type"),
+            rows=[
+                [
+                    Cell(key),
+                    Cell(value.get("title", "")),
+                    Cell(value.get("type", value.get("format", ""))),
+                ]
+                for key, value in members.items()
+            ],
+        )
+        return document_page(request, page)
+    document = JsonSchema(
+        schema_uri="https://json-schema.org/draft/2020-12/schema",
+        id=f"{request.base_url}{path}",
+        type="object",
+        title=collection.title,
+        properties=members,
+        additional_properties=False,
+    )
+    return json_reply(document, SCHEMA_JSON)
 
 
 def _rectangle(box: list[float]) -> dict[str, Any]:

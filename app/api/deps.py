@@ -1,8 +1,8 @@
-"""What endpoints ask for: settings, store, storage, and a caller who may.
+"""Dependencies of endpoints: settings, database, storage, and a caller with the scope needed.
 
-What does not wait is `async`: it costs a call, where anything else costs a change of threads. Endpoints
-take a connection in their own thread, for as long as they need it: who held one and waited for a thread
-would wait for those who have a thread and wait for a connection.
+Dependencies that do not wait are `async`: FastAPI calls them directly, and runs others in a thread. An
+endpoint takes a database connection in its own thread and for as long as it needs it. A dependency that
+held a connection and waited for a thread could wait for a thread that waits for a connection.
 """
 
 from collections.abc import AsyncIterator
@@ -21,12 +21,13 @@ from app.db.tokens import Token
 from app.errors import NotAllowed
 from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
+from app.usecases.installation import Installation
 
 UPLOADS_AT_ONCE = 32
 
 
 def threads_for(settings: Settings) -> int:
-    """Threads for endpoints: with all uploads under way, one for each connection is left."""
+    """Number of threads for endpoints: one for each upload at once and for each database connection."""
     return UPLOADS_AT_ONCE + 2 * settings.pool_size
 
 
@@ -56,22 +57,31 @@ StorageDep = Annotated[Storage, Depends(_storage)]
 ChipsDep = Annotated[StoredChips, Depends(_chips)]
 
 
+async def _installation(
+    database: DatabaseDep, storage: StorageDep, settings: SettingsDep
+) -> Installation:
+    return Installation(database, storage, settings)
+
+
+InstallationDep = Annotated[Installation, Depends(_installation)]
+
+
 async def _caller(
     request: Request, database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
 ) -> Token | None:
-    """The caller's token, None when none was sent; one that is sent but wrong is refused."""
+    """The caller's token, None if the request has none; an invalid token is refused."""
     if authorization is None:
         return None
     kind, _, secret = authorization.partition(" ")
     if kind.lower() != "bearer" or not secret.strip():
         raise NotAllowed("the Authorization header must read `Bearer TOKEN`", authenticated=False)
-    caller = await run_in_threadpool(_known, request.app.state.issuer, database, secret.strip())
+    caller = await run_in_threadpool(_token, request.app.state.issuer, database, secret.strip())
     here = request_context.current()
     here.actor, here.actor_name = caller.id, caller.name
     return caller
 
 
-def _known(issuer: Issuer | None, database: Database, secret: str) -> Token:
+def _token(issuer: Issuer | None, database: Database, secret: str) -> Token:
     if issuer is not None and looks_like_jwt(secret):
         return authenticate_identity(database, issuer.identify(secret))
     with database.reading() as connection:
@@ -82,13 +92,19 @@ CallerDep = Annotated[Token | None, Depends(_caller)]
 
 
 async def _turn(request: Request, caller: CallerDep) -> AsyncIterator[None]:
-    """A turn among those who send files: each holds a thread for as long as sending takes."""
+    """Count an upload in progress: each occupies a thread until all of its bytes have arrived.
+
+    Raises:
+        HTTPException: as many uploads as are allowed are in progress.
+    """
     turns: CapacityLimiter = request.app.state.upload_turns
     try:
         turns.acquire_on_behalf_of_nowait(request)
     except WouldBlock:
-        said = f"{UPLOADS_AT_ONCE} files are being sent already, as many as are taken at once: try again"
-        raise HTTPException(503, said, {"Retry-After": "5"}) from None
+        detail = (
+            f"{UPLOADS_AT_ONCE} uploads are in progress, the most that are allowed at once: try again"
+        )
+        raise HTTPException(503, detail, {"Retry-After": "5"}) from None
     try:
         yield
     finally:
@@ -111,14 +127,14 @@ async def _admin(caller: CallerDep) -> Token:
 
 
 async def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
-    """Anybody where points are public, else a caller with scope `read`."""
+    """A caller with scope `read`, or any caller if points are public."""
     if caller is None and settings.public_points:
         return None
     return require(caller, Scope.READ)
 
 
 async def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
-    """Anybody where metrics are public, else a caller with scope `monitor`."""
+    """A caller with scope `monitor`, or any caller if metrics are public."""
     if caller is None and settings.public_metrics:
         return None
     return require(caller, Scope.MONITOR)

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
-from app.api.pages import features_page
+from app.api.pages import Page, count_text, features_page
 from app.api.streams import Streamed
 from app.auth import Scope, is_administrator, require
 from app.db.engine import Database
@@ -197,9 +197,8 @@ def item(
     ]
     if form == "html":
         feature = json.loads(text)
-        return features_page(
-            request, collection, f"{collection.title}: {feature['id']}", [feature], links
-        )
+        html = Page(f"{collection.title}: {feature['id']}", collection.description, links)
+        return features_page(request, collection, [feature], html)
     body = f'{text[:-1]},"links":{json.dumps(links)}}}'
     return Response(body, media_type=GEOJSON, headers={"Content-Crs": f"<{reply_crs.uri}>"})
 
@@ -243,7 +242,9 @@ def _page_reply(page: PageRequest) -> Response:
     headers = {**_headers(page), **_answer_headers(answer, links)}
     if page.form == "html":
         rows = json.loads(b'{"features":[' + body + b"]}")["features"]
-        return features_page(page.request, page.collection, page.collection.title, rows, links, answer)
+        description = f"{count_text(answer)} {page.collection.description}"
+        html = Page(page.collection.title, description, links)
+        return features_page(page.request, page.collection, rows, html)
     if page.form == "json":
         body = b'{"type":"FeatureCollection","features":[' + body + _members(answer, links)
     elif page.form == "csv":

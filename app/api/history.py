@@ -1,41 +1,36 @@
-"""What registrations say of points, and what an administrator makes of it."""
-
-from dataclasses import asdict
-from typing import Any
+"""Suspension and reinstatement of points, for administrators."""
 
 from fastapi import APIRouter
-from fastapi.encoders import jsonable_encoder
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Admin, DatabaseDep
-from app.db.history import PointHistory
+from app.api.models.features import PointHistoryRecord
 from app.usecases import history
 
 router = APIRouter(prefix="/points", tags=["points"])
 
 
 class Suspension(BaseModel):
-    """Why a point is suspended."""
+    """The suspension of a point."""
 
     model_config = ConfigDict(extra="forbid")
 
-    because: str
+    because: str = Field(description="Reason of the suspension.")
 
 
 @router.post("/{point_id}/suspend")
-def suspend(point_id: int, body: Suspension, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Serve a point no longer; what is proposed for it is in the collection `point-history`."""
+def suspend(
+    *, point_id: int, body: Suspension, database: DatabaseDep, caller: Admin
+) -> PointHistoryRecord:
+    """Suspend a point: it is no longer served. The collection `point-history` has the proposals."""
     with database.transaction() as connection:
-        return _told(history.suspend_point(connection, point_id, body.because))
+        record = history.suspend_point(connection, point_id, body.because)
+    return PointHistoryRecord.model_validate(record)
 
 
 @router.post("/{point_id}/reinstate")
-def reinstate(point_id: int, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Serve a suspended point again; its history begins anew."""
+def reinstate(*, point_id: int, database: DatabaseDep, caller: Admin) -> PointHistoryRecord:
+    """Serve a suspended point again; its history starts anew."""
     with database.transaction() as connection:
-        return _told(history.reinstate_point(connection, point_id))
-
-
-def _told(found: PointHistory) -> dict[str, Any]:
-    told: dict[str, Any] = jsonable_encoder(asdict(found))
-    return told
+        record = history.reinstate_point(connection, point_id)
+    return PointHistoryRecord.model_validate(record)

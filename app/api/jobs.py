@@ -1,11 +1,15 @@
-"""OGC API - Processes: jobs, where they stand and what they made."""
+"""OGC API - Processes: jobs, their states and messages."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 from uuid import UUID
 
 from fastapi import APIRouter, Depends, Query, Request
+from pydantic import BaseModel, Field
 
 from app.api.deps import DatabaseDep, Reader
+from app.api.models.base import Link
+from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
+from app.api.negotiation import JSON
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.schema import JobState
 from app.errors import NoSuchJob
@@ -15,6 +19,7 @@ from app.usecases.features.query import parse_interval
 router = APIRouter(tags=["jobs"])
 
 MOST_LISTED = 1000
+RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"
 
 
 async def _job_id(job_id: str) -> UUID:
@@ -27,115 +32,116 @@ async def _job_id(job_id: str) -> UUID:
 JobId = Annotated[UUID, Depends(_job_id)]
 
 
+class JobsQuery(BaseModel):
+    """The parameters of a page of jobs."""
+
+    process_id: list[str] | None = Field(default=None, alias="processID")
+    status: list[JobState] | None = None
+    type: list[Literal["process"]] | None = Field(default=None, description="Every job is of this type.")
+    datetime: str | None = Field(
+        default=None,
+        description="Time of the request: a time, or an interval FROM/TO with `..` for an open end.",
+    )
+    min_duration: float | None = Field(default=None, alias="minDuration", ge=0, description="Seconds.")
+    max_duration: float | None = Field(default=None, alias="maxDuration", ge=0, description="Seconds.")
+    limit: int = Field(default=100, ge=1, le=MOST_LISTED, description="Number of jobs on a page.")
+    after: UUID | None = Field(default=None, description="From the link `next`.")
+
+    @property
+    def job_filter(self) -> JobFilter:
+        """The jobs that meet the parameters."""
+        since, until = (None, None) if self.datetime is None else parse_interval(self.datetime)
+        return JobFilter(
+            kinds=tuple(self.process_id or ()),
+            states=tuple(self.status or ()),
+            since=since,
+            until=until,
+            min_duration_s=self.min_duration,
+            max_duration_s=self.max_duration,
+        )
+
+
 @router.get("/jobs")
 def list_jobs(
-    request: Request,
-    database: DatabaseDep,
-    caller: Reader,
-    process_id: Annotated[list[str] | None, Query(alias="processID")] = None,
-    status: Annotated[list[JobState] | None, Query()] = None,
-    type: Annotated[list[Literal["process"]] | None, Query(description="Every job is one.")] = None,
-    datetime: Annotated[
-        str | None,
-        Query(description="When it was asked for: a time, or FROM/TO with .. for an open end."),
-    ] = None,
-    min_duration: Annotated[
-        float | None, Query(alias="minDuration", ge=0, description="Seconds.")
-    ] = None,
-    max_duration: Annotated[
-        float | None, Query(alias="maxDuration", ge=0, description="Seconds.")
-    ] = None,
-    limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
-    after: Annotated[UUID | None, Query(description="From the link `next`.")] = None,
-) -> dict[str, Any]:
-    """The caller's jobs, the newest first; everybody's for an administrator."""
-    since, until = (None, None) if datetime is None else parse_interval(datetime)
-    wanted = JobFilter(
-        tuple(process_id or ()), tuple(status or ()), since, until, min_duration, max_duration
-    )
+    *, request: Request, database: DatabaseDep, caller: Reader, query: Annotated[JobsQuery, Query()]
+) -> Jobs:
+    """List the jobs of the caller, newest first; administrators see all jobs."""
     with database.reading() as connection:
-        found = jobs.list_jobs(connection, caller, wanted, limit + 1, after)
-    page = found[:limit]
-    links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
-    if len(found) > limit:
+        listed = jobs.list_jobs(connection, caller, query.job_filter, query.limit + 1, query.after)
+    page = listed[: query.limit]
+    links = [Link(rel="self", href=str(request.url), type=JSON)]
+    if len(listed) > query.limit:
         following = str(request.url.include_query_params(after=page[-1].id))
-        links.append({"rel": "next", "href": following, "type": "application/json"})
-    return {"jobs": [status_info(request, job) for job in page], "links": links}
+        links.append(Link(rel="next", href=following, type=JSON))
+    return Jobs(jobs=[status_info(request, job) for job in page], links=links)
 
 
 @router.get("/jobs/{job_id}")
-def show_job(job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> dict[str, Any]:
-    """Where a job stands.
+def show_job(*, job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> StatusInfo:
+    """Return the state of a job.
 
-    While it waits, `amers:queuePosition` counts the jobs to be begun up to it; until it ends,
-    `amers:estimatedEnd` says when it may, from the durations of jobs before it.
+    `amers:queuePosition` is the place in the queue of a job that waits. `amers:estimatedEnd` is
+    estimated from the durations of earlier jobs, until the job ends.
     """
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
-        course = {
-            "amers:queuePosition": jobs.queue_position(connection, job),
-            "amers:estimatedEnd": jobs.expected_end(connection, job),
-        }
-    told = {name: value for name, value in course.items() if value is not None}
-    return {**status_info(request, job), **told}
+        status = status_info(request, job)
+        status.queue_position = jobs.queue_position(connection, job)
+        status.estimated_end = jobs.expected_end(connection, job)
+    return status
 
 
 @router.get("/jobs/{job_id}/messages")
-def show_messages(
-    job_id: JobId, request: Request, database: DatabaseDep, caller: Reader
-) -> dict[str, Any]:
-    """What a job has said on its way, the oldest message first: the last thousand."""
+def show_messages(*, job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> Messages:
+    """Return the last thousand messages of a job, oldest first."""
     with database.reading() as connection:
-        said = jobs.read_messages(connection, caller, job_id)
+        messages = jobs.read_messages(connection, caller, job_id)
     here = f"{request.base_url}jobs/{job_id}"
-    return {
-        "messages": [vars(message) for message in said],
-        "links": [
-            {"rel": "self", "href": f"{here}/messages", "type": "application/json"},
-            {"rel": "up", "href": here, "type": "application/json"},
+    return Messages(
+        messages=[Message.model_validate(message) for message in messages],
+        links=[
+            Link(rel="self", href=f"{here}/messages", type=JSON),
+            Link(rel="up", href=here, type=JSON),
         ],
-    }
+    )
 
 
 @router.delete("/jobs/{job_id}")
-def dismiss_job(
-    job_id: JobId, request: Request, database: DatabaseDep, caller: Reader
-) -> dict[str, Any]:
-    """Dismiss a job that has not ended; work on it stops within seconds."""
+def dismiss_job(*, job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> StatusInfo:
+    """Dismiss a job that has not ended; its worker stops within seconds."""
     with database.transaction() as connection:
         return status_info(request, jobs.dismiss(connection, caller, job_id))
 
 
 def job_url(request: Request, job: Job) -> str:
-    """Where a job is watched."""
+    """The address of a job."""
     return f"{request.base_url}jobs/{job.id}"
 
 
-def status_info(request: Request, job: Job) -> dict[str, Any]:
-    """A job as OGC API - Processes tells it; `error` holds the problem details of a failure."""
+def status_info(request: Request, job: Job) -> StatusInfo:
+    """A job as OGC API - Processes describes it."""
     here = job_url(request, job)
     links = [
-        {"rel": "self", "href": here, "type": "application/json"},
-        {"rel": "related", "href": f"{here}/messages", "type": "application/json", "title": "messages"},
+        Link(rel="self", href=here, type=JSON),
+        Link(rel="related", href=f"{here}/messages", type=JSON, title="messages"),
     ]
     if job.state == "successful" and job.results_removed_at is None:
-        results = {"rel": "http://www.opengis.net/def/rel/ogc/1.0/results", "href": f"{here}/results"}
-        links.append({**results, "type": "application/json"})
+        links.append(Link(rel=RESULTS, href=f"{here}/results", type=JSON))
     if "scene" in job.inputs:
         scene = f"{request.base_url}scenes/{job.inputs['scene']}"
-        links.append({"rel": "related", "href": scene, "type": "application/json", "title": "scene"})
-    return {
-        "jobID": job.id,
-        "processID": job.kind,
-        "type": "process",
-        "status": job.state,
-        "progress": job.progress,
-        "message": job.message,
-        "inputs": job.inputs,
-        "created": job.created_at,
-        "started": job.started_at,
-        "finished": job.finished_at,
-        "updated": job.updated_at,
-        **({"error": job.error} if job.error else {}),
-        "links": links,
-    }
+        links.append(Link(rel="related", href=scene, type=JSON, title="scene"))
+    return StatusInfo(
+        job_id=job.id,
+        process_id=job.kind,
+        type="process",
+        status=job.state,
+        progress=job.progress,
+        message=job.message,
+        inputs=job.inputs,
+        created=job.created_at,
+        started=job.started_at,
+        finished=job.finished_at,
+        updated=job.updated_at,
+        error=JobError.model_validate(job.error) if job.error else None,
+        links=links,
+    )

@@ -1,11 +1,10 @@
-"""JSON Schemas of what is served: of the properties of a collection, and of the documents of OGC API.
+"""JSON Schemas of the features that the database builds: their properties, a feature, a page.
 
-Sources: OGC 17-069r4 (Features), OGC 20-057 (Tiles), OGC 19-072 (Common); RFC 7946, RFC 9457.
+Sources: RFC 7946; OGC 17-069r4 (Features); OGC 23-058 (Features - Part 5, schemas).
 """
 
 from typing import Any
 
-from app.api.negotiation import HTML, JSON
 from app.db.features.collection import Collection, Property
 
 Schema = dict[str, Any]
@@ -19,70 +18,92 @@ JSON_TYPES: dict[str, dict[str, str]] = {
     "date": {"type": "string", "format": "date"},
     "timestamptz": {"type": "string", "format": "date-time"},
 }
+COUNT: Schema = {"type": "integer", "minimum": 0}
 
 
 def reference(name: str) -> Schema:
-    """A schema of `COMPONENTS`, by name."""
+    """A reference to a schema of the API's description."""
     return {"$ref": f"#/components/schemas/{name}"}
 
 
-def document_of(name: str, kind: str = JSON) -> dict[int | str, dict[str, Any]]:
-    """What the description of the API says of a document that is a page for people too."""
-    return {200: {"description": name, "content": {kind: {"schema": reference(name)}, HTML: {}}}}
-
-
-def json_of(name: str) -> dict[int | str, dict[str, Any]]:
-    """What the description of the API says of a document that is JSON only."""
-    return {200: {"description": name, "content": {JSON: {"schema": reference(name)}}}}
+LINKS: Schema = {"type": "array", "items": reference("Link")}
 
 
 def property_schema(item: Property) -> Schema:
-    """A property that is known."""
-    said: Schema = {"title": item.title, **JSON_TYPES[item.type]}
+    """A property whose value is known."""
+    schema: Schema = {"title": item.title, **JSON_TYPES[item.type]}
     if item.choices:
-        said["enum"] = list(item.choices)
+        schema["enum"] = list(item.choices)
     if item.unit:
-        said["x-ogc-unit"] = item.unit
-    return said
+        schema["x-ogc-unit"] = item.unit
+    return schema
 
 
 def geometry_schema(collection: Collection) -> Schema:
-    """The geometry of a collection, as OGC API - Features - Part 5 says it."""
-    # Outlines are cut at 180 degrees.
+    """The geometry of a collection as OGC API - Features - Part 5 describes it."""
+    return {"title": "Geometry", "format": _geometry_format(collection)}
+
+
+def _geometry_format(collection: Collection) -> str:
+    # Outlines are cut at 180 degrees, into several polygons.
     kind = "point" if collection.geometry_type == "Point" else "polygon-or-multipolygon"
-    return {"title": "Geometry", "format": f"geometry-{kind}"}
+    return f"geometry-{kind}"
 
 
-def feature_schema(collection: Collection) -> Schema:
-    """A feature in GeoJSON; those that are asked for alone may have more properties."""
+def schema_name(collection: Collection, kind: str = "") -> str:
+    """The name of a schema of a collection: `PointFeature`, `PointHistoryPage`."""
+    words = collection.id.removesuffix("s").split("-")
+    return "".join(word.capitalize() for word in words) + kind
+
+
+def collection_schemas(collection: Collection) -> dict[str, Schema]:
+    """The schemas of the features of a collection, by name."""
+    return {
+        schema_name(collection, "FeatureProperties"): _properties_schema(collection),
+        schema_name(collection, "Feature"): _feature_schema(collection),
+        schema_name(collection, "Page"): _page_schema(collection),
+    }
+
+
+def _properties_schema(collection: Collection) -> Schema:
+    """The properties of a feature; a request may ask for some of them only."""
+    return {
+        "type": "object",
+        "description": f"Properties of a feature of the collection {collection.id}.",
+        "properties": {item.name: _nullable_schema(item) for item in collection.queryables.values()},
+    }
+
+
+def _feature_schema(collection: Collection) -> Schema:
     kinds = [collection.geometry_type, f"Multi{collection.geometry_type}"]
     geometry = {
         "type": ["object", "null"],
+        "format": _geometry_format(collection),
         "required": ["type", "coordinates"],
         "properties": {"type": {"enum": kinds}, "coordinates": {"type": "array"}},
     }
-    properties = {item.name: _perhaps_null(item) for item in collection.queryables.values()}
     return {
         "type": "object",
+        "description": f"A feature of the collection {collection.id} in GeoJSON.",
         "required": ["type", "id", "geometry", "properties"],
         "properties": {
             "type": {"const": "Feature"},
             "id": JSON_TYPES[collection.key.type],
             "geometry": geometry,
-            "properties": {"type": "object", "properties": properties},
+            "properties": reference(schema_name(collection, "FeatureProperties")),
             "links": LINKS,
         },
     }
 
 
-def page_schema(collection: Collection) -> Schema:
-    """A page of features in GeoJSON."""
+def _page_schema(collection: Collection) -> Schema:
     return {
         "type": "object",
+        "description": f"A page of features of the collection {collection.id} in GeoJSON.",
         "required": ["type", "features", "links", "numberMatched", "numberReturned"],
         "properties": {
             "type": {"const": "FeatureCollection"},
-            "features": {"type": "array", "items": feature_schema(collection)},
+            "features": {"type": "array", "items": reference(schema_name(collection, "Feature"))},
             "links": LINKS,
             "numberMatched": COUNT,
             "numberReturned": COUNT,
@@ -91,73 +112,10 @@ def page_schema(collection: Collection) -> Schema:
     }
 
 
-def _perhaps_null(item: Property) -> Schema:
-    said = property_schema(item)
+def _nullable_schema(item: Property) -> Schema:
+    schema = property_schema(item)
     if item.nullable:
-        said["type"] = [said["type"], "null"]
+        schema["type"] = [schema["type"], "null"]
         if item.choices:
-            said["enum"] = [*item.choices, None]
-    return said
-
-
-def _object(required: str, **properties: Schema) -> Schema:
-    return {"type": "object", "required": required.split(), "properties": properties}
-
-
-def _array(items: Schema) -> Schema:
-    return {"type": "array", "items": items}
-
-
-TEXT: Schema = {"type": "string"}
-TEXTS = _array(TEXT)
-COUNT: Schema = {"type": "integer", "minimum": 0}
-LINKS = _array(reference("Link"))
-BOXES = _array({"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 6})
-COMPONENTS: dict[str, Schema] = {
-    "Problem": {
-        **_object("type title status detail", type=TEXT, title=TEXT, status=COUNT, detail=TEXT),
-        "description": "Problem details, RFC 9457.",
-    },
-    "Link": _object("rel href", rel=TEXT, href=TEXT, type=TEXT, title=TEXT),
-    "Landing": _object("title links", title=TEXT, description=TEXT, links=LINKS),
-    "Conformance": _object("conformsTo", conformsTo=TEXTS),
-    "Collections": _object(
-        "links collections", links=LINKS, collections=_array(reference("Collection"))
-    ),
-    "Collection": _object(
-        "id links",
-        id=TEXT,
-        title=TEXT,
-        description=TEXT,
-        itemType=TEXT,
-        crs=TEXTS,
-        storageCrs=TEXT,
-        extent=_object("spatial", spatial=_object("bbox", bbox=BOXES, crs=TEXT)),
-        links=LINKS,
-    ),
-    "JsonSchema": _object(
-        "$schema $id type properties",
-        **{"$schema": TEXT, "$id": TEXT, "type": {"const": "object"}, "properties": {"type": "object"}},
-    ),
-    "TileSets": _object("tilesets", tilesets=_array(reference("TileSet"))),
-    "TileSet": _object(
-        "dataType crs links",
-        title=TEXT,
-        dataType={"const": "vector"},
-        crs=TEXT,
-        tileMatrixSetURI=TEXT,
-        links=LINKS,
-        layers=_array(_object("id dataType", id=TEXT, dataType={"const": "vector"})),
-    ),
-    "TileMatrixSets": _object(
-        "tileMatrixSets", tileMatrixSets=_array(_object("id links", id=TEXT, uri=TEXT, links=LINKS))
-    ),
-    "TileMatrixSet": _object(
-        "id crs tileMatrices",
-        id=TEXT,
-        uri=TEXT,
-        crs=TEXT,
-        orderedAxes=TEXTS,
-        tileMatrices=_array({"type": "object", "required": ["id", "scaleDenominator", "cellSize"]}),
-    ),
-}
+            schema["enum"] = [*item.choices, None]
+    return schema

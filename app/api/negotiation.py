@@ -1,9 +1,12 @@
-"""Which format a reply has: `f=` decides, then the header Accept."""
+"""The format of a reply, which the parameter `f` decides or else the header Accept; media types."""
 
 from collections.abc import Mapping
+from typing import Any
 
-from fastapi import Request
+from fastapi import Request, Response
+from fastapi.responses import JSONResponse
 
+from app.api.models.base import Reply
 from app.errors import InvalidParameter
 
 GEOJSON = "application/geo+json"
@@ -27,19 +30,46 @@ FEATURES = {
 }
 
 
-def chosen_format(request: Request, formats: Mapping[str, str], asked: str | None) -> str:
-    """The name of the format of a reply, the first of `formats` when nothing speaks for another.
+class GeoJsonResponse(JSONResponse):
+    """A reply in GeoJSON."""
+
+    media_type = GEOJSON
+
+
+class SchemaResponse(JSONResponse):
+    """A JSON Schema."""
+
+    media_type = SCHEMA_JSON
+
+
+def json_reply(document: Reply, media_type: str = JSON) -> Response:
+    """A document as JSON, for endpoints that have other formats too."""
+    return Response(document.model_dump_json(by_alias=True), media_type=media_type)
+
+
+def described(model: type[Reply], *others: str) -> dict[int | str, dict[str, Any]]:
+    """The description of a reply that an endpoint makes itself: its model, and its other media types."""
+    text = (model.__doc__ or model.__name__).partition("\n")[0]
+    return {200: {"description": text, "model": model, "content": {other: {} for other in others}}}
+
+
+def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -> str:
+    """The name of the format of a reply; the first of `formats` by default.
+
+    Args:
+        formats: names and media types.
+        f: the parameter of that name.
 
     Raises:
-        InvalidParameter: `f` names none of them.
+        InvalidParameter: `f` is none of the names.
     """
-    if asked is not None:
-        if asked not in formats:
-            raise InvalidParameter(f"f: {asked!r:.40} found, one of {', '.join(formats)} expected")
-        return asked
+    if f is not None:
+        if f not in formats:
+            raise InvalidParameter(f"f: {f!r:.40} found, one of {', '.join(formats)} expected")
+        return f
     by_type = {kind.split(";")[0]: name for name, kind in formats.items()}
     by_type.setdefault(JSON, "json")
-    wanted = []
+    accepted = []
     for rank, part in enumerate(request.headers.get("accept", "").split(",")):
         kind, *parameters = (word.strip().lower() for word in part.split(";"))
         weights = [word[2:] for word in parameters if word.startswith("q=")]
@@ -50,15 +80,15 @@ def chosen_format(request: Request, formats: Mapping[str, str], asked: str | Non
         name = by_type.get(kind)
         versions = [word for word in parameters if word.startswith("version=")]
         if name is not None and weight > 0.0 and all(word in formats[name] for word in versions):
-            wanted.append((-weight, rank, name))
-    return min(wanted)[2] if wanted else next(iter(formats))
+            accepted.append((-weight, rank, name))
+    return min(accepted)[2] if accepted else next(iter(formats))
 
 
 def refuse_unknown(request: Request, known: set[str]) -> None:
-    """Refuse parameters that nobody knows, as OGC API calls for.
+    """Refuse parameters that the endpoint does not have, as OGC API requires.
 
     Raises:
-        InvalidParameter: naming them.
+        InvalidParameter: there are some; the message names them.
     """
     unknown = sorted(set(request.query_params) - known)
     if unknown:

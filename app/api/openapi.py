@@ -1,21 +1,22 @@
-"""The description of the API: what the framework makes of the code, and what OGC clients look for."""
+"""The OpenAPI description: what FastAPI makes of the code, completed for clients of OGC API."""
 
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
 
-from app.api.json_schemas import COMPONENTS, feature_schema, page_schema, property_schema, reference
+from app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
+from app.api.models.base import Link, Problem
 from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
 from app.db.features.collection import Collection, Property
 from app.usecases.features.items import COLLECTIONS
 from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
 
 REFUSED = {
-    "description": "What was wrong, as problem details.",
+    "description": "The request cannot be served; problem details say why.",
     "content": {PROBLEM_JSON: {"schema": reference("Problem")}},
 }
-
 COMMA_SEPARATED = ("bbox", "collections", "ids")
 PLACES: dict[str, dict[str, Any]] = {
     "matrix_set": {"enum": [MATRIX_SET]},
@@ -26,24 +27,26 @@ PLACES: dict[str, dict[str, Any]] = {
 
 
 def install(app: FastAPI) -> None:
-    """Make the application describe itself so."""
+    """Give an application the completed description."""
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
-            made = get_openapi(
+            document = get_openapi(
                 title=app.title, version=app.version, description=app.description, routes=app.routes
             )
-            app.openapi_schema = _finished(made)
+            app.openapi_schema = _completed(document)
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-def _finished(document: dict[str, Any]) -> dict[str, Any]:
+def _completed(document: dict[str, Any]) -> dict[str, Any]:
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     for unused in ("HTTPValidationError", "ValidationError"):
         schemas.pop(unused, None)
-    schemas |= COMPONENTS
+    for collection in COLLECTIONS.values():
+        schemas |= collection_schemas(collection)
+    schemas |= _model_schemas()
     document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
     document["security"] = [{"bearer": []}, {}]
     for path, operations in list(document["paths"].items()):
@@ -53,8 +56,16 @@ def _finished(document: dict[str, Any]) -> dict[str, Any]:
             parameters = [_parameter(item, operation) for item in operation.get("parameters", [])]
             operation["parameters"] = [item for item in parameters if item is not None]
         if "{collection}" in path:
-            _spell_out(document["paths"], path)
+            _expand_collections(document["paths"], path)
     return document
+
+
+def _model_schemas() -> dict[str, Any]:
+    """Schemas of the models that only this module refers to."""
+    models = [(Link, "serialization"), (Problem, "serialization")]
+    _, document = models_json_schema(models, ref_template="#/components/schemas/{model}")  # type: ignore[arg-type]
+    schemas: dict[str, Any] = document["$defs"]
+    return schemas
 
 
 def _parameter(parameter: dict[str, Any], operation: dict[str, Any]) -> dict[str, Any] | None:
@@ -84,20 +95,21 @@ def _kinds(schema: dict[str, Any]) -> list[dict[str, Any]]:
     return [{**shared, **kind} for kind in schema.get("anyOf", [{}])]
 
 
-def _spell_out(paths: dict[str, Any], path: str) -> None:
-    """A path for each collection: there clients look for the largest page and what filters may name."""
+def _expand_collections(paths: dict[str, Any], path: str) -> None:
+    """Replace a path of any collection by one for each: clients read limits and properties there."""
     operations = paths.pop(path)
     for name, collection in COLLECTIONS.items():
-        own = path.replace("{collection}", name)
-        if own not in paths:
-            paths[own] = {
+        own_path = path.replace("{collection}", name)
+        if own_path not in paths:
+            paths[own_path] = {
                 method: _of_collection(operation, collection, path)
                 for method, operation in operations.items()
             }
 
 
 def _of_collection(operation: dict[str, Any], collection: Collection, path: str) -> dict[str, Any]:
-    parameters = [item for item in operation.get("parameters", []) if item["name"] != "collection"]
+    """An operation of any collection as that of one."""
+    parameters = [item for item in operation["parameters"] if item["name"] != "collection"]
     own = {
         **operation,
         "operationId": f"{operation['operationId']}_{collection.id}",
@@ -106,19 +118,20 @@ def _of_collection(operation: dict[str, Any], collection: Collection, path: str)
     if path.endswith("/items"):
         own["parameters"] = parameters + [_equal(item) for item in collection.queryables.values()]
     if path.endswith(("/items", "/search")):
-        own["responses"] = _giving(page_schema(collection), operation["responses"])
+        own["responses"] = _with_geojson(schema_name(collection, "Page"), operation["responses"])
     elif path.endswith("/{feature_id}"):
-        own["responses"] = _giving(feature_schema(collection), operation["responses"])
+        own["responses"] = _with_geojson(schema_name(collection, "Feature"), operation["responses"])
     return own
 
 
 def _equal(item: Property) -> dict[str, Any]:
-    """The parameter that asks for features of which a property has a value."""
+    """The parameter for features of which a property has a value."""
     schema = property_schema(item)
     return {"name": item.name, "in": "query", "required": False, "schema": schema}
 
 
-def _giving(schema: dict[str, Any], responses: dict[str, Any]) -> dict[str, Any]:
-    good = responses["200"]
-    content = {**good["content"], GEOJSON: {"schema": schema}}
-    return {**responses, "200": {**good, "content": content}}
+def _with_geojson(name: str, responses: dict[str, Any]) -> dict[str, Any]:
+    """Responses whose GeoJSON follows a schema."""
+    ok = responses["200"]
+    content = {**ok["content"], GEOJSON: {"schema": reference(name)}}
+    return {**responses, "200": {**ok, "content": content}}

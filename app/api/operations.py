@@ -1,16 +1,18 @@
-"""For those who keep the service running: metrics, and the record of changes."""
+"""Operation of the service: metrics and the audit trail."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.encoders import jsonable_encoder
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
 from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
+from app.api.models.administration import ChangeRecord, ChangeRecords
+from app.api.models.base import Link
+from app.api.negotiation import JSON
 from app.usecases import operations
 from app.usecases.operations import InstallationFigures
 
@@ -19,40 +21,48 @@ router = APIRouter(tags=["operations"])
 
 @router.get("/metrics", response_class=Response)
 def metrics(
-    request: Request, database: DatabaseDep, settings: SettingsDep, caller: MetricsReader
+    *, request: Request, database: DatabaseDep, settings: SettingsDep, caller: MetricsReader
 ) -> Response:
-    """Figures for Prometheus: requests of this process, jobs, queue, blocks, points, disk."""
+    """Return metrics for Prometheus: requests of this process, jobs, queue, blocks, points, disk."""
     with database.reading() as connection:
         figures = operations.installation_figures(connection, settings.data_folder)
-    now = CollectorRegistry()
-    now.register(_Figures(figures))
-    text = generate_latest(request.app.state.metrics.registry) + generate_latest(now)
+    registry = CollectorRegistry()
+    registry.register(_InstallationCollector(figures))
+    text = generate_latest(request.app.state.metrics.registry) + generate_latest(registry)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @router.get("/audit")
 def audit(
+    *,
     request: Request,
     database: DatabaseDep,
     caller: Admin,
-    limit: Annotated[int, Query(ge=1, le=operations.MOST_CHANGES)] = 100,
+    limit: Annotated[
+        int, Query(ge=1, le=operations.MOST_CHANGES, description="Number of changes on a page.")
+    ] = 100,
     before: Annotated[
-        int | None, Query(le=2**63 - 1, description="Changes with smaller ids only.")
+        int | None, Query(le=2**63 - 1, description="Only changes with smaller ids.")
     ] = None,
-    kind: Annotated[str | None, Query(description="token, block, scene or job.")] = None,
-    subject: Annotated[str | None, Query(description="Id of one of them.", max_length=300)] = None,
-) -> dict[str, Any]:
-    """Every change of a token, a block, a scene or a job, the newest first; it only grows."""
+    kind: Annotated[str | None, Query(description="Only changes of this kind of thing.")] = None,
+    subject: Annotated[
+        str | None, Query(max_length=300, description="Only changes of the thing with this id.")
+    ] = None,
+) -> ChangeRecords:
+    """List the changes of tokens, blocks, scenes, jobs, points and references, newest first."""
     with database.reading() as connection:
-        found = operations.list_changes(connection, limit, before=before, kind=kind, subject=subject)
-    links = [{"rel": "self", "href": str(request.url), "type": "application/json"}]
-    if len(found) == limit:
-        following = str(request.url.include_query_params(before=found[-1].id))
-        links.append({"rel": "next", "href": following, "type": "application/json"})
-    return {"changes": jsonable_encoder(found), "links": links}
+        changes = operations.list_changes(connection, limit, before=before, kind=kind, subject=subject)
+    links = [Link(rel="self", href=str(request.url), type=JSON)]
+    if len(changes) == limit:
+        following = str(request.url.include_query_params(before=changes[-1].id))
+        links.append(Link(rel="next", href=following, type=JSON))
+    records = [ChangeRecord.model_validate(change) for change in changes]
+    return ChangeRecords(changes=records, links=links)
 
 
-class _Figures(Collector):
+class _InstallationCollector(Collector):
+    """The figures of an installation as Prometheus gauges."""
+
     def __init__(self, figures: InstallationFigures) -> None:
         self._figures = figures
 
@@ -67,22 +77,22 @@ class _Figures(Collector):
             blocks.add_metric((state,), number)
         yield blocks
         for name, text, value in (
-            ("amers_queue_length", "Entries of the queue that no worker has taken.", store.queue),
+            ("amers_queue_length", "Jobs in the queue that no worker has taken.", store.queue),
             (
                 "amers_oldest_waiting_job_seconds",
-                "Age of the oldest job that waits.",
+                "Age of the oldest job that waits, seconds.",
                 store.oldest_waiting_s,
             ),
             ("amers_points_published", "Points that are served.", store.points),
-            ("amers_database_bytes", "Size of the database.", store.database_bytes),
+            ("amers_database_bytes", "Size of the database, bytes.", store.database_bytes),
             (
                 "amers_disk_free_bytes",
-                "Free on the disk of the data folder.",
+                "Free bytes on the disk of the data folder.",
                 self._figures.disk_free_bytes,
             ),
             (
                 "amers_disk_total_bytes",
-                "Size of the disk of the data folder.",
+                "Size of the disk of the data folder, bytes.",
                 self._figures.disk_total_bytes,
             ),
         ):

@@ -1,13 +1,14 @@
-"""The same replies as pages for people: a table, a small map drawn in SVG, links; no script."""
+"""Replies as HTML: a table, a small map in SVG, links; no script."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
+from app.api.models.base import Link
 from app.db.features.collection import Collection
 from app.usecases.features.items import FeaturePage
 
@@ -18,7 +19,7 @@ MARGIN = 0.05
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table, perhaps a link."""
+    """A cell of a table, with the address of a link or without."""
 
     text: str
     href: str = ""
@@ -26,66 +27,74 @@ class Cell:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A map: the box that is seen, outlines and dots as SVG paths, and what it says in words."""
+    """A map.
+
+    Attributes:
+        box: the box that is seen, as `viewBox` has it.
+        lines, dots: outlines and positions as SVG paths.
+        text: the box in words.
+    """
 
     box: str
     lines: str
     dots: str
-    said: str
+    text: str
 
 
-def document_page(
-    request: Request,
-    title: str,
-    description: str,
-    links: Sequence[dict[str, Any]],
-    columns: Sequence[str] = (),
-    rows: Sequence[Sequence[Cell]] = (),
-    drawing: Drawing | None = None,
-) -> HTMLResponse:
-    """A page."""
-    text = TEMPLATES.get_template("page.html").render(
-        title=title,
-        description=description,
-        base=str(request.base_url),
-        links=links,
-        columns=columns,
-        rows=rows,
-        map=drawing,
-    )
+@dataclass(frozen=True)
+class Page:
+    """What a page shows.
+
+    Attributes:
+        links: links, or their members.
+        columns: heads of the table.
+        rows: of the table; an empty table is not shown.
+    """
+
+    title: str
+    description: str = ""
+    links: Sequence[Link | dict[str, Any]] = ()
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[Cell]] = ()
+    drawing: Drawing | None = None
+
+
+def document_page(request: Request, page: Page) -> HTMLResponse:
+    """A page as HTML."""
+    text = TEMPLATES.get_template("page.html").render(page=page, base=str(request.base_url))
     return HTMLResponse(text, headers={"Content-Security-Policy": POLICY})
 
 
 def features_page(
-    request: Request,
-    collection: Collection,
-    title: str,
-    found: Sequence[dict[str, Any]],
-    links: Sequence[dict[str, Any]],
-    answer: FeaturePage | None = None,
+    request: Request, collection: Collection, features: Sequence[dict[str, Any]], page: Page
 ) -> HTMLResponse:
-    """Features as a page."""
-    names = [name for name in (found[0]["properties"] if found else {})]
+    """Features as HTML: a map, and a table with a row for each.
+
+    Args:
+        page: title, description and links.
+    """
+    names = list(features[0]["properties"]) if features else []
     here = f"{request.base_url}collections/{collection.id}/items"
     rows = [
         [
             Cell(str(feature["id"]), f"{here}/{feature['id']}?f=html"),
             *(Cell(_shown(feature["properties"].get(name))) for name in names),
         ]
-        for feature in found
+        for feature in features
     ]
-    said = collection.description
-    if answer is not None:
-        about = "" if answer.matched.exact else "about "
-        said = f"{answer.returned:,} of {about}{answer.matched.number:,}. {said}"
+    drawing = drawn(feature["geometry"] for feature in features)
     columns = [collection.key.name, *names]
-    return document_page(
-        request, title, said, links, columns, rows, drawn(feature["geometry"] for feature in found)
-    )
+    return document_page(request, replace(page, columns=columns, rows=rows, drawing=drawing))
+
+
+def count_text(page: FeaturePage) -> str:
+    """How many features a page has, of how many."""
+    about = "" if page.matched.exact else "about "
+    return f"{page.returned:,} of {about}{page.matched.number:,}."
 
 
 def drawn(geometries: Iterable[dict[str, Any] | None]) -> Drawing | None:
-    """Geometries in longitude and latitude, drawn; None without any."""
+    """A map of geometries in longitude and latitude; None without any."""
     dots, rings = [], []
     for geometry in geometries:
         if geometry is None:
@@ -107,7 +116,7 @@ def drawn(geometries: Iterable[dict[str, Any] | None]) -> Drawing | None:
         box=" ".join(f"{value:.6g}" for value in box),
         lines="".join("M" + "L".join(f"{p[0]:.6f} {-p[1]:.6f}" for p in ring) + "Z" for ring in rings),
         dots="".join(f"M{p[0]:.6f} {-p[1]:.6f}h0" for p in dots),
-        said=f"{west:.3f} to {east:.3f} east, {south:.3f} to {north:.3f} north",
+        text=f"{west:.3f} to {east:.3f} east, {south:.3f} to {north:.3f} north",
     )
 
 

@@ -1,4 +1,4 @@
-"""Control points: pages of a box, one point, its chips."""
+"""Control points: one point with its views, and its chips."""
 
 import json
 from datetime import date
@@ -8,8 +8,19 @@ from fastapi import APIRouter, Query, Request, Response
 
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import CrsUri, Format
-from app.api.negotiation import GEOJSON, HTML, JSON, NPZ, TIFF, chosen_format, refuse_unknown
-from app.api.pages import features_page
+from app.api.models.features import PointWithViews
+from app.api.negotiation import (
+    GEOJSON,
+    HTML,
+    JSON,
+    NPZ,
+    TIFF,
+    GeoJsonResponse,
+    chosen_format,
+    described,
+    refuse_unknown,
+)
+from app.api.pages import Page, features_page
 from app.db.features.collection import Viewer
 from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
@@ -40,12 +51,9 @@ NOT_PROPERTIES = {
 PointId = int
 
 
-@router.get(
-    "/{point_id}",
-    response_class=Response,
-    responses={200: {"description": "A point.", "content": {GEOJSON: {}, HTML: {}}}},
-)
+@router.get("/{point_id}", response_class=GeoJsonResponse, responses=described(PointWithViews, HTML))
 def item(
+    *,
     point_id: PointId,
     request: Request,
     database: DatabaseDep,
@@ -53,32 +61,40 @@ def item(
     crs: CrsUri = None,
     f: Format = None,
 ) -> Response:
-    """One point, its views and the images they were cut from, and how registrations fared with it."""
+    """Return one point with its views, their images, and its history in registrations."""
     refuse_unknown(request, {"crs", "f"})
-    given = POINTS.storage_crs
+    reply_crs = POINTS.storage_crs
     with database.reading() as connection:
         point = points.find_point(connection, point_id)
         feature = _feature(point, str(request.url.replace(query="")))
         if crs is not None:
-            found, given = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
-            feature["geometry"] = json.loads(found)["geometry"]
+            text, reply_crs = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
+            feature["geometry"] = json.loads(text)["geometry"]
     text = json.dumps(feature, default=_plain)
     if chosen_format(request, {"json": GEOJSON, "html": HTML}, f) == "html":
-        shown = json.loads(text)
-        shown["properties"]["views"] = len(point.views)
-        return features_page(request, POINTS, f"Point {point_id}", [shown], shown["links"])
-    return Response(text, media_type=GEOJSON, headers={"Content-Crs": f"<{given.uri}>"})
+        row = json.loads(text)
+        row["properties"]["views"] = len(point.views)
+        page = Page(f"Point {point_id}", POINTS.description, row["links"])
+        return features_page(request, POINTS, [row], page)
+    return Response(text, media_type=GEOJSON, headers={"Content-Crs": f"<{reply_crs.uri}>"})
 
 
-@router.get("/{point_id}/chips", response_class=Response)
+@router.get(
+    "/{point_id}/chips",
+    response_class=Response,
+    responses={200: {"description": "The chips.", "content": {NPZ: {}, PNG: {}}}},
+)
 def chips(
+    *,
     point_id: PointId,
     database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
-    f: Annotated[Literal["npz", "png"], Query(description="png: all chips on one sheet.")] = "npz",
+    f: Annotated[
+        Literal["npz", "png"], Query(description="npz: raw values; png: all chips on one sheet.")
+    ] = "npz",
 ) -> Response:
-    """All chips of a point: raw values with what they show, or a sheet to look at."""
+    """Return all chips of a point: raw values with their metadata, or a sheet to look at."""
     with database.reading() as connection:
         point = points.find_point(connection, point_id)
     labelled = points.read_chips(stored, point)
@@ -87,16 +103,24 @@ def chips(
     return _download(format_chips_npz(labelled), NPZ, f"{point_id}.npz")
 
 
-@router.get("/{point_id}/chips/{view}", response_class=Response)
+@router.get(
+    "/{point_id}/chips/{view}",
+    response_class=Response,
+    responses={200: {"description": "A chip.", "content": {PNG: {}, TIFF: {}, NPZ: {}}}},
+)
 def chip(
+    *,
     point_id: PointId,
     view: int,
     database: DatabaseDep,
     stored: ChipsDep,
     caller: PointsReader,
-    f: Annotated[Literal["png", "tif", "npz"], Query(description="tif: GeoTIFF of raw values.")] = "png",
+    f: Annotated[
+        Literal["png", "tif", "npz"],
+        Query(description="png: stretched; tif: GeoTIFF of raw values; npz: raw values."),
+    ] = "png",
 ) -> Response:
-    """One chip: stretched to look at, or its raw values."""
+    """Return one chip: stretched to look at, or its raw values."""
     with database.reading() as connection:
         point = points.find_point(connection, point_id)
     labelled = points.read_chip(stored, point, view)
@@ -114,12 +138,12 @@ def _download(content: bytes, kind: str, name: str) -> Response:
 
 
 def _feature(point: PointDetail, url: str) -> dict[str, Any]:
-    known = {**vars(point), **vars(point.history)}
+    members = {**vars(point), **vars(point.history)}
     return {
         "type": "Feature",
         "id": point.id,
         "geometry": {"type": "Point", "coordinates": [point.lon_deg, point.lat_deg, point.height_m]},
-        "properties": {k: v for k, v in known.items() if k not in NOT_PROPERTIES},
+        "properties": {k: v for k, v in members.items() if k not in NOT_PROPERTIES},
         "links": [
             {"rel": "self", "href": url, "type": GEOJSON},
             {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},
@@ -128,5 +152,5 @@ def _feature(point: PointDetail, url: str) -> dict[str, Any]:
 
 
 def _plain(value: date | PointView) -> Any:
-    """What JSON has no type for: dates, times and views."""
+    """Dates, times and views as values that JSON has."""
     return value.isoformat() if isinstance(value, date) else vars(value)

@@ -1,4 +1,4 @@
-"""OGC API - Processes: what the service can be asked to do, and asking."""
+"""OGC API - Processes: the processes and their execution."""
 
 from typing import Annotated, Any, Literal
 
@@ -7,6 +7,16 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import DatabaseDep, Reader, SettingsDep
 from app.api.jobs import job_url, status_info
+from app.api.models.base import Link
+from app.api.models.jobs import (
+    InputDescription,
+    OutputDescription,
+    ProcessDescription,
+    Processes,
+    ProcessSummary,
+    StatusInfo,
+)
+from app.api.negotiation import JSON
 from app.errors import InputError
 from app.usecases import jobs
 from app.usecases.jobs import JobRequest
@@ -16,85 +26,91 @@ from app.usecases.registration.deliverables import media_type
 router = APIRouter(tags=["processes"])
 
 VERSION = "1.0.0"
-JSON = "application/json"
 OGC = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"
 CONFORMS_TO = tuple(
     f"{OGC}{name}" for name in ("core", "ogc-process-description", "json", "job-list", "dismiss")
 )
-QUALIFIERS = {"value", "mediaType", "encoding", "schema", "format"}
-"""Members of an input whose value is told with what it is."""
+EXECUTE = "http://www.opengis.net/def/rel/ogc/1.0/execute"
+QUALIFIED_VALUE = {"value", "mediaType", "encoding", "schema", "format"}
+"""Members of an input that gives its value together with a description of it."""
 SCENES = ("scenes/", "collections/scenes/items/")
 
 
-class OutputAsked(BaseModel):
-    """How one output shall be told."""
+class RequestedOutput(BaseModel):
+    """How one output is sent."""
 
     model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     transmission_mode: Literal["value", "reference"] = Field("value", alias="transmissionMode")
-    format: dict[str, Any] | None = Field(None, description="Each output has one format: its own.")
+    format: dict[str, Any] | None = Field(None, description="Ignored: every output has one format.")
 
 
 class Execute(BaseModel):
-    """The body of an execution.
-
-    Attributes:
-        inputs: those of the process, by name.
-        outputs: those wanted, by name, files by value unless said otherwise; all of them, files by
-            reference, if there is none.
-        response: results in one document, or as they are.
-    """
+    """The body of an execution."""
 
     model_config = ConfigDict(extra="forbid")
 
-    inputs: dict[str, Any] = Field(default_factory=dict)
-    outputs: dict[str, OutputAsked] | None = None
-    response: Literal["document", "raw"] = "document"
+    inputs: dict[str, Any] = Field(default_factory=dict, description="Inputs of the process, by name.")
+    outputs: dict[str, RequestedOutput] | None = Field(
+        default=None,
+        description="Requested outputs, by name; files are sent by value unless `transmissionMode` is"
+        " `reference`. Without this member, all outputs are sent, files by reference.",
+    )
+    response: Literal["document", "raw"] = Field(
+        default="document", description="Whether the results are one document or the outputs themselves."
+    )
 
 
 @router.get("/processes")
 def list_processes(
+    *,
     request: Request,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Most processes on the page.")] = 10,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Number of processes on a page.")] = 10,
     offset: Annotated[int, Query(ge=0, le=1000, description="From the link `next`.")] = 0,
-) -> dict[str, Any]:
-    """The processes, in short."""
+) -> Processes:
+    """List the processes."""
     base = str(request.base_url)
-    every = list(jobs.PROCESSES.values())
-    links = [{"rel": "self", "href": str(request.url), "type": JSON}]
-    if offset + limit < len(every):
+    processes = list(jobs.PROCESSES.values())
+    links = [Link(rel="self", href=str(request.url), type=JSON)]
+    if offset + limit < len(processes):
         following = str(request.url.include_query_params(offset=offset + limit))
-        links.append({"rel": "next", "href": following, "type": JSON})
-    page = every[offset : offset + limit]
-    return {"processes": [_summary(base, process) for process in page], "links": links}
+        links.append(Link(rel="next", href=following, type=JSON))
+    page = processes[offset : offset + limit]
+    return Processes(
+        processes=[ProcessSummary(**_summary(base, process)) for process in page], links=links
+    )
 
 
 @router.get("/processes/{process_id}")
-def describe_process(process_id: str, request: Request) -> dict[str, Any]:
-    """One process with its inputs and outputs."""
+def describe_process(*, process_id: str, request: Request) -> ProcessDescription:
+    """Return one process with its inputs and outputs."""
     process = jobs.find_process(process_id)
     schema = process.input_schema()
     required = schema.get("required", [])
     descriptions = process.input_descriptions()
     inputs = {
-        name: {
-            "title": name,
-            **({"description": descriptions[name]} if name in descriptions else {}),
-            "minOccurs": 1 if name in required else 0,
-            "schema": inlined(member, schema.get("$defs", {})),
-        }
+        name: InputDescription(
+            title=name,
+            description=descriptions.get(name),
+            min_occurs=1 if name in required else 0,
+            value_schema=inlined(member, schema.get("$defs", {})),
+        )
         for name, member in schema["properties"].items()
     }
     outputs = {
-        name: {"title": value["title"], "schema": value} for name, value in process.values.items()
+        name: OutputDescription(title=value["title"], value_schema=value)
+        for name, value in process.values.items()
     }
     for name, text in process.outputs.items():
-        outputs[name] = {"title": name, "description": text, "schema": _file_schema(request, name)}
-    return {**_summary(str(request.base_url), process), "inputs": inputs, "outputs": outputs}
+        outputs[name] = OutputDescription(
+            title=name, description=text, value_schema=_file_schema(request, name)
+        )
+    return ProcessDescription(**_summary(str(request.base_url), process), inputs=inputs, outputs=outputs)
 
 
 @router.post("/processes/{process_id}/execution", status_code=status.HTTP_201_CREATED)
 def execute(
+    *,
     process_id: str,
     body: Execute,
     request: Request,
@@ -104,14 +120,15 @@ def execute(
     caller: Reader,
     idempotency_key: Annotated[str | None, Header()] = None,
     prefer: Annotated[str | None, Header()] = None,
-) -> dict[str, Any]:
-    """Ask for work; the answer is a job to watch, whatever `Prefer` says.
+) -> StatusInfo:
+    """Create a job of a process; jobs are asynchronous whatever the header `Prefer` asks for.
 
-    The same request with the same `Idempotency-Key` asks for it once.
+    A repeated request with the same `Idempotency-Key` returns the job of the first one.
     """
-    inputs = {name: _plain(request, name, value) for name, value in body.inputs.items()}
-    asked = body.outputs
-    outputs = None if asked is None else {name: one.transmission_mode for name, one in asked.items()}
+    inputs = {name: _input_value(request, name, value) for name, value in body.inputs.items()}
+    outputs = None
+    if body.outputs is not None:
+        outputs = {name: output.transmission_mode for name, output in body.outputs.items()}
     with database.transaction() as connection:
         job_request = JobRequest(process_id, inputs, outputs, body.response)
         job = jobs.execute(connection, settings, caller, job_request, idempotency_key)
@@ -121,27 +138,27 @@ def execute(
     return status_info(request, job)
 
 
-def _plain(request: Request, name: str, value: Any) -> Any:
-    """The value of an input that is told as such, with what it is, or as a link to something of ours.
+def _input_value(request: Request, name: str, value: Any) -> Any:
+    """The value of an input: as it is, inside a qualified value, or the id in a link to a scene.
 
     Raises:
-        InputError: the link leads elsewhere; nothing is fetched.
+        InputError: the link leads elsewhere; the service fetches nothing.
     """
     if not isinstance(value, dict):
         return value
-    if "value" in value and value.keys() <= QUALIFIERS:
+    if "value" in value and value.keys() <= QUALIFIED_VALUE:
         return value["value"]
     if "href" not in value:
         return value
     path = str(value["href"]).removeprefix(str(request.base_url))
-    known = next((path.removeprefix(start) for start in SCENES if path.startswith(start)), "")
-    if not known or "/" in known:
-        raise InputError(f"inputs.{name}.href: only scenes of this service are taken by reference")
-    return known
+    scene_id = next((path.removeprefix(start) for start in SCENES if path.startswith(start)), "")
+    if not scene_id or "/" in scene_id:
+        raise InputError(f"inputs.{name}.href: no scene of this service; other links are not fetched")
+    return scene_id
 
 
 def inlined(schema: Any, definitions: dict[str, Any]) -> Any:
-    """A JSON Schema that needs no definitions from elsewhere; ours never name themselves."""
+    """A JSON Schema with each reference replaced by its definition; definitions are not recursive."""
     if isinstance(schema, list):
         return [inlined(item, definitions) for item in schema]
     if not isinstance(schema, dict):
@@ -154,28 +171,27 @@ def inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 
 
 def _file_schema(request: Request, name: str) -> dict[str, Any]:
-    """What a file of the results holds."""
+    """The JSON Schema of a file of the results."""
     kind = media_type(name)
     if name == "report.json":
         return {"$ref": f"{request.base_url}schemas/report.json", "contentMediaType": kind}
     if kind in (JSON, "application/geo+json"):
         return {"type": "object", "contentMediaType": kind}
-    encoded = {} if kind.startswith("text/") else {"contentEncoding": "base64"}
-    return {"type": "string", "contentMediaType": kind, **encoded}
+    encoding = {} if kind.startswith("text/") else {"contentEncoding": "base64"}
+    return {"type": "string", "contentMediaType": kind, **encoding}
 
 
 def _summary(base: str, process: Process) -> dict[str, Any]:
     here = f"{base}processes/{process.id}"
-    execute = "http://www.opengis.net/def/rel/ogc/1.0/execute"
     return {
         "id": process.id,
         "title": process.title,
         "description": process.description,
         "version": VERSION,
-        "jobControlOptions": ["async-execute", "dismiss"],
-        "outputTransmission": ["value", "reference"],
+        "job_control_options": ["async-execute", "dismiss"],
+        "output_transmission": ["value", "reference"],
         "links": [
-            {"rel": "self", "href": here, "type": JSON, "title": "its description"},
-            {"rel": execute, "href": f"{here}/execution", "type": JSON, "title": "where to ask for it"},
+            Link(rel="self", href=here, type=JSON, title="description of the process"),
+            Link(rel=EXECUTE, href=f"{here}/execution", type=JSON, title="execution of the process"),
         ],
     }

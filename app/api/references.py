@@ -1,13 +1,9 @@
-"""Reference images that scenes are registered on where there are no points."""
-
-from dataclasses import asdict
-from typing import Any
+"""Reference images: scenes are registered on them where there are no points."""
 
 from fastapi import APIRouter
-from fastapi.encoders import jsonable_encoder
 
 from app.api.deps import Admin, DatabaseDep, Registrar, SettingsDep
-from app.db.references import ReferenceRow
+from app.api.models.administration import Reference, References
 from app.usecases import references
 from app.usecases.references import NewReference
 
@@ -15,28 +11,24 @@ router = APIRouter(prefix="/references", tags=["references"])
 
 
 @router.get("")
-def list_references(database: DatabaseDep, caller: Registrar) -> dict[str, Any]:
-    """The reference images, by name."""
+def list_references(*, database: DatabaseDep, caller: Registrar) -> References:
+    """List the reference images by name."""
     with database.reading() as connection:
-        return {"references": [_told(row) for row in references.list_references(connection)]}
+        rows = references.list_references(connection)
+    return References(references=[Reference.model_validate(row) for row in rows])
 
 
 @router.post("", status_code=201)
 def add_reference(
-    body: NewReference, database: DatabaseDep, settings: SettingsDep, caller: Admin
-) -> dict[str, Any]:
-    """Let scenes be registered on a reference image below AMERS_REFERENCE_FOLDER."""
+    *, body: NewReference, database: DatabaseDep, settings: SettingsDep, caller: Admin
+) -> Reference:
+    """Add a reference image that lies below AMERS_REFERENCE_FOLDER."""
     with database.transaction() as connection:
-        return _told(references.add_reference(connection, settings, body))
+        return Reference.model_validate(references.add_reference(connection, settings, body))
 
 
 @router.delete("/{name}", status_code=204)
-def remove_reference(name: str, database: DatabaseDep, caller: Admin) -> None:
-    """Use a reference image no longer; its files stay where they are."""
+def remove_reference(*, name: str, database: DatabaseDep, caller: Admin) -> None:
+    """Remove a reference image from the list; its files are not touched."""
     with database.transaction() as connection:
         references.remove_reference(connection, name)
-
-
-def _told(row: ReferenceRow) -> dict[str, Any]:
-    told: dict[str, Any] = jsonable_encoder(asdict(row))
-    return told

@@ -1,4 +1,4 @@
-"""OGC API - Processes: what a job made, told in a document or sent as it is."""
+"""OGC API - Processes: the results of a job, in one document or as they are."""
 
 import json
 from http import HTTPStatus
@@ -14,51 +14,64 @@ from app.api.deps import DatabaseDep, Reader, StorageDep
 from app.api.error_responses import HTTP_STATUS, OGC_EXCEPTIONS, problem
 from app.api.files import file_reply
 from app.api.jobs import JobId, job_url
+from app.api.models.jobs import ResultFile
 from app.api.negotiation import JSON, SCHEMA_JSON
 from app.db.jobs.jobs import Job
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases import jobs, results
 from app.usecases.registration.deliverables import media_type
-from app.usecases.results import ResultFile
 from services import errors as errors_of_science
 from services.reports import document
 
 router = APIRouter(tags=["jobs"])
 
+Part = tuple[str, dict[str, str], bytes]
+"""Name, headers and content of a part of a multipart reply."""
 
-@router.get("/jobs/{job_id}/results", response_class=Response)
+
+@router.get(
+    "/jobs/{job_id}/results",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The results in a document, or an output as it is.",
+            "model": dict[str, ResultFile | Any],
+            "content": {"*/*": {}},
+        }
+    },
+)
 def show_results(
-    job_id: JobId, request: Request, database: DatabaseDep, storage: StorageDep, caller: Reader
+    *, job_id: JobId, request: Request, database: DatabaseDep, storage: StorageDep, caller: Reader
 ) -> Response:
-    """What a job made, as its request asked for: all of it in a document if it said nothing."""
+    """Return the results of a job as its request asked for them; by default all in one document."""
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
     if job.state == "failed":
-        return _failed(job)
+        return _failure_reply(job)
     if job.state != "successful":
         title = f"The job is {job.state}"
         return problem(404, job.message, title=title, type=f"{OGC_EXCEPTIONS}result-not-ready")
     if job.results_removed_at is not None:
         return problem(410, f"the results were removed on {job.results_removed_at:%Y-%m-%d}")
+    here = job_url(request, job)
     values, files = results.requested_results(storage, job)
     if job.response == "raw":
-        return _raw(storage, job_url(request, job), values, files)
-    here = job_url(request, job)
-    told = {
+        return _raw_reply(storage, here, values, files)
+    members = {
         file.name: results.file_value(storage, file)
         if file.transmission == "value"
-        else _link(here, file)
+        else _result_file(here, file).model_dump()
         for file in files
     }
-    return JSONResponse(jsonable_encoder({**values, **told}))
+    return JSONResponse(jsonable_encoder({**values, **members}))
 
 
 @router.get("/jobs/{job_id}/results/{name}", response_class=Response)
 def download_result(
-    job_id: JobId, name: str, database: DatabaseDep, storage: StorageDep, caller: Reader
+    *, job_id: JobId, name: str, database: DatabaseDep, storage: StorageDep, caller: Reader
 ) -> Response:
-    """One file of the results."""
+    """Return one file of the results."""
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
     return file_reply(storage, results.result_key(job, name), media_type(name))
@@ -70,49 +83,52 @@ def download_result(
     responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
 )
 def report_schema() -> JSONResponse:
-    """The JSON Schema of `report.json`, the report of a registration."""
+    """Return the JSON Schema of `report.json`, the report of a registration."""
     return JSONResponse(document.report_schema(), media_type=SCHEMA_JSON)
 
 
-def _link(here: str, file: ResultFile) -> dict[str, str]:
-    return {"href": f"{here}/results/{file.name}", "type": file.media_type, "title": file.name}
+def _result_file(here: str, file: results.ResultFile) -> ResultFile:
+    return ResultFile(href=f"{here}/results/{file.name}", type=file.media_type, title=file.name)
 
 
-def _failed(job: Job) -> Response:
-    """The reason of a failure, under the status that it would have had as a reply."""
+def _failure_reply(job: Job) -> Response:
+    """The error of a failed job, with the status that the error has in a reply."""
     error = job.error or {"title": "Internal error", "detail": job.message}
     name = error.get("error", "")
     kind: Any = getattr(errors, name, None) or getattr(errors_of_science, name, None)
-    told = isinstance(kind, type) and issubclass(kind, AmersError)
-    status = next(HTTP_STATUS[k] for k in kind.__mro__ if k in HTTP_STATUS) if told else 500
-    said = {key: value for key, value in error.items() if key not in ("type", "status")}
-    return problem(status, **{"detail": "the job failed", **said})
+    is_ours = isinstance(kind, type) and issubclass(kind, AmersError)
+    status = next(HTTP_STATUS[k] for k in kind.__mro__ if k in HTTP_STATUS) if is_ours else 500
+    members = {key: value for key, value in error.items() if key not in ("type", "status")}
+    return problem(status, **{"detail": "the job failed", **members})
 
 
-def _raw(storage: Storage, here: str, values: dict[str, Any], files: list[ResultFile]) -> Response:
-    """Outputs as they are: one alone, several as parts, references alone as links of the header."""
+def _raw_reply(
+    storage: Storage, here: str, values: dict[str, Any], files: list[results.ResultFile]
+) -> Response:
+    """Outputs as they are: one as the body, several as parts, references alone in the header Link."""
     if not values and all(file.transmission == "reference" for file in files):
         links = [f'<{here}/results/{f.name}>; rel="item"; type="{f.media_type}"' for f in files]
         return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Link": ", ".join(links)})
     if not values and len(files) == 1:
         return file_reply(storage, files[0].key, files[0].media_type)
-    parts = [
+    parts: list[Part] = [
         (name, {"Content-Type": JSON}, json.dumps(value).encode()) for name, value in values.items()
     ]
     for file in files:
-        place = {"Content-Type": file.media_type}
+        headers = {"Content-Type": file.media_type}
         if file.transmission == "reference":
-            parts.append((file.name, {**place, "Content-Location": _link(here, file)["href"]}, b""))
+            headers["Content-Location"] = _result_file(here, file).href
+            parts.append((file.name, headers, b""))
         else:
-            parts.append((file.name, place, results.file_bytes(storage, file)))
+            parts.append((file.name, headers, results.file_bytes(storage, file)))
     if len(parts) == 1:
         _, headers, body = parts[0]
         return Response(body, media_type=headers["Content-Type"])
-    return _multipart(parts)
+    return _multipart_reply(parts)
 
 
-def _multipart(parts: list[tuple[str, dict[str, str], bytes]]) -> Response:
-    """Parts that belong together (RFC 2387), each under the name of its output."""
+def _multipart_reply(parts: list[Part]) -> Response:
+    """Outputs as the parts of a multipart/related body (RFC 2387), each with the name of its output."""
     boundary = uuid4().hex
     body = b""
     for name, headers, content in parts:

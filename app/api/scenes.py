@@ -1,42 +1,40 @@
-"""Scenes: the request to take one in, and what there is."""
+"""Scenes: upload, registration of scenes on the server, lists, files, removal."""
 
 import re
 from base64 import b64decode
 from email.message import Message
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, BackgroundTasks, Query, Request, Response, status
 from pydantic import BaseModel, Field
 
-from app.api.body import body_chunks
-from app.api.deps import DatabaseDep, Registrar, SettingsDep, StorageDep, UploadTurn
+from app.api.body import BINARY_BODY, announced_length, body_chunks
+from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
 from app.api.files import file_reply
+from app.api.models.scenes import Scene, Scenes, StoredFile
 from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
 from app.usecases.features.stac import scene_media_type
-from app.usecases.installation import Installation
 from app.usecases.scenes import SentFile
 
 router = APIRouter(tags=["scenes"])
 
 MOST_LISTED = 1000
-BINARY_BODY = {
-    "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
-}
 
 
 class SceneOnServer(BaseModel):
-    """A scene on the server.
+    """A scene that lies on the server."""
 
-    Attributes:
-        path: of its image, below AMERS_SCENE_FOLDER; models lie beside it.
-        sigma_m: accuracy of its model, metres.
-    """
-
-    path: str = Field(min_length=1, max_length=1000)
-    sigma_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    path: str = Field(
+        min_length=1,
+        max_length=1000,
+        description="Path of the image below AMERS_SCENE_FOLDER; its model lies beside it.",
+    )
+    sigma_m: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="Accuracy of its model, metres (1 sigma)."
+    )
 
 
 @router.post(
@@ -46,27 +44,27 @@ class SceneOnServer(BaseModel):
     openapi_extra={"requestBody": BINARY_BODY},
 )
 def upload_scene(
+    *,
     request: Request,
     response: Response,
-    database: DatabaseDep,
-    storage: StorageDep,
-    settings: SettingsDep,
+    installation: InstallationDep,
     caller: Registrar,
     name: Annotated[str | None, Query(description="Name of the file.")] = None,
     sigma_m: Annotated[
-        float | None, Query(gt=0, allow_inf_nan=False, description="Accuracy of its model, metres.")
+        float | None,
+        Query(gt=0, allow_inf_nan=False, description="Accuracy of its model, metres (1 sigma)."),
     ] = None,
-) -> dict[str, Any]:
+) -> Scene:
     """Upload the image of a scene as the body of the request: GeoTIFF, JPEG 2000 or NITF.
 
-    The name comes from the query or from `Content-Disposition`; a checksum in `Repr-Digest` (sha-256) or
-    `X-Checksum` (sha256 in hexadecimal) is compared. Files with the model follow by
-    `PUT /scenes/{id}/files/{name}`.
+    The name is in the query or in `Content-Disposition`. A checksum in `Repr-Digest` (sha-256) or
+    `X-Checksum` (sha256 in hexadecimal) is compared with the file. Upload the files of its model next,
+    by `PUT /scenes/{id}/files/{name}`.
     """
     sent = _sent_file(request, name or _disposition_name(request))
-    scene = scenes.upload_scene(Installation(database, storage, settings), caller, sent, sigma_m)
-    response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
-    return _scene(scene)
+    row = scenes.upload_scene(installation, caller, sent, sigma_m)
+    response.headers["Location"] = str(request.url_for("show_scene", scene_id=row.id))
+    return _scene(row)
 
 
 @router.put(
@@ -75,29 +73,26 @@ def upload_scene(
     openapi_extra={"requestBody": BINARY_BODY},
 )
 def upload_beside(
+    *,
     scene_id: UUID,
     name: str,
     request: Request,
-    database: DatabaseDep,
-    storage: StorageDep,
-    settings: SettingsDep,
+    installation: InstallationDep,
     caller: Registrar,
-) -> dict[str, Any]:
-    """Upload a file to lie beside the image of a scene: model, terrain, mask or check points."""
+) -> StoredFile:
+    """Upload a side file of a scene: model, terrain, mask or check points."""
     sent = _sent_file(request, name)
-    stored = scenes.upload_side_file(Installation(database, storage, settings), caller, scene_id, sent)
-    return {
-        "name": stored.key.rsplit("/", 1)[1],
-        "size_bytes": stored.size_bytes,
-        "sha256": stored.sha256,
-    }
+    stored = scenes.upload_side_file(installation, caller, scene_id, sent)
+    return StoredFile(
+        name=stored.key.rsplit("/", 1)[1], size_bytes=stored.size_bytes, sha256=stored.sha256
+    )
 
 
 @router.get("/scenes/{scene_id}/files/{name}", response_class=Response)
 def download_file(
-    scene_id: UUID, name: str, database: DatabaseDep, storage: StorageDep, caller: Registrar
+    *, scene_id: UUID, name: str, database: DatabaseDep, storage: StorageDep, caller: Registrar
 ) -> Response:
-    """The image of a scene, or a file that was laid beside it, as it was sent."""
+    """Return the image or a side file of a scene as it was uploaded."""
     with database.reading() as connection:
         key = scenes.file_key(connection, caller, scene_id, name)
     return file_reply(storage, key, scene_media_type(name))
@@ -105,42 +100,44 @@ def download_file(
 
 @router.post("/scenes/reference", status_code=status.HTTP_201_CREATED)
 def refer_to_scene(
+    *,
     body: SceneOnServer,
     request: Request,
     response: Response,
     database: DatabaseDep,
     settings: SettingsDep,
     caller: Registrar,
-) -> dict[str, Any]:
-    """Take in a scene that lies on the server, below the folder of `AMERS_SCENE_FOLDER`."""
+) -> Scene:
+    """Add a scene that lies on the server, below the folder AMERS_SCENE_FOLDER."""
     with database.transaction() as connection:
-        scene = scenes.add_server_scene(connection, settings, caller, body.path, body.sigma_m)
-    response.headers["Location"] = str(request.url_for("show_scene", scene_id=scene.id))
-    return _scene(scene)
+        row = scenes.add_server_scene(connection, settings, caller, body.path, body.sigma_m)
+    response.headers["Location"] = str(request.url_for("show_scene", scene_id=row.id))
+    return _scene(row)
 
 
 @router.get("/scenes")
 def list_scenes(
+    *,
     database: DatabaseDep,
     caller: Registrar,
-    limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100,
-) -> dict[str, Any]:
-    """The caller's scenes, the newest first; everybody's for an administrator."""
+    limit: Annotated[int, Query(ge=1, le=MOST_LISTED, description="Number of scenes.")] = 100,
+) -> Scenes:
+    """List the scenes of the caller, newest first; administrators see all scenes."""
     with database.reading() as connection:
-        found = scenes.list_scenes(connection, caller, limit)
-    return {"scenes": [_scene(scene) for scene in found]}
+        rows = scenes.list_scenes(connection, caller, limit)
+    return Scenes(scenes=[_scene(row) for row in rows])
 
 
 @router.get("/scenes/{scene_id}")
-def show_scene(scene_id: UUID, database: DatabaseDep, caller: Registrar) -> dict[str, Any]:
-    """One scene."""
+def show_scene(*, scene_id: UUID, database: DatabaseDep, caller: Registrar) -> Scene:
+    """Return one scene."""
     with database.reading() as connection:
-        scene = scenes.visible_scene(connection, caller, scene_id)
-    return _scene(scene)
+        return _scene(scenes.visible_scene(connection, caller, scene_id))
 
 
 @router.delete("/scenes/{scene_id}", status_code=status.HTTP_204_NO_CONTENT)
 def remove_scene(
+    *,
     scene_id: UUID,
     database: DatabaseDep,
     storage: StorageDep,
@@ -153,33 +150,32 @@ def remove_scene(
     after_commit.add_task(scenes.delete_files, storage, scene_id)
 
 
-def _scene(scene: SceneRow) -> dict[str, Any]:
-    return {
-        "id": scene.id,
-        "name": scene.name,
-        "state": scene.state,
-        "file": scene.file_name,
-        "models": sorted(scene.models) if scene.state != "removed" else [],
-        "size_bytes": scene.size_bytes,
-        "sha256": scene.sha256,
-        "sigma_m": scene.sigma_m,
-        "sensor": scene.sensor,
-        "acquired": scene.acquired_at,
-        "gsd_m": scene.gsd_m,
-        "footprint": scene.footprint,
-        "created": scene.created_at,
-        "removed": scene.removed_at,
-    }
+def _scene(row: SceneRow) -> Scene:
+    return Scene(
+        id=row.id,
+        name=row.name,
+        state=row.state,
+        file=row.file_name,
+        models=sorted(row.models) if row.state != "removed" else [],
+        size_bytes=row.size_bytes,
+        sha256=row.sha256,
+        sigma_m=row.sigma_m,
+        sensor=row.sensor,
+        acquired=row.acquired_at,
+        gsd_m=row.gsd_m,
+        footprint=row.footprint,
+        created=row.created_at,
+        removed=row.removed_at,
+    )
 
 
 def _sent_file(request: Request, name: str | None) -> SentFile:
     if not name:
-        raise InputError("the file has no name: send ?name= or Content-Disposition")
-    length = request.headers.get("content-length", "")
+        raise InputError("the file has no name: send ?name= or the header Content-Disposition")
     return SentFile(
         name=name,
         chunks=body_chunks(request),
-        size_bytes=int(length) if length.isdigit() else None,
+        size_bytes=announced_length(request),
         sha256=_announced_sha256(request),
     )
 
@@ -192,24 +188,24 @@ def _disposition_name(request: Request) -> str | None:
 
 
 def _announced_sha256(request: Request) -> str | None:
-    """The checksum the sender announces, in hexadecimal.
+    """The SHA-256 in the headers of an upload, in hexadecimal; None without one.
 
     Raises:
-        InputError: there is one, but not a SHA-256.
+        InputError: the header is not a SHA-256.
     """
     plain = request.headers.get("x-checksum")
     if plain is not None:
         if not re.fullmatch(r"[0-9a-fA-F]{64}", plain):
-            raise InputError("X-Checksum is not a SHA-256 in hexadecimal")
+            raise InputError("X-Checksum: not a SHA-256 in hexadecimal, 64 digits")
         return plain.lower()
     digest = request.headers.get("repr-digest", "")
-    found = re.search(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]*):", digest)
-    if found is None:
+    match = re.search(r"(?:^|,)\s*sha-256=:([A-Za-z0-9+/=]*):", digest)
+    if match is None:
         return None
     try:
-        raw = b64decode(found[1], validate=True)
+        raw = b64decode(match[1], validate=True)
     except ValueError:
         raw = b""
     if len(raw) != 32:
-        raise InputError("the sha-256 of Repr-Digest is not the base64 of 32 bytes")
+        raise InputError("Repr-Digest: its sha-256 is not the base64 of 32 bytes")
     return raw.hex()

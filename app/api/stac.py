@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WithJsonSchema
 
 from app.api import features
@@ -22,13 +21,17 @@ from app.api.features import (
     parameter_names,
     viewer_of,
 )
+from app.api.models.base import Link
+from app.api.models.features import StacItem, StacItems
 from app.api.negotiation import (
     FEATURES,
     GEOJSON,
     HTML,
     JSON,
     SCHEMA_JSON,
+    GeoJsonResponse,
     chosen_format,
+    described,
     refuse_unknown,
 )
 from app.api.processes import inlined
@@ -49,28 +52,29 @@ CONFORMS_TO = (
     f"{API}item-search#sort",
 )
 SEARCH_LINKS = (
-    {"rel": "root", "path": "", "type": JSON, "title": "this document"},
-    {"rel": "child", "path": f"collections/{stac.COLLECTION}", "type": JSON, "title": "Scenes"},
-    {
-        "rel": "http://www.opengis.net/def/rel/ogc/1.0/queryables",
-        "path": f"collections/{stac.COLLECTION}/queryables",
-        "type": SCHEMA_JSON,
-        "title": "what a search may name",
-    },
-    {"rel": "search", "path": "search", "type": GEOJSON, "title": "search of scenes", "method": "GET"},
-    {"rel": "search", "path": "search", "type": GEOJSON, "title": "search of scenes", "method": "POST"},
+    Link(rel="root", href="", type=JSON, title="this document"),
+    Link(rel="child", href=f"collections/{stac.COLLECTION}", type=JSON, title="Scenes"),
+    Link(
+        rel="http://www.opengis.net/def/rel/ogc/1.0/queryables",
+        href=f"collections/{stac.COLLECTION}/queryables",
+        type=SCHEMA_JSON,
+        title="properties that a filter of the search may name",
+    ),
+    Link(rel="search", href="search", type=GEOJSON, title="search of scenes", method="GET"),
+    Link(rel="search", href="search", type=GEOJSON, title="search of scenes", method="POST"),
 )
-LANDING_MEMBERS = {"type": "Catalog", "stac_version": stac.VERSION, "id": "amers"}
-COLLECTION_MEMBERS = {"type": "Collection", "stac_version": stac.VERSION, "license": "other"}
-ITEMS: dict[int | str, dict[str, Any]] = {200: {"description": "A page.", "content": {GEOJSON: {}}}}
+LANDING_MEMBERS: dict[str, Any] = {"type": "Catalog", "stac_version": stac.VERSION, "id": "amers"}
+COLLECTION_MEMBERS: dict[str, Any] = {
+    "type": "Collection",
+    "stac_version": stac.VERSION,
+    "license": "other",
+}
+ITEMS = described(StacItems)
 
 
-def landing_links(base: str) -> list[dict[str, str]]:
-    """The links of a STAC catalog that can be searched."""
-    return [
-        {name: value for name, value in link.items() if name != "path"} | {"href": base + link["path"]}
-        for link in SEARCH_LINKS
-    ]
+def landing_links(base: str) -> list[Link]:
+    """The links of a STAC catalog with search, below the address of the service."""
+    return [link.model_copy(update={"href": base + link.href}) for link in SEARCH_LINKS]
 
 
 def _split(value: Any) -> Any:
@@ -165,7 +169,7 @@ ViewerDep = Annotated[Viewer, Depends(_scenes_viewer)]
 NextLink = Callable[[str], dict[str, Any]]
 
 
-@router.get("/search", response_class=Response, responses=ITEMS)
+@router.get("/search", response_class=GeoJsonResponse, responses=ITEMS)
 def search(
     *,
     request: Request,
@@ -182,7 +186,7 @@ def search(
 
 @router.post(
     "/search",
-    response_class=Response,
+    response_class=GeoJsonResponse,
     responses=ITEMS,
     openapi_extra={
         "requestBody": {
@@ -242,8 +246,8 @@ def items(
 
 @router.get(
     "/collections/scenes/items/{item_id}",
-    response_class=Response,
-    responses={200: {"description": "An item.", "content": {GEOJSON: {}, HTML: {}}}},
+    response_class=GeoJsonResponse,
+    responses=described(StacItem, HTML),
 )
 def item(
     *,
@@ -270,7 +274,7 @@ def item(
         text, reply_crs = all_features.find_feature(connection, SCENES, viewer, item_id, None)
         items = stac.stac_items(connection, text.encode(), str(request.base_url))
     headers = {"Content-Crs": f"<{reply_crs.uri}>"}
-    return JSONResponse(items[0], media_type=GEOJSON, headers=headers)
+    return GeoJsonResponse(items[0], headers=headers)
 
 
 def _resolved(
@@ -307,7 +311,7 @@ def _page_reply(
         "links": links,
     }
     headers = {"Content-Crs": f"<{SCENES.storage_crs.uri}>"}
-    return JSONResponse(page, media_type=GEOJSON, headers=headers)
+    return GeoJsonResponse(page, headers=headers)
 
 
 def _next_of_query(request: Request) -> NextLink:

@@ -1,4 +1,4 @@
-"""The landing page, what the service conforms to, its description, and whether it lives."""
+"""The landing page, the conformance classes, the description of the API, and health checks."""
 
 from typing import Any
 
@@ -8,9 +8,19 @@ from fastapi.responses import JSONResponse
 from app.api import processes, stac
 from app.api.deps import DatabaseDep
 from app.api.features import Format
-from app.api.json_schemas import document_of
-from app.api.negotiation import DOCUMENTS, HTML, JSON, OPENAPI_JSON, chosen_format, refuse_unknown
-from app.api.pages import Cell, document_page
+from app.api.models.base import Link
+from app.api.models.documents import Conformance, Health, Landing
+from app.api.negotiation import (
+    DOCUMENTS,
+    HTML,
+    JSON,
+    OPENAPI_JSON,
+    chosen_format,
+    described,
+    json_reply,
+    refuse_unknown,
+)
+from app.api.pages import Cell, Page, document_page
 
 router = APIRouter(tags=["system"])
 
@@ -50,74 +60,86 @@ REL = "http://www.opengis.net/def/rel/ogc/1.0/"
 LINKS = (
     ("self", "", JSON, "this document"),
     ("alternate", "?f=html", HTML, "this document as a page"),
-    ("service-desc", "api", OPENAPI_JSON, "the API, machine readable"),
-    ("service-doc", "api?f=html", HTML, "the API, for people"),
-    ("conformance", "conformance", JSON, "what the service conforms to"),
-    (f"{REL}conformance", "conformance", JSON, "what the service conforms to"),
+    ("service-desc", "api", OPENAPI_JSON, "description of the API in OpenAPI"),
+    ("service-doc", "api?f=html", HTML, "description of the API as a page"),
+    ("conformance", "conformance", JSON, "conformance classes of the service"),
+    (f"{REL}conformance", "conformance", JSON, "conformance classes of the service"),
     ("data", "collections", JSON, "the collections"),
     (f"{REL}data", "collections", JSON, "the collections"),
-    (f"{REL}tiling-schemes", "tileMatrixSets", JSON, "the grids of tiles"),
+    (f"{REL}tiling-schemes", "tileMatrixSets", JSON, "tile matrix sets"),
     (f"{REL}processes", "processes", JSON, "the processes"),
     (f"{REL}job-list", "jobs", JSON, "the jobs"),
     ("related", "map", HTML, "the map"),
 )
 
 
-@router.get("/", response_class=Response, responses=document_of("Landing"))
-def landing(request: Request, f: Format = None) -> Response:
-    """What this is, and where everything begins."""
+@router.get("/", response_class=Response, responses=described(Landing, HTML))
+def landing(*, request: Request, f: Format = None) -> Response:
+    """Return the landing page with links to everything else."""
     refuse_unknown(request, {"f"})
     title, description = request.app.title, request.app.description
     links = [
-        {"rel": rel, "href": f"{request.base_url}{path}", "type": kind, "title": said}
-        for rel, path, kind, said in LINKS
+        Link(rel=rel, href=f"{request.base_url}{path}", type=kind, title=text)
+        for rel, path, kind, text in LINKS
     ]
     if chosen_format(request, DOCUMENTS, f) == "json":
         links += stac.landing_links(str(request.base_url))
-        said = {"title": title, "description": description, "conformsTo": CONFORMS_TO}
-        return JSONResponse({**stac.LANDING_MEMBERS, **said, "links": links})
-    pages = {link["title"]: link for link in links if not link["rel"].startswith("http")}
-    return document_page(request, title, description, list(pages.values()))
+        return json_reply(
+            Landing(
+                **stac.LANDING_MEMBERS,
+                title=title,
+                description=description,
+                conforms_to=CONFORMS_TO,
+                links=links,
+            )
+        )
+    pages = {link.title: link for link in links if not link.rel.startswith("http")}
+    return document_page(request, Page(title, description, list(pages.values())))
 
 
-@router.get("/conformance", response_class=Response, responses=document_of("Conformance"))
-def conformance(request: Request, f: Format = None) -> Response:
-    """The conformance classes of OGC API that the service keeps."""
+@router.get("/conformance", response_class=Response, responses=described(Conformance, HTML))
+def conformance(*, request: Request, f: Format = None) -> Response:
+    """Return the conformance classes of OGC API and STAC that the service implements."""
     refuse_unknown(request, {"f"})
     if chosen_format(request, DOCUMENTS, f) == "json":
-        return JSONResponse({"conformsTo": CONFORMS_TO})
+        return json_reply(Conformance(conforms_to=CONFORMS_TO))
     rows = [[Cell(name)] for name in CONFORMS_TO]
-    return document_page(request, "Conformance", "", [], ("class",), rows)
+    return document_page(request, Page("Conformance", columns=("class",), rows=rows))
 
 
 @router.get("/api", include_in_schema=False)
-def description(request: Request, f: Format = None) -> Response:
-    """The API in OpenAPI 3.1, or as a list of what can be asked."""
+def description(*, request: Request, f: Format = None) -> Response:
+    """Return the description of the API in OpenAPI 3.1, or a list of its operations."""
     refuse_unknown(request, {"f"})
     document: dict[str, Any] = request.app.openapi()
     form = chosen_format(request, {"json": OPENAPI_JSON, "plain": JSON, "html": HTML}, f)
     if form != "html":
-        # GDAL refuses the type of version 3.1, and says with Accept that plain JSON will do.
+        # GDAL refuses the media type of OpenAPI 3.1; its Accept header also allows plain JSON.
         return JSONResponse(document, media_type=OPENAPI_JSON if form == "json" else JSON)
     rows = [
         [Cell(method.upper()), Cell(path), Cell(operation.get("description", ""))]
         for path, operations in document["paths"].items()
         for method, operation in operations.items()
     ]
-    title = f"{document['info']['title']} {document['info']['version']}"
-    columns = ("method", "path", "what it does")
-    return document_page(request, title, document["info"]["description"], [], columns, rows)
+    info = document["info"]
+    page = Page(
+        f"{info['title']} {info['version']}",
+        info["description"],
+        columns=("method", "path", "operation"),
+        rows=rows,
+    )
+    return document_page(request, page)
 
 
 @router.get("/healthz")
-def alive() -> dict[str, str]:
-    """The process answers."""
-    return {"status": "alive"}
+def alive() -> Health:
+    """Report that the process answers."""
+    return Health(status="alive")
 
 
 @router.get("/readyz")
-def ready(database: DatabaseDep) -> dict[str, str]:
-    """The database answers too."""
+def ready(*, database: DatabaseDep) -> Health:
+    """Report that the process and the database answer."""
     with database.reading() as connection:
         connection.execute("select postgis_version()")
-    return {"status": "ready"}
+    return Health(status="ready")

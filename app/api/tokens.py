@@ -1,44 +1,38 @@
-"""Tokens: who may call, kept by an administrator; and whose token this is."""
-
-from dataclasses import asdict
-from typing import Any
+"""Tokens: administrators create, list and revoke them; callers see their own."""
 
 from fastapi import APIRouter, Request, Response
-from fastapi.encoders import jsonable_encoder
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Admin, CallerDep, DatabaseDep
+from app.api.models.administration import NewTokenRecord, TokenRecord, TokenRecords
 from app.auth import Scope, require_token
-from app.db.tokens import Token
 from app.usecases import tokens
 
 router = APIRouter(prefix="/tokens", tags=["tokens"])
 
 
 class TokenToMake(BaseModel):
-    """A token as an administrator wants it.
-
-    Attributes:
-        name: for people.
-        scopes: what it allows.
-        days: how long it is valid; none: for ever.
-        upload_quota_bytes, job_quota: what it may have at once; none: as the settings say.
-    """
+    """A token to create."""
 
     model_config = ConfigDict(extra="forbid")
 
-    name: str
-    scopes: list[Scope]
-    days: int | None = None
-    upload_quota_bytes: int | None = None
-    job_quota: int | None = None
+    name: str = Field(description="Name of the token, for people.")
+    scopes: list[Scope] = Field(description="What the token allows.")
+    days: int | None = Field(default=None, description="Days until it expires; null: never.")
+    upload_quota_bytes: int | None = Field(
+        default=None,
+        description="Bytes its scenes may take in the storage; null: as the settings have it.",
+    )
+    job_quota: int | None = Field(
+        default=None, description="Jobs that may wait or run at once; null: as the settings have it."
+    )
 
 
 @router.post("", status_code=201)
 def create(
-    body: TokenToMake, request: Request, response: Response, database: DatabaseDep, caller: Admin
-) -> dict[str, Any]:
-    """Make a token; the reply holds its secret, this once."""
+    *, body: TokenToMake, request: Request, response: Response, database: DatabaseDep, caller: Admin
+) -> NewTokenRecord:
+    """Create a token; only this reply has its secret."""
     with database.transaction() as connection:
         new = tokens.create_token(
             connection,
@@ -50,29 +44,25 @@ def create(
         )
     response.headers["Location"] = f"{request.base_url}tokens/{new.token.id}"
     response.headers["Cache-Control"] = "no-store"
-    return {**_record(new.token), "secret": new.secret}
+    return NewTokenRecord(**TokenRecord.model_validate(new.token).model_dump(), secret=new.secret)
 
 
 @router.get("")
-def list_tokens(database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """All tokens, the newest first, revoked and expired ones too; never a secret."""
+def list_tokens(*, database: DatabaseDep, caller: Admin) -> TokenRecords:
+    """List all tokens without their secrets, newest first, revoked and expired ones included."""
     with database.reading() as connection:
-        return {"tokens": [_record(token) for token in tokens.list_tokens(connection)]}
+        listed = tokens.list_tokens(connection)
+    return TokenRecords(tokens=[TokenRecord.model_validate(token) for token in listed])
 
 
 @router.get("/self")
-def own_token(caller: CallerDep) -> dict[str, Any]:
-    """Whose token this request carries, and what it allows."""
-    return _record(require_token(caller))
+def own_token(*, caller: CallerDep) -> TokenRecord:
+    """Return the token of this request."""
+    return TokenRecord.model_validate(require_token(caller))
 
 
 @router.delete("/{token_id}")
-def revoke(token_id: str, database: DatabaseDep, caller: Admin) -> dict[str, Any]:
-    """Refuse a token from now on, by its id or its name."""
+def revoke(*, token_id: str, database: DatabaseDep, caller: Admin) -> TokenRecord:
+    """Revoke a token by its id or its name; requests with it are refused from now on."""
     with database.transaction() as connection:
-        return _record(tokens.revoke_token(connection, token_id))
-
-
-def _record(token: Token) -> dict[str, Any]:
-    record: dict[str, Any] = jsonable_encoder(asdict(token))
-    return record
+        return TokenRecord.model_validate(tokens.revoke_token(connection, token_id))

@@ -1,0 +1,79 @@
+"""Models of what administrators see: tokens, references, the audit trail."""
+
+from datetime import datetime
+from typing import Literal
+from uuid import UUID
+
+from app.api.models.base import JsonObject, Link, Reply
+from app.api.models.features import AnyGeometry
+from app.auth import Scope
+
+
+class TokenRecord(Reply):
+    """A token without its secret; null quotas are those of the settings."""
+
+    id: UUID
+    name: str
+    scopes: list[Scope]
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    subject: str | None
+    upload_quota_bytes: int | None
+    job_quota: int | None
+
+
+class NewTokenRecord(TokenRecord):
+    """A new token; this reply alone has its secret."""
+
+    secret: str
+
+
+class TokenRecords(Reply):
+    """Tokens, newest first."""
+
+    tokens: list[TokenRecord]
+
+
+class Reference(Reply):
+    """A reference image; paths are below AMERS_REFERENCE_FOLDER."""
+
+    id: int
+    name: str
+    image: str
+    dem: str | None
+    vertical: str | None
+    geoid: str | None
+    sigma_m: float | None
+    gsd_m: float
+    created_at: datetime
+    footprint: AnyGeometry
+
+
+class References(Reply):
+    """Reference images, by name."""
+
+    references: list[Reference]
+
+
+class ChangeRecord(Reply):
+    """A change in the audit trail; `before` or `after` is null where the row did not exist."""
+
+    id: int
+    at: datetime
+    actor: UUID | None
+    actor_name: str
+    request_id: str | None
+    job_id: UUID | None
+    kind: str
+    subject: str
+    action: Literal["created", "changed", "deleted"]
+    before: JsonObject | None
+    after: JsonObject | None
+
+
+class ChangeRecords(Reply):
+    """A page of the audit trail, newest first."""
+
+    changes: list[ChangeRecord]
+    links: list[Link]

@@ -1,0 +1,57 @@
+"""Models of scenes and of uploads."""
+
+from datetime import datetime
+from typing import Literal
+from uuid import UUID
+
+from app.api.models.base import Reply
+from app.api.models.features import AnyGeometry
+from app.db.scenes import SceneState
+from app.db.uploads import Purpose
+
+
+class Scene(Reply):
+    """A scene; what its files state about it is null until it is registered."""
+
+    id: UUID
+    name: str
+    state: SceneState
+    file: str
+    models: list[str]
+    size_bytes: int | None
+    sha256: str | None
+    sigma_m: float | None
+    sensor: str | None
+    acquired: datetime | None
+    gsd_m: float | None
+    footprint: AnyGeometry | None
+    created: datetime
+    removed: datetime | None
+
+
+class Scenes(Reply):
+    """Scenes, newest first."""
+
+    scenes: list[Scene]
+
+
+class StoredFile(Reply):
+    """A file in the storage."""
+
+    name: str
+    size_bytes: int
+    sha256: str
+
+
+class Upload(Reply):
+    """A resumable upload; `offset` is the number of bytes that have arrived."""
+
+    id: UUID
+    state: Literal["arriving", "finished"]
+    purpose: Purpose
+    name: str
+    offset: int
+    size_bytes: int
+    scene: UUID | None
+    created: datetime
+    expires: datetime | None
