@@ -1,4 +1,4 @@
-"""The HTTP application: a table of contents."""
+"""The HTTP application: its routers and its middleware."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -32,7 +32,7 @@ from app.api import (
     uploads,
 )
 from app.api.body import BodyLimit
-from app.api.request_log import RequestMetrics, Watch
+from app.api.request_log import RequestLog, RequestMetrics
 from app.config import Settings, read_settings
 from app.db import engine
 from app.oidc import Issuer
@@ -94,16 +94,16 @@ CORS_EXPOSED = (
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """The application of one installation; settings come from the environment if not given."""
-    chosen = settings or read_settings()
+    """The application of one installation; by default its settings come from the environment."""
+    settings = settings or read_settings()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        to_thread.current_default_thread_limiter().total_tokens = deps.threads_for(chosen)
-        opening = engine.opened(chosen)
-        app.state.settings = chosen
+        to_thread.current_default_thread_limiter().total_tokens = deps.threads_for(settings)
+        opening = engine.opened(settings)
+        app.state.settings = settings
         app.state.database = await run_in_threadpool(opening.__enter__)
-        app.state.storage = open_storage(chosen)
+        app.state.storage = open_storage(settings)
         app.state.chips = StoredChips(app.state.storage)
         try:
             yield
@@ -117,24 +117,24 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=version("amers"),
         lifespan=lifespan,
         openapi_url=None,
-        # Their pages load scripts from elsewhere.
+        # The pages of FastAPI load scripts from other sites.
         docs_url=None,
         redoc_url=None,
     )
     app.add_middleware(
-        BodyLimit, limit_bytes=chosen.body_limit_bytes, upload_limit_bytes=chosen.upload_limit_bytes
+        BodyLimit, limit_bytes=settings.body_limit_bytes, upload_limit_bytes=settings.upload_limit_bytes
     )
     app.add_middleware(
         CORSMiddleware,
-        allow_origins=chosen.cors_origins,
+        allow_origins=settings.cors_origins,
         allow_methods=CORS_METHODS,
         allow_headers=CORS_HEADERS,
         expose_headers=CORS_EXPOSED,
     )
     app.state.metrics = RequestMetrics()
     app.state.upload_turns = CapacityLimiter(deps.UPLOADS_AT_ONCE)
-    app.state.issuer = None if chosen.oidc_issuer is None else Issuer(chosen)
-    app.add_middleware(Watch, metrics=app.state.metrics)
+    app.state.issuer = None if settings.oidc_issuer is None else Issuer(settings)
+    app.add_middleware(RequestLog, metrics=app.state.metrics)
     error_responses.install(app)
     openapi.install(app)
     for router in ROUTERS:

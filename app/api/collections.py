@@ -145,7 +145,7 @@ def sortables(
 def schema(
     *, request: Request, collection: CollectionDep, viewer: ViewerDep, f: Format = None
 ) -> Response:
-    """Return the properties of a feature and their roles (OGC API - Features - Part 5) as a JSON Schema."""
+    """Return the properties of a feature and their roles, as a JSON Schema (Features - Part 5)."""
     members: dict[str, Any] = {}
     for item in collection.queryables.values():
         members[item.name] = property_schema(item)

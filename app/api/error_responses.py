@@ -1,4 +1,4 @@
-"""Errors into replies: the only place that knows both. Replies are RFC 9457 problem details."""
+"""Replies to errors: problem details of RFC 9457. No other module knows errors and HTTP statuses."""
 
 import logging
 from http import HTTPStatus
@@ -44,7 +44,7 @@ PROBLEM_TYPES: dict[type[Exception], str] = {
     NoSuchProcess: f"{OGC_EXCEPTIONS}no-such-process",
 }
 UNUSABLE = (None, "22003", "22021", "22P05")
-"""What PostgreSQL calls numbers and characters that it cannot hold; None: its driver refused them."""
+"""SQLSTATEs of numbers and characters that PostgreSQL cannot store; None: the driver refused them."""
 RETRY_SECONDS = "5"
 HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
 
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the application a problem reply."""
+    """Reply to every error of an application with problem details."""
     app.add_exception_handler(AmersError, _refused)
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _not_routed)
@@ -71,13 +71,13 @@ def problem(
     headers: dict[str, str] | None = None,
     **more: Any,
 ) -> JSONResponse:
-    """A problem reply.
+    """A reply with problem details.
 
     Args:
         status: HTTP status.
         detail: what is wrong with this request, with its numbers.
-        title: what kind of problem it is; the status in words if not given.
-        more: members of the reply beside the standard ones.
+        title: kind of problem; by default the name of the status.
+        more: members beside the standard ones.
     """
     body = {
         "type": "about:blank",
@@ -109,7 +109,7 @@ def _malformed(request: Request, error: Exception) -> JSONResponse:
         {"field": ".".join(map(str, item["loc"])), "message": item["msg"]} for item in error.errors()
     ]
     detail = "; ".join(f"{item['field']}: {item['message']}" for item in wrong)
-    # OGC API calls for 400 where a parameter of the query is wrong; 422 is for what is sent.
+    # OGC API requires 400 for a wrong parameter of the query; a wrong body is 422.
     only_query = all(item["loc"][0] == "query" for item in error.errors())
     return problem(400 if only_query else 422, detail, error="InputError", errors=wrong)
 
@@ -121,10 +121,10 @@ def _not_routed(request: Request, error: Exception) -> JSONResponse:
 
 
 def _unusable(request: Request, error: Exception) -> JSONResponse:
-    """A value that no column holds, as a NUL in a text; other such errors are mistakes of ours."""
+    """The reply to a value that no column can store, as a NUL in a text; other data errors are bugs."""
     assert isinstance(error, psycopg.DataError)
     if error.sqlstate not in UNUSABLE:
-        log.error("%s %s broke off", request.method, request.url.path, exc_info=error)
+        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return _unexpected(request, error)
     first_line = str(error).partition("\n")[0]
     log.warning("%s %s: %s", request.method, request.url.path, first_line)
@@ -133,10 +133,10 @@ def _unusable(request: Request, error: Exception) -> JSONResponse:
 
 
 def _no_room(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s broke off", request.method, request.url.path, exc_info=error)
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     if not is_no_room(error):
         return _unexpected(request, error)
-    detail = "a disk of the service is full; nothing of this was kept that is not whole: try again later"
+    detail = "a disk of the service is full; no part of this request was stored: try again later"
     return problem(507, detail, headers={"Retry-After": RETRY_SECONDS})
 
 
@@ -144,7 +144,7 @@ def _unavailable(request: Request, error: Exception) -> JSONResponse:
     if is_no_room(error):
         return _no_room(request, error)
     if isinstance(error, psycopg.errors.QueryCanceled):
-        return problem(503, "the database stopped this request: it took too long; ask for less")
+        return problem(503, "the request took the database too long and was stopped; ask for less")
     return problem(
         503, "the database does not answer; try again", headers={"Retry-After": RETRY_SECONDS}
     )
@@ -158,7 +158,7 @@ def _storage_unavailable(request: Request, error: Exception) -> JSONResponse:
 
 
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
-    """Says nothing of what happened inside; the server logs the error with its trace."""
+    """The reply to a bug or an outage: no details, which the log has with their trace."""
     request_id = getattr(request.state, "request_id", None)
     headers = None if request_id is None else {"X-Request-ID": request_id}
-    return problem(500, "an unexpected error, which has been logged", headers=headers)
+    return problem(500, "an unexpected error; the service has logged it", headers=headers)

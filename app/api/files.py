@@ -9,12 +9,12 @@ from app.storage import Storage
 
 PIECE_BYTES = 1 << 20
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
-"""A report shows and styles what is in it, and does nothing else."""
+"""A report may show its own images and styles, and nothing else."""
 HEADERS = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": PAGE_POLICY}
 
 
 def file_reply(storage: Storage, key: str, media_type: str) -> Response:
-    """A file of the storage, streamed; in parts too where it lies on this machine.
+    """A file of the storage, streamed; requests for ranges work if it lies on this machine.
 
     Raises:
         NotFound: there is no such file.

@@ -1,4 +1,4 @@
-"""Every request watched: its id, its line in the log, its place in the metrics."""
+"""The log and the metrics of requests: each request has an id, a line in the log and a duration."""
 
 import logging
 import re
@@ -15,13 +15,13 @@ ACCEPTED_ID = re.compile(rb"[A-Za-z0-9._\-]{1,64}")
 BUCKETS_S = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 NONE = "none"
-"""For paths that lead nowhere and odd methods: whoever tries names must not make a series of each."""
+"""Label of unknown paths and methods: requests for random names must not each make a time series."""
 
 log = logging.getLogger("amers.requests")
 
 
 class RequestMetrics:
-    """How long requests took, by route, in a registry of one application."""
+    """The durations of requests by route, in the registry of one application."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -34,16 +34,16 @@ class RequestMetrics:
         )
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Count a request that has ended."""
+        """Record the duration of a request."""
         self._seconds.labels(method, route, str(status)).observe(seconds)
 
 
-class Watch:
-    """Gives each request an origin, and tells the log and the metrics how it ended.
+class RequestLog:
+    """Gives each request an id and a context; logs its outcome and records its duration.
 
     Attributes:
-        app: what is watched.
-        metrics: where durations are kept.
+        app: the application that gets the requests.
+        metrics: durations of the requests.
     """
 
     def __init__(self, app: ASGIApp, metrics: RequestMetrics) -> None:
@@ -51,7 +51,7 @@ class Watch:
         self.metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request; an id that the caller sends is kept if it is one."""
+        """Handle one request; a valid `X-Request-ID` of the caller is kept as its id."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -60,7 +60,7 @@ class Watch:
         started = time.perf_counter()
         status = 500
 
-        async def answer(message: Message) -> None:
+        async def send_with_id(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
@@ -69,21 +69,21 @@ class Watch:
             await send(message)
 
         origin = Origin(actor_name="anybody", request_id=request_id.decode())
-        # For the reply to an unexpected error, which is made outside of this.
+        # The reply to an unexpected error is made outside of this middleware.
         scope.setdefault("state", {})["request_id"] = origin.request_id
         with working_for(origin):
             try:
-                await self.app(scope, receive, answer)
+                await self.app(scope, receive, send_with_id)
             except Exception:
-                log.exception("%s %s broke off", scope["method"], scope["path"])
+                log.exception("%s %s failed", scope["method"], scope["path"])
                 raise
             finally:
-                self._tell(scope, status, time.perf_counter() - started)
+                self._record(scope, status, time.perf_counter() - started)
 
-    def _tell(self, scope: Scope, status: int, seconds: float) -> None:
+    def _record(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", NONE)
         method = scope["method"] if scope["method"] in METHODS else NONE
         self.metrics.observe(method, route, status, seconds)
         fields = {"status": status, "duration_ms": round(1000.0 * seconds, 1)}
-        # The path, not the query: a filter may hold what its sender would not want to be kept.
+        # Without the query: a filter may contain confidential values.
         log.info("%s %s", scope["method"], scope["path"], extra=fields)

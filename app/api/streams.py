@@ -1,4 +1,4 @@
-"""Replies in pieces that come straight from the database."""
+"""Replies that the database sends piece by piece."""
 
 from collections.abc import AsyncIterator, Generator, Iterable
 from functools import partial
@@ -12,38 +12,38 @@ from app.api.body import STALLED_S
 
 
 class Streamed(StreamingResponse):
-    """Pieces that hold a connection until they are all read, or the reader is gone or silent.
+    """A reply in pieces; its database connection is held until all are sent or the reader is gone.
 
-    They are made in a thread beside those of endpoints, which may all be waiting for a connection: there
-    are as many such replies at once as there are connections.
+    The pieces are made in a thread of their own, because the threads of endpoints may all wait for a
+    connection. There are at most as many such replies at once as there are connections.
     """
 
     def __init__(
         self,
-        ahead: Iterable[bytes],
+        first_pieces: Iterable[bytes],
         pieces: Generator[bytes, None, None],
         media_type: str,
         headers: dict[str, str],
     ) -> None:
         self._pieces = pieces
         self._thread = CapacityLimiter(1)
-        super().__init__(self._made(ahead), media_type=media_type, headers=headers)
+        super().__init__(self._all_pieces(first_pieces), media_type=media_type, headers=headers)
 
-    async def _made(self, ahead: Iterable[bytes]) -> AsyncIterator[bytes]:
-        for piece in ahead:
+    async def _all_pieces(self, first_pieces: Iterable[bytes]) -> AsyncIterator[bytes]:
+        for piece in first_pieces:
             yield piece
-        following = partial(next, self._pieces, None)
-        while (piece := await to_thread.run_sync(following, limiter=self._thread)) is not None:
+        next_piece = partial(next, self._pieces, None)
+        while (piece := await to_thread.run_sync(next_piece, limiter=self._thread)) is not None:
             yield piece
 
     async def stream_response(self, send: Send) -> None:
-        """Send all pieces, and let go of what they hold whatever happens.
+        """Send all pieces, and release the connection in any case.
 
         Raises:
-            ClientDisconnect: the reader takes nothing any more.
+            ClientDisconnect: the reader takes no more data.
         """
 
-        async def patiently(message: Message) -> None:
+        async def send_or_give_up(message: Message) -> None:
             try:
                 with fail_after(STALLED_S):
                     await send(message)
@@ -51,7 +51,7 @@ class Streamed(StreamingResponse):
                 raise ClientDisconnect from None
 
         try:
-            await super().stream_response(patiently)
+            await super().stream_response(send_or_give_up)
         finally:
             with CancelScope(shield=True):
                 await to_thread.run_sync(self._pieces.close, limiter=self._thread)

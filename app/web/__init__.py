@@ -1,1 +1,1 @@
-"""The entry point for people: the map page."""
+"""The map page, the entry point for people."""

@@ -1,4 +1,4 @@
-"""The map page: files that `make page` has built, under a policy that lets nothing in from elsewhere."""
+"""The map page: files built by `make page`, under a content security policy without other sites."""
 
 from hashlib import sha256
 from mimetypes import guess_type
@@ -18,7 +18,7 @@ POLICY = "; ".join(
         "worker-src 'self'",
         "connect-src 'self'",
         "img-src 'self' blob: data:",
-        # A report that the page opens inherits this policy, and styles itself.
+        # A report that the page opens inherits this policy; its styles are inside it.
         "style-src 'self' 'unsafe-inline'",
         "base-uri 'none'",
         "form-action 'none'",
@@ -37,21 +37,21 @@ HEADERS = {
 
 @router.get("/map")
 def page(request: Request) -> Response:
-    """The page itself."""
+    """Return the page."""
     return _file(request, "index.html")
 
 
 @router.get("/map/{name}")
 def part(name: str, request: Request) -> Response:
-    """One of the files the page is made of."""
+    """Return a file of the page."""
     return _file(request, name)
 
 
 def _file(request: Request, name: str) -> Response:
-    """A built file, compressed for those who take it, or nothing new for those who have it.
+    """A file of the page, compressed if the browser accepts that; status 304 if the browser has it.
 
     Raises:
-        NotFound: there is no such file, or the page is not built here.
+        NotFound: the page has no such file, or is not built in this installation.
     """
     if not (BUILT / "index.html").is_file():
         raise NotFound("the page is not built in this installation: run `make page` where Node.js is")

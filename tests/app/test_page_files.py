@@ -1,6 +1,9 @@
 """The files of the map page, as they are served."""
 
 import json
+import os
+import subprocess
+import sys
 from gzip import compress
 from pathlib import Path
 
@@ -61,3 +64,14 @@ def test_the_lock_file_has_versions_and_no_addresses():
     assert "resolved" not in text
     wanted = json.loads((ROOT / "web" / "package.json").read_text())["devDependencies"]
     assert [version for version in wanted.values() if not version[0].isdigit()] == []
+
+
+def test_the_types_of_the_page_are_those_of_the_api_and_the_report():
+    script = ROOT / "scripts" / "make_api_types.py"
+    check = subprocess.run(
+        [sys.executable, script, "--check"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert check.returncode == 0, check.stdout + check.stderr

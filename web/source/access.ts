@@ -1,25 +1,24 @@
-// Signing in: a bearer token, kept in this tab until it is closed.
+// Sign in: a bearer token, kept in this tab until it is closed.
 
 import { get, Refused, setToken, token } from "./api";
+import type { Scope, TokenRecord } from "./api_types";
 import { fill, h, problem } from "./elements";
 import type { ShowView } from "./place";
 
-export interface Caller {
-  name: string;
-  scopes: string[];
-}
-const INCLUDED: Record<string, string[]> = {
+export type Caller = Pick<TokenRecord, "name" | "scopes">;
+const INCLUDED: Record<Scope, Scope[]> = {
   read: ["read"],
+  monitor: ["monitor"],
   register: ["read", "register"],
-  admin: ["read", "register", "admin"],
+  admin: ["read", "register", "monitor", "admin"],
 };
 
-/** Whose token this tab holds, with all scopes it includes; null without one. */
+/** The caller whose token this tab keeps, with all scopes that it includes; null without a token. */
 export async function whoCalls(): Promise<Caller | null> {
   if (!token()) return null;
   try {
-    const { name, scopes } = await get<Caller>("tokens/self");
-    return { name, scopes: [...new Set(scopes.flatMap((scope) => INCLUDED[scope] ?? []))] };
+    const { name, scopes } = await get<TokenRecord>("tokens/self");
+    return { name, scopes: [...new Set(scopes.flatMap((scope) => INCLUDED[scope]))] };
   } catch (error) {
     if (error instanceof Refused && error.status === 401) setToken(null);
     throw error;
@@ -29,26 +28,26 @@ export async function whoCalls(): Promise<Caller | null> {
 export const showAccess: ShowView = async ({ panel, scopes }) => {
   if (token()) {
     fill(
-    panel,
+      panel,
       h("h1", { tabindex: -1 }, "Signed in"),
-      h("p", {}, `This token allows: ${scopes.join(", ")}. It is kept until this tab is closed.`),
+      h("p", {}, `This token allows: ${scopes.join(", ")}. This tab keeps it until you close it.`),
       h("p", {}, h("button", { type: "button", onclick: () => enter(null) }, "Sign out")),
     );
     return;
   }
   const secret = h("input", { type: "password", id: "secret", autocomplete: "off", spellcheck: false, required: true });
-  const told = h("div");
+  const message = h("div");
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Sign in"),
-    h("p", {}, "Paste a token. An administrator makes one with ", h("code", {}, "amers token create"), "; it is kept until this tab is closed."),
+    h("p", {}, "Paste a token. An administrator creates one with ", h("code", {}, "amers token create"), ". This tab keeps it until you close it."),
     h(
       "form",
       { onsubmit: (event) => void submit(event) },
       h("label", { for: "secret" }, "Token"),
       secret,
       h("button", { type: "submit", class: "strong" }, "Sign in"),
-      told,
+      message,
     ),
   );
 
@@ -60,12 +59,12 @@ export const showAccess: ShowView = async ({ panel, scopes }) => {
       enter(secret.value.trim());
     } catch (error) {
       setToken(null);
-      told.replaceChildren(problem(error));
+      message.replaceChildren(problem(error));
     }
   }
 };
 
-/** Start afresh as somebody else; nothing more is shown of what the last caller saw. */
+/** Load the page again for another caller, without anything that the last caller saw. */
 function enter(secret: string | null): void {
   setToken(secret);
   history.replaceState(null, "", "#/points");

@@ -15,12 +15,13 @@ import { mapStyle } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
 
-type Shape = Geometry | Pick<FeatureCollection, "type" | "features">;
+type Outlined = Feature<Geometry | null>;
+type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
 
 const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
 
-/** The map and what is on it; where the browser has no WebGL, everything but the map works. */
+/** The map and its layers; without WebGL the rest of the page works. */
 export class Atlas {
   private readonly map: MapLibre | null;
   private readonly ready: Promise<void>;
@@ -33,18 +34,18 @@ export class Atlas {
       return;
     }
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
-    for (const begun of ["movestart", "dataloading"] as const) map.on(begun, () => container.setAttribute("aria-busy", "true"));
+    for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
       const { x, y } = event.point;
-      const [found] = map.queryRenderedFeatures(
+      const [point] = map.queryRenderedFeatures(
         [
           [x - NEAR_PX, y - NEAR_PX],
           [x + NEAR_PX, y + NEAR_PX],
         ],
         { layers: ["points"] },
       );
-      if (found) onPoint(Number(found.properties["id"]));
+      if (point) onPoint(Number(point.properties["id"]));
     });
     map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
     map.on("mouseleave", "points", () => (map.getCanvas().style.cursor = ""));
@@ -59,14 +60,14 @@ export class Atlas {
     return [west, Math.max(seen.getSouth(), -90), east, Math.min(seen.getNorth(), 90)];
   }
 
-  /** Calls back now and after every move of the map, until the signal. */
+  /** Call back now and after every move of the map, until the signal aborts. */
   whileMoving(callback: () => void, signal: AbortSignal): void {
     callback();
     this.map?.on("moveend", callback);
     signal.addEventListener("abort", () => this.map?.off("moveend", callback));
   }
 
-  /** Bring something into view; `closest` keeps small things in their surroundings. */
+  /** Bring a shape into view, at the zoom `closest` at most. */
   fit(geometry: Shape | null | undefined, closest = 14): void {
     const positions = geometry ? inOnePlace(positionsOf(geometry)) : [];
     if (!this.map || positions.length === 0) return;
@@ -80,14 +81,14 @@ export class Atlas {
     this.map?.setFilter("chosen", ["==", ["get", "id"], id ?? -1]);
   }
 
-  /** Put other features on one of the layers that the page fills itself. */
-  async show(source: "blocks" | "scenes" | "vectors", features: Feature[]): Promise<void> {
+  /** Replace the features of a layer that the page fills itself. */
+  async show(source: "blocks" | "scenes" | "vectors", features: Outlined[]): Promise<void> {
     await this.ready;
-    const found = this.map?.getSource(source);
-    if (found instanceof GeoJSONSource) found.setData({ type: "FeatureCollection", features });
+    const layer = this.map?.getSource(source);
+    if (layer instanceof GeoJSONSource) layer.setData({ type: "FeatureCollection", features } as FeatureCollection);
   }
 
-  /** Ask for points and densities again: a block has come or gone. */
+  /** Load points and densities again, after a block was published or withdrawn. */
   refresh(): void {
     for (const name of ["points", "density"]) {
       const source = this.map?.getSource(name);
@@ -133,7 +134,7 @@ function wrapped(longitude: number): number {
   return ((((longitude + 180) % 360) + 360) % 360) - 180;
 }
 
-/** Positions on both sides of 180 degrees lie beside each other if longitudes go on: outlines are cut there. */
+/** Positions with longitudes beyond 180 degrees where that keeps an outline together that was cut there. */
 function inOnePlace(positions: Position[]): Position[] {
   const onwards = positions.map(([lon, lat]): Position => [lon! < 0 ? lon! + 360 : lon!, lat!]);
   return width(positions) > 180 && width(onwards) < width(positions) ? onwards : positions;
@@ -147,7 +148,7 @@ function width(positions: Position[]): number {
 function positionsOf(geometry: Shape): Position[] {
   switch (geometry.type) {
     case "FeatureCollection":
-      return geometry.features.flatMap((feature) => positionsOf(feature.geometry));
+      return geometry.features.flatMap((feature) => (feature.geometry ? positionsOf(feature.geometry) : []));
     case "GeometryCollection":
       return geometry.geometries.flatMap(positionsOf);
     case "Point":

@@ -1,4 +1,4 @@
-// Small pieces of the page: elements, figures and dates as people read them.
+// Elements of the page, and figures and dates as text.
 
 type Child = Node | string | number | null | undefined | false;
 type Attribute = string | number | boolean | null | undefined | ((event: Event) => void);
@@ -19,18 +19,18 @@ export function h<Name extends keyof HTMLElementTagNameMap>(
   return element;
 }
 
-/** Put other children into an element; empty ones are left out. */
+/** Replace the children of an element; empty ones are left out. */
 export function fill(element: HTMLElement, ...children: Child[]): void {
   element.replaceChildren(...children.filter((child) => child != null && child !== false).map((child) => child as Node));
 }
 
-/** A list of names and their values; rows without a value are left out. */
+/** A list of names and values; rows without a value are left out. */
 export function facts(rows: Record<string, Child>): HTMLElement {
   const shown = Object.entries(rows).filter(([, value]) => value != null && value !== "" && value !== false);
   return h("dl", { class: "facts" }, ...shown.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
 }
 
-/** A word on the state of something, with a colour that only repeats the word. */
+/** A state as a word; its colour repeats the word and adds nothing. */
 export function badge(state: string): HTMLElement {
   return h("span", { class: `badge ${state.replace(/\W/g, "-")}` }, state);
 }
@@ -39,7 +39,7 @@ export function problem(error: unknown): HTMLElement {
   return h("p", { class: "problem", role: "alert" }, error instanceof Error ? error.message : String(error));
 }
 
-/** Three significant digits for measures, thousands apart for counts; a dash for what is not known. */
+/** A number with its unit: three significant digits, counts with separated thousands, a dash for unknown. */
 export function figure(value: number | null | undefined, unit = ""): string {
   if (value == null || !Number.isFinite(value)) return "–";
   const whole = Number.isInteger(value) || Math.abs(value) >= 1000;

@@ -1,31 +1,18 @@
-// A job: its progress while it runs, its reason when it failed, its report when it is done.
+// A job: its progress while it runs, its error if it failed, its report if it was successful.
 
-import type { FeatureCollection, Point, Polygon } from "geojson";
-import { blobUrl, call, get, type Job, type Result, type Verdict } from "./api";
+import type { FeatureCollection, Point, Polygon, Position } from "geojson";
+import { blobUrl, call, get } from "./api";
+import type { ResultFile, StatusInfo } from "./api_types";
 import { badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
+import type { Criterion, Report } from "./report_types";
 import { type MeasureProperties, residualVectors } from "./residuals";
 
 const POLL_MS = 1000;
 
-interface Spread {
-  n: number;
-  rms: number;
-}
-interface Report {
-  verdict: Verdict;
-  criteria: { name: string; value: number | null; comparison: string; limit: number; needed_for: string; met: boolean }[];
-  scene: { name: string; gsd_m: number; footprint_lon_lat: [number, number][] };
-  correction: { order: string; words: string[]; shift_m: number };
-  point_counts: { visible: number; matched: number; active: number };
-  reasons: { stage: string; reason: string; count: number }[];
-  image_residuals_px: Record<"x" | "y" | "xy", Spread>;
-  ground_residuals_m: Record<"east" | "north" | "horizontal", Spread>;
-  predicted: { worst_px: number | null; worst_m: number | null };
-}
-type Results = Record<string, Result>;
+type Results = Record<string, ResultFile>;
 
-/** Watches a job until it has ended, then shows what it made. */
+/** Shows the progress of a job until it ends, then its results. */
 export const showJob: ShowView = async (place, id) => {
   const { panel, signal } = place;
   const heading = h("h1", { tabindex: -1 }, "Job");
@@ -50,15 +37,15 @@ export const showJob: ShowView = async (place, id) => {
   else fill(body, outcome(job));
 };
 
-function find(id: string, signal: AbortSignal): Promise<Job> {
-  return get<Job>(`jobs/${encodeURIComponent(id)}`, signal);
+function find(id: string, signal: AbortSignal): Promise<StatusInfo> {
+  return get<StatusInfo>(`jobs/${encodeURIComponent(id)}`, signal);
 }
 
-function ended(job: Job): boolean {
+function ended(job: StatusInfo): boolean {
   return !["accepted", "running"].includes(job.status);
 }
 
-function progressOf(first: Job): { element: HTMLElement; update(job: Job): void } {
+function progressOf(first: StatusInfo): { element: HTMLElement; update(job: StatusInfo): void } {
   const bar = h("progress", { max: 100, "aria-label": "Progress of the job" });
   const words = h("p", {});
   const stop = h("button", { type: "button", onclick: () => void dismiss() }, "Stop");
@@ -66,7 +53,7 @@ function progressOf(first: Job): { element: HTMLElement; update(job: Job): void 
     element: h("div", { class: "upload" }, words, bar, stop),
     update(job) {
       bar.value = job.progress;
-      words.textContent = standing(job);
+      words.textContent = stateText(job);
     },
   };
 
@@ -80,15 +67,15 @@ function progressOf(first: Job): { element: HTMLElement; update(job: Job): void 
   }
 }
 
-/** Where a job stands that has not ended. */
-function standing(job: Job): string {
+/** The state of a job that has not ended, in words. */
+function stateText(job: StatusInfo): string {
   const { "amers:queuePosition": position, "amers:estimatedEnd": end } = job;
   const waiting = position == null ? "Waiting for a worker" : `Waiting for a worker: number ${position} in the queue`;
-  const now = job.status === "accepted" ? waiting : `${job.progress} % · ${job.message ?? "at work"}`;
-  return end ? `${now} · may end on ${when(end)}` : now;
+  const state = job.status === "accepted" ? waiting : `${job.progress} % · ${job.message ?? "running"}`;
+  return end ? `${state} · expected to end on ${when(end)}` : state;
 }
 
-function outcome(job: Job): HTMLElement {
+function outcome(job: StatusInfo): HTMLElement {
   return h(
     "div",
     {},
@@ -97,19 +84,19 @@ function outcome(job: Job): HTMLElement {
   );
 }
 
-async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElement, body: HTMLElement): Promise<void> {
+async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: HTMLElement, body: HTMLElement): Promise<void> {
   const results = await get<Results>(`jobs/${job.jobID}/results`, signal);
-  const told = results["report.json"];
-  const measured = results["control_points.geojson"];
-  if (!told || !measured) {
-    fill(body, outcome(job), toBlock(results), await downloads(results, signal));
+  const reportFile = results["report.json"];
+  const pointsFile = results["control_points.geojson"];
+  if (!reportFile || !pointsFile) {
+    fill(body, outcome(job), blockLink(results), await downloads(results, signal));
     return;
   }
   const [report, points] = await Promise.all([
-    get<Report>(told.href, signal),
-    get<FeatureCollection<Point, MeasureProperties>>(measured.href, signal),
+    get<Report>(reportFile.href, signal),
+    get<FeatureCollection<Point, MeasureProperties>>(pointsFile.href, signal),
   ]);
-  const ring = report.scene.footprint_lon_lat;
+  const ring = report.scene.footprint_lon_lat as Position[];
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
   const { features, exaggeration } = residualVectors(points);
   heading.textContent = report.scene.name;
@@ -120,8 +107,8 @@ async function showResults({ atlas, signal }: Place, job: Job, heading: HTMLElem
   atlas.fit(footprint, 17);
 }
 
-/** The way to the block that a job has brought into the store. */
-function toBlock({ number }: Record<string, unknown>): HTMLElement | null {
+/** A link to the block that a job has ingested. */
+function blockLink({ number }: Record<string, unknown>): HTMLElement | null {
   if (typeof number !== "number") return null;
   return h("p", {}, h("a", { class: "button strong", href: `#/block/${number}` }, "See the block"));
 }
@@ -147,32 +134,18 @@ function summary(report: Report, exaggeration: number): HTMLElement[] {
   ];
 }
 
-/** The criteria in the words of the report's page, each with its unit. */
-const CRITERIA: Record<string, [words: string, unit?: string]> = {
-  active_points: ["Active points"],
-  coverage_percent: ["Coverage of the image", "%"],
-  active_of_matched: ["Active / matched"],
-  residual_std_px: ["Unexplained residual", "px"],
-  displacement_px: ["Displacement with fewer points", "px"],
-  predicted_ce90_px: ["Predicted CE90, worst place", "px"],
-  unit_weight: ["Residuals over what is expected"],
-  second_consensus_share: ["Points that tell another story"],
-  check_points: ["Check points over what is expected"],
-};
-
-function criterion({ name, value, comparison, limit, needed_for, met }: Report["criteria"][number]): HTMLElement {
-  const [words, unit] = CRITERIA[name] ?? [name.replaceAll("_", " ")];
+function criterion({ label, value, comparison, limit, unit, needed_for, met, calculation }: Criterion): HTMLElement {
   return h(
     "tr",
-    {},
-    h("th", { scope: "row" }, words),
+    { title: calculation },
+    h("th", { scope: "row" }, label),
     h("td", {}, figure(value, unit)),
     h("td", {}, `${comparison} ${figure(limit, unit)}`),
     h("td", { class: met ? "" : "missed" }, met ? "yes" : `no, not ${needed_for}`),
   );
 }
 
-/** Links to the files; they are fetched with the token first, which a plain link could not send. */
+/** Links to the files of the results. The page fetches them, because a plain link cannot send the token. */
 async function downloads(results: Results, signal: AbortSignal): Promise<HTMLElement> {
   const files = Object.values(results).filter((result) => typeof result === "object" && result?.href);
   const page = files.find(({ title }) => title === "report.html");
@@ -183,7 +156,7 @@ async function downloads(results: Results, signal: AbortSignal): Promise<HTMLEle
   });
   return h("div", {}, open, files.length ? h("h2", {}, "Files") : null, h("ul", { class: "list" }, ...rows));
 
-  async function save(event: Event, file: Result, link: HTMLElement): Promise<void> {
+  async function save(event: Event, file: ResultFile, link: HTMLElement): Promise<void> {
     event.preventDefault();
     try {
       h("a", { href: await blobUrl(file.href, signal), download: file.title }).click();

@@ -1,4 +1,4 @@
-// The page begins here: who calls, the map, and which view the address names.
+// The start of the page: the caller, the map, and the view that the address names.
 
 import { type Caller, showAccess, whoCalls } from "./access";
 import { Refused } from "./api";
@@ -33,7 +33,7 @@ async function start(): Promise<void> {
   await Promise.all([route(atlas, caller, false), opening(atlas)]);
 }
 
-/** What the map shows at first: the blocks there are. */
+/** Show the blocks on the map, and fit it to them. */
 async function opening(atlas: Atlas): Promise<void> {
   try {
     const { features } = await blocks();
@@ -59,7 +59,7 @@ async function route(atlas: Atlas, caller: Caller | null, moved: boolean): Promi
     await view.show({ panel, atlas, signal, scopes: caller?.scopes ?? [] }, decodeURIComponent(argument));
     if (moved && !signal.aborted) panel.querySelector("h1")?.focus({ preventScroll: true });
   } catch (error) {
-    if (!signal.aborted) panel.replaceChildren(h("h1", { tabindex: -1 }, "That did not work"), problem(error));
+    if (!signal.aborted) panel.replaceChildren(h("h1", { tabindex: -1 }, "An error occurred"), problem(error));
   }
 }
 

@@ -1,11 +1,11 @@
-// What every view is given, and where it leads.
+// What every view gets, and how it leads to another.
 
 import type { Atlas } from "./atlas";
 
 export interface Place {
   panel: HTMLElement;
   atlas: Atlas;
-  /** Ends when the reader goes elsewhere. */
+  /** Aborts when another view is shown. */
   signal: AbortSignal;
   /** The caller's scopes; empty for the public. */
   scopes: string[];
@@ -17,12 +17,12 @@ export function go(address: string): void {
   location.hash = address;
 }
 
-/** Tell something in passing, aloud for those who listen. */
+/** Show a short message, which screen readers read aloud. */
 export function announce(text: string): void {
   document.getElementById("status")!.textContent = text;
 }
 
-/** Wait, or stop waiting at once when the reader goes elsewhere. */
+/** Wait, or stop at once when the signal aborts. */
 export function pause(milliseconds: number, signal: AbortSignal): Promise<void> {
   return new Promise((resolve, reject) => {
     const timer = setTimeout(resolve, milliseconds);

@@ -1,13 +1,14 @@
-// Points: what is in view, and one point with its chips.
+// Points: those in view of the map, and one point with its chips.
 
-import { blobUrl, get, type Page, type PointFeature, type View } from "./api";
+import { blobUrl, type FeaturePage, get, type PointOfPage } from "./api";
+import type { PointViewProperties, PointWithViews } from "./api_types";
 import { facts, figure, fill, h, plural, problem } from "./elements";
 import type { ShowView } from "./place";
 
 const LISTED = 50;
 const SETTLED_MS = 250;
 
-/** The points of the part of the world that the map shows, counted and listed. */
+/** Shows the number of points in view of the map, and a list of the first. */
 export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   const list = h("ul", { class: "list", "aria-label": "Points in view" });
   const count = h("p", { class: "count" }, "…");
@@ -20,16 +21,16 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
     count,
     list,
   );
-  let asked = 0;
+  let moves = 0;
   atlas.whileMoving(() => {
-    const mine = ++asked;
-    setTimeout(() => mine === asked && !signal.aborted && void refresh(), mine === 1 ? 0 : SETTLED_MS);
+    const move = ++moves;
+    setTimeout(() => move === moves && !signal.aborted && void refresh(), move === 1 ? 0 : SETTLED_MS);
   }, signal);
 
   async function refresh(): Promise<void> {
     try {
-      const page = await get<Page<PointFeature>>(`collections/points/items?bbox=${atlas.bounds().join(",")}&limit=${LISTED}`, signal);
-      const total = page.numberMatched ?? page.features.length;
+      const page = await get<FeaturePage<PointOfPage>>(`collections/points/items?bbox=${atlas.bounds().join(",")}&limit=${LISTED}`, signal);
+      const total = page.numberMatched;
       count.textContent = total > page.features.length ? `${plural(total, "point")}, the first ${page.features.length}:` : plural(total, "point");
       list.replaceChildren(...page.features.map(row));
     } catch (error) {
@@ -38,9 +39,9 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   }
 };
 
-/** One point: where it is, how well that is known, and what it looks like. */
+/** Shows one point: position, accuracy, chips. */
 export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
-  const point = await get<PointFeature>(`collections/points/items/${encodeURIComponent(id)}`, signal);
+  const point = await get<PointWithViews>(`collections/points/items/${encodeURIComponent(id)}`, signal);
   const [lon, lat, height] = point.geometry.coordinates;
   const { properties } = point;
   const chips = h("ul", { class: "chips", "aria-label": "Chips" });
@@ -59,19 +60,19 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
       Saliency: figure(properties.saliency),
       Block: properties.block,
     }),
-    h("h2", {}, plural(properties.views?.length ?? 0, "chip")),
+    h("h2", {}, plural(properties.views.length, "chip")),
     chips,
   );
   atlas.fit(point.geometry, 13);
   await atlas.choose(Number(id));
   signal.addEventListener("abort", () => void atlas.choose(null));
-  await Promise.all((properties.views ?? []).map((view, number) => show(chips, id, view, number, signal)));
+  await Promise.all(properties.views.map((view, number) => show(chips, id, view, number, signal)));
 };
 
-async function show(chips: HTMLElement, id: string, view: View, number: number, signal: AbortSignal): Promise<void> {
-  const told = [view.image_id, figure(view.gsd_m, "m"), view.acquired_at?.slice(0, 10)].filter(Boolean).join(" · ");
-  const image = h("img", { alt: `Chip ${number}: ${told}`, width: 101, height: 101 });
-  chips.append(h("li", {}, h("figure", {}, image, h("figcaption", {}, told))));
+async function show(chips: HTMLElement, id: string, view: PointViewProperties, number: number, signal: AbortSignal): Promise<void> {
+  const caption = [view.image_id, figure(view.gsd_m, "m"), view.acquired_at?.slice(0, 10)].filter(Boolean).join(" · ");
+  const image = h("img", { alt: `Chip ${number}: ${caption}`, width: 101, height: 101 });
+  chips.append(h("li", {}, h("figure", {}, image, h("figcaption", {}, caption))));
   try {
     image.src = await blobUrl(`collections/points/items/${encodeURIComponent(id)}/chips/${number}?f=png`, signal);
   } catch (error) {
@@ -79,8 +80,8 @@ async function show(chips: HTMLElement, id: string, view: View, number: number, 
   }
 }
 
-function row(point: PointFeature): HTMLElement {
-  const [lon, lat] = point.geometry.coordinates;
+function row(point: PointOfPage): HTMLElement {
+  const [lon, lat] = point.geometry?.type === "Point" ? point.geometry.coordinates : [];
   return h(
     "li",
     {},

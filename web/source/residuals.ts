@@ -1,4 +1,4 @@
-// Residuals of a registration as vectors on the map, exaggerated by a round number that is told.
+// Residuals of a registration as vectors on the map, exaggerated by a round number.
 
 import type { Feature, FeatureCollection, Point } from "geojson";
 
@@ -10,23 +10,23 @@ export interface MeasureProperties {
 }
 
 const METRES_PER_DEGREE = 111_320;
-/** A long residual (the 90 % quantile) is drawn as this part of the points' spread. */
+/** Length of a long residual (the 90 % quantile) on the map, as a part of the extent of the points. */
 const LONG_SHARE = 0.08;
 
 /**
- * Points and vectors; a vector leads from the true place to where the refined model puts the point in the scene.
+ * Points and vectors; a vector leads from the true position to where the refined model puts the point of the scene.
  *
- * @returns the features, and how many times longer than true the vectors are drawn.
+ * @returns the features, and the factor by which the vectors are longer than the residuals.
  */
 export function residualVectors(points: FeatureCollection<Point, MeasureProperties>): { features: Feature[]; exaggeration: number } {
-  const found = points.features.filter(({ properties }) => properties.residual_east_m != null && properties.residual_north_m != null);
-  const lengths = found
+  const withResiduals = points.features.filter(({ properties }) => properties.residual_east_m != null && properties.residual_north_m != null);
+  const lengths = withResiduals
     .filter(({ properties }) => properties.status === "active")
     .map(({ properties }) => Math.hypot(properties.residual_east_m!, properties.residual_north_m!))
     .sort((one, other) => one - other);
   const long = lengths[Math.floor(0.9 * (lengths.length - 1))] ?? 0;
-  const exaggeration = long > 0 ? roundNumber((LONG_SHARE * spreadM(points)) / long) : 1;
-  const lines = found.map(({ geometry, properties }): Feature => {
+  const exaggeration = long > 0 ? roundNumber((LONG_SHARE * diagonalM(points)) / long) : 1;
+  const lines = withResiduals.map(({ geometry, properties }): Feature => {
     const [lon, lat] = geometry.coordinates as [number, number];
     const north = (exaggeration * properties.residual_north_m!) / METRES_PER_DEGREE;
     const east = (exaggeration * properties.residual_east_m!) / (METRES_PER_DEGREE * Math.cos((lat * Math.PI) / 180));
@@ -36,7 +36,7 @@ export function residualVectors(points: FeatureCollection<Point, MeasureProperti
 }
 
 /** The diagonal of the box around the points, metres. */
-function spreadM(points: FeatureCollection<Point>): number {
+function diagonalM(points: FeatureCollection<Point>): number {
   const lons = points.features.map(({ geometry }) => geometry.coordinates[0]!);
   const lats = points.features.map(({ geometry }) => geometry.coordinates[1]!);
   const [south, north] = [Math.min(...lats), Math.max(...lats)];

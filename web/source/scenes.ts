@@ -1,7 +1,8 @@
-// Scenes: one's own, and the way of a new one from a file to its registration.
+// Scenes: those of the caller, and the upload and registration of a new one.
 
 import type { Feature } from "geojson";
-import { get, type Job, post, type Scene } from "./api";
+import { get, post } from "./api";
+import type { Jobs, Scene, Scenes, StatusInfo } from "./api_types";
 import { badge, bytes, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { go, type Place, type ShowView } from "./place";
 import { send, uploadModel } from "./upload";
@@ -9,20 +10,20 @@ import { send, uploadModel } from "./upload";
 const IMAGES = ".tif,.tiff,.jp2,.j2k,.ntf,.nitf,.zip,.tar";
 const MODELS = ".txt,.xml,.rpb,.rpc";
 
-/** The caller's scenes and jobs, and the form for another scene. */
+/** Shows the scenes and jobs of the caller, and the form for a new scene. */
 export const showScenes: ShowView = async (place) => {
   const { panel, atlas, signal, scopes } = place;
   if (!scopes.includes("register")) {
     fill(
-    panel,
+      panel,
       h("h1", { tabindex: -1 }, "Scenes"),
-      h("p", {}, "Scenes are registered by those who may: ", h("a", { href: "#/access" }, "sign in"), " with a token of scope ", h("code", {}, "register"), "."),
+      h("p", {}, "To register scenes, ", h("a", { href: "#/access" }, "sign in"), " with a token of scope ", h("code", {}, "register"), "."),
     );
     return;
   }
   const [{ scenes }, { jobs }] = await Promise.all([
-    get<{ scenes: Scene[] }>("scenes?limit=200", signal),
-    get<{ jobs: Job[] }>("jobs?limit=20", signal),
+    get<Scenes>("scenes?limit=200", signal),
+    get<Jobs>("jobs?limit=20", signal),
   ]);
   await atlas.show("scenes", outlines(scenes));
   fill(
@@ -36,12 +37,12 @@ export const showScenes: ShowView = async (place) => {
   );
 };
 
-/** One scene: its files, and its registration once more. */
+/** Shows one scene: its files, and a button to register it again. */
 export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
   const scene = await get<Scene>(`scenes/${encodeURIComponent(id)}`, signal);
   await atlas.show("scenes", outlines([scene]));
   atlas.fit(scene.footprint);
-  const told = h("div");
+  const message = h("div");
   const again = h("button", { type: "button", class: "strong", onclick: () => void start() }, "Register");
   fill(
     panel,
@@ -49,13 +50,13 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
     h("h1", { tabindex: -1 }, scene.name),
     facts({
       State: badge(scene.state),
-      Image: `${scene.file}, ${bytes(scene.size_bytes)}`,
+      Image: `${scene.file}, ${bytes(scene.size_bytes ?? 0)}`,
       Models: scene.models.join(", "),
       "Accuracy of its model": scene.sigma_m == null ? "unknown" : figure(scene.sigma_m, "m"),
       Uploaded: when(scene.created),
     }),
-    scene.removed ? h("p", { class: "quiet" }, `Its files were removed on ${when(scene.removed)}.`) : h("p", {}, again),
-    told,
+    scene.removed ? h("p", { class: "quiet" }, `The files were removed on ${when(scene.removed)}.`) : h("p", {}, again),
+    message,
   );
 
   async function start(): Promise<void> {
@@ -64,7 +65,7 @@ export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
       go(`#/job/${await register(scene.id)}`);
     } catch (error) {
       again.disabled = false;
-      told.replaceChildren(problem(error));
+      message.replaceChildren(problem(error));
     }
   }
 };
@@ -87,7 +88,7 @@ function uploadForm({ signal }: Place): HTMLElement {
     { onsubmit: (event) => void submit(event) },
     h("label", { for: "image" }, "Image", h("span", { class: "quiet" }, " GeoTIFF, JPEG 2000, NITF, or an archive")),
     image,
-    h("label", { for: "models" }, "Model files", h("span", { class: "quiet" }, " if not inside: RPC text, RPB, DIMAP")),
+    h("label", { for: "models" }, "Model files", h("span", { class: "quiet" }, " if not in the image: RPC text, RPB, DIMAP")),
     models,
     h("label", { for: "sigma" }, "Accuracy of the model, metres"),
     sigma,
@@ -112,9 +113,9 @@ function uploadForm({ signal }: Place): HTMLElement {
   }
 }
 
-/** Ask for the registration of a scene; the id of the job. */
+/** Start the registration of a scene; returns the id of its job. */
 async function register(scene: string): Promise<string> {
-  const job = await post<Job>("processes/register-scene/execution", { inputs: { scene } });
+  const job = await post<StatusInfo>("processes/register-scene/execution", { inputs: { scene } });
   return job.jobID;
 }
 
@@ -124,11 +125,11 @@ function sceneRow(scene: Scene): HTMLElement {
     {},
     h("a", { href: `#/scene/${scene.id}` }, scene.name),
     badge(scene.state),
-    h("span", { class: "quiet" }, `${bytes(scene.size_bytes)} · ${plural(scene.models.length, "model file")} · ${when(scene.created)}`),
+    h("span", { class: "quiet" }, `${bytes(scene.size_bytes ?? 0)} · ${plural(scene.models.length, "model file")} · ${when(scene.created)}`),
   );
 }
 
-function jobRow(job: Job): HTMLElement {
+function jobRow(job: StatusInfo): HTMLElement {
   return h(
     "li",
     {},

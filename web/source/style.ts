@@ -1,13 +1,13 @@
-// How the map looks, by day and by night; the colours of the densities are those of the legend.
+// The style of the map in light and dark; the density colours are those of the legend.
 
 import type { GeoJSONSourceSpecification, LayerSpecification, StyleSpecification } from "maplibre-gl";
 import { BASE } from "./api";
 
 const TILES = "tiles/WebMercatorQuad/{z}/{y}/{x}";
-/** Densities the specification of a block asks for, points per km². */
+/** Densities that the specification of a block requires, points per km². */
 export const HALF_PER_KM2 = 0.5;
 export const QUARTER_PER_KM2 = 0.25;
-/** From here on the tiles hold points one by one. */
+/** Lowest zoom whose tiles hold single points. */
 export const POINTS_ZOOM = 8;
 const TILES_ZOOM = 14;
 

@@ -1,4 +1,4 @@
-// Uploads that survive a lost connection and a closed tab: tus 1.0, piece by piece.
+// Uploads that resume after a lost connection or a closed tab: tus 1.0, piece by piece.
 
 import { type HttpResponse, type PreviousUpload, Upload } from "tus-js-client";
 import { address, authorization, call, Refused } from "./api";
@@ -7,25 +7,25 @@ import { bytes, h } from "./elements";
 const PIECE_BYTES = 8 * 1024 * 1024;
 const RETRY_MS = [0, 1000, 3000, 5000, 10000, 20000, 30000];
 
-/** What has arrived: the upload, and the scene it has become if it is one. */
-export interface Arrived {
+/** A complete upload; `scene` is empty unless the file is the image of a scene. */
+export interface CompleteUpload {
   upload: string;
   scene: string;
 }
 interface Sending {
-  done: Promise<Arrived>;
+  complete: Promise<CompleteUpload>;
   pause(): void;
   resume(): void;
 }
 
 /**
- * Upload a file under the reader's eyes; the same file said the same of goes on where it once stopped.
+ * Upload a file and show the progress; the same file with the same metadata resumes where it stopped.
  *
- * @param metadata what the service is told of the file, beside its name.
- * @param state where the progress is shown.
- * @param signal ends when the reader goes elsewhere: the upload waits for him to come back.
+ * @param metadata of the file, beside its name.
+ * @param state element that shows the progress.
+ * @param signal aborts when another view is shown: the upload pauses.
  */
-export async function send(file: File, metadata: Record<string, string>, state: HTMLElement, signal: AbortSignal): Promise<Arrived> {
+export async function send(file: File, metadata: Record<string, string>, state: HTMLElement, signal: AbortSignal): Promise<CompleteUpload> {
   const bar = h("progress", { max: file.size, value: 0, "aria-label": "Upload" });
   const figures = h("span", { class: "quiet" }, bytes(0));
   const sending = begin(file, { filename: file.name, ...metadata }, (sent) => {
@@ -36,7 +36,7 @@ export async function send(file: File, metadata: Record<string, string>, state: 
   const leaving = (): void => sending.pause();
   signal.addEventListener("abort", leaving);
   try {
-    return await sending.done;
+    return await sending.complete;
   } finally {
     signal.removeEventListener("abort", leaving);
   }
@@ -52,7 +52,7 @@ function begin(file: File, metadata: Record<string, string>, progress: (sent: nu
   const name = ["amers", endpoint, file.size, file.lastModified, JSON.stringify(metadata)].join(" ");
   let scene = "";
   let upload!: Upload;
-  const done = new Promise<Arrived>((resolve, reject) => {
+  const complete = new Promise<CompleteUpload>((resolve, reject) => {
     upload = new Upload(file, {
       endpoint,
       headers: { Accept: "application/json", ...authorization() },
@@ -74,7 +74,7 @@ function begin(file: File, metadata: Record<string, string>, progress: (sent: nu
     if (latest) upload.resumeFromPreviousUpload(latest);
     upload.start();
   });
-  return { done, pause: () => void upload.abort(), resume: () => upload.start() };
+  return { complete, pause: () => void upload.abort(), resume: () => upload.start() };
 }
 
 function begunAt({ creationTime }: PreviousUpload): number {
@@ -89,14 +89,14 @@ function pauseButton(sending: Sending): HTMLElement {
     const paused = button.textContent === "Pause";
     if (paused) sending.pause();
     else sending.resume();
-    button.textContent = paused ? "Go on" : "Pause";
+    button.textContent = paused ? "Resume" : "Pause";
   }
 }
 
-/** What went wrong with an upload, in the service's own words if it said any. */
+/** The error of an upload, with the message of the service if there is one. */
 function refusal(error: Error): Refused {
   const reply = "originalResponse" in error ? (error.originalResponse as HttpResponse | null) : null;
-  if (!reply) return new Refused(0, "The service does not answer; choose the same file again to go on.");
+  if (!reply) return new Refused(0, "The service does not answer. Choose the same file again to resume.");
   try {
     return new Refused(reply.getStatus(), (JSON.parse(reply.getBody()) as { detail: string }).detail);
   } catch {
