@@ -116,7 +116,8 @@ function blockLink({ number }: Record<string, unknown>): HTMLElement | null {
 function summary(report: Report, exaggeration: number): HTMLElement[] {
   const { point_counts: counts, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
   return [
-    h("p", {}, badge(report.verdict), " ", h("span", { class: "quiet" }, report.correction.words.join("; "))),
+    h("p", {}, badge(report.verdict), " ", report.verdict_explanation),
+    h("p", { class: "quiet" }, report.correction.words.join("; ")),
     facts({
       "Points visible, matched, active": `${figure(counts.visible)}, ${figure(counts.matched)}, ${figure(counts.active)}`,
       "Residual in the image, rms": `${figure(px.xy.rms, "px")} (x ${figure(px.x.rms)}, y ${figure(px.y.rms)})`,

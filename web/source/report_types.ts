@@ -34,6 +34,28 @@ export interface Acquisition {
   sun_azimuth_deg: number | null;
 }
 
+/** How a scene is adjusted. */
+export interface AdjustmentOptions {
+  /** of the correction; None selects it by cross-validation. Drift and skew are then estimated whatever the order, as far as the measures determine them. */
+  order: "shift" | "drift" | "affine" | null;
+  /** a measure is deactivated when its residual exceeds this many standard deviations. */
+  tolerance: number | null;
+  /** smallest number of active measures. */
+  min_points: number;
+  /** measures for each parameter that an order needs to be considered. */
+  points_per_parameter: number | null;
+  /** spread of the measures that an order beyond the shift needs: standard deviation along each axis, in half sizes of the image (an even spread has 0.58). */
+  min_spread: number | null;
+  /** an order replaces a simpler one when it reduces the cross-validated residual by this fraction. */
+  min_gain: number | null;
+  /** of the cross-validation. */
+  folds: number;
+  /** a priori standard deviation of drift and skew at the edge of the image, pixels; the measures may raise it, never lower it. */
+  prior_slope_sigma_px: number | null;
+  /** the same where the order is given; None leaves drift and skew to the measures. */
+  slope_px: number | null | null;
+}
+
 /** A block whose points were used. */
 export interface BlockUsed {
   /** of the block. */
@@ -42,23 +64,41 @@ export interface BlockUsed {
   version: string;
 }
 
-/** Accuracy against points that had no part in the registration. */
+/** Accuracy at points that had no part in the registration. */
 export interface Check {
-  /** what the points are, in words. */
+  /** what the points are, for people. */
   against: string;
-  /** of the registered model there; a single scene gives no heights, hence no LE90. */
+  /** of the registered model; a single scene gives no heights, hence no LE90. */
   accuracy: Accuracy;
-  /** of the marks; x along samples, y along lines; None when not marked. */
+  /** of the marks; x along samples, y along lines; null when there are no marks. */
   image_residuals_px: ImageResiduals | null;
-  /** the residuals in units of what model, marks and points state; None when unknown. */
+  /** the residuals in units of the stated precision of model, marks and points; null when unknown. */
   normalised: NormalisedError | null;
 }
 
-/** The correction that was found, from positions by the delivered model to true ones. */
+/** Options of the coarse search: few points, far out. */
+export interface CoarseOptions {
+  /** a search radius up to this many pixels of the fine chips needs no coarse search. */
+  max_fine_radius_px: number;
+  /** number of points to try that the scene is expected to show whole, wherever it lies. */
+  points: number;
+  /** number of chips of one ground sampling that the scene should show whole for that ground sampling to be used. */
+  enough: number;
+  /** normalised correlation below which a chip is not found; the consensus of many points decides which of these matches are right. */
+  min_score: number | null;
+  /** largest search radius, pixels; to search further, the chips are reduced. */
+  max_search_px: number;
+  /** largest reduction of a chip; below 25 pixels a chip is hardly distinctive. */
+  max_reduction: number;
+  /** a consensus with more expected false alarms than this is refused. */
+  max_false_alarms: number | null;
+}
+
+/** The correction of the model: from image positions by the delivered model to true positions. */
 export interface CorrectionRecord {
   /** "shift", "drift" or "affine". */
   order: string;
-  /** the order and why it was chosen, in words. */
+  /** the order and why it was chosen, as a sentence. */
   order_reason: string;
   /** of the orders that were compared. */
   order_scores: OrderScore[];
@@ -78,10 +118,20 @@ export interface CorrectionRecord {
   words: string[];
   /** a posteriori standard deviation of unit weight. */
   sigma0: number | null;
-  /** largest difference between the corrected model and the one written; 0 when that carries the correction exactly. */
-  refit_error_px: number | null;
-  /** which files carry the correction, and how well, in words. */
-  refined_note: string;
+}
+
+/** When a correlation peak is accepted. */
+export interface CorrelationOptions {
+  /** smallest normalised correlation of a chip that is found (SRP's published example). */
+  min_score: number | null;
+  /** largest ratio of the second peak to the first; above it the position is ambiguous. */
+  max_second: number | null;
+  /** smallest distance between the first and the second peak. */
+  second_distance_px: number;
+  /** smallest standard deviation over mean; below it a chip is flat. */
+  min_contrast: number | null;
+  /** largest sigma along any direction, chip pixels; above it the position is ambiguous. */
+  max_sigma_px: number | null;
 }
 
 /** Share of equal cells of the image that hold an active point. */
@@ -94,23 +144,31 @@ export interface Coverage {
   percent: number | null;
 }
 
-/** One threshold and whether it was met. */
+/** A figure of a registration, compared with its limit. */
 export interface Criterion {
-  /** what is compared, with its unit. */
+  /** identifier of the criterion. */
   name: string;
-  /** NaN when it could not be computed; such a criterion is not met. */
+  /** name of the criterion for people. */
+  label: string;
+  /** the figure; NaN when it could not be computed. */
   value: number | null;
-  /** of the value with the limit. */
+  /** "at least" or "at most". */
   comparison: "at least" | "at most";
-  /** as given in the options. */
+  /** the threshold, in the unit of the value. */
   limit: number | null;
-  /** the verdict that is lost when it is not met. */
+  /** of value and limit, "" for counts and ratios. */
+  unit: string;
+  /** digits after the point that are worth showing. */
+  decimals: number;
+  /** "good" or "usable": the best verdict that is impossible without this criterion. */
   needed_for: "good" | "usable";
-  /** whether it was met. */
-  passed: boolean;
+  /** whether the value meets the limit; a value that could not be computed never does. */
+  met: boolean;
+  /** how the value is calculated, for people. */
+  calculation: string;
 }
 
-/** How far one place of the image moves between the full solution and those of fewer points. */
+/** Displacement of one place of the image between the full solution and solutions with fewer points. */
 export interface Displacement {
   /** "top left", "top right", "bottom right", "bottom left" or "centre". */
   place: string;
@@ -122,17 +180,17 @@ export interface Displacement {
   median_m: number | null;
   /** length, over the draws. */
   max_m: number | null;
-  /** along samples and lines in the first draw: one redone adjustment, as it is published. */
+  /** along samples and lines in the first draw: one repeated adjustment, as in the published tables. */
   x_m: number | null;
-  /** along samples and lines in the first draw: one redone adjustment, as it is published. */
+  /** along samples and lines in the first draw: one repeated adjustment, as in the published tables. */
   y_m: number | null;
 }
 
-/** Residuals of the active points on the ground, metres; a single scene says nothing about heights. */
+/** Residuals of the active points on the ground, metres; a single scene gives no heights. */
 export interface GroundResiduals {
-  /** of the horizontal plane through the point. */
+  /** in the horizontal plane through the point. */
   east: Statistics;
-  /** of the horizontal plane through the point. */
+  /** in the horizontal plane through the point. */
   north: Statistics;
   /** length of the residual. */
   horizontal: Statistics;
@@ -146,6 +204,20 @@ export interface ImageResiduals {
   y: Statistics;
   /** length of the residual. */
   xy: Statistics;
+}
+
+/** How control points are matched. */
+export interface MatchingOptions {
+  /** largest number of views of a point that are tried. */
+  max_views: number;
+  /** largest distance between measures of one point by several views that agree, pixels of the chips as they are searched. */
+  agreement_px: number | null;
+  /** smallest correlation of gradients that is accepted for a point whose grey values do not correlate. */
+  min_gradient_score: number | null;
+  /** differences between a view and the scene that decide which views are tried. */
+  view_distance: ViewDistanceScales;
+  /** acceptance of correlation peaks. With a `min_score` of 0.6, 215 of 216 peaks in four simulated scenes were right; the agreement of views and points rejects others. */
+  correlation: CorrelationOptions;
 }
 
 /** Mean square of errors in units of their stated precision; 1 when the precision is honest. */
@@ -169,27 +241,27 @@ export type Numbers = number | null | Numbers[];
 export interface OrderScore {
   /** "shift", "drift" or "affine". */
   order: string;
-  /** distance of left-out points from where the others expect them, rms, pixels. */
+  /** distance of the points left out of the fit from their predicted positions, rms, pixels. */
   left_out_px: number | null;
 }
 
-/** How many points a scene was given, and what became of them. */
+/** Numbers of points at the stages of a registration. */
 export interface PointCounts {
-  /** points the scene could show (Popini). */
+  /** points that the scene could show (published as Popini). */
   visible: number;
-  /** of these, points that were not tried because others stand for them. */
-  unused: number;
-  /** found, and their views agree (Spatio). */
+  /** visible points that were not searched, because well-spread others represent them. */
+  not_tried: number;
+  /** points that were found, and whose views agree (published as Spatio). */
   matched: number;
-  /** used by the final adjustment (Actif). */
+  /** points that the final adjustment uses (published as Actif). */
   active: number;
-  /** ratios, 0 to 1; NaN over nothing. */
+  /** ratios, 0 to 1; NaN when the divisor is zero. */
   active_of_matched: number | null;
-  /** ratios, 0 to 1; NaN over nothing. */
+  /** ratios, 0 to 1; NaN when the divisor is zero. */
   active_of_visible: number | null;
 }
 
-/** What the covariance of the correction says about positions all over the image. */
+/** Accuracy all over the image, predicted by the covariance of the correction. */
 export interface PredictedAccuracy {
   /** (g, g) on a regular grid from corner to corner. */
   std_line_px: Numbers[];
@@ -207,6 +279,50 @@ export interface PredictedAccuracy {
   median_m: number | null;
   /** of the frame of the points' blocks, by the circular normal law; NaN when unknown. */
   frame_ce90_m: number | null;
+}
+
+/** Thresholds and sampling of a qualification. */
+export interface QualificationOptions {
+  /** smallest number of active points (SRP: one measure is never enough, at least 20). */
+  good_active_points: number;
+  /** smallest coverage of the image by active points. */
+  good_coverage_percent: number | null;
+  /** smallest ratio of active to matched points. */
+  good_active_of_matched: number | null;
+  /** largest standard deviation of the active residuals, of the worse coordinate, without the part that chance and the stated accuracy of the points explain. */
+  good_residual_std_px: number | null;
+  /** largest displacement of a corner or the centre when a part of the points is held out: the worst place, the median over the draws. */
+  good_displacement_px: number | null;
+  /** the limits of displacement and CE90 as shares of the CE90 of the points, where these allow more than the limits in pixels. Points coarser than the pixels still make a model several times better than they are (SRP: corners within 0.3 m with points of 3 m). */
+  good_displacement_of_points: number | null;
+  /** largest predicted CE90 of the correction over the image. */
+  good_ce90_px: number | null;
+  /** the limits of displacement and CE90 as shares of the CE90 of the points, where these allow more than the limits in pixels. Points coarser than the pixels still make a model several times better than they are (SRP: corners within 0.3 m with points of 3 m). */
+  good_ce90_of_points: number | null;
+  /** largest standard deviation of unit weight: residuals over the stated sigmas. */
+  good_unit_weight: number | null;
+  /** largest group of deactivated points that agree on another displacement, as a share of the active points. A scene has one displacement, not two. */
+  good_second_consensus_share: number | null;
+  /** smallest number of active points. */
+  usable_active_points: number;
+  /** largest standard deviation of the active residuals, of the worse coordinate, without the part that chance and the stated accuracy of the points explain. */
+  usable_residual_std_px: number | null;
+  /** largest displacement of a corner or the centre when a part of the points is held out: the worst place, the median over the draws. */
+  usable_displacement_px: number | null;
+  /** the limits of displacement and CE90 as shares of the CE90 of the points, where these allow more than the limits in pixels. Points coarser than the pixels still make a model several times better than they are (SRP: corners within 0.3 m with points of 3 m). */
+  usable_displacement_of_points: number | null;
+  /** largest predicted CE90 of the correction over the image. */
+  usable_ce90_px: number | null;
+  /** the limits of displacement and CE90 as shares of the CE90 of the points, where these allow more than the limits in pixels. Points coarser than the pixels still make a model several times better than they are (SRP: corners within 0.3 m with points of 3 m). */
+  usable_ce90_of_points: number | null;
+  /** cells of the coverage along each side of the image. */
+  coverage_cells: number;
+  /** nodes of the predicted accuracy along each side of the image. */
+  grid: number;
+  /** number of repeated adjustments in the stability test. */
+  draws: number;
+  /** share of the active points in each draw. */
+  kept_share: number | null;
 }
 
 /** A quantile of a sample with a confidence interval that assumes no law. */
@@ -227,58 +343,126 @@ export interface Quantile {
   note: string;
 }
 
-/** How many points left for one reason. */
+/** Number of points that are not active for one reason. */
 export interface ReasonCount {
   /** "not matched", or "deactivated" after a match. */
-  stage: string;
-  /** as given by the matching or the adjustment. */
+  stage: "not matched" | "deactivated";
+  /** code given by the matching or the adjustment. */
   reason: string;
-  /** points. */
+  /** what the code means, for people. */
+  label: string;
+  /** number of points. */
   count: number;
 }
 
-/** The record of one registration, as `report.json` holds it. */
+/** How places are matched on a reference. */
+export interface ReferenceMatchingOptions {
+  /** side of the window of the reference that is correlated, pixels of the level; odd. */
+  window_px: number;
+  /** when a correlation peak is accepted. */
+  correlation: CorrelationOptions;
+}
+
+/** Options of a registration on a reference ortho-image. */
+export interface ReferenceOptions {
+  /** number of places searched at the finest level, evenly over the scene. */
+  places: number;
+  /** number of places searched at the coarser levels; where less than a quarter of them agree, `places` are searched. */
+  leading_places: number;
+  /** the first level is so coarse that three standard deviations of the model are at most this many of its pixels. */
+  first_radius_px: number;
+  /** largest number of searches at the finest level, each through the last model. */
+  fine_stages: number;
+  /** a search at the finest level that moves every corner of the image by at most this many pixels of the level is the last. */
+  settled_px: number | null;
+  /** smallest number of whole windows that the scene must hold at a level. */
+  enough: number;
+  /** a first consensus with more expected false alarms than this is refused. */
+  max_false_alarms: number | null;
+  /** how places are searched. */
+  matching: ReferenceMatchingOptions;
+}
+
+/** The files of the refined model. */
+export interface RefinedModelRecord {
+  /** largest difference between the corrected model and the model in the files; 0 when they carry the correction exactly, null when no model was written. */
+  max_error_px: number | null;
+  /** which files carry the correction, and how well, as a sentence. */
+  note: string;
+}
+
+/** Options of a registration, on control points or on a reference image. */
+export interface RegistrationOptions {
+  /** largest number of points tried, well spread over the image; 0 tries all points. */
+  max_points: number;
+  /** number of searches with the fine chips, each through the last model. */
+  fine_stages: number;
+  /** of the random draws of the stability test. */
+  seed: number;
+  /** of the coarse search. */
+  coarse: CoarseOptions;
+  /** how points are searched. */
+  matching: MatchingOptions;
+  /** of the correction. */
+  adjustment: AdjustmentOptions;
+  /** thresholds of the verdict. */
+  qualification: QualificationOptions;
+  /** of a registration on a reference image. */
+  reference: ReferenceOptions;
+}
+
+/** The report of one registration. */
 export interface Report {
   /** of the document, with its version. */
-  format: "amers-registration-report/1";
-  /** of Amers. */
-  software_version: string;
-  /** UTC. */
-  started_at: string | null;
-  /** UTC. */
-  finished_at: string | null;
+  format: "amers-registration-report/2";
+  /** how and when the registration was run. */
+  run: RunRecord;
   /** "good", "usable" or "failed"; follows from the criteria alone. */
   verdict: "good" | "usable" | "failed";
-  /** every threshold with the value held against it. */
+  /** what the verdict means, for people. */
+  verdict_explanation: string;
+  /** every figure that has a limit. */
   criteria: Criterion[];
   /** what was registered. */
   scene: SceneRecord;
-  /** whether on control points or on a reference image. */
-  method: "control points" | "reference image";
-  /** whose points were used; the reference image, where that was. */
-  blocks: BlockUsed[];
-  /** what was found. */
+  /** of the model of the scene. */
   correction: CorrectionRecord;
-  /** rounds of matching, in order. */
-  passes: SearchStage[];
+  /** the files that carry the correction. */
+  refined_model: RefinedModelRecord;
+  /** the searches of the points, in order. */
+  search_stages: SearchStage[];
   /** points visible, matched and active. */
-  equipment: PointCounts;
+  point_counts: PointCounts;
   /** why points are not active, commonest first. */
   reasons: ReasonCount[];
   /** of the active points; x along samples, y along lines. */
   image_residuals_px: ImageResiduals;
   /** of the active points; no heights, which a single scene does not give. */
   ground_residuals_m: GroundResiduals;
-  /** the adjustment redone without a part of its points; not absolute accuracy. */
+  /** the adjustment repeated without a part of its points; not absolute accuracy. */
   stability: Stability;
   /** accuracy by the covariance of the correction. */
   predicted: PredictedAccuracy;
   /** of the image by active points. */
   coverage: Coverage;
-  /** against points that had no part in the registration. */
+  /** accuracy at points that had no part in the registration. */
   checks: Check[];
-  /** of the registration, as it was run. */
-  options: Record<string, unknown>;
+}
+
+/** How and when a registration was run. */
+export interface RunRecord {
+  /** of Amers. */
+  software_version: string;
+  /** UTC; None when unknown. */
+  started_at: string | null;
+  /** UTC; None when unknown. */
+  finished_at: string | null;
+  /** whether on control points or on a reference image. */
+  method: "control points" | "reference image";
+  /** the blocks whose points were used, or the reference image. */
+  blocks: BlockUsed[];
+  /** of the registration. */
+  options: RegistrationOptions;
 }
 
 /** The scene that was registered. */
@@ -293,7 +477,7 @@ export interface SceneRecord {
   samples: number;
   /** ground sampling at the centre, metres. */
   gsd_m: number | null;
-  /** kind of the delivered model. */
+  /** kind of the delivered model, such as "RPC". */
   model: string;
   /** accuracy of the model before registration, one standard deviation a coordinate, metres. */
   sigma_m: number | null;
@@ -301,37 +485,37 @@ export interface SceneRecord {
   footprint_lon_lat: Numbers[];
 }
 
-/** One search of the points through one model. */
+/** Summary of one search of the points through one model. */
 export interface SearchStage {
-  /** "coarse" or "fine". */
+  /** "coarse" or "fine" on control points, "reference" on a reference image. */
   name: string;
-  /** ground sampling of the chips. */
+  /** ground sampling of the chips that were searched. */
   chip_gsd_m: number | null;
-  /** how far they were searched. */
+  /** search radius on the ground. */
   search_radius_m: number | null;
-  /** numbers of points: searched, found, and part of the consensus. */
+  /** numbers of points searched, found, and in agreement with each other. */
   tried: number;
-  /** numbers of points: searched, found, and part of the consensus. */
+  /** numbers of points searched, found, and in agreement with each other. */
   matched: number;
-  /** numbers of points: searched, found, and part of the consensus. */
-  agreeing: number;
-  /** how far the agreeing points lay from where they were expected, root mean square. */
-  move_m: number | null;
+  /** numbers of points searched, found, and in agreement with each other. */
+  inliers: number;
+  /** distance of the inliers from their expected positions, root mean square. */
+  displacement_rms_m: number | null;
 }
 
-/** The adjustment redone without a part of its points. Shows stability, not absolute accuracy. */
+/** The adjustment repeated without a part of its points. It shows stability, not absolute accuracy. */
 export interface Stability {
-  /** of the active points in each draw. */
+  /** share of the active points in each draw. */
   kept_share: number | null;
-  /** adjustments that succeeded. */
+  /** number of adjustments that succeeded. */
   draws: number;
-  /** adjustments that gave no solution. */
+  /** number of adjustments that gave no solution. */
   failed_draws: number;
-  /** points held out of each draw. */
+  /** number of points held out of each draw. */
   held_out_per_draw: number;
   /** of the four corners and the centre; empty when no draw succeeded. */
   displacements: Displacement[];
-  /** residuals of the points held out, all draws together; a point counts once in each draw it was held out of. */
+  /** residuals of the points held out, all draws together; a point counts once in each draw that it was held out of. */
   held_out_px: ImageResiduals;
   /** the same on the ground, by the ground sampling of the image. */
   held_out_m: ImageResiduals;
@@ -349,4 +533,20 @@ export interface Statistics {
   std: number | null;
   /** about zero. */
   rms: number | null;
+}
+
+/** Differences between a view and a scene that have equal weight. */
+export interface ViewDistanceScales {
+  /** angle between the lines of sight. */
+  direction_deg: number | null;
+  /** difference of the days of the year. */
+  season_days: number | null;
+  /** differences of the direction of the sun. */
+  sun_elevation_deg: number | null;
+  /** differences of the direction of the sun. */
+  sun_azimuth_deg: number | null;
+  /** distance of a view by another sensor. */
+  sensor: number | null;
+  /** loss of health; see `types.health`. */
+  health: number | null;
 }

@@ -5,7 +5,7 @@ from typing import Literal
 from uuid import UUID
 
 from app.api.models.base import Count, Reply
-from app.db.blocks import BlockState
+from app.db.schema import BlockState
 
 
 class BlockRecord(Reply):

@@ -10,7 +10,7 @@ from uuid import UUID
 from pydantic import ConfigDict, Field
 
 from app.api.models.base import JsonObject, Link, Missing, Reply, missing
-from app.db.jobs.jobs import JobState
+from app.db.schema import JobState
 
 Percent = Annotated[int, Field(ge=0, le=100)]
 

@@ -6,8 +6,7 @@ from uuid import UUID
 
 from app.api.models.base import Reply
 from app.api.models.features import AnyGeometry
-from app.db.scenes import SceneState
-from app.db.uploads import Purpose
+from app.db.schema import SceneState, UploadPurpose
 
 
 class Scene(Reply):
@@ -48,7 +47,7 @@ class Upload(Reply):
 
     id: UUID
     state: Literal["arriving", "finished"]
-    purpose: Purpose
+    purpose: UploadPurpose
     name: str
     offset: int
     size_bytes: int
