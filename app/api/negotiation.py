@@ -84,14 +84,14 @@ def chosen_format(request: Request, formats: Mapping[str, str], f: str | None) -
     return min(accepted)[2] if accepted else next(iter(formats))
 
 
-def refuse_unknown(request: Request, known: set[str]) -> None:
+def refuse_unknown(request: Request, parameters: set[str]) -> None:
     """Refuse parameters that the endpoint does not have, as OGC API requires.
 
     Raises:
         InvalidParameter: there are some; the message names them.
     """
-    unknown = sorted(set(request.query_params) - known)
+    unknown = sorted(set(request.query_params) - parameters)
     if unknown:
         raise InvalidParameter(
-            f"{', '.join(unknown)[:200]}: no such parameter; there are {', '.join(sorted(known))}"
+            f"{', '.join(unknown)[:200]}: no such parameter; there are {', '.join(sorted(parameters))}"
         )

@@ -12,7 +12,7 @@ from app.api.body import STALLED_S
 
 
 class Streamed(StreamingResponse):
-    """A reply in pieces; its database connection is held until all are sent or the reader is gone.
+    """A reply in pieces; its database connection is in use until all are sent or the reader is gone.
 
     The pieces are made in a thread of their own, because the threads of endpoints may all wait for a
     connection. There are at most as many such replies at once as there are connections.

@@ -151,7 +151,7 @@ def send(
     except WrongChecksum as wrong:
         return problem(CHECKSUM_MISMATCH, str(wrong), title="Checksum Mismatch", headers=TUS)
     except ClientDisconnect:
-        return problem(400, "the connection broke; the bytes that have arrived are kept", headers=TUS)
+        return problem(400, "the connection broke; the bytes that arrived are stored", headers=TUS)
     return Response(status_code=204, headers=_headers(upload) | {"Upload-Offset": str(arrived)})
 
 

@@ -9,7 +9,7 @@ Schema = dict[str, Any]
 
 
 def _simplify(schema: Schema) -> None:
-    """Describe members without titles, and one that is not required as missing or known, never null."""
+    """Drop the titles of members, and null from the types of members that may be missing."""
     required = schema.get("required", [])
     for name, member in schema.get("properties", {}).items():
         member.pop("title", None)
