@@ -1,4 +1,4 @@
-"""Questions and orders that must be refused: of queries, filters, searches, executions, places."""
+"""Requests that must be refused: queries, filters, searches, executions, paths."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,12 +19,12 @@ class Bad:
     """A request that must be refused.
 
     Attributes:
-        name: what is wrong with it.
-        says: what the refusal names.
-        who: whose token it carries.
-        status: None: any refusal will do.
-        json, content: of the body; `<name>` in them, path and headers is an id of the installation.
-        metadata: of an upload by tus.
+        name: what is wrong with the request.
+        says: text that the refusal contains.
+        who: the caller whose token the request carries.
+        status: expected status; None accepts every 4xx.
+        json, content: the body; `<name>` in it, path and headers is an id of the installation.
+        metadata: metadata of a tus upload.
     """
 
     name: str
@@ -39,11 +39,11 @@ class Bad:
     metadata: dict[str, str] = field(default_factory=dict)
 
 
-def asked(name: str, query: str, says: str) -> Bad:
-    return Bad(f"query {name}", "GET", f"{ITEMS}?{query}", says, "read", 400)
+def query(name: str, parameters: str, says: str) -> Bad:
+    return Bad(f"query {name}", "GET", f"{ITEMS}?{parameters}", says, "read", 400)
 
 
-def filtered(name: str, text: str, says: str = "filter") -> Bad:
+def text_filter(name: str, text: str, says: str = "filter") -> Bad:
     return Bad(
         f"filter {name}",
         "POST",
@@ -55,7 +55,7 @@ def filtered(name: str, text: str, says: str = "filter") -> Bad:
     )
 
 
-def filtered_json(name: str, value: Any, says: str = "filter") -> Bad:
+def json_filter(name: str, value: Any, says: str = "filter") -> Bad:
     return Bad(
         f"filter json {name}",
         "POST",
@@ -67,11 +67,11 @@ def filtered_json(name: str, value: Any, says: str = "filter") -> Bad:
     )
 
 
-def searched(name: str, says: str, **members: Any) -> Bad:
+def search(name: str, says: str, **members: Any) -> Bad:
     return Bad(f"search {name}", "POST", SEARCH, says, "read", None, members)
 
 
-def executed(
+def execution(
     name: str, says: str, inputs: Any, process: str = "register-scene", who: str = "register"
 ) -> Bad:
     path = f"/processes/{process}/execution"
@@ -90,84 +90,84 @@ def deep_json_filter(depth: int) -> dict[str, Any]:
 
 
 QUERIES = [
-    asked("limit zero", "limit=0", "limit"),
-    asked("limit negative", "limit=-5", "limit"),
-    asked("limit no number", "limit=ten", "limit"),
-    asked("limit a fraction", "limit=1.5", "limit"),
-    asked("limit infinite", "limit=inf", "limit"),
-    asked("bbox of three numbers", "bbox=1,2,3", "bbox"),
-    asked("bbox of seven numbers", "bbox=1,2,3,4,5,6,7", "bbox"),
-    asked("bbox not numbers", "bbox=a,b,c,d", "bbox"),
-    asked("bbox NaN", "bbox=nan,0,1,1", "bbox"),
-    asked("bbox infinite", "bbox=-inf,-inf,inf,inf", "bbox"),
-    asked("bbox beyond the poles", "bbox=0,-91,1,91", "bbox"),
-    asked("bbox upside down", "bbox=0,2,1,1", "bbox"),
-    asked("bbox of huge numbers", f"bbox={HUGE},0,1,1", "bbox"),
-    asked("bbox with SQL", "bbox=0,0,1,1);drop table point;--", "bbox"),
-    asked("bbox empty", "bbox=", "bbox"),
-    asked("bbox in an unknown system", "bbox=0,0,1,1&bbox-crs=urn:x", "bbox-crs"),
-    asked("crs a file", "crs=file:///etc/passwd", "crs"),
-    asked("crs an address", "crs=http://169.254.169.254/latest", "crs"),
-    asked("crs unknown", "crs=http://www.opengis.net/def/crs/EPSG/0/999999", "crs"),
-    asked("datetime no time", "datetime=yesterday", "datetime"),
-    asked("datetime month 13", "datetime=2024-13-01", "datetime"),
-    asked("datetime backwards", "datetime=2024-02-01/2024-01-01", "datetime"),
-    asked("datetime of three", "datetime=2024-01-01/2024-02-01/2024-03-01", "datetime"),
-    asked("datetime with SQL", "datetime=2024-01-01'%20or%201=1--", "datetime"),
-    asked("sort by what is not there", "sortby=password", "sortby"),
-    asked("sort by SQL", "sortby=saliency%20desc;select%20pg_sleep(9)", "sortby"),
-    asked("sort by a column of the table that is none of the collection", "sortby=chip_file", "sortby"),
-    asked("properties not there", "properties=secret_hash", "properties"),
-    asked("properties with SQL", "properties=id,(select%20secret_hash%20from%20token)", "properties"),
-    asked("an unknown parameter", "where=1=1", "where"),
-    asked("a page token made up", "token=AAAA", "token"),
-    asked("a page token of base64 garbage", "token=eyJhIjoxfQ==.xxxx", "token"),
-    asked("a page token not ASCII", "token=%F0%9F%92%A9", "token"),
-    asked("a page token of NUL", "token=%00", "token"),
-    asked("a format that is none", "f=exe", "f"),
-    asked("a format with a path", "f=../../etc/passwd", "f"),
-    asked("filter language unknown", "filter=true&filter-lang=sql", "filter-lang"),
-    asked("filter system unknown", "filter=true&filter-crs=urn:x", "filter-crs"),
-    asked("a filter that is not UTF-8", "filter=%FF%FE%FA", "filter"),
-    asked("a filter with NUL", "filter=typology='a%00b'", ""),
-    asked("a typology with NUL", "typology=a%00b", ""),
+    query("limit zero", "limit=0", "limit"),
+    query("limit negative", "limit=-5", "limit"),
+    query("limit no number", "limit=ten", "limit"),
+    query("limit a fraction", "limit=1.5", "limit"),
+    query("limit infinite", "limit=inf", "limit"),
+    query("bbox of three numbers", "bbox=1,2,3", "bbox"),
+    query("bbox of seven numbers", "bbox=1,2,3,4,5,6,7", "bbox"),
+    query("bbox not numbers", "bbox=a,b,c,d", "bbox"),
+    query("bbox NaN", "bbox=nan,0,1,1", "bbox"),
+    query("bbox infinite", "bbox=-inf,-inf,inf,inf", "bbox"),
+    query("bbox beyond the poles", "bbox=0,-91,1,91", "bbox"),
+    query("bbox upside down", "bbox=0,2,1,1", "bbox"),
+    query("bbox of huge numbers", f"bbox={HUGE},0,1,1", "bbox"),
+    query("bbox with SQL", "bbox=0,0,1,1);drop table point;--", "bbox"),
+    query("bbox empty", "bbox=", "bbox"),
+    query("bbox in an unknown system", "bbox=0,0,1,1&bbox-crs=urn:x", "bbox-crs"),
+    query("crs a file", "crs=file:///etc/passwd", "crs"),
+    query("crs an address", "crs=http://169.254.169.254/latest", "crs"),
+    query("crs unknown", "crs=http://www.opengis.net/def/crs/EPSG/0/999999", "crs"),
+    query("datetime no time", "datetime=yesterday", "datetime"),
+    query("datetime month 13", "datetime=2024-13-01", "datetime"),
+    query("datetime backwards", "datetime=2024-02-01/2024-01-01", "datetime"),
+    query("datetime of three", "datetime=2024-01-01/2024-02-01/2024-03-01", "datetime"),
+    query("datetime with SQL", "datetime=2024-01-01'%20or%201=1--", "datetime"),
+    query("sort by what is not there", "sortby=password", "sortby"),
+    query("sort by SQL", "sortby=saliency%20desc;select%20pg_sleep(9)", "sortby"),
+    query("sort by a column of the table that the collection lacks", "sortby=chip_file", "sortby"),
+    query("properties not there", "properties=secret_hash", "properties"),
+    query("properties with SQL", "properties=id,(select%20secret_hash%20from%20token)", "properties"),
+    query("an unknown parameter", "where=1=1", "where"),
+    query("a page token made up", "token=AAAA", "token"),
+    query("a page token of base64 garbage", "token=eyJhIjoxfQ==.xxxx", "token"),
+    query("a page token not ASCII", "token=%F0%9F%92%A9", "token"),
+    query("a page token of NUL", "token=%00", "token"),
+    query("an unknown format", "f=exe", "f"),
+    query("a format with a path", "f=../../etc/passwd", "f"),
+    query("filter language unknown", "filter=true&filter-lang=sql", "filter-lang"),
+    query("filter system unknown", "filter=true&filter-crs=urn:x", "filter-crs"),
+    query("a filter that is not UTF-8", "filter=%FF%FE%FA", "filter"),
+    query("a filter with NUL", "filter=typology='a%00b'", ""),
+    query("a typology with NUL", "typology=a%00b", ""),
 ]
 FILTERS = [
-    filtered("SQL after it", "saliency > 0; drop table point"),
-    filtered("SQL in a text that is closed", "typology = 'x' or 1=1 --'"),
-    filtered("a union", "saliency > 0 union select secret_hash from token"),
-    filtered("a subquery", "saliency > (select 1)"),
-    filtered("a function of the database", "pg_sleep(10) = 1"),
-    filtered("a function that reads files", "pg_read_file('/etc/passwd') = 'x'"),
-    filtered("a function that asks others", "dblink('host=1.2.3.4','select 1') = 1"),
-    filtered("a property of another table", "secret_hash = 'x'"),
-    filtered("a property of the system", "ctid = '(0,1)'"),
-    filtered("a quoted name with SQL", '"saliency"" or true --" > 0'),
-    filtered("a comment", "saliency /* */ > 0"),
-    filtered("an open quotation", "typology = 'x"),
-    filtered("an open parenthesis", "((saliency > 0)"),
-    filtered("parentheses too deep", "(" * 60 + "saliency > 0" + ")" * 60),
-    filtered("too long", "saliency > 0 and " * 2000 + "saliency > 0"),
-    filtered("empty", " "),
-    filtered("a number where a condition belongs", "1"),
-    filtered("a text compared with a number", "saliency = 'x'"),
-    filtered("a number beyond all numbers", f"saliency > 1e{HUGE}"),
-    filtered("a geometry that is none", "s_intersects(geometry, POINT(a b))"),
-    filtered("a geometry of NaN", "s_intersects(geometry, POINT(nan nan))"),
-    filtered("a polygon that is open", "s_intersects(geometry, POLYGON((0 0, 1 0, 1 1)))"),
-    filtered("a relation unknown", "s_eats(geometry, POINT(0 0))"),
-    filtered("a relation without an argument", "s_intersects(geometry)"),
-    filtered("a time that is none", "t_after(first_view, TIMESTAMP('tomorrow'))"),
-    filtered("NUL", "typology = '\0'"),
-    filtered("a lone surrogate", "typology = '\ud800'"),
-    filtered_json("an unknown operator", {"op": "exec", "args": [1]}),
-    filtered_json("no arguments", {"op": "="}),
-    filtered_json("arguments of a wrong kind", {"op": "=", "args": "x"}),
-    filtered_json(
+    text_filter("SQL after it", "saliency > 0; drop table point"),
+    text_filter("SQL in a text that is closed", "typology = 'x' or 1=1 --'"),
+    text_filter("a union", "saliency > 0 union select secret_hash from token"),
+    text_filter("a subquery", "saliency > (select 1)"),
+    text_filter("a function of the database", "pg_sleep(10) = 1"),
+    text_filter("a function that reads files", "pg_read_file('/etc/passwd') = 'x'"),
+    text_filter("a function that asks others", "dblink('host=1.2.3.4','select 1') = 1"),
+    text_filter("a property of another table", "secret_hash = 'x'"),
+    text_filter("a property of the system", "ctid = '(0,1)'"),
+    text_filter("a quoted name with SQL", '"saliency"" or true --" > 0'),
+    text_filter("a comment", "saliency /* */ > 0"),
+    text_filter("an open quotation", "typology = 'x"),
+    text_filter("an open parenthesis", "((saliency > 0)"),
+    text_filter("parentheses too deep", "(" * 60 + "saliency > 0" + ")" * 60),
+    text_filter("too long", "saliency > 0 and " * 2000 + "saliency > 0"),
+    text_filter("empty", " "),
+    text_filter("a number where a condition belongs", "1"),
+    text_filter("a text compared with a number", "saliency = 'x'"),
+    text_filter("a number beyond all numbers", f"saliency > 1e{HUGE}"),
+    text_filter("a geometry that is none", "s_intersects(geometry, POINT(a b))"),
+    text_filter("a geometry of NaN", "s_intersects(geometry, POINT(nan nan))"),
+    text_filter("a polygon that is open", "s_intersects(geometry, POLYGON((0 0, 1 0, 1 1)))"),
+    text_filter("a relation unknown", "s_eats(geometry, POINT(0 0))"),
+    text_filter("a relation without an argument", "s_intersects(geometry)"),
+    text_filter("a time that is none", "t_after(first_view, TIMESTAMP('tomorrow'))"),
+    text_filter("NUL", "typology = '\0'"),
+    text_filter("a lone surrogate", "typology = '\ud800'"),
+    json_filter("an unknown operator", {"op": "exec", "args": [1]}),
+    json_filter("no arguments", {"op": "="}),
+    json_filter("arguments of a wrong kind", {"op": "=", "args": "x"}),
+    json_filter(
         "a property that is SQL", {"op": "=", "args": [{"property": 'id"; drop table point; --'}, 1]}
     ),
-    filtered_json("a property that is a list", {"op": "=", "args": [{"property": ["id"]}, 1]}),
-    filtered_json("too deep", deep_json_filter(100)),
+    json_filter("a property that is a list", {"op": "=", "args": [{"property": ["id"]}, 1]}),
+    json_filter("too deep", deep_json_filter(100)),
     body(
         "filter far too deep",
         SEARCH,
@@ -177,45 +177,43 @@ FILTERS = [
         + b"]}" * 800
         + b"}",
     ),
-    filtered_json(
+    json_filter(
         "too many nodes",
         {"op": "or", "args": [{"op": "=", "args": [{"property": "saliency"}, i]} for i in range(2000)]},
     ),
-    filtered_json("a function", {"op": "pg_sleep", "args": [10]}),
-    filtered_json("like with a number", {"op": "like", "args": [{"property": "typology"}, 3]}),
-    filtered_json("in without a list", {"op": "in", "args": [{"property": "typology"}, "x"]}),
-    filtered_json("a list", [1, 2]),
-    searched("an unknown member", "where", where="1=1"),
-    searched(
+    json_filter("a function", {"op": "pg_sleep", "args": [10]}),
+    json_filter("like with a number", {"op": "like", "args": [{"property": "typology"}, 3]}),
+    json_filter("in without a list", {"op": "in", "args": [{"property": "typology"}, "x"]}),
+    json_filter("a list", [1, 2]),
+    search("an unknown member", "where", where="1=1"),
+    search(
         "a polygon of one point", "geometry", intersects={"type": "Polygon", "coordinates": [[[0, 0]]]}
     ),
-    searched(
+    search(
         "a geometry of an unknown kind",
         "geometry",
         intersects={"type": "Sphere", "coordinates": [0, 0]},
     ),
-    searched(
-        "coordinates of texts", "geometry", intersects={"type": "Point", "coordinates": ["a", "b"]}
-    ),
-    searched(
+    search("coordinates of texts", "geometry", intersects={"type": "Point", "coordinates": ["a", "b"]}),
+    search(
         "coordinates beyond the Earth",
         "geometry",
         intersects={"type": "Point", "coordinates": [999, 999]},
     ),
-    searched("no coordinates", "geometry", intersects={"type": "Point"}),
-    searched(
+    search("no coordinates", "geometry", intersects={"type": "Point"}),
+    search(
         "a polygon that crosses itself",
         "geometry",
         intersects={"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [1, 0], [0, 1], [0, 0]]]},
     ),
-    searched(
+    search(
         "too many corners",
         "positions",
         intersects={"type": "LineString", "coordinates": [[i / 1e4, 0] for i in range(10_500)]},
     ),
-    searched("a limit that is a text", "limit", limit="many"),
-    searched("a limit that is negative", "limit", limit=-1),
-    searched("a limit that is huge", "limit", limit=-(10**40)),
+    search("a limit that is a text", "limit", limit="many"),
+    search("a limit that is negative", "limit", limit=-1),
+    search("a limit that is huge", "limit", limit=-(10**40)),
     body(
         "search NaN",
         SEARCH,
@@ -241,55 +239,57 @@ FILTERS = [
     body("search too large", SEARCH, b'{"filter": "' + b"a" * BODY_LIMIT_BYTES + b'"}', "larger"),
 ]
 EXECUTIONS = [
-    executed("nothing", "scene", {}),
-    executed("a scene that is no id", "scene", {"scene": "../../etc/passwd"}),
-    executed("a scene that is a number", "scene", {"scene": 7}),
-    executed("a scene that is null", "scene", {"scene": None}),
-    executed("a scene that is SQL", "scene", {"scene": "' or 1=1 --"}),
-    executed("a scene that is not there", "no scene", {"scene": NO_ID}),
-    executed("the scene of somebody else", "no scene", {"scene": "<others_scene>"}),
-    executed("an unknown input", "sceen", {"scene": "<own_scene>", "sceen": 1}),
-    executed(
+    execution("nothing", "scene", {}),
+    execution("a scene that is no id", "scene", {"scene": "../../etc/passwd"}),
+    execution("a scene that is a number", "scene", {"scene": 7}),
+    execution("a scene that is null", "scene", {"scene": None}),
+    execution("a scene that is SQL", "scene", {"scene": "' or 1=1 --"}),
+    execution("a scene that is not there", "no scene", {"scene": NO_ID}),
+    execution("the scene of somebody else", "no scene", {"scene": "<others_scene>"}),
+    execution("an unknown input", "sceen", {"scene": "<own_scene>", "sceen": 1}),
+    execution(
         "a model with a path", "model", {"scene": "<own_scene>", "model": "../../../outside/canary.txt"}
     ),
-    executed("a model with an absolute path", "model", {"scene": "<own_scene>", "model": "/etc/passwd"}),
-    executed(
+    execution(
+        "a model with an absolute path", "model", {"scene": "<own_scene>", "model": "/etc/passwd"}
+    ),
+    execution(
         "a model of GDAL's virtual files",
         "model",
         {"scene": "<own_scene>", "model": "/vsicurl/http://127.0.0.1/x"},
     ),
-    executed("options that are a list", "options", {"scene": "<own_scene>", "options": []}),
-    executed("an option unknown", "fine_pases", {"scene": "<own_scene>", "options": {"fine_pases": 1}}),
-    executed(
+    execution("options that are a list", "options", {"scene": "<own_scene>", "options": []}),
+    execution("an option unknown", "fine_pases", {"scene": "<own_scene>", "options": {"fine_pases": 1}}),
+    execution(
         "an option of a wrong type",
         "max_points",
         {"scene": "<own_scene>", "options": {"max_points": "all"}},
     ),
-    executed(
+    execution(
         "an option that is null", "max_points", {"scene": "<own_scene>", "options": {"max_points": None}}
     ),
-    executed("inputs that are a list", "inputs", []),
-    executed("inputs that are a text", "inputs", "scene"),
-    executed("an unknown process", "no process", {}, "drop-table"),
-    executed("a process with a path", "", {}, "..%2f..%2fadmin"),
-    executed("an ingestion without the scope", "scope", {"path": "x"}, "ingest-block"),
-    executed("an ingestion of nothing", "path", {}, "ingest-block", "admin"),
-    executed(
+    execution("inputs that are a list", "inputs", []),
+    execution("inputs that are a text", "inputs", "scene"),
+    execution("an unknown process", "no process", {}, "drop-table"),
+    execution("a process with a path", "", {}, "..%2f..%2fadmin"),
+    execution("an ingestion without the scope", "scope", {"path": "x"}, "ingest-block"),
+    execution("an ingestion of nothing", "path", {}, "ingest-block", "admin"),
+    execution(
         "an ingestion of an upload that is not there",
         "no uploaded",
         {"upload": NO_ID},
         "ingest-block",
         "admin",
     ),
-    executed(
+    execution(
         "an ingestion with priority NaN as text",
         "priority",
         {"path": "x", "priority": "NaN"},
         "ingest-block",
         "admin",
     ),
-    executed("an export of nothing", "bbox", {}, "export-block", "admin"),
-    executed(
+    execution("an export of nothing", "bbox", {}, "export-block", "admin"),
+    execution(
         "an export of a box of texts", "bbox", {"bbox": ["a", "b", "c", "d"]}, "export-block", "admin"
     ),
     body(
@@ -378,4 +378,4 @@ PLACES = [
     Bad("a method that is not for this", "DELETE", "/collections", "", status=405),
     Bad("a path that leads nowhere", "GET", "/.env", "", status=404),
 ]
-QUESTIONS = [*QUERIES, *FILTERS, *EXECUTIONS, *PLACES]
+BAD_REQUESTS = [*QUERIES, *FILTERS, *EXECUTIONS, *PLACES]

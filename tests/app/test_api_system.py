@@ -1,4 +1,4 @@
-"""The landing page, health, access, and the replies to requests that cannot be served."""
+"""The landing page, health checks, access by scopes, and replies to errors."""
 
 import pytest
 from fastapi import FastAPI
@@ -12,16 +12,16 @@ from app.main import create_app
 from app.usecases.tokens import create_token, list_tokens
 from services.errors import NotEnoughPoints
 
-DOORS = {"read": Reader, "register": Registrar, "admin": Admin}
+SCOPES = {"read": Reader, "register": Registrar, "admin": Admin}
 
 
 @pytest.fixture
 def app(settings):
     """The application with endpoints of the tests beside its own."""
     app = create_app(settings)
-    for name, caller in DOORS.items():
-        app.add_api_route(f"/probe/{name}", probe(caller))
-    app.add_api_route("/probe/points", probe(PointsReader))
+    for name, caller in SCOPES.items():
+        app.add_api_route(f"/scope/{name}", endpoint_for(caller))
+    app.add_api_route("/scope/points", endpoint_for(PointsReader))
 
     @app.get("/number/{number}")
     def number(number: int, database: DatabaseDep) -> int:
@@ -52,11 +52,11 @@ def app(settings):
     return app
 
 
-def probe(caller: type) -> object:
-    def enter(caller: caller) -> str:
+def endpoint_for(caller: type) -> object:
+    def show_caller(caller: caller) -> str:
         return caller.name if caller else "anybody"
 
-    return enter
+    return show_caller
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def client(app):
 
 
 def refused(reply, status: int) -> dict:
-    """The problem details of a reply, after a check that they are what RFC 9457 says."""
+    """The problem details of a reply, checked against RFC 9457."""
     assert reply.status_code == status, reply.text
     assert reply.headers["content-type"] == error_responses.PROBLEM_JSON
     problem = reply.json()
@@ -77,7 +77,7 @@ def refused(reply, status: int) -> dict:
     return problem
 
 
-def test_the_landing_page_links_to_what_there_is(client, bearer):
+def test_every_link_of_the_landing_page_works(client, bearer):
     page, headers = client.get("/").json(), bearer("register")
     for link in page["links"]:
         assert client.get(link["href"], headers=headers).status_code == 200, link
@@ -88,7 +88,7 @@ def test_a_ready_service_has_a_database_that_answers(client):
     assert client.get("/readyz").json() == {"status": "ready"}
 
 
-def test_connections_that_the_database_has_ended_are_noticed_before_they_are_used(client, dsn):
+def test_connections_that_the_database_has_closed_are_replaced_before_use(client, dsn):
     ours = "datname = current_database() and pid <> pg_backend_pid()"
     with engine.connect(dsn) as connection:
         connection.execute(f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}")
@@ -100,16 +100,16 @@ def test_the_description_of_the_api_is_openapi_3_1(client):
     assert client.get("/api").json()["openapi"].startswith("3.1")
 
 
-@pytest.mark.parametrize("path", ["/probe/read", "/probe/register", "/probe/admin", "/probe/points"])
-def test_a_door_is_closed_to_callers_without_a_token(client, path):
+@pytest.mark.parametrize("path", ["/scope/read", "/scope/register", "/scope/admin", "/scope/points"])
+def test_an_endpoint_refuses_callers_without_a_token(client, path):
     reply = client.get(path)
     refused(reply, 401)
     assert reply.headers["www-authenticate"].startswith("Bearer")
 
 
 @pytest.mark.parametrize("header", ["Bearer wrong", "Bearer ", "Basic dTpw", "nonsense", "Bearer \x00"])
-@pytest.mark.parametrize("path", ["/probe/read", "/probe/points"])
-def test_a_wrong_token_is_refused_and_never_taken_for_none(client, settings, path, header):
+@pytest.mark.parametrize("path", ["/scope/read", "/scope/points"])
+def test_an_invalid_token_is_refused_and_never_treated_as_no_token(client, settings, path, header):
     public = TestClient(client.app)
     client.app.state.settings = settings.model_copy(update={"public_points": True})
     refused(public.get(path, headers={"Authorization": header}), 401)
@@ -120,24 +120,24 @@ def test_a_wrong_token_is_refused_and_never_taken_for_none(client, settings, pat
     [
         ("read", {"read", "points"}),
         ("register", {"read", "register", "points"}),
-        ("admin", {*DOORS, "points"}),
+        ("admin", {*SCOPES, "points"}),
     ],
 )
-def test_a_token_opens_the_doors_of_its_scope(client, bearer, scope, opened):
+def test_a_token_opens_the_endpoints_of_its_scope(client, bearer, scope, opened):
     headers = bearer(scope)
-    for name in (*DOORS, "points"):
-        reply = client.get(f"/probe/{name}", headers=headers)
+    for name in (*SCOPES, "points"):
+        reply = client.get(f"/scope/{name}", headers=headers)
         if name in opened:
             assert reply.json() == f"a token to {scope}"
         else:
             assert "scope" in refused(reply, 403)["detail"]
 
 
-def test_points_are_open_to_anybody_only_where_the_setting_says_so(client, settings):
-    refused(client.get("/probe/points"), 401)
+def test_points_are_open_without_a_token_only_if_the_setting_allows_it(client, settings):
+    refused(client.get("/scope/points"), 401)
     client.app.state.settings = settings.model_copy(update={"public_points": True})
-    assert client.get("/probe/points").json() == "anybody"
-    refused(client.get("/probe/read"), 401)
+    assert client.get("/scope/points").json() == "anybody"
+    refused(client.get("/scope/read"), 401)
 
 
 def test_a_wrong_parameter_is_named(client):
@@ -166,7 +166,7 @@ def test_a_body_over_the_limit_is_refused_announced_or_not(client, settings):
     assert client.post("/scenes/echo", content=body, headers=json).status_code == 200
 
 
-def test_an_unexpected_error_says_nothing_of_the_inside(client):
+def test_the_reply_to_an_unexpected_error_reveals_nothing(client):
     @client.app.get("/broken")
     def broken() -> None:
         raise KeyError("the inside")
@@ -182,7 +182,7 @@ def test_a_request_that_takes_the_database_too_long_is_stopped(app, settings, ds
         assert "too long" in refused(client.get("/slow"), 503)["detail"]
 
 
-def test_a_request_is_kept_whole_or_not_at_all(client, connection):
+def test_a_request_is_stored_completely_or_not_at_all(client, connection):
     assert client.post("/token/whole").status_code == 200
     assert [token.name for token in list_tokens(connection)] == ["whole"]
     refused(client.post("/token/spoiled"), 409)

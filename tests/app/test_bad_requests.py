@@ -1,4 +1,4 @@
-"""Requests that are wrong or mean harm: a clear 4xx, and nothing is changed or told."""
+"""Wrong and hostile requests: each is refused with a clear 4xx, changes nothing and reveals nothing."""
 
 import json
 from base64 import b64encode
@@ -10,12 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.app.bad_deliveries import DELIVERIES
-from tests.app.bad_requests import JSON, QUESTIONS, Bad
+from tests.app.bad_requests import BAD_REQUESTS, JSON, Bad
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import make_flat_world
 from tests.app.hostile_installation import CANARY, Installation, hostile_installation, told
 
-CASES = [*QUESTIONS, *DELIVERIES]
+CASES = [*BAD_REQUESTS, *DELIVERIES]
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def store(cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Install
         yield store
 
 
-def replied(store: Installation, case: Bad) -> httpx.Response:
-    """The reply to a case, with the ids of the installation in it."""
+def reply_to(store: Installation, case: Bad) -> httpx.Response:
+    """The reply to a case, whose placeholders are replaced by ids of the installation."""
     headers = {name: store.filled(value).encode("latin-1") for name, value in case.headers.items()}
     if case.metadata:
         pairs = (
@@ -54,7 +54,7 @@ def replied(store: Installation, case: Bad) -> httpx.Response:
 
 @pytest.fixture
 def untouched(store: Installation) -> Iterator[None]:
-    """All rows and files are the same after a test."""
+    """Checks that a test changes no row and no file."""
     before = store.known_digest()
     yield
     assert store.digest() == before
@@ -62,7 +62,7 @@ def untouched(store: Installation) -> Iterator[None]:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_bad_request_is_refused_clearly_and_changes_nothing(store: Installation, untouched, case: Bad):
-    reply = replied(store, case)
+    reply = reply_to(store, case)
     assert 400 <= reply.status_code < 500, f"{reply.status_code} {reply.text[:500]}"
     assert case.status in (None, reply.status_code), f"{reply.status_code} {reply.text[:500]}"
     assert reply.headers["content-type"] == "application/problem+json"
@@ -115,6 +115,6 @@ def test_a_filter_of_any_text_is_answered_or_refused_and_nothing_else(
     assert reply.status_code in (200, 400, 422), reply.text
 
 
-def test_there_are_as_many_bad_requests_as_were_promised():
+def test_there_are_at_least_200_different_bad_requests():
     names = [case.name for case in CASES]
     assert len(set(names)) == len(names) >= 200

@@ -1,6 +1,6 @@
-"""The service held to its own description: cases made from it, valid and not, by schemathesis.
+"""The service follows its own description: schemathesis makes valid and invalid requests from it.
 
-AMERS_API_CASES says how many cases an operation gets, a few if it is not set.
+AMERS_API_CASES sets the number of cases for each operation, 5 by default.
 """
 
 import os
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.long
 CASES = int(os.environ.get("AMERS_API_CASES", "5"))
 CONFIG = {
     "generation": {"max-examples": CASES, "deterministic": "AMERS_API_CASES" not in os.environ},
-    # Every edge of every parameter by itself: thousands of cases.
+    # The phase tries every limit of every parameter: thousands of cases.
     "phases": {"coverage": {"enabled": "AMERS_API_CASES" in os.environ}},
 }
 CHECKS = [
@@ -35,8 +35,8 @@ CHECKS = [
     content_type_conformance,
     response_schema_conformance,
 ]
-THERE_ARE = {"point_id": 2**26 + 7, "feature_id": 2**26 + 7, "reference": "calanques", "view": 2}
-"""What paths can name in the store of the tests; half of the cases do."""
+EXISTING = {"point_id": 2**26 + 7, "feature_id": 2**26 + 7, "reference": "calanques", "view": 2}
+"""Identifiers of things in the store of the tests; half of the cases use them."""
 
 DESCRIPTION = schemathesis.openapi.from_dict(
     create_app(Settings(data_folder=Path("unused"))).openapi(),
@@ -51,19 +51,19 @@ def served(cluster, tmp_path_factory) -> Iterator[Served]:
 
 
 @schemathesis.serializer("application/offset+octet-stream")
-def as_it_is(context, value):
+def raw_bytes(context, value):
     return value if isinstance(value, bytes) else str(value).encode()
 
 
 @DESCRIPTION.hook
 def map_path_parameters(context, path_parameters):
-    """Half of the paths lead to something."""
+    """Use existing identifiers in half of the cases."""
     if not path_parameters or len(str(path_parameters)) % 2:
         return path_parameters
-    return {name: THERE_ARE.get(name, value) for name, value in path_parameters.items()}
+    return {name: EXISTING.get(name, value) for name, value in path_parameters.items()}
 
 
 @DESCRIPTION.parametrize()
-def test_every_reply_is_one_that_the_description_of_the_api_knows(case, served):
+def test_every_reply_follows_the_description_of_the_api(case, served):
     reply = case.call(base_url=served.url, headers=served.authorization)
     case.validate_response(reply, checks=CHECKS, headers=served.authorization)

@@ -16,7 +16,7 @@ export interface Accuracy {
   le90_m: Quantile | null;
 }
 
-/** How and when an image was taken. */
+/** Sensor, time and geometry of the acquisition of an image. */
 export interface Acquisition {
   /** name of the image, unique within a block. */
   image_id: string;
@@ -24,9 +24,9 @@ export interface Acquisition {
   sensor: string;
   /** UTC, None when unknown. */
   acquired_at: string | null;
-  /** angle between the vertical and the line of sight at the ground, at the centre. */
+  /** angle at the ground between the vertical and the line of sight of the image centre; NaN when unknown. */
   incidence_deg: number | null;
-  /** from the ground to the sensor, clockwise from north. */
+  /** direction from the ground to the sensor, clockwise from north; NaN when unknown. */
   azimuth_deg: number | null;
   /** at the centre of the image; NaN when unknown. */
   sun_elevation_deg: number | null;
