@@ -1,4 +1,4 @@
-"""`amers demo`: the main job on a simulated world, with nothing to configure."""
+"""`amers demo`: the whole work on a simulated world, with nothing to configure."""
 
 import shutil
 import tempfile
@@ -20,27 +20,29 @@ MARK = ".amers-demo"
 
 
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of its own, made anew.")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder; emptied first.")] = Path(
         "demo-output"
     ),
     as_json: AsJson = False,
 ) -> None:
-    """Run the main job on a simulated world: images, block, store, registration, report."""
-    folder = _emptied(output)
+    """Run the whole work on a simulated world: images, block, store, registration, report."""
+    folder = _empty_folder(output)
     with _private_store() as settings, shown_progress() as progress:
         outcome = run_demo(folder, settings, DemoOptions(), progress)
     if as_json:
         show_one(_record(outcome), as_json=True)
         return
     show(_rows(outcome), as_json=False)
-    typer.echo(f"\nThe report: {outcome.report.absolute()}")
+    typer.echo(f"\nReport: {outcome.report.absolute()}")
 
 
-def _emptied(folder: Path) -> Path:
-    """The folder, empty; only what an earlier demonstration left is deleted."""
+def _empty_folder(folder: Path) -> Path:
+    """Empty or create a folder; only the outputs of an earlier demonstration are deleted."""
     if folder.exists() and any(folder.iterdir()):
         if not (folder / MARK).is_file():
-            raise InputError(f"{folder}: holds something else than an earlier demonstration")
+            raise InputError(
+                f"--output: {folder} has other files than an earlier demonstration; choose another folder"
+            )
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MARK).touch()
@@ -49,9 +51,9 @@ def _emptied(folder: Path) -> Path:
 
 @contextmanager
 def _private_store() -> Iterator[Settings]:
-    """A store for the demonstration alone: simulated points must not meet real ones."""
+    """Settings of a temporary store: simulated points must not mix with real ones."""
     folder = Path(tempfile.mkdtemp(prefix="amers-demo-"))
-    # The database server of an administrator runs as another user, who has to pass.
+    # Started by root, the database server runs as another user, who has to enter the folder.
     folder.chmod(0o711)
     try:
         yield Settings(database_url=None, data_folder=folder)
@@ -62,9 +64,9 @@ def _private_store() -> Iterator[Settings]:
 def _record(outcome: DemoOutcome) -> Row:
     counts = outcome.registration.qualification.point_counts
     return {
-        "points produced": outcome.produced,
-        "points ingested": outcome.ingested,
-        "points served in the footprint": outcome.served,
+        "points produced": outcome.counts.produced,
+        "points ingested": outcome.counts.ingested,
+        "points served in the footprint": outcome.counts.served,
         "points visible": counts.visible,
         "points matched": counts.matched,
         "points active": counts.active,

@@ -1,4 +1,4 @@
-"""A service of Amers, as a command asks it: upload, execute, watch, download."""
+"""Client of an Amers service: upload a scene, execute its registration, wait, download the results."""
 
 import json
 import time
@@ -19,12 +19,12 @@ from services.types import Progress
 CHUNK_BYTES = 1 << 20
 POLL_S = 0.5
 UPLOAD_SHARE = 0.2
-"""Share of the progress that the upload is."""
+"""Share of the upload in the progress."""
 TIMEOUT_S = 60.0
 
 
 class ServiceFailure(RuntimeError):
-    """The service does not answer, or not as it should."""
+    """The service does not answer, or not as expected."""
 
 
 class Service:
@@ -45,34 +45,37 @@ class Service:
     def register(
         self, files: SceneFiles, folder: Path, progress: Progress, copy_image: bool = False
     ) -> dict[str, Any]:
-        """Have a scene registered and download what came out of it.
+        """Register a scene on the service and download the outputs.
 
         Args:
             files: of the scene.
-            folder: for what comes out of it.
-            progress: told where the work stands.
-            copy_image: also have a GeoTIFF copied, with the refined model in its tags.
+            folder: for the outputs.
+            progress: receives the fraction done and a message.
+            copy_image: also copy a GeoTIFF, with the refined model in its tags.
 
         Returns:
             The report as a document.
 
         Raises:
-            InputError: the scene is not usable, or the service refuses what is asked of it.
+            InputError: the scene cannot be used, or the service refuses a request.
             ComputationError: the scene could not be registered.
-            ServiceFailure: the service does not answer, or not as it should.
+            ServiceFailure: the service does not answer, or not as expected.
         """
-        given = [path for path in (files.mask, files.check_points) if path is not None]
-        beside = [*_files_beside(files), *given]
+        optional_files = [path for path in (files.mask, files.check_points) if path is not None]
+        side_files = [*_model_files(files), *optional_files]
         scene = self._upload_scene(files, progress)
-        names = {path: self._upload_model(scene, path) for path in beside}
-        named = {"model": files.model, "mask": files.mask, "check_points": files.check_points}
-        asked = {name: names[path] for name, path in named.items() if path is not None}
-        said = {"bands": files.bands, "check_heights": files.check_heights}
-        asked |= {name: value for name, value in said.items() if value is not None}
-        inputs = {"scene": scene, "copy_image": copy_image, **asked}
+        names = {path: self._upload_side_file(scene, path) for path in side_files}
+        paths = {"model": files.model, "mask": files.mask, "check_points": files.check_points}
+        values = {"bands": files.bands, "check_heights": files.check_heights}
+        inputs = {
+            "scene": scene,
+            "copy_image": copy_image,
+            **{name: names[path] for name, path in paths.items() if path is not None},
+            **{name: value for name, value in values.items() if value is not None},
+        }
         execution = "processes/register-scene/execution"
-        job = self._ask("POST", execution, json={"inputs": inputs}).json()
-        job = self._watch(job, progress)
+        job = self._request("POST", execution, json={"inputs": inputs}).json()
+        job = self._wait(job, progress)
         if job["status"] != "successful":
             raise _failure(job)
         self._download(job["jobID"], folder)
@@ -82,7 +85,7 @@ class Service:
     def _upload_scene(self, files: SceneFiles, progress: Progress) -> str:
         size = files.image.stat().st_size
         query = {"name": files.image.name, "sigma_m": files.sigma_m}
-        reply = self._ask(
+        reply = self._request(
             "POST",
             "scenes",
             params={name: value for name, value in query.items() if value is not None},
@@ -91,25 +94,28 @@ class Service:
         )
         return str(reply.json()["id"])
 
-    def _upload_model(self, scene: str, path: Path) -> str:
-        """Name under which the service has the file."""
+    def _upload_side_file(self, scene: str, path: Path) -> str:
+        """Upload a file beside the image of a scene; returns the name that the service gives it."""
         with path.open("rb") as file:
-            reply = self._ask("PUT", f"scenes/{scene}/files/{quote(path.name, safe='')}", content=file)
+            reply = self._request(
+                "PUT", f"scenes/{scene}/files/{quote(path.name, safe='')}", content=file
+            )
         return str(reply.json()["name"])
 
-    def _watch(self, job: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    def _wait(self, job: dict[str, Any], progress: Progress) -> dict[str, Any]:
+        """Wait until a job has ended; returns its last status."""
         while job["status"] in ("accepted", "running"):
             time.sleep(POLL_S)
-            job = self._ask("GET", f"jobs/{job['jobID']}").json()
+            job = self._request("GET", f"jobs/{job['jobID']}").json()
             progress(UPLOAD_SHARE + (1.0 - UPLOAD_SHARE) * job["progress"] / 100.0, job["message"])
         return job
 
     def _download(self, job_id: str, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        results = self._ask("GET", f"jobs/{job_id}/results").json()
+        results = self._request("GET", f"jobs/{job_id}/results").json()
         for name in (name for name, value in results.items() if isinstance(value, dict)):
             if Path(name).name != name:
-                raise ServiceFailure(f"the service names a file {name!r}")
+                raise ServiceFailure(f"the service names a result {name!r}, which is not a file name")
             with self._http.stream("GET", f"jobs/{job_id}/results/{name}") as reply:
                 if reply.is_error:
                     raise ServiceFailure(f"{reply.url}: {reply.status_code} {reply.reason_phrase}")
@@ -117,10 +123,10 @@ class Service:
                     for chunk in reply.iter_bytes(CHUNK_BYTES):
                         file.write(chunk)
 
-    def _ask(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """A reply that is not an error."""
+    def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """The reply to a request; error replies raise."""
         try:
-            reply = self._http.request(method, path, **request)
+            reply = self._http.request(method, path, **options)
         except httpx.HTTPError as error:
             raise ServiceFailure(f"{self._http.base_url}: {error}") from error
         if reply.is_client_error:
@@ -130,8 +136,8 @@ class Service:
         return reply
 
 
-def _files_beside(files: SceneFiles) -> list[Path]:
-    """The files with the model of a scene, which is looked at before anything is sent.
+def _model_files(files: SceneFiles) -> list[Path]:
+    """The files with the model of a scene, which is read to check it before anything is sent.
 
     Raises:
         FormatError: the scene has no usable model.
@@ -149,7 +155,7 @@ def _chunks(path: Path, size: int, progress: Progress) -> Iterator[bytes]:
 
 
 def _failure(job: dict[str, Any]) -> AmersError | ServiceFailure:
-    """The error that ended a job, of the kind it was over there."""
+    """The error that ended a job, of the same kind as on the service."""
     kind = getattr(errors, job.get("error", {}).get("error", ""), None)
     if isinstance(kind, type) and issubclass(kind, ComputationError):
         return ComputationError(job["message"])

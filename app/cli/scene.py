@@ -1,4 +1,4 @@
-"""`amers scene`: scenes and their registration."""
+"""`amers scene`: register and orthorectify scenes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,173 +18,181 @@ from app.storage import open_storage
 from app.usecases.orthorectification import OrthoMap, run_orthorectification
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.reference_source import ReferenceFiles, this_reference
-from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
+from app.usecases.registration.reference_source import ReferenceFiles, given_reference
+from app.usecases.registration.register import (
+    ControlSources,
+    SceneFiles,
+    image_key,
+    record_registration,
+    run_registration,
+)
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
-from services.registration.options import RegistrationOptions
 from services.reports.document import report_document
 from services.types import Progress
 
-app = typer.Typer(help="Scenes and their registration.", no_args_is_help=True)
+app = typer.Typer(help="Register and orthorectify scenes.", no_args_is_help=True)
 
 Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
-"""Registers one scene, writes what came out of it into a folder, returns the report as a document; the
-last says whether its image is copied."""
-
-
-@app.callback()
-def group() -> None:
-    """Scenes and their registration."""
+"""Registers one scene into a folder and returns its report; the last argument copies the image too."""
 
 
 @app.command()
 def register(
     scenes: Annotated[list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    *,
     block: Annotated[
-        Path | None, typer.Option(help="Take the points from this block folder; no database.")
+        Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
     ] = None,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Ortho-image to register on; beside --block, where the block has no point."),
+        typer.Option(help="Ortho-image to register on; with --block only where it has no points."),
     ] = None,
     dem: Annotated[
-        Path | None, typer.Option(help="GeoTIFF with the heights of the ground of the reference.")
+        Path | None, typer.Option(help="GeoTIFF with the heights of the reference's ground.")
     ] = None,
     vertical: Annotated[
-        str | None, typer.Option(help="What these heights are counted from: ellipsoid, EGM96, EPSG:…")
+        str | None, typer.Option(help="Vertical datum of these heights: ellipsoid, EGM96, EPSG:…")
     ] = None,
     geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the model, metres.", min=0.01)
+        float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(help="File of the model, if it is not found by itself.")
+        Path | None, typer.Option(help="File of the model; by default it is found by its name.")
     ] = None,
     bands: Annotated[
-        str | None, typer.Option(help="Looked at: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
+        str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Image of the same ground, not zero where not to look.")
+        Path | None, typer.Option(help="Image of the same ground; pixels that are not 0 are not used.")
     ] = None,
     check_points: Annotated[
         Path | None, typer.Option(help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.")
     ] = None,
     check_heights: Annotated[
         str | None,
-        typer.Option(
-            help="What their heights are above, where the file does not say: ellipsoid, EPSG:…"
-        ),
+        typer.Option(help="Vertical datum of the check points, if not in the file: ellipsoid, EPSG:…"),
     ] = None,
     copy_image: Annotated[
-        bool, typer.Option("--copy-image", help="Copy a GeoTIFF, the refined model in its tags.")
+        bool, typer.Option("--copy-image", help="Copy a GeoTIFF with the refined model in its tags.")
     ] = False,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder; one inside it for each of several scenes.")
+        Path, typer.Option("-o", "--output", help="Folder; each of several scenes gets one inside it.")
     ] = Path("registered"),
-    server: Annotated[str | None, typer.Option(help="Let this service do it.")] = None,
+    server: Annotated[
+        str | None, typer.Option(help="Address of an Amers service that does the registration.")
+    ] = None,
     token: Annotated[
         str | None,
-        typer.Option(envvar="AMERS_TOKEN", help="For the service; better in the environment."),
+        typer.Option(envvar="AMERS_TOKEN", help="Token for the service; prefer the variable."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Refine the model of scenes on control points: report, points and refined model go into a folder.
+    """Refine the sensor models of scenes on control points; write report, points and refined models.
 
-    Points come from the store unless --block, --reference or --server says otherwise.
+    The points come from the store unless --block, --reference or --server is given.
     """
-    of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
+    files_of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
     _refuse_contradictions(block, reference, dem, server)
-    _refuse_mixed_up(scenes, [name for name, file in of_one.items() if file is not None])
+    _refuse_shared_files(scenes, [name for name, file in files_of_one.items() if file is not None])
     try:
         terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
-        held = None if reference is None else ReferenceFiles(reference, terrain)
-        with _registrar(block, held, server, token) as do:
+        reference_files = None if reference is None else ReferenceFiles(reference, terrain)
+        with _registrar(block, reference_files, server, token) as register_one:
             outcomes = [
-                _one(
-                    do,
+                _outcome(
+                    register_one,
                     SceneFiles(scene, model, sigma_m, bands, mask, check_points, check_heights),
                     folder,
                     copy_image,
                 )
-                for scene, folder in _folders(scenes, output)
+                for scene, folder in _output_folders(scenes, output)
             ]
     except ServiceFailure as failure:
         typer.echo(f"amers: {failure}", err=True)
         raise typer.Exit(1) from failure
-    _show([outcome for outcome in outcomes if isinstance(outcome, dict)], as_json, len(scenes))
+    records = [outcome for outcome in outcomes if isinstance(outcome, dict)]
+    _show(records, as_json=as_json, is_one_scene=len(scenes) == 1)
     _raise_worst([outcome for outcome in outcomes if isinstance(outcome, AmersError)])
 
 
 @app.command()
 def ortho(
     scene: Annotated[Path, typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    *,
     dem: Annotated[Path, typer.Option(help="GeoTIFF with the heights of the ground.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The GeoTIFF to write.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
     model: Annotated[
         Path | None,
-        typer.Option(help="File of the model, refined perhaps, if it is not found by itself."),
+        typer.Option(help="File of the model, such as a refined one; by default found by its name."),
     ] = None,
     vertical: Annotated[
         str | None,
-        typer.Option(help="What the heights are counted from: ellipsoid, EGM96, EGM2008, EPSG:…"),
+        typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…"),
     ] = None,
     geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     fill_px: Annotated[
-        int, typer.Option(help="Fill voids of the terrain from so many nodes away.", min=0, max=50)
+        int, typer.Option(help="Fill voids of the terrain from this many nodes away.", min=0, max=50)
     ] = 0,
     crs: Annotated[
-        str | None, typer.Option(help="Of the map; by default the UTM zone of the centre.")
+        str | None,
+        typer.Option(help="Coordinate reference system of the map; by default the UTM zone."),
     ] = None,
     gsd_m: Annotated[
-        float | None, typer.Option(help="Ground sampling; by default that of the scene.", min=0.001)
+        float | None,
+        typer.Option(help="Ground sampling, metres; by default that of the scene.", min=0.001),
     ] = None,
-    kernel: Annotated[str, typer.Option(help="cubic or bilinear.")] = "cubic",
+    kernel: Annotated[str, typer.Option(help="Interpolation: cubic or bilinear.")] = "cubic",
     tolerance_px: Annotated[
-        float, typer.Option(help="How far positions may be from the model's, pixels.", min=1e-4)
+        float, typer.Option(help="Largest allowed error of the mapping, pixels.", min=1e-4)
     ] = 0.1,
     hide: Annotated[
         bool, typer.Option("--hide", help="Leave out ground that other ground hides from the sensor.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Lay a scene on a map through its model and a terrain: a cloud-optimised GeoTIFF with overviews."""
+    """Orthorectify a scene through its model and a terrain into a cloud-optimised GeoTIFF."""
     if kernel not in ("cubic", "bilinear"):
-        raise InputError(f"--kernel: expected cubic or bilinear, found {kernel}")
-    options = OrthoOptions("cubic" if kernel == "cubic" else "bilinear", tolerance_px, hide)
-    terrain = TerrainFile(dem, vertical, geoid, fill_px)
+        raise InputError(f"--kernel: {kernel} found, cubic or bilinear expected")
     with shown_progress() as progress:
-        made = run_orthorectification(
+        orthorectified = run_orthorectification(
             scene,
-            terrain,
+            TerrainFile(dem, vertical, geoid, fill_px),
             output,
             model=model,
             ortho_map=OrthoMap(crs, gsd_m),
-            options=options,
+            options=OrthoOptions("cubic" if kernel == "cubic" else "bilinear", tolerance_px, hide),
             progress=progress,
         )
-    show_one(asdict(made), as_json=as_json)
+    show_one(asdict(orthorectified), as_json=as_json)
 
 
 def _refuse_contradictions(
     block: Path | None, reference: Path | None, dem: Path | None, server: str | None
 ) -> None:
     if server is not None and (reference is not None or block is not None):
-        raise InputError("--server excludes --reference and --block: the service has its own")
+        raise InputError(
+            "--server: the service uses its own points and references; leave out --block and --reference"
+        )
     if dem is not None and reference is None:
-        raise InputError("--dem is the ground of a --reference")
+        raise InputError("--dem: it has the heights of a reference; add --reference")
 
 
-def _refuse_mixed_up(scenes: list[Path], of_one: list[str]) -> None:
-    """Refuse files of one scene for several, and scenes that would write into the same folder."""
-    if of_one and len(scenes) > 1:
-        raise InputError(f"{', '.join(of_one)}: of one scene, {len(scenes)} given")
+def _refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
+    """Refuse files of one scene with several scenes, and scenes that would share an output folder."""
+    if files_of_one and len(scenes) > 1:
+        raise InputError(
+            f"{', '.join(files_of_one)}: belongs to one scene, but {len(scenes)} scenes are given"
+        )
     names = [scene.stem for scene in scenes]
     if len(set(names)) < len(names):
-        raise InputError("several scenes of the same name would write into the same folder")
+        raise InputError(
+            "several scenes of the same name would write into the same folder; register them separately"
+        )
 
 
-def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
+def _output_folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
     for scene in scenes:
         yield scene, output if len(scenes) == 1 else output / scene.stem
 
@@ -193,70 +201,69 @@ def _folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
 def _registrar(
     block: Path | None, reference: ReferenceFiles | None, server: str | None, token: str | None
 ) -> Iterator[Register]:
-    """How scenes are registered: on a block folder, a reference, the store, or by a service."""
+    """The function that registers scenes: on given files, by a service, or on the store."""
     if block is not None or reference is not None:
         yield _on_files(block, reference)
     elif server is not None:
         with Service(server, token or "") as service:
             yield service.register
     else:
-        with _on_store() as do:
-            yield do
+        with _on_store() as register_one:
+            yield register_one
 
 
 def _on_files(block: Path | None, reference: ReferenceFiles | None) -> Register:
-    find_points = None if block is None else points_of_block(block)
-    find_reference = None if reference is None else this_reference(reference)
+    """A function that registers scenes on a block folder, a reference, or both."""
+    sources = ControlSources(
+        find_points=None if block is None else points_of_block(block),
+        find_reference=None if reference is None else given_reference(reference),
+    )
 
-    def do(files: SceneFiles, folder: Path, progress: Progress, copy_image: bool) -> dict[str, Any]:
-        made = run_registration(
-            files,
-            find_points,
-            RegistrationOptions(),
-            folder,
-            progress,
-            find_reference,
-            copy_image=copy_image,
-        )
-        return report_document(made.report)
+    def register_one(
+        files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
+    ) -> dict[str, Any]:
+        registered = run_registration(files, sources, folder, copy_image=copy_image, progress=progress)
+        return report_document(registered.report)
 
-    return do
+    return register_one
 
 
 @contextmanager
 def _on_store() -> Iterator[Register]:
-    """Registers with the points of the store, which remembers the registration and its measures."""
+    """A function that registers scenes on the store and records the registrations there."""
     settings = read_settings()
     storage = open_storage(settings)
     with engine.opened(settings) as database:
+        sources = ControlSources(
+            points_of_store(database, storage), references_of_store(database, settings)
+        )
 
-        def do(files: SceneFiles, folder: Path, progress: Progress, copy_image: bool) -> dict[str, Any]:
-            made = run_registration(
-                files,
-                points_of_store(database, storage),
-                RegistrationOptions(),
-                folder,
-                progress,
-                references_of_store(database, settings),
-                copy_image=copy_image,
+        def register_one(
+            files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
+        ) -> dict[str, Any]:
+            registered = run_registration(
+                files, sources, folder, copy_image=copy_image, progress=progress
             )
             with database.transaction() as connection:
-                record(connection, made, key_of_file(files.image))
-            return report_document(made.report)
+                record_registration(connection, registered, image_key(files.image))
+            return report_document(registered.report)
 
-        yield do
+        yield register_one
 
 
-def _one(do: Register, files: SceneFiles, folder: Path, copy_image: bool) -> dict[str, Any] | AmersError:
-    """What is shown of one registered scene, or why it was not registered."""
+def _outcome(
+    register_one: Register, files: SceneFiles, folder: Path, copy_image: bool
+) -> dict[str, Any] | AmersError:
+    """The figures to show of one registered scene, or the error that ended its registration."""
     try:
         with shown_progress() as progress:
-            report = do(files, folder, progress, copy_image)
+            report = register_one(files, folder, progress, copy_image)
     except AmersError as error:
         return error
     if report["verdict"] == "failed":
         return ComputationError(
-            f"{files.image}: registered, but not to be trusted: see {folder / 'report.html'}"
+            f"{files.image}: the registration has the verdict failed, do not use its model; see "
+            f"{folder / 'report.html'}"
         )
     counts, correction = report["point_counts"], report["correction"]
     return {
@@ -276,19 +283,19 @@ def _one(do: Register, files: SceneFiles, folder: Path, copy_image: bool) -> dic
 
 
 def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
-    """What is shown of independent check points, if there are any."""
+    """The figures to show of independent check points, if there are any."""
     if not checks:
         return {}
     accuracy = checks[0]["accuracy"]
     return {"check_points": accuracy["n"], "check_ce90_m": accuracy["ce90_m"]["value"]}
 
 
-def _show(records: list[dict[str, Any]], as_json: bool, asked: int) -> None:
+def _show(records: list[dict[str, Any]], *, as_json: bool, is_one_scene: bool) -> None:
     if as_json:
-        print_json(records[0] if asked == 1 and records else records)
+        print_json(records[0] if is_one_scene and records else records)
         return
-    for found in records:
-        show_one({name: _rounded(value) for name, value in found.items()}, as_json=False)
+    for record in records:
+        show_one({name: _rounded(value) for name, value in record.items()}, as_json=False)
 
 
 def _rounded(value: Any) -> Any:
@@ -300,7 +307,7 @@ def _rounded(value: Any) -> Any:
 
 
 def _raise_worst(errors: list[AmersError]) -> None:
-    """Tell every error; the last one told ends the command, one of the input before one of the data."""
+    """Print all errors but one, which is raised: an error of the input rather than of a computation."""
     ordered = sorted(errors, key=lambda error: not isinstance(error, ComputationError))
     for error in ordered[:-1]:
         typer.echo(f"amers: {error}", err=True)

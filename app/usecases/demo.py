@@ -1,4 +1,4 @@
-"""The main job on a simulated world, where the truth is known: images, block, store, scene, report."""
+"""The whole work on a simulated world, compared with the truth: images, block, store, scene, report."""
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -12,14 +12,19 @@ from app.storage import open_storage
 from app.usecases.blocks import lifecycle
 from app.usecases.production import BlockIdentity, run_production
 from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import SceneFiles, key_of_file, record, run_registration
+from app.usecases.registration.register import (
+    ControlSources,
+    SceneFiles,
+    image_key,
+    record_registration,
+    run_registration,
+)
 from services.adjustment.intersection import intersect
 from services.formats.images.raster import write_raster
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.production.from_images import Production, ProductionOptions
 from services.quality.accuracy import Quantile, sample_quantile
 from services.registration.on_points import Registration
-from services.registration.options import RegistrationOptions
 from services.simulation.view import (
     SimulatedView,
     ViewPlan,
@@ -34,18 +39,18 @@ from services.types import Array, Observations, Progress, part_of
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """The simulated world and what happens in it.
+    """Options of the simulated world and of the work in it.
 
     Attributes:
-        seed: of everything random.
+        seed: of all random numbers.
         size_m, posting_m, relief_m: of the world.
-        views: images the block is made from.
+        views: number of images that the block is made from.
         shape: lines and samples of all images.
-        gsd_m: their ground sampling.
-        block_error_m: how far the models of the block's images are wrong, each in its own direction.
-        scene_error_m: east and north, how far the model of the scene is wrong.
-        scene_skew_px: how much it is wrong by more at the edges of the image.
-        production: of the block.
+        gsd_m: ground sampling of all images.
+        block_error_m: error of the models of the block's images, each in a direction of its own.
+        scene_error_m: error of the scene's model, east and north.
+        scene_skew_px: additional error of the scene's model at the edges of the image.
+        production: options of the block.
     """
 
     seed: int = 1
@@ -64,25 +69,32 @@ class DemoOptions:
 
 
 @dataclass(frozen=True)
-class DemoOutcome:
-    """What the demonstration found, beside what is true.
-
-    Attributes:
-        produced, ingested, served: points made, loaded, and returned for the footprint of the scene.
-        registration: of the scene.
-        before_m: CE90 of the scene's model as delivered against the truth.
-        in_frame_px: CE90 of the registered model against the truth moved into the block's frame.
-        absolute_m: CE90 of the registered model against the truth.
-        injected_m: east and north error of the scene's model at its centre.
-        to_recover_m: the same seen from the frame of the block.
-        recovered_m: east and north error the registration found there.
-        frame_error_m: east, north, up error of the frame of the block.
-        report: path of the page.
-    """
+class DemoCounts:
+    """Numbers of points made, loaded into the store, and served for the scene's footprint."""
 
     produced: int
     ingested: int
     served: int
+
+
+@dataclass(frozen=True)
+class DemoOutcome:
+    """The results of the demonstration beside the truth.
+
+    Attributes:
+        counts: of points.
+        registration: of the scene.
+        before_m: CE90 of the scene's delivered model against the truth.
+        in_frame_px: CE90 of the registered model against the truth shifted into the block's frame.
+        absolute_m: CE90 of the registered model against the truth.
+        injected_m: east and north error of the scene's delivered model at its centre.
+        to_recover_m: the same error relative to the block's frame.
+        recovered_m: the error that the registration corrected there, east and north.
+        frame_error_m: error of the block's frame, east, north, up.
+        report: path of the report page.
+    """
+
+    counts: DemoCounts
     registration: Registration
     before_m: Quantile
     in_frame_px: Quantile
@@ -94,28 +106,29 @@ class DemoOutcome:
     report: Path
 
 
+@dataclass(frozen=True)
+class _Truth:
+    """The simulated world, the images of the block and the scene."""
+
+    world: World
+    sources: list[SimulatedView]
+    scene: SimulatedView
+
+
 def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: Progress) -> DemoOutcome:
-    """Simulate, produce, ingest, publish, query, register, compare with the truth.
+    """Simulate, produce, ingest, publish, query, register, and compare with the truth.
 
     Args:
         folder: for images, block and report; must be empty.
         settings: of a store for the demonstration alone.
-        options: of the world.
-        progress: told where the work stands.
+        options: of the world and the work.
+        progress: receives the fraction done and a message.
     """
-    rng = np.random.default_rng(options.seed)
-    progress(0.0, "simulating a world")
-    world = make_world(rng, options.size_m, options.posting_m, options.relief_m)
-    progress(0.05, f"simulating {options.views} images for the block")
-    sources = simulate_block(
-        world, rng, options.views, options.shape, options.gsd_m, options.block_error_m
-    )
-    progress(0.25, "simulating the scene")
-    scene = _scene(world, options, rng)
-    images = [_written(view, folder / "images") for view in sources]
-    image = _written(scene, folder / "images")
+    truth = _simulate(options, progress)
+    images = [_write_image(view, folder / "images") for view in truth.sources]
+    image = _write_image(truth.scene, folder / "images")
 
-    produced = run_production(
+    production = run_production(
         images,
         folder / "block",
         BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),
@@ -130,19 +143,30 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
             ingested = lifecycle.ingest_block(connection, storage, folder / "block")
             lifecycle.publish_block(connection, str(ingested.block.number))
         sigma_m = float(np.hypot(*options.scene_error_m))
+        find_points = points_of_store(database, storage)
         registered = run_registration(
             SceneFiles(image, sigma_m=sigma_m),
-            points_of_store(database, storage),
-            RegistrationOptions(),
+            ControlSources(find_points),
             folder / "registered",
-            part_of(progress, 0.75, 0.25),
+            progress=part_of(progress, 0.75, 0.25),
         )
         with database.transaction() as connection:
-            record(connection, registered, key_of_file(image))
-            served = len(points_of_store(database, storage)(registered.footprint).points)
-    return _compared(
-        world, sources, scene, produced, registered.registration, folder, ingested.block.n_points, served
+            record_registration(connection, registered, image_key(image))
+        n_served = len(find_points(registered.footprint).points)
+    counts = DemoCounts(len(production.points), ingested.block.n_points, n_served)
+    return _compare(truth, production, registered.registration, counts, registered.files["report.html"])
+
+
+def _simulate(options: DemoOptions, progress: Progress) -> _Truth:
+    rng = np.random.default_rng(options.seed)
+    progress(0.0, "simulating a world")
+    world = make_world(rng, options.size_m, options.posting_m, options.relief_m)
+    progress(0.05, f"simulating {options.views} images for the block")
+    sources = simulate_block(
+        world, rng, options.views, options.shape, options.gsd_m, options.block_error_m
     )
+    progress(0.25, "simulating the scene")
+    return _Truth(world, sources, _scene(world, options, rng))
 
 
 def _scene(world: World, options: DemoOptions, rng: np.random.Generator) -> SimulatedView:
@@ -160,27 +184,25 @@ def _scene(world: World, options: DemoOptions, rng: np.random.Generator) -> Simu
     return simulate_view(world, plan, rng, options.scene_error_m, skew_px)
 
 
-def _written(view: SimulatedView, folder: Path) -> Path:
-    """The image with its delivered model, as a file like any other."""
+def _write_image(view: SimulatedView, folder: Path) -> Path:
+    """Write a simulated image with its delivered model as a GeoTIFF; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{view.geometry.plan.image_id}.tif"
     write_raster(path, view.pixels, view.geometry.delivered)
     return path
 
 
-def _compared(
-    world: World,
-    sources: list[SimulatedView],
-    scene: SimulatedView,
-    produced: Production,
+def _compare(
+    truth: _Truth,
+    production: Production,
     registration: Registration,
-    folder: Path,
-    ingested: int,
-    served: int,
+    counts: DemoCounts,
+    report: Path,
 ) -> DemoOutcome:
     """The outcome beside the truth, over a grid of the ground that the scene shows."""
+    world, scene = truth.world, truth.scene
     origin = np.append(world.centre_lon_lat, np.mean(world.height_range_m))
-    frame_m = _frame_error_m(sources, produced, origin)
+    frame_m = _frame_error_m(truth.sources, production, origin)
     ground = _grid(scene, world)
     moved = lon_lat_h_from_east_north_up(east_north_up(ground, origin) + frame_m, origin)
     true_px = true_line_sample(scene, ground)
@@ -196,9 +218,7 @@ def _compared(
         return np.asarray(np.linalg.solve(derivative, error_px[0]), dtype=np.float64)
 
     return DemoOutcome(
-        produced=len(produced.points),
-        ingested=ingested,
-        served=served,
+        counts=counts,
         registration=registration,
         before_m=_ce90((delivered.project(ground) - true_px) * gsd_m),
         in_frame_px=_ce90(model.project(moved) - true_px),
@@ -207,19 +227,19 @@ def _compared(
         to_recover_m=metres(delivered.project(centre_moved) - true_centre),
         recovered_m=metres(delivered.project(centre_moved) - model.project(centre_moved)),
         frame_error_m=frame_m,
-        report=folder / "registered" / "report.html",
+        report=report,
     )
 
 
-def _frame_error_m(sources: list[SimulatedView], produced: Production, origin: Array) -> Array:
-    """East, north, up (3,) from where the block's points really are to where the block says.
+def _frame_error_m(sources: list[SimulatedView], production: Production, origin: Array) -> Array:
+    """East, north, up (3,) from the true positions of the block's points to the positions in the block.
 
-    What an image shows at a position is the same whatever its model: the rays of the true models through
-    the positions the adjusted ones give meet where the point really is.
+    An adjusted model projects a point of the block to the image position that shows it. The rays of the
+    true models through these image positions intersect at the true position of the point.
     """
-    points = produced.points.lon_lat_h
+    points = production.points.lon_lat_h
     n, views = len(points), len(sources)
-    seen = np.stack([model.project(points) for model in produced.adjustment.models], axis=1)
+    seen = np.stack([model.project(points) for model in production.adjustment.models], axis=1)
     rays = Observations(
         np.repeat(np.arange(n), views),
         np.tile(np.arange(views), n),
@@ -233,7 +253,7 @@ def _frame_error_m(sources: list[SimulatedView], produced: Production, origin: A
 
 
 def _grid(scene: SimulatedView, world: World, per_side: int = 21) -> Array:
-    """Ground points (n, 3) that the scene shows, evenly over the image."""
+    """Ground points (n, 3) that the scene shows, on a regular grid of the image."""
     lines, samples = scene.pixels.shape
     axes = np.linspace(0.0, lines - 1.0, per_side), np.linspace(0.0, samples - 1.0, per_side)
     line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Reference images of an installation: registered by an administrator, found for a scene, remembered."""
+"""Reference images of an installation: add, list, find one for a scene, record where scenes matched."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,16 +31,15 @@ LONGEST_NAME = 120
 
 @dataclass(frozen=True)
 class NewReference:
-    """A reference image that an administrator lets scenes be registered on.
+    """A reference image that an administrator adds; paths are relative to AMERS_REFERENCE_FOLDER.
 
     Attributes:
-        name: for people.
-        image: path of the ortho-image below AMERS_REFERENCE_FOLDER.
-        dem: path of the heights of the same place, there too; without it only ortho-images can be
-            registered on the reference.
-        vertical: what the heights are counted from, when the file does not say: ellipsoid, EGM96, EPSG:…
-        geoid: path of a grid file of the geoid, there too, if PROJ has none.
-        sigma_m: how well the image lies on the Earth as a whole, one standard deviation a coordinate.
+        name: for people, unique.
+        image: path of the ortho-image.
+        dem: path of the heights of the same ground; without it only ortho-images can be registered.
+        vertical: vertical datum of the heights (ellipsoid, EGM96, EPSG:…), where the file states none.
+        geoid: path of a grid file of the geoid, where PROJ has none.
+        sigma_m: accuracy of the image's frame on the Earth, one standard deviation per coordinate.
     """
 
     name: str
@@ -52,20 +51,19 @@ class NewReference:
 
 
 def add_reference(connection: Connection, settings: Settings, new: NewReference) -> ReferenceRow:
-    """Let scenes be registered on a reference image; its files are opened and stay where they are.
+    """Add a reference image; its files are opened to check them, and stay in their folder.
 
     Raises:
-        InputError: no folder is open, a file is not below it or cannot be used, or the name is none.
-        Conflict: there is a reference of that name.
+        InputError: AMERS_REFERENCE_FOLDER is not set, or the name or a file cannot be used.
+        Conflict: another reference has this name.
     """
     if not 1 <= len(new.name.strip()) <= LONGEST_NAME:
-        raise InputError(f"name: 1 to {LONGEST_NAME} characters expected, {len(new.name)} found")
+        raise InputError(f"name: {len(new.name)} characters found, 1 to {LONGEST_NAME} expected")
     if new.sigma_m is not None and not 0.0 < new.sigma_m < np.inf:
         raise InputError(f"sigma_m: {new.sigma_m:g} found, more than 0 expected")
-    files = _files(settings, new.image, new.dem, new.vertical, new.geoid, new.sigma_m)
-    held = read_reference(files)
-    assert isinstance(held.model, OrthoModel)
-    scene = Scene(held.image, held.model, Acquisition(new.name), 0.0)
+    reference = read_reference(_reference_files(settings, new))
+    assert isinstance(reference.model, OrthoModel)
+    scene = Scene(reference.image, reference.model, Acquisition(new.name), 0.0)
     row = references.insert_reference(
         connection,
         name=new.name.strip(),
@@ -74,11 +72,11 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
         vertical=new.vertical,
         geoid=new.geoid,
         sigma_m=new.sigma_m,
-        gsd_m=held.model.grid.gsd_m,
+        gsd_m=reference.model.grid.gsd_m,
         outline=scene_footprint(scene),
     )
     if row is None:
-        raise Conflict(f"there is a reference {new.name!r} already")
+        raise Conflict(f"name: there is a reference {new.name!r} already; choose another name")
     return row
 
 
@@ -88,96 +86,98 @@ def list_references(connection: Connection) -> list[ReferenceRow]:
 
 
 def remove_reference(connection: Connection, name: str) -> None:
-    """Use a reference no longer; the places found on it are forgotten, its files stay where they are.
+    """Delete a reference with the places recorded on it; its files stay in their folder.
 
     Raises:
-        NotFound: there is none of that name.
+        NotFound: there is no reference of this name.
     """
     if not references.delete_reference(connection, name):
         raise NotFound(f"no reference {name:.120}")
 
 
 def references_of_store(database: Database, settings: Settings) -> FindReference:
-    """The references of the installation, with the places that earlier scenes were found by."""
+    """A source of the installation's references, with the places where earlier scenes matched them."""
 
     def find(outline: Array) -> FoundReference | None:
-        with database.transaction() as connection:
+        with database.snapshot() as connection:
             row = references.best_reference(connection, outline)
             if row is None:
                 return None
-            known = references.places_inside(connection, row.id, outline, worthwhile=True)
-        files = _files(settings, row.image, row.dem, row.vertical, row.geoid, row.sigma_m)
-        return FoundReference(row.name, files, row.id, row.gsd_m, known.lon_lat_h)
+            places = references.places_inside(connection, row.id, outline, worthwhile=True)
+        return FoundReference(
+            row.name, _reference_files(settings, row), row.id, row.gsd_m, places.lon_lat_h
+        )
 
     return find
 
 
-def keep_places(
+def record_places(
     connection: Connection, found: FoundReference, registration: Registration, outline: Array
 ) -> None:
-    """Remember where a scene was found on a reference, for the next scene of the same ground.
+    """Record where a scene matched a reference, for later scenes of the same ground.
 
-    Places nearer each other than half a search window show the same ground and are one; so many
-    scenes do not leave more places than the ground has room for. A failed registration leaves none.
+    Places nearer to each other than half a search window show the same ground and count as one, so the
+    number of places on a piece of ground is limited. A failed registration is not recorded.
 
     Args:
-        outline: (m, 2) lon, lat that holds the scene.
+        connection: with the transaction that stores the registration.
+        found: the reference.
+        registration: of the scene on the reference.
+        outline: (m, 2) lon, lat that contains the scene.
     """
     if found.id is None or registration.qualification.verdict == "failed":
         return
     if not references.lock_reference(connection, found.id):
         return
     measures = registration.measures
-    tried = np.isfinite(measures.lon_lat_h).all(axis=1) & (measures.reason != "nodata")
-    kept = references.places_inside(connection, found.id, outline, worthwhile=False)
+    is_tried = np.isfinite(measures.lon_lat_h).all(axis=1) & (measures.reason != "nodata")
+    earlier = references.places_inside(connection, found.id, outline, worthwhile=False)
     apart_m = ReferenceMatchingOptions().window_px / 2.0 * found.gsd_m
-    place = ecef_from_lon_lat_h(measures.lon_lat_h[tried])
-    active = measures.active[tried]
-    same = np.full(len(place), len(kept.id))
-    if len(kept.id):
-        _, same = cKDTree(ecef_from_lon_lat_h(kept.lon_lat_h)).query(place, distance_upper_bound=apart_m)
-    again = same < len(kept.id)
-    ids, first = np.unique(same[again], return_inverse=True)
-    seen = np.bincount(first, weights=active[again], minlength=len(ids)) > 0
-    references.count_places(connection, kept.id[ids], seen)
-    new = np.flatnonzero(~again & active)
-    new = new[_apart(place[new], apart_m)]
-    references.insert_places(connection, found.id, measures.lon_lat_h[tried][new])
+    place = ecef_from_lon_lat_h(measures.lon_lat_h[is_tried])
+    is_active = measures.active[is_tried]
+    nearest = np.full(len(place), len(earlier.id))
+    if len(earlier.id):
+        tree = cKDTree(ecef_from_lon_lat_h(earlier.lon_lat_h))
+        _, nearest = tree.query(place, distance_upper_bound=apart_m)
+    is_again = nearest < len(earlier.id)
+    rows, row_of_place = np.unique(nearest[is_again], return_inverse=True)
+    is_matched = np.bincount(row_of_place, weights=is_active[is_again], minlength=len(rows)) > 0
+    references.count_places(connection, earlier.id[rows], is_matched)
+    new = np.flatnonzero(~is_again & is_active)
+    new = new[_mutually_apart(place[new], apart_m)]
+    references.insert_places(connection, found.id, measures.lon_lat_h[is_tried][new])
 
 
-def _apart(ecef: Array, apart_m: float) -> BoolArray:
-    """Places (n, 3) of which none is too near an earlier one of them."""
-    kept = np.ones(len(ecef), dtype=bool)
+def _mutually_apart(ecef: Array, apart_m: float) -> BoolArray:
+    """Which places (n, 3) to take so that no two of them are nearer than a distance; the first stays."""
+    is_taken = np.ones(len(ecef), dtype=bool)
     if len(ecef):
         for first, second in sorted(cKDTree(ecef).query_pairs(apart_m)):
-            kept[second] &= not kept[first]
-    return kept
+            is_taken[second] &= not is_taken[first]
+    return is_taken
 
 
-def _files(
-    settings: Settings,
-    image: str,
-    dem: str | None,
-    vertical: str | None,
-    geoid: str | None,
-    sigma_m: float | None,
-) -> ReferenceFiles:
+def _reference_files(settings: Settings, reference: NewReference | ReferenceRow) -> ReferenceFiles:
     """The files of a reference on this machine.
 
     Raises:
-        InputError: no folder is open, or a path is not one of a file below it.
+        InputError: AMERS_REFERENCE_FOLDER is not set, or a path does not lead to a file below it.
     """
     terrain = None
-    if dem is not None:
-        grid = None if geoid is None else _below(settings, "geoid", geoid)
-        terrain = TerrainFile(_below(settings, "dem", dem), vertical, grid)
-    elif vertical is not None or geoid is not None:
-        raise InputError("vertical, geoid: of the heights of a dem, which is not given")
-    return ReferenceFiles(_below(settings, "image", image), terrain, sigma_m)
+    if reference.dem is not None:
+        geoid = None if reference.geoid is None else _path_below(settings, "geoid", reference.geoid)
+        dem = _path_below(settings, "dem", reference.dem)
+        terrain = TerrainFile(dem, reference.vertical, geoid)
+    elif reference.vertical is not None or reference.geoid is not None:
+        raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
+    image = _path_below(settings, "image", reference.image)
+    return ReferenceFiles(image, terrain, reference.sigma_m)
 
 
-def _below(settings: Settings, name: str, path: str) -> Path:
-    """A file below AMERS_REFERENCE_FOLDER."""
+def _path_below(settings: Settings, field: str, path: str) -> Path:
+    """The path of a file below AMERS_REFERENCE_FOLDER."""
     if settings.reference_folder is None:
-        raise InputError("no reference image can be used: AMERS_REFERENCE_FOLDER is not set")
-    return file_below(settings.reference_folder, path, name, "AMERS_REFERENCE_FOLDER")
+        raise InputError(
+            f"{field}: reference images cannot be used, because AMERS_REFERENCE_FOLDER is not set"
+        )
+    return file_below(settings.reference_folder, path, field, "AMERS_REFERENCE_FOLDER")

@@ -22,12 +22,11 @@ from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.production import BlockIdentity, run_production
 from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import SceneFiles, run_registration
+from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from services.formats.block.check import check_block
 from services.formats.images.raster import write_raster
 from services.imagery.scene import scene_footprint
 from services.production.from_images import ProductionOptions
-from services.registration.options import RegistrationOptions
 from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
 from services.simulation.world import World, make_world
 
@@ -266,8 +265,8 @@ def test_a_scene_is_registered_on_points_of_the_store(
     assert settings.database_url is not None
     files = SceneFiles(made.scene, sigma_m=SIGMA_M)
     with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
-        find = points_of_store(database, storage)
-        done = run_registration(files, find, RegistrationOptions(), tmp_path / "out")
+        sources = ControlSources(points_of_store(database, storage))
+        done = run_registration(files, sources, tmp_path / "out")
     measures = done.registration.measures
     assert measures.active.sum() >= 15
     assert (measures.lon_lat_h[measures.active, 0] > 0.0).any()

@@ -22,7 +22,12 @@ from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.history import record_measures
 from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
+from app.usecases.registration.register import (
+    ControlSources,
+    RegisteredScene,
+    SceneFiles,
+    run_registration,
+)
 from services.formats.block.check import check_block
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
@@ -53,7 +58,12 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 def registered(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> RegisteredScene:
     """The scene registered on all points of the block; ids are those of the block."""
     files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
-    return run_registration(files, points_of_block(world.block), OPTIONS, tmp_path_factory.mktemp("out"))
+    return run_registration(
+        files,
+        ControlSources(points_of_block(world.block)),
+        tmp_path_factory.mktemp("out"),
+        options=OPTIONS,
+    )
 
 
 @pytest.fixture
@@ -269,7 +279,8 @@ def test_the_next_registration_prefers_points_that_have_served(
     files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
 
     def vanished_tried(folder: str) -> int:
-        made = run_registration(files, points_of_store(database, storage), few, tmp_path / folder)
+        sources = ControlSources(points_of_store(database, storage))
+        made = run_registration(files, sources, tmp_path / folder, options=few)
         measures = made.registration.measures
         return int(((measures.reason != "not_tried") & (measures.point_id < first_id + VANISHED)).sum())
 

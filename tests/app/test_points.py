@@ -160,7 +160,7 @@ def test_a_token_of_another_query_is_refused(made, get):
         assert other != link
         reply = get(other)
         assert reply.status_code == 400
-        assert "not of this query" in reply.json()["detail"]
+        assert "does not belong to this query" in reply.json()["detail"]
 
 
 def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(

@@ -23,11 +23,16 @@ from app.usecases.jobs import do_attempt
 from app.usecases.references import (
     NewReference,
     add_reference,
-    keep_places,
+    record_places,
     references_of_store,
     remove_reference,
 )
-from app.usecases.registration.register import RegisteredScene, SceneFiles, run_registration
+from app.usecases.registration.register import (
+    ControlSources,
+    RegisteredScene,
+    SceneFiles,
+    run_registration,
+)
 from services.errors import CoverageError
 from services.imagery.source import ArrayImage, sample_image
 from services.map_grid import MapGrid, xy_of_lon_lat
@@ -96,10 +101,10 @@ def registered(database: Database, settings: Settings, image: Path, output: Path
     """A scene registered as the service would, its places kept."""
     find = references_of_store(database, settings)
     files = SceneFiles(image, sigma_m=SIGMA_M)
-    made = run_registration(files, None, OPTIONS, output, find_reference=find)
+    made = run_registration(files, ControlSources(None, find), output, options=OPTIONS)
     assert made.reference is not None
     with database.transaction() as connection:
-        keep_places(connection, made.reference, made.registration, made.footprint)
+        record_places(connection, made.reference, made.registration, made.footprint)
     return made
 
 
@@ -167,8 +172,8 @@ def test_places_found_are_kept_and_searched_first_in_the_next_scene(
     find = references_of_store(database, settings)
     known = find(first.footprint)
     assert known is not None
-    assert known.known is not None
-    assert len(known.known) == len(once)
+    assert known.earlier_places is not None
+    assert len(known.earlier_places) == len(once)
 
     second = registered(database, settings, folder / "second.tif", tmp_path / "second")
     found = second.registration.adjustment.correction.parameters[:, 0]
@@ -190,12 +195,12 @@ def test_a_failed_registration_leaves_no_places(
 ) -> None:
     find = references_of_store(database, settings)
     files = SceneFiles(folder / "first.tif", sigma_m=SIGMA_M)
-    made = run_registration(files, None, OPTIONS, tmp_path, find_reference=find)
+    made = run_registration(files, ControlSources(None, find), tmp_path, options=OPTIONS)
     assert made.reference is not None
     failed = replace(
         made.registration, qualification=replace(made.registration.qualification, verdict="failed")
     )
-    keep_places(connection, made.reference, failed, made.footprint)
+    record_places(connection, made.reference, failed, made.footprint)
     assert places(connection) == []
 
 
@@ -205,7 +210,7 @@ def test_a_scene_beside_every_reference_says_so(
     files = SceneFiles(folder / "first.tif", sigma_m=SIGMA_M)
     find = references_of_store(database, settings)
     with pytest.raises(CoverageError, match="no reference image shows the ground"):
-        run_registration(files, None, OPTIONS, tmp_path, find_reference=find)
+        run_registration(files, ControlSources(None, find), tmp_path, options=OPTIONS)
 
 
 def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked(

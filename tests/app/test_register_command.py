@@ -219,9 +219,9 @@ def test_the_command_lets_a_service_register(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--reference", "land.tif"), "--server excludes --reference"),
-        (("--block", "folder"), "--server excludes --reference and --block"),
-        (("--dem", "heights.tif"), "--dem is the ground of a --reference"),
+        (("--reference", "land.tif"), "--server: the service uses its own"),
+        (("--block", "folder"), "--server: the service uses its own"),
+        (("--dem", "heights.tif"), "--dem: it has the heights of a reference"),
     ],
 )
 def test_what_a_service_has_of_its_own_is_not_sent_to_it(

@@ -13,9 +13,8 @@ from app.config import Settings
 from app.db import engine
 from app.storage import Storage
 from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.register import SceneFiles, run_registration
+from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from services.formats.sensor_models.rpc_files import read_rpc
-from services.registration.options import RegistrationOptions
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
@@ -164,10 +163,12 @@ def test_block_folder_and_store_give_the_same_registration(
     world: FlatWorld, published: None, settings: Settings, storage: Storage, tmp_path: Path
 ):
     assert settings.database_url is not None
-    files, options = SceneFiles(world.tagged, sigma_m=SIGMA_M), RegistrationOptions()
+    files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
     with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
-        stored = run_registration(files, points_of_store(database, storage), options, tmp_path / "a")
-    folder = run_registration(files, points_of_block(world.block), options, tmp_path / "b")
+        of_store = ControlSources(points_of_store(database, storage))
+        stored = run_registration(files, of_store, tmp_path / "a")
+    of_block = ControlSources(points_of_block(world.block))
+    folder = run_registration(files, of_block, tmp_path / "b")
     assert np.array_equal(stored.registration.measures.active, folder.registration.measures.active)
     difference_px = np.abs(
         stored.registration.adjustment.correction.parameters

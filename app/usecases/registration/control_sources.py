@@ -1,4 +1,4 @@
-"""Where control points of a scene come from: a block folder, or the published blocks of the store."""
+"""Sources of control points for a scene: a block folder, or the published blocks of the store."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,13 +16,14 @@ from services.types import Array, ChipSource, ControlPoints
 
 @dataclass(frozen=True)
 class ControlSet:
-    """Control points of a piece of ground.
+    """Control points of an area.
 
     Attributes:
-        chips: where the chips of the points are.
-        blocks: whose points they are.
-        frame_sigma_m: how well the frame of the worst of them is known, one standard deviation a
-            coordinate; NaN when a block does not say.
+        points: the control points.
+        chips: source of their chips.
+        blocks: that the points come from.
+        frame_sigma_m: accuracy of the worst frame of these blocks, one standard deviation per
+            coordinate; NaN when a block does not state it.
     """
 
     points: ControlPoints
@@ -32,35 +33,38 @@ class ControlSet:
 
 
 FindPoints = Callable[[Array], ControlSet]
-"""Points inside an outline (n, 2) of lon, lat."""
+"""Finds the control points inside an outline (n, 2) of lon, lat."""
 
 
 def points_of_block(folder: Path) -> FindPoints:
-    """Points straight out of a block folder, once it has been checked entirely."""
+    """A source of the points of a block folder, which is checked completely first."""
     contents = check_block(folder)
     metadata = contents.document.metadata
-    said = next((figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m"), None)
+    figures = (figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m")
+    frame_sigma_m = next(figures, None)
 
     def find(outline: Array) -> ControlSet:
         block = BlockUsed(metadata.id, metadata.version)
-        return ControlSet(contents.points, FolderChips(folder), (block,), _frame_sigma_m([said]))
+        return ControlSet(
+            contents.points, FolderChips(folder), (block,), _worst_sigma_m([frame_sigma_m])
+        )
 
     return find
 
 
 def points_of_store(database: Database, storage: Storage) -> FindPoints:
-    """Points of the published blocks of the store."""
+    """A source of the points of the published blocks of the store."""
 
     def find(outline: Array) -> ControlSet:
-        with database.transaction() as connection:
-            found = control_points(connection, outline)
-        blocks = tuple(BlockUsed(block.id, block.version) for block in found.blocks)
-        frame_sigma_m = _frame_sigma_m([block.frame_sigma_m for block in found.blocks])
-        return ControlSet(found.points, StoredChips(storage), blocks, frame_sigma_m)
+        with database.snapshot() as connection:
+            stored = control_points(connection, outline)
+        blocks = tuple(BlockUsed(block.id, block.version) for block in stored.blocks)
+        frame_sigma_m = _worst_sigma_m([block.frame_sigma_m for block in stored.blocks])
+        return ControlSet(stored.points, StoredChips(storage), blocks, frame_sigma_m)
 
     return find
 
 
-def _frame_sigma_m(said: Sequence[float | None]) -> float:
-    """The worst of what blocks say of their frames; NaN when one says nothing."""
-    return math.nan if None in said or not said else max(value for value in said if value is not None)
+def _worst_sigma_m(stated: Sequence[float | None]) -> float:
+    """The largest of the frame sigmas that blocks state; NaN when a block states none."""
+    return math.nan if None in stated or not stated else max(s for s in stated if s is not None)

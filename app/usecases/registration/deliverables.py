@@ -1,4 +1,4 @@
-"""What a registration leaves in a folder: report, control points, refined model."""
+"""The outputs of a registration: write its report and control points, in the formats of many tools."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from services.types import Array, ControlPoints, Measures
 OUTPUTS = {
     "report.json": "The report as a document.",
     "report.html": "The report as a page.",
-    "control_points.geojson": "What happened to each control point.",
+    "control_points.geojson": "The measure of each control point, with its status.",
     "control_points.gcp": "The active control points for the Ames Stereo Pipeline.",
     "control_points.points": "The control points for the georeferencer of QGIS.",
     "control_points.pts": "The active control points for ENVI.",
@@ -26,10 +26,10 @@ OUTPUTS = {
     "control_points_opf.json": "The active control points as OPF 1.0.",
     "gcp_list.txt": "The active control points for OpenDroneMap.",
     "residuals.gpkg": "Residual vectors and control points as layers of a GeoPackage.",
-    "correction.json": "The correction found, whatever the model of the scene.",
+    "correction.json": "The correction, for every kind of sensor model.",
     "refined_RPC.TXT": "The refined model as RPC text, in the pixels of the image, unless none fits.",
 }
-"""What a registration makes; the refined model in the convention of the input comes on top."""
+"""Outputs of a registration; the refined model in the format of the input comes in addition."""
 
 MEDIA_TYPES = {
     ".json": "application/json",
@@ -50,7 +50,7 @@ MEDIA_TYPES = {
 def write_outputs(
     folder: Path, report: RegistrationReport, image: str, points: ControlPoints
 ) -> list[Path]:
-    """The report of a registration and its control points, written into a folder as files.
+    """Write the report of a registration and its control points into a folder; returns the paths.
 
     Args:
         folder: must exist; files of the same names are replaced.
@@ -64,7 +64,7 @@ def write_outputs(
         "report.json": format_report(report),
         "report.html": format_html(report),
         "control_points.geojson": format_measures(measures, image, sigma_m),
-        **_exchanged(measures, image, sigma_m),
+        **_exchange_formats(measures, image, sigma_m),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -73,8 +73,8 @@ def write_outputs(
     return [*(folder / name for name in texts), layers]
 
 
-def _exchanged(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]:
-    """The points that were matched, in the formats of other tools."""
+def _exchange_formats(measures: Measures, image: str, sigma_m: Array) -> dict[str, str]:
+    """The matched points in the formats of other tools, by file name."""
     matched = np.flatnonzero(measures.matched)
     marks = marked_points(
         [str(point) for point in measures.point_id[matched]],

@@ -1,9 +1,9 @@
-"""Registering an uploaded scene as a job, on the points and reference images of the store."""
+"""The process `register-scene`: register an uploaded scene on points and references of the store."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 from uuid import UUID
 
 from app.auth import Scope
@@ -14,7 +14,12 @@ from app.usecases.processes import Commit, Process, Work
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_store
 from app.usecases.registration.deliverables import OUTPUTS
-from app.usecases.registration.register import Method, SceneFiles, record, run_registration
+from app.usecases.registration.register import (
+    ControlSources,
+    SceneFiles,
+    record_registration,
+    run_registration,
+)
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
 from services.formats.images.bands import parse_bands
@@ -22,23 +27,24 @@ from services.imagery.scene import scene_gsd_m
 from services.registration.options import RegistrationOptions
 from services.reports.report import Method as ReportedMethod
 
+Method = Literal["auto", "points", "reference"]
+"""What a scene is registered on: control points, a reference image, or the first of both that exists."""
+
 
 @dataclass(frozen=True)
 class RegisterScene:
-    """What a user says to have a scene registered.
-
-    Files are named that were uploaded beside the image.
+    """The inputs of a registration; files are named as they were uploaded beside the image.
 
     Attributes:
         scene: id of an uploaded scene.
-        model: name of the file that holds its model; by default it is found.
-        method: "points", "reference", or "auto": on points, on a reference where there is none.
-        bands: what is looked at, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic
-            band or the mean of the visible ones.
-        mask: name of an image of the same ground that is not zero where pixels shall not be used.
+        model: name of the file with the scene's model; by default it is found by its name.
+        method: "points", "reference", or "auto": on points, and where there are none on a reference.
+        bands: bands to use, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic band or
+            the mean of the visible ones.
+        mask: name of an image of the same ground; pixels are not used where it is not zero.
         check_points: name of a file with points that are held out of the registration.
-        check_heights: what the heights in it are above, where its format cannot say.
-        copy_image: whether a GeoTIFF is delivered again with the refined model in its tags.
+        check_heights: vertical datum of the check points' heights, where their format cannot state it.
+        copy_image: whether a GeoTIFF is copied to the outputs with the refined model in its tags.
         options: of the registration.
     """
 
@@ -61,54 +67,67 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
 
 
 def _run(work: Work) -> Commit:
-    """Register an uploaded scene; the files are in the storage before the rows that name them."""
+    """Register an uploaded scene and put the outputs into the storage before rows refer to them."""
     inputs: RegisterScene = work.inputs
-    with work.database.transaction() as connection:
+    with work.database.reading() as connection:
         scene = present_scene(connection, inputs.scene)
-    find_points = points_of_store(work.database, work.storage)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
-        made = run_registration(
-            _files_of(inputs, image, scene.sigma_m),
-            find_points,
-            inputs.options,
+        registered = run_registration(
+            _scene_files(inputs, image, scene.sigma_m),
+            _control_sources(work, inputs.method),
             Path(folder),
-            work.progress,
-            references_of_store(work.database, work.settings),
-            inputs.method,
-            inputs.copy_image,
+            options=inputs.options,
+            copy_image=inputs.copy_image,
+            progress=work.progress,
         )
-        gsd_m = scene_gsd_m(made.scene)
+        gsd_m = scene_gsd_m(registered.scene)
         keys = {
             name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
-            for name, path in made.files.items()
+            for name, path in registered.files.items()
         }
 
     def commit(connection: Connection) -> dict[str, Any]:
-        key = scene.sha256 or f"scene {scene.id}"
-        record(connection, made, key, job_id=work.job.id, scene_id=inputs.scene, keys=keys)
-        scenes.set_footprint(connection, inputs.scene, made.footprint)
-        taken, shape = made.scene.acquisition, made.scene.image.shape
-        scenes.describe(connection, inputs.scene, taken, shape, gsd_m)
-        return {"verdict": made.report.verdict, "method": made.report.run.method, "files": keys}
+        scene_key = scene.sha256 or f"scene {scene.id}"
+        record_registration(
+            connection, registered, scene_key, job_id=work.job.id, scene_id=scene.id, keys=keys
+        )
+        scenes.set_footprint(connection, scene.id, registered.footprint)
+        acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
+        scenes.describe(connection, scene.id, acquisition, shape, gsd_m)
+        return {
+            "verdict": registered.report.verdict,
+            "method": registered.report.run.method,
+            "files": keys,
+        }
 
     return commit
 
 
-def _files_of(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
-    """The files of a scene that lie beside its image, by the names they were uploaded under."""
+def _control_sources(work: Work, method: Method) -> ControlSources:
+    """The sources of control in the store that a method allows."""
+    points = points_of_store(work.database, work.storage)
+    references = references_of_store(work.database, work.settings)
+    return ControlSources(
+        find_points=None if method == "reference" else points,
+        find_reference=None if method == "points" else references,
+    )
+
+
+def _scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
+    """The files of a scene, which lie beside its image under the names of the inputs."""
 
     def beside(name: str | None) -> Path | None:
         return None if name is None else image.with_name(name)
 
     return SceneFiles(
-        image,
-        beside(inputs.model),
-        sigma_m,
-        inputs.bands,
-        beside(inputs.mask),
-        beside(inputs.check_points),
-        inputs.check_heights,
+        image=image,
+        model=beside(inputs.model),
+        sigma_m=sigma_m,
+        bands=inputs.bands,
+        mask=beside(inputs.mask),
+        check_points=beside(inputs.check_points),
+        check_heights=inputs.check_heights,
     )
 
 
@@ -122,7 +141,7 @@ REGISTER_SCENE = Process(
     check=_check,
     run=_run,
     values={
-        "verdict": {"enum": ["good", "usable", "failed"], "title": "How good it is"},
-        "method": {"enum": list(get_args(ReportedMethod)), "title": "What it was registered on"},
+        "verdict": {"enum": ["good", "usable", "failed"], "title": "Verdict on the registration"},
+        "method": {"enum": list(get_args(ReportedMethod)), "title": "Control that was used"},
     },
 )

@@ -1,4 +1,4 @@
-"""A reference ortho-image and a terrain, to register scenes on where there are no control points."""
+"""Reference ortho-images with terrains, to register scenes on where there are no control points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,22 +19,22 @@ from services.sensors.ortho import OrthoModel
 from services.types import Array, Progress
 
 LOCAL_SIGMA_PX = 0.3
-"""How far details of an ortho-image lie off the rest of it, one standard deviation, its own pixels."""
+"""Assumed local error of an ortho-image, independent between places: one sigma, in its own pixels."""
 COMMON_SIGMA_PX = 0.1
-"""What all of them share towards another image: shadows and roofs that lean alike, its own pixels."""
+"""Assumed error that all places share, from shadows and leaning roofs: one sigma, in its own pixels."""
 NO_HEIGHT_SIGMA_M = 5000.0
-"""Of heights nobody gave: land reaches from -430 to 8,850 m."""
+"""Sigma of unknown heights: land reaches from -430 to 8,850 m."""
 
 
 @dataclass(frozen=True)
 class ReferenceFiles:
-    """A reference on the disk.
+    """The files of a reference.
 
     Attributes:
         image: ortho-image: GeoTIFF (or COG) or JPEG 2000 on a map.
-        terrain: heights of the same place; only an ortho-image as scene needs none.
-        sigma_m: how well the image lies on the Earth as a whole, one standard deviation a coordinate;
-            None when unknown.
+        terrain: heights of the same ground; only scenes that are ortho-images can be registered without.
+        sigma_m: accuracy of the image's frame on the Earth, one standard deviation per coordinate; None
+            when unknown.
     """
 
     image: Path
@@ -49,24 +49,24 @@ class FoundReference:
     Attributes:
         name: for people.
         files: on this machine.
-        id: in the store; None for one that a command names.
-        gsd_m: its ground sampling; NaN for one that a command names.
-        known: (k, 3) ground positions that earlier scenes were found by, the best first.
+        id: of its row in the store; None for files that a command names.
+        gsd_m: its ground sampling; NaN for files that a command names.
+        earlier_places: (k, 3) ground positions where earlier scenes matched it, the best first.
     """
 
     name: str
     files: ReferenceFiles
     id: int | None = None
     gsd_m: float = float("nan")
-    known: Array | None = None
+    earlier_places: Array | None = None
 
 
 FindReference = Callable[[Array], FoundReference | None]
-"""A reference that shows what is inside an outline (n, 2) of lon, lat; None when there is none."""
+"""Finds a reference that shows the ground of an outline (n, 2) of lon, lat; None without any."""
 
 
-def this_reference(files: ReferenceFiles) -> FindReference:
-    """The reference a command names, whatever the scene."""
+def given_reference(files: ReferenceFiles) -> FindReference:
+    """A source of one reference, whatever the outline."""
     return lambda outline: FoundReference(files.image.name, files)
 
 
@@ -80,7 +80,7 @@ def register_on(
     """
     reference = read_reference(found.files)
     registration = register_on_reference(
-        scene, reference, options, progress=progress, earlier_places=found.known
+        scene, reference, options, progress=progress, earlier_places=found.earlier_places
     )
     lon_lat_h = registration.measures.lon_lat_h
     points = reference_points(lon_lat_h, reference)
@@ -93,13 +93,15 @@ def read_reference(files: ReferenceFiles) -> Reference:
     """Open a reference; its files stay open and are read by windows.
 
     Raises:
-        InputError: when the image lies on no map, or the terrain cannot be used.
+        InputError: the image has no coordinate reference system, or the terrain cannot be used.
     """
     image = open_raster(files.image)
     grid = map_grid_of(image)
     if grid is None:
         image.close()
-        raise InputError(f"{files.image}: expected an ortho-image on a map, found no reference system")
+        raise InputError(
+            f"{files.image}: no coordinate reference system found, an ortho-image on a map expected"
+        )
     model = OrthoModel(grid)
     gsd_m = grid.gsd_m
     terrain = None

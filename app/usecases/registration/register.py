@@ -1,11 +1,10 @@
-"""Registering a scene: read its files, find points, call the science, write the outcome."""
+"""Register a scene: read its files, find control, call the science, write the outcome."""
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 from uuid import UUID
 
 import numpy as np
@@ -14,7 +13,7 @@ import shapely
 from app.db import registrations
 from app.db.engine import Connection
 from app.usecases import history
-from app.usecases.references import keep_places
+from app.usecases.references import record_places
 from app.usecases.registration.check_points import read_check_points
 from app.usecases.registration.control_sources import ControlSet, FindPoints
 from app.usecases.registration.deliverables import write_outputs
@@ -24,6 +23,7 @@ from services.errors import CoverageError
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.refined_model import write_refined
+from services.geodesy import metres_per_degree
 from services.imagery.scene import Scene, scene_footprint
 from services.quality.check_points import CheckPoints, check_model, with_check_points
 from services.registration.on_points import Registration, register_scene
@@ -32,26 +32,21 @@ from services.reports.build import build_report, scene_record
 from services.reports.document import report_document
 from services.reports.figure_data import figure_data
 from services.reports.report import Check, RefinedModelRecord, RegistrationReport, RunRecord
-from services.types import Array, Progress, no_progress
-
-Method = Literal["auto", "points", "reference"]
-"""What a scene is registered on: control points, a reference image, or that where there is no point."""
-
-METRES_PER_DEGREE = 111_320.0
+from services.types import Array, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """A scene on the disk.
+    """The files of a scene.
 
     Attributes:
-        image: the image; what lies beside it is looked at for a model.
-        model: file of the model, if it is not found by itself.
-        sigma_m: accuracy of the model, metres; by default what the producer or the sensor says.
-        bands: what is looked at; see `services.formats.images.bands.parse_bands`.
-        mask: image of the same ground, not zero where pixels shall not be used.
-        check_points: points held out of the registration.
-        check_heights: what their heights are above, where their format cannot say.
+        image: of the scene.
+        model: file of its model; None finds it by its name.
+        sigma_m: accuracy of the model, metres; by default that of the producer or the sensor.
+        bands: to use; see `services.formats.images.bands.parse_bands`.
+        mask: image of the same ground; pixels are not used where it is not zero.
+        check_points: file of points held out of the registration.
+        check_heights: vertical datum of their heights, where their format cannot state it.
     """
 
     image: Path
@@ -64,12 +59,27 @@ class SceneFiles:
 
 
 @dataclass(frozen=True)
-class RegisteredScene:
-    """What a registration made.
+class ControlSources:
+    """Where a registration looks for its control.
 
     Attributes:
-        scene: as read; its pixels are gone once its files are.
-        reference: what it was registered on; None: control points.
+        find_points: finds control points; None for none.
+        find_reference: finds a reference image where there are no control points; None for none.
+    """
+
+    find_points: FindPoints | None = None
+    find_reference: FindReference | None = None
+
+
+@dataclass(frozen=True)
+class RegisteredScene:
+    """A registered scene and its outputs.
+
+    Attributes:
+        scene: as read; its pixels cannot be read once its files are deleted.
+        registration: of the scene.
+        reference: that the scene was registered on; None for control points.
+        report: of the registration.
         footprint: (n, 2) lon, lat outline of the scene.
         files: the outputs, by name.
     """
@@ -84,50 +94,43 @@ class RegisteredScene:
 
 def run_registration(
     files: SceneFiles,
-    find_points: FindPoints | None,
-    options: RegistrationOptions,
+    sources: ControlSources,
     folder: Path,
-    progress: Progress = no_progress,
-    find_reference: FindReference | None = None,
-    method: Method = "auto",
+    *,
+    options: RegistrationOptions = RegistrationOptions(),
     copy_image: bool = False,
+    progress: Progress = no_progress,
 ) -> RegisteredScene:
-    """Register one scene and write what came out of it into a folder.
+    """Register one scene and write the outputs into a folder.
 
     Args:
-        files: the scene.
-        find_points: the control points; None: there are none.
-        options: thresholds.
-        folder: made when missing.
-        progress: told where the work stands.
-        find_reference: what the scene is registered on where there is no control point.
-        method: "auto" or one of both.
+        files: of the scene.
+        sources: of control points and reference images.
+        folder: for the outputs; created when missing.
+        options: of the registration.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
+        progress: receives the fraction done and a message.
 
     Raises:
         InputError: the scene, its mask or its check points cannot be used.
-        ComputationError: it cannot be registered.
+        ComputationError: the scene cannot be registered.
     """
     started_at = datetime.now(UTC)
     bands = None if files.bands is None else parse_bands(files.bands)
     scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
-    held_out = None
+    check_points = None
     if files.check_points is not None:
-        held_out = read_check_points(files.check_points, files.check_heights, files.image, scene)
-    footprint = scene_footprint(scene)
-    outline = _grown(footprint, MAX_ERROR_SIGMAS * scene.sigma_m)
-    registration, found, reference = _registered(
-        scene,
-        outline,
-        None if method == "reference" else find_points,
-        None if method == "points" else find_reference,
-        options,
-        lambda fraction, message: progress(0.9 * fraction, message),
-    )
+        check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
+
+    registration, control, reference = _register(scene, sources, options, part_of(progress, 0.0, 0.9))
+
     checks: tuple[Check, ...] = ()
-    if held_out is not None and files.check_points is not None:
-        registration, check = _checked(registration, held_out, found, options, files.check_points.name)
+    if check_points is not None and files.check_points is not None:
+        registration, check = _check(
+            registration, check_points, control, options, files.check_points.name
+        )
         checks = (check,)
+
     progress(0.9, "writing the report")
     refined = write_refined(
         files.image,
@@ -146,58 +149,98 @@ def run_registration(
             started_at=started_at,
             finished_at=datetime.now(UTC),
             method="control points" if reference is None else "reference image",
-            blocks=found.blocks,
+            blocks=control.blocks,
             options=options,
         ),
         RefinedModelRecord(refined.max_error_px, refined.note),
-        figure_data(scene, found.points, found.chips, registration),
+        figure_data(scene, control.points, control.chips, registration),
         checks=checks,
     )
-    paths = write_outputs(folder, report, files.image.name, found.points)
-    written = {path.name: path for path in (*paths, *refined.files)}
-    return RegisteredScene(scene, registration, reference, report, footprint, written)
+    paths = write_outputs(folder, report, files.image.name, control.points)
+    outputs = {path.name: path for path in (*paths, *refined.files)}
+    return RegisteredScene(scene, registration, reference, report, scene_footprint(scene), outputs)
 
 
-def _registered(
-    scene: Scene,
-    outline: Array,
-    find_points: FindPoints | None,
-    find_reference: FindReference | None,
-    options: RegistrationOptions,
-    progress: Progress,
+def record_registration(
+    connection: Connection,
+    registered: RegisteredScene,
+    scene_key: str,
+    *,
+    job_id: UUID | None = None,
+    scene_id: UUID | None = None,
+    keys: dict[str, str] | None = None,
+) -> UUID:
+    """Store a registration with the measures of its points or places; returns the id of its row.
+
+    Args:
+        connection: with the transaction that ends the registration.
+        registered: the registration.
+        scene_key: identifies the image; see `history.record_measures`.
+        job_id, scene_id: of the job that did it; None for a command.
+        keys: storage keys of the outputs, by name.
+    """
+    document = report_document(registered.report)
+    registration_id = registrations.insert_registration(
+        connection,
+        job_id=job_id,
+        scene_id=scene_id,
+        block_versions=document["run"]["blocks"],
+        options=document["run"]["options"],
+        report=document,
+        verdict=registered.registration.qualification.verdict,
+        files=keys or {},
+    )
+    registration, reference = registered.registration, registered.reference
+    if reference is None:
+        history.record_measures(connection, registration_id, registration, scene_key)
+    else:
+        record_places(connection, reference, registration, registered.footprint)
+    return registration_id
+
+
+def image_key(image: Path) -> str:
+    """A key that identifies an image file by its path, size and time, without reading the file."""
+    status = image.stat()
+    identity = f"{image.resolve()} {status.st_size} {status.st_mtime_ns}"
+    return sha256(identity.encode()).hexdigest()
+
+
+def _register(
+    scene: Scene, sources: ControlSources, options: RegistrationOptions, progress: Progress
 ) -> tuple[Registration, ControlSet, FoundReference | None]:
-    """A registration and what it was made on: control points, or else places of a reference."""
-    missing = CoverageError("no reference image shows the ground of the scene")
-    if find_points is not None:
+    """The registration of a scene on control points, or else on a reference image; and its control."""
+    outline = _grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
+    no_control = CoverageError("no reference image shows the ground of the scene")
+    if sources.find_points is not None:
         progress(0.0, "looking for points")
-        found = find_points(outline)
+        control = sources.find_points(outline)
         try:
             registration = register_scene(
                 scene,
-                found.points,
-                found.chips,
+                control.points,
+                control.chips,
                 options,
                 progress=progress,
-                frame_sigma_m=found.frame_sigma_m,
+                frame_sigma_m=control.frame_sigma_m,
             )
-            return registration, found, None
+            return registration, control, None
         except CoverageError as error:
-            missing = error
-    reference = None if find_reference is None else find_reference(outline)
+            no_control = error
+    reference = None if sources.find_reference is None else sources.find_reference(outline)
     if reference is None:
-        raise missing
+        raise no_control
     return (*register_on(reference, scene, options, progress), reference)
 
 
-def _checked(
+def _check(
     registration: Registration,
     points: CheckPoints,
-    found: ControlSet,
+    control: ControlSet,
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:
     """The registration, qualified with check points too, and its accuracy at these points."""
-    checked = check_model(registration.model, registration.adjustment, points, found.frame_sigma_m)
+    checked = check_model(registration.model, registration.adjustment, points, control.frame_sigma_m)
     limit = options.qualification.good_unit_weight
     qualification = with_check_points(registration.qualification, checked, limit)
     check = Check(
@@ -209,49 +252,10 @@ def _checked(
     return replace(registration, qualification=qualification), check
 
 
-def record(
-    connection: Connection,
-    registered: RegisteredScene,
-    scene_key: str,
-    *,
-    job_id: UUID | None = None,
-    scene_id: UUID | None = None,
-    keys: dict[str, str] | None = None,
-) -> UUID:
-    """Remember a registration and what happened to each point in it.
-
-    Args:
-        scene_key: the same for the same image; see `history.record_measures`.
-    """
-    report = report_document(registered.report)
-    registration_id = registrations.insert_registration(
-        connection,
-        job_id=job_id,
-        scene_id=scene_id,
-        block_versions=report["run"]["blocks"],
-        options=report["run"]["options"],
-        report=report,
-        verdict=registered.registration.qualification.verdict,
-        files=keys or {},
-    )
-    made, reference = registered.registration, registered.reference
-    if reference is None:
-        history.record_measures(connection, registration_id, made, scene_key)
-    else:
-        keep_places(connection, reference, made, registered.footprint)
-    return registration_id
-
-
-def key_of_file(image: Path) -> str:
-    """What tells an image on the disk from others without reading it all: its place, size and time."""
-    found = image.stat()
-    said = f"{image.resolve()} {found.st_size} {found.st_mtime_ns}"
-    return sha256(said.encode()).hexdigest()
-
-
 def _grown(outline: Array, metres: float) -> Array:
-    """An outline (n, 2) of lon, lat with so many metres more on every side."""
+    """An outline (n, 2) of lon, lat, grown by a distance on every side."""
     centre = outline.mean(axis=0)
-    scale = METRES_PER_DEGREE * np.array([max(np.cos(np.radians(centre[1])), 0.01), 1.0])
+    east_m, north_m = metres_per_degree(float(centre[1]), 0.0)
+    scale = np.array([max(east_m, 0.01 * north_m), north_m])
     grown = shapely.buffer(shapely.Polygon((outline - centre) * scale), metres, quad_segs=2)
     return np.asarray(centre + np.array(grown.exterior.coords)[:-1] / scale)
