@@ -41,7 +41,7 @@ def _empty_folder(folder: Path) -> Path:
     if folder.exists() and any(folder.iterdir()):
         if not (folder / MARK).is_file():
             raise InputError(
-                f"--output: {folder} has other files than an earlier demonstration; choose another folder"
+                f"--output: {folder} has files of something else than the demonstration; choose another"
             )
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
