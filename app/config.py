@@ -1,4 +1,7 @@
-"""Settings of the installation, from the environment (prefix `AMERS_`), which nothing else reads."""
+"""Settings of the installation, from environment variables with the prefix `AMERS_`.
+
+No other module reads the environment.
+"""
 
 import os
 from pathlib import Path
@@ -14,7 +17,7 @@ MEBIBYTE = 1 << 20
 
 
 def default_data_folder() -> Path:
-    """Where Amers keeps its data when nobody says otherwise."""
+    """The default of `AMERS_DATA_FOLDER`."""
     if os.geteuid() == 0:
         return Path("/var/lib/amers")
     base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
@@ -22,38 +25,37 @@ def default_data_folder() -> Path:
 
 
 class Settings(BaseSettings):
-    """Infrastructure of one installation; options of algorithms live beside the algorithms.
+    """Infrastructure of one installation; options of algorithms are defined beside the algorithms.
 
     Attributes:
-        database_url: PostgreSQL with PostGIS, `postgresql://user:password@host/name`; none means a
+        database_url: PostgreSQL with PostGIS, `postgresql://user:password@host/name`; None runs a
             private cluster in the data folder.
-        data_folder: the private cluster and the stored files.
-        host, port: where the API listens.
-        upload_limit_bytes: largest scene that can be uploaded.
-        body_limit_bytes: largest body of every other request.
-        public_points: points and chips can be read without a token.
-        pool_size: most connections one API process opens for reading, and again for writing.
-        read_timeout_seconds: longest time the database may spend on one statement of a reading request.
-        job_memory_bytes, job_seconds: what one job may use before it is stopped.
-        result_days: how long the files that jobs made are kept; none: for ever.
-        lease_seconds: how long a job waits for a silent worker before another takes it over.
-        storage_url: a bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; none: the
-            data folder.
-        scene_folder: holds scenes that may be registered where they lie; none: not at all.
-        reference_folder: holds the reference images and terrains that scenes may be registered on; none:
-            there are none.
-        ingest_folder: holds the block folders that may be ingested through the API; none: not at all.
-        quota_upload_bytes: what the scenes of one token may take in the storage at once.
-        quota_jobs: how many jobs of one token may wait or run at once.
-        public_metrics: metrics can be read without a token.
-        cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*`: all.
-        oidc_issuer: an OpenID Connect issuer whose tokens are accepted beside our own; none: none are.
-        oidc_audience: whom such a token must be for.
-        oidc_keys_url: where the issuer's keys are; none: where its discovery document says.
-        oidc_claim: the claim that says what a token allows.
-        oidc_scopes: values of that claim, each with the scope of ours that it stands for.
-        log_format: lines for people (`text`) or for programs (`json`).
-        log_level: the least grave events that are logged.
+        data_folder: for the private cluster and the stored files.
+        host, port: that the API listens on.
+        upload_limit_bytes: largest upload of an image or a block.
+        body_limit_bytes: largest body of all other requests.
+        public_points: whether points and chips can be read without a token.
+        pool_size: largest number of connections of one API process, for reading and again for writing.
+        read_timeout_seconds: time limit of the database for one statement of a reading request.
+        job_memory_bytes, job_seconds: limits of one job on memory and time.
+        result_days: days until the result files of a job are removed; None keeps them.
+        lease_seconds: time after which another worker takes over the job of a silent worker.
+        storage_url: bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; None stores them
+            in the data folder.
+        scene_folder: scenes below it can be registered without an upload; None allows none.
+        reference_folder: reference images and terrains below it can be added; None allows none.
+        ingest_folder: block folders below it can be ingested through the API; None allows none.
+        quota_upload_bytes: largest total size of the uploads of one token in the storage.
+        quota_jobs: largest number of open jobs of one token.
+        public_metrics: whether metrics can be read without a token.
+        cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*` for all.
+        oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
+        oidc_audience: required audience of such a token.
+        oidc_keys_url: address of the issuer's keys; None takes it from the discovery document.
+        oidc_claim: claim with the permissions of a token.
+        oidc_scopes: values of that claim, each with the scope of Amers that it grants.
+        log_format: `text` for people or `json` for programs.
+        log_level: least severe level that is logged.
     """
 
     model_config = SettingsConfigDict(env_prefix="AMERS_", frozen=True)
@@ -113,13 +115,13 @@ def read_settings() -> Settings:
     """The settings of this process.
 
     Raises:
-        InputError: a variable does not hold what it should; the message names it.
+        InputError: variables have unusable values; the message names them.
     """
     try:
         return Settings()
     except ValidationError as error:
-        wrong = "; ".join(
+        problems = "; ".join(
             f"AMERS_{'_'.join(str(part) for part in item['loc']).upper()}: {item['msg']}"
             for item in error.errors()
         )
-        raise InputError(f"wrong setting: {wrong}") from None
+        raise InputError(f"environment: {problems}") from None

@@ -1,7 +1,7 @@
-"""Where the work under way comes from: which request, which job, which caller.
+"""The origin of the work under way: the request, the job and the caller it belongs to.
 
-Every line of the log and every row of the audit says it. An origin belongs to one request or one attempt
-at a job; code on its way fills in what it finds out, the caller for instance.
+Every line of the log and every row of the audit contains it. An origin belongs to one request or one
+attempt at a job; later steps add what they learn, such as the caller.
 """
 
 import os
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from uuid import UUID
 
 
-def _who_runs_this() -> str:
+def _command_line_user() -> str:
     try:
         return f"{pwd.getpwuid(os.geteuid()).pw_name} on the command line"
     except KeyError:
@@ -22,17 +22,17 @@ def _who_runs_this() -> str:
 
 @dataclass
 class Origin:
-    """Who and what is behind a change.
+    """The origin of a change.
 
     Attributes:
         actor: id of the caller's token; None for commands and workers.
         actor_name: for people.
-        request_id: as the reply's `X-Request-ID` says it.
-        job_id: the job under way.
+        request_id: the `X-Request-ID` of the reply.
+        job_id: of the job under way.
     """
 
     actor: UUID | None = None
-    actor_name: str = field(default_factory=_who_runs_this)
+    actor_name: str = field(default_factory=_command_line_user)
     request_id: str | None = None
     job_id: UUID | None = None
 
@@ -42,13 +42,13 @@ _current: ContextVar[Origin] = ContextVar("origin", default=_COMMAND)
 
 
 def current() -> Origin:
-    """The origin of the work under way; that of a command when nobody has said otherwise."""
+    """The origin of the work under way; by default a command of the user of this process."""
     return _current.get()
 
 
 @contextmanager
 def working_for(origin: Origin) -> Iterator[Origin]:
-    """Work that comes from somewhere else, threads started on the way included."""
+    """Set the origin of the work in the context, including that of threads started there."""
     token = _current.set(origin)
     try:
         yield origin

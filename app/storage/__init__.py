@@ -1,4 +1,4 @@
-"""Files by key, in a folder or in a bucket: written whole or not at all, read by position."""
+"""Files by key in a folder or a bucket: written completely or not at all, and read by position."""
 
 from app.config import Settings
 from app.storage.chips import StoredChips
@@ -29,7 +29,7 @@ def open_storage(settings: Settings) -> Storage:
     """The storage of an installation: a bucket where `storage_url` names one, else its data folder.
 
     Raises:
-        InputError: the bucket cannot be used as it is named.
+        InputError: `storage_url` names a bucket that cannot be used.
     """
     folder = settings.data_folder / "storage"
     if settings.storage_url is None:

@@ -17,21 +17,20 @@ from app.errors import InputError, NotFound, StorageOutage
 from app.storage.folder import COPY_BYTES, RangeReader, Storage, checked_key
 
 RETRIES = 3
-PATIENCE = timedelta(seconds=20)
-"""A request is repeated for so long; then the storage is out, and whoever asked is told."""
+RETRY_TIMEOUT = timedelta(seconds=20)
+"""A failing request is repeated for this time; then it raises `StorageOutage`."""
 
 
 @dataclass(frozen=True)
 class BucketStorage(Storage):
     """Files in a bucket, under the same keys as in a folder.
 
-    A file is written into `folder` first, where its checksum is taken, and then sent: it appears in the
-    bucket complete, or not at all.
+    A file is first written into `folder`, where its checksum is computed, and then sent. It appears in
+    the bucket when it is complete.
 
     Attributes:
-        folder: of this machine, for what is not finished.
-        url: `s3://BUCKET/PREFIX`; where the service is and who may use it is said by the `AWS_...`
-            variables that all its tools know.
+        folder: of this machine, for unfinished files.
+        url: `s3://BUCKET/PREFIX`; the common `AWS_...` variables set address and credentials.
     """
 
     url: str
@@ -39,22 +38,22 @@ class BucketStorage(Storage):
 
     def __post_init__(self) -> None:
         try:
-            # Plain HTTP only where AWS_ENDPOINT_URL says so itself.
+            # Plain HTTP is used only if AWS_ENDPOINT_URL begins with http://.
             store = S3Store.from_url(
                 self.url,
                 client_options={"allow_http": True},
-                retry_config={"max_retries": RETRIES, "retry_timeout": PATIENCE},
+                retry_config={"max_retries": RETRIES, "retry_timeout": RETRY_TIMEOUT},
             )
         except Exception as error:
             raise InputError(f"AMERS_STORAGE_URL: {self.url!r} cannot be used: {error}") from error
         object.__setattr__(self, "store", store)
 
     def local(self, key: str) -> Path | None:
-        """Nothing of a bucket lies on this machine."""
+        """None: the files of a bucket do not lie on this machine."""
         return None
 
     def path(self, key: str) -> Path:
-        """Nothing of a bucket lies in a folder.
+        """Raise: the files of a bucket have no paths.
 
         Raises:
             NotFound: always.
@@ -62,14 +61,14 @@ class BucketStorage(Storage):
         raise NotFound(f"{checked_key(key)} lies in {self.url}, not in a folder")
 
     def open(self, key: str) -> BinaryIO:
-        """A file, for reading: piece by piece, as it is read."""
+        """Open a file to read it from its start, by range requests."""
         return io.BufferedReader(_RangeFile(self.reader(key), self.size(key)), COPY_BYTES)
 
     def fetch(self, key: str, folder: Path) -> Path:
-        """A copy of a file, in the folder under its own name.
+        """Copy a file into a folder under its own name; returns the path.
 
         Raises:
-            InputError: the key is not one.
+            InputError: the key is malformed.
             NotFound: there is no such file.
         """
         path = folder / key.rsplit("/", 1)[-1]
@@ -78,17 +77,17 @@ class BucketStorage(Storage):
         return path
 
     def reader(self, key: str) -> RangeReader:
-        """A file, to be read by requests for ranges of it."""
+        """Open a file to read it by range requests."""
         self.size(key)
         return _BucketReader(self.store, key)
 
     def size(self, key: str) -> int:
-        """How large a file is, bytes."""
-        with _answering(key):
+        """The size of a file, bytes."""
+        with _storage_errors(key):
             return int(obstore.head(self.store, checked_key(key))["size"])
 
     def exists(self, key: str) -> bool:
-        """Whether there is a file of that key."""
+        """Whether there is a file of this key."""
         try:
             self.size(key)
         except NotFound:
@@ -96,24 +95,24 @@ class BucketStorage(Storage):
         return True
 
     def delete(self, key: str) -> None:
-        """Remove a file, if it is there."""
-        with _answering(key):
+        """Delete a file, if it exists."""
+        with _storage_errors(key):
             obstore.delete(self.store, checked_key(key))
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a prefix, sorted."""
-        with _answering(prefix):
+        with _storage_errors(prefix):
             pages = obstore.list(self.store, prefix=checked_key(prefix))
-            return sorted(found["path"] for page in pages for found in page)
+            return sorted(entry["path"] for page in pages for entry in page)
 
     def _download(self, key: str, file: IO[bytes]) -> None:
-        with _answering(key):
+        with _storage_errors(key):
             for chunk in obstore.get(self.store, checked_key(key)).stream(min_chunk_size=COPY_BYTES):
                 file.write(chunk)
 
     def _place(self, unfinished: Path, key: str) -> None:
-        """Send a file, in several parts at once when it is large."""
-        with _answering(key):
+        """Send a finished file to its key; a large one goes in several parts at once."""
+        with _storage_errors(key):
             obstore.put(self.store, checked_key(key), unfinished)
         os.unlink(unfinished)
 
@@ -126,15 +125,15 @@ class _BucketReader:
     def read(self, start: int, length: int) -> bytes:
         if length == 0:
             return b""
-        with _answering(self.key):
+        with _storage_errors(self.key):
             return bytes(obstore.get_range(self.store, self.key, start=start, length=length))
 
     def close(self) -> None:
-        """Nothing is open between requests."""
+        """Do nothing: no connection is kept between requests."""
 
 
 class _RangeFile(io.RawIOBase):
-    """A file read from its beginning to its end, by requests for ranges of it."""
+    """A file that is read from its beginning to its end by range requests."""
 
     def __init__(self, reader: RangeReader, size: int) -> None:
         self._reader = reader
@@ -152,7 +151,8 @@ class _RangeFile(io.RawIOBase):
 
 
 @contextmanager
-def _answering(key: str) -> Iterator[None]:
+def _storage_errors(key: str) -> Iterator[None]:
+    """Translate errors of the storage service into ours."""
     try:
         yield
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The chips of the storage, read by position."""
+"""Chips of blocks in the storage, read by position."""
 
 import io
 import threading
@@ -19,10 +19,10 @@ class _OpenChipFile:
 
 
 class StoredChips:
-    """The chips of the storage, as a `services.types.ChipSource`; files are named by their keys.
+    """A `services.types.ChipSource` of the chip files in the storage, which are named by their keys.
 
-    Files stay open and their headers parsed; a read is one `pread`, or one request for a range of bytes.
-    Safe to share between threads.
+    Files stay open with their headers parsed, so that a read is one `pread` or one range request. Threads
+    may share it.
     """
 
     def __init__(self, storage: Storage) -> None:
@@ -37,7 +37,7 @@ class StoredChips:
             (count, 101, 101) uint8 or uint16; 0 is nodata.
 
         Raises:
-            FormatError: the file is not one of chips, or ends before the last of them.
+            FormatError: it is not a chip file, or it ends before the last requested chip.
         """
         with self._lock:
             chips = self._find(file)

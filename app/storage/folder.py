@@ -1,4 +1,4 @@
-"""Files by key in one folder: written whole or not at all, read by position."""
+"""Files by key in a folder: written completely or not at all, and read by position."""
 
 import fcntl
 import hashlib
@@ -34,17 +34,17 @@ class StoredFile:
 
 
 class RangeReader(Protocol):
-    """An open file of the storage that is read by position; safe to share between threads."""
+    """An open file of the storage that is read by position; threads may share it."""
 
     def read(self, start: int, length: int) -> bytes:
-        """So many bytes from a position; fewer at the end of the file."""
+        """`length` bytes from position `start`; fewer at the end of the file."""
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
 
 
 class Writing:
-    """A file on its way into the storage; its size and checksum are taken as it passes."""
+    """A file that is being written into the storage; computes its size and checksum on the way."""
 
     def __init__(self, file: BinaryIO, path: Path, limit_bytes: int | None) -> None:
         self._file = file
@@ -57,23 +57,21 @@ class Writing:
         """Append bytes.
 
         Raises:
-            TooLarge: the file would become larger than it may.
+            TooLarge: the file exceeds its limit.
         """
         self.size_bytes += len(chunk)
         if self._limit_bytes is not None and self.size_bytes > self._limit_bytes:
-            raise TooLarge(
-                f"the file is larger than {self._limit_bytes} bytes, the most that is accepted"
-            )
+            raise TooLarge(f"the file exceeds the accepted size of {self._limit_bytes} bytes")
         self._hash.update(chunk)
         self._file.write(chunk)
 
     @property
     def sha256(self) -> str:
-        """Checksum of what was written so far, in hexadecimal."""
+        """Checksum of the bytes written so far, in hexadecimal."""
         return self._hash.hexdigest()
 
     def finish(self) -> Path:
-        """The file, once all its bytes are on the disk."""
+        """Write all bytes through to the disk; returns the path of the file."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return self._path
@@ -83,25 +81,25 @@ class Writing:
 class Storage:
     """Files below one folder, under keys such as `scenes/ID/scene.tif`.
 
-    A key is made of letters, digits, `_`, `-`, `.` and `/`; no part of it begins with a dot, and no link
-    below the folder is followed. A file appears under its key complete and on the disk, or not at all.
+    A key consists of letters, digits, `_`, `-`, `.` and `/`; none of its parts begins with a dot. Links
+    below the folder are not followed. A file appears under its key when it is complete and on the disk.
     """
 
     folder: Path
 
     @contextmanager
     def writing(self, key: str, limit_bytes: int | None = None) -> Iterator[Writing]:
-        """Write a file piece by piece; it takes its place at the end, or vanishes by an exception."""
+        """Write a file in pieces; it gets its key at the end of the context, an exception deletes it."""
         self._locate(key)
         with self._unfinished(limit_bytes) as writing:
             yield writing
             self._place(writing.finish(), key)
 
     def put(self, key: str, chunks: Iterable[bytes], limit_bytes: int | None = None) -> StoredFile:
-        """Store a file, replacing the one of that key.
+        """Store a file; it replaces a file of the same key.
 
         Raises:
-            TooLarge: there are more bytes than the limit; nothing is stored.
+            TooLarge: the file exceeds the limit; nothing is stored.
         """
         with self.writing(key, limit_bytes) as writing:
             for chunk in chunks:
@@ -114,9 +112,9 @@ class Storage:
             return self.put(key, iter(lambda: file.read(COPY_BYTES), b""))
 
     def put_chips(self, path: Path, expected_sha256: str | None = None) -> StoredFile:
-        """Store a copy of a block's chip file under its checksum, unless it is there already.
+        """Store a copy of a block's chip file under its checksum, unless the storage has it already.
 
-        What has another checksum than expected is not stored; the reply tells the one it has.
+        A file with another checksum than expected is not stored; the result has its actual checksum.
         """
         with self._unfinished(None) as writing:
             with path.open("rb") as file:
@@ -128,16 +126,16 @@ class Storage:
         return StoredFile(key, writing.size_bytes, writing.sha256)
 
     def adopt(self, path: Path, key: str) -> None:
-        """Make a file of `scratch` the one of that key; it is no longer where it was."""
+        """Move a file of `scratch` to a key."""
         self._locate(key)
         with path.open("rb") as file:
             os.fsync(file.fileno())
         self._place(path, key)
 
     def scratch(self) -> Path:
-        """A folder for what is not finished, on the file system of the storage if it has one.
+        """A folder for unfinished files, on the file system of the storage if it is a folder.
 
-        What stays in it is swept after a while.
+        Files that stay in it are swept after some hours.
         """
         folder = self.folder / UNFINISHED
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -145,47 +143,48 @@ class Storage:
 
     @contextmanager
     def scratch_folder(self, prefix: str) -> Iterator[Path]:
-        """A folder in `scratch` that is removed at the end, and not swept before."""
+        """A folder in `scratch` that is deleted at the end of the context, and not swept before."""
         with (
             TemporaryDirectory(prefix=prefix, dir=self.scratch()) as folder,
-            _held(Path(folder)),
+            _locked(Path(folder)),
         ):
             yield Path(folder)
 
     def fetch(self, key: str, folder: Path) -> Path:
-        """A file on this machine, for libraries that open files themselves: never to be changed.
+        """The path of a file on this machine, for libraries that open files; do not change the file.
 
         Args:
-            folder: where a copy goes if the storage is elsewhere.
+            key: of the file.
+            folder: for a copy, if the storage is a bucket.
 
         Raises:
-            InputError: the key is not one.
+            InputError: the key is malformed.
             NotFound: there is no such file.
         """
         return self.path(key)
 
     def reader(self, key: str) -> RangeReader:
-        """A file, to be read by position."""
+        """Open a file to read it by position."""
         return _FileReader(os.open(self.path(key), os.O_RDONLY | os.O_CLOEXEC))
 
     def size(self, key: str) -> int:
-        """How large a file is, bytes."""
+        """The size of a file, bytes."""
         return self.path(key).stat().st_size
 
     def local(self, key: str) -> Path | None:
-        """Where a file lies on this machine; None in a storage whose files do not.
+        """The path of a file on this machine; None if the storage is a bucket.
 
         Raises:
-            InputError: the key is not one.
+            InputError: the key is malformed.
             NotFound: there is no such file.
         """
         return self.path(key)
 
     def path(self, key: str) -> Path:
-        """Where a file of the folder is.
+        """The path of a file in the folder.
 
         Raises:
-            InputError: the key is not one.
+            InputError: the key is malformed.
             NotFound: there is no such file.
         """
         path = self._locate(key)
@@ -194,15 +193,15 @@ class Storage:
         return path
 
     def open(self, key: str) -> BinaryIO:
-        """A file, for reading."""
+        """Open a file to read it from its start."""
         return self.path(key).open("rb")
 
     def exists(self, key: str) -> bool:
-        """Whether there is a file of that key."""
+        """Whether there is a file of this key."""
         return self._locate(key).is_file()
 
     def delete(self, key: str) -> None:
-        """Remove a file, if it is there, and the folders it leaves empty."""
+        """Delete a file, if it exists, and the folders that become empty."""
         path = self._locate(key)
         path.unlink(missing_ok=True)
         with suppress(OSError):
@@ -211,25 +210,26 @@ class Storage:
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""
-        found = (
+        files = (
             path for path in self._locate(prefix).rglob("*") if path.is_file() and not path.is_symlink()
         )
-        return sorted(path.relative_to(self.folder).as_posix() for path in found)
+        return sorted(path.relative_to(self.folder).as_posix() for path in files)
 
     def sweep_unfinished(self, older_than_s: float, spare: str) -> list[str]:
-        """Remove what writers that were killed left behind; returns the names removed.
+        """Delete the unfinished files of killed writers; returns their names.
 
-        Whoever still writes holds a lock: he loses nothing to a clock that jumps ahead.
+        A writer locks its file, so a clock that jumps ahead does not delete files in use.
 
         Args:
-            spare: what begins like this belongs to somebody else.
+            older_than_s: least age of the files.
+            spare: files whose names begin with this text stay.
         """
         swept = []
         for path in (self.folder / UNFINISHED).glob("*"):
             with suppress(FileNotFoundError, BlockingIOError):
                 if time.time() - path.stat().st_mtime < older_than_s or path.name.startswith(spare):
                     continue
-                with _held(path, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                with _locked(path, fcntl.LOCK_EX | fcntl.LOCK_NB):
                     if path.is_dir():
                         shutil.rmtree(path, ignore_errors=True)
                     else:
@@ -238,7 +238,7 @@ class Storage:
         return swept
 
     def _place(self, unfinished: Path, key: str) -> None:
-        """Give a file its name."""
+        """Move a finished file to its key."""
         path = self._locate(key)
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         unfinished.replace(path)
@@ -255,12 +255,14 @@ class Storage:
             for part in (path, *path.parents)
             if part.is_relative_to(self.folder) and part != self.folder
         ):
-            raise InputError(f"{key!r} passes through a link")
+            raise InputError(
+                f"the key {key!r} leads through a link; links in the storage are not followed"
+            )
         return path
 
     @contextmanager
     def _unfinished(self, limit_bytes: int | None) -> Iterator[Writing]:
-        """A temporary file on the same file system, so that one rename puts it in its place."""
+        """A temporary file on the file system of the storage, so that one rename moves it to its key."""
         handle, name = mkstemp(dir=self.scratch())
         try:
             with os.fdopen(handle, "wb") as file:
@@ -282,36 +284,38 @@ class _FileReader:
 
 
 @contextmanager
-def _held(path: Path, how: int = fcntl.LOCK_SH) -> Iterator[None]:
-    """A lock on a file or folder; the kernel lets go of it however its holder ends."""
+def _locked(path: Path, mode: int = fcntl.LOCK_SH) -> Iterator[None]:
+    """Lock a file or folder; the kernel releases the lock of a killed process."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        _lock(descriptor, how)
+        _lock(descriptor, mode)
         yield
     finally:
         os.close(descriptor)
 
 
-def _lock(descriptor: int, how: int) -> None:
+def _lock(descriptor: int, mode: int) -> None:
     try:
-        fcntl.flock(descriptor, how)
+        fcntl.flock(descriptor, mode)
     except BlockingIOError:
         raise
     except OSError:
-        return  # a file system that knows no such locks: its files are swept by their age alone
+        return  # The file system has no such locks: its files are swept by their age alone.
 
 
 def checked_key(key: str) -> str:
-    """The key, if it is one.
+    """The key, after a check of its form.
 
     Raises:
-        InputError: it is not.
+        InputError: the key is malformed.
     """
     if not KEY.fullmatch(key) or key.split("/")[0] == UNFINISHED:
-        raise InputError(f"not a key of the storage: {key!r}")
+        raise InputError(
+            f"{key!r} is not a key of the storage: expected names of letters, digits, . _ -"
+        )
     return key
 
 
 def chips_key(sha256: str) -> str:
-    """The key of a chip file: its content's checksum, so that the same file is stored once."""
+    """The key of a chip file: the checksum of its content, so that equal files are stored once."""
     return f"chips/{sha256}.npy"

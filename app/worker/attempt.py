@@ -1,7 +1,7 @@
-"""One attempt at a job: a process of its own, watched, and what becomes of the job when it ends.
+"""One attempt at a job in a process of its own, which the worker supervises.
 
-The process writes the outcome itself. The worker only keeps the lease alive, kills the process when the
-job is no longer its own, and settles the job when the process ended without an outcome.
+The process writes the outcome itself. The worker renews the lease, kills the process when the job is no
+longer its own, and updates the job when the process ended without an outcome.
 """
 
 import logging
@@ -27,12 +27,12 @@ from app.request_context import Origin, working_for
 from app.storage import Storage
 
 FAILURES_ALLOWED = 3
-"""A job fails when so many attempts at it have ended without an outcome."""
+"""A job fails when this many attempts at it have ended without an outcome."""
 POLL_S = 0.2
 LONGEST_BEAT_S = 2.0
-"""A lease is renewed at least this often, which is also how soon a dismissed job is noticed."""
+"""Longest time between renewals of a lease; a dismissed job is noticed within this time."""
 OUT_OF_MEMORY = 77
-"""Exit code of a process that met its memory limit."""
+"""Exit code of a process that reached its memory limit."""
 NO_ROOM = 78
 """Exit code of a process that found a disk full."""
 
@@ -50,22 +50,22 @@ log = logging.getLogger(__name__)
 
 
 class Stopped(Exception):
-    """The worker has to stop."""
+    """The worker must stop."""
 
 
 class TooLong(Exception):
-    """The process ran beyond its time limit."""
+    """The process exceeded its time limit."""
 
 
 @dataclass(frozen=True)
 class Attempts:
-    """How a worker does jobs.
+    """Does attempts at jobs for one worker.
 
     Attributes:
         database: with the jobs.
-        settings: the installation's.
-        worker: name of this worker, for the record.
-        should_stop: asked all the time while a job is done.
+        settings: of the installation.
+        worker: name of this worker, recorded in its jobs.
+        should_stop: whether the worker must stop; called several times a second during an attempt.
     """
 
     database: Database
@@ -74,7 +74,7 @@ class Attempts:
     should_stop: Callable[[], bool]
 
     def do_job(self, job_id: UUID) -> None:
-        """Claim a job and see one attempt at it through; does nothing when it is not to be had."""
+        """Claim a job and do one attempt at it; does nothing when the job cannot be claimed."""
         with working_for(Origin(actor_name=f"worker {self.worker}", job_id=job_id)):
             self._do_job(job_id)
 
@@ -82,25 +82,29 @@ class Attempts:
         with self.database.transaction() as connection:
             job = attempts.claim(connection, job_id, self.worker, self.settings.lease_seconds)
         if job is None:
-            log.info("job %s is not to be had", job_id)
+            log.info("job %s cannot be claimed: it has ended, or another worker has it", job_id)
             return
         log.info("job %s: attempt %d at %s", job.id, job.attempt, job.kind)
         try:
-            self._see_through(job)
+            self._supervise(job)
         except LostJob as lost:
             log.info("%s", lost)
 
-    def _see_through(self, job: Job) -> None:
-        """Run the process; write what it could not write itself."""
+    def _supervise(self, job: Job) -> None:
+        """Run the process, and update the job when the process did not write an outcome."""
         try:
             code = self._run(job)
         except Stopped:
             with self.database.transaction() as connection:
                 attempts.give_back(connection, job.id, job.attempt)
-            log.info("job %s: given back", job.id)
+            log.info("job %s: given back to the queue, because this worker stops", job.id)
         except TooLong:
-            allowed_s = self.settings.job_seconds
-            self._fail(job, "Time limit", f"stopped after the {allowed_s:g} s that a job may take")
+            self._fail(
+                job,
+                "Time limit",
+                f"the job was stopped after {self.settings.job_seconds:g} s, the limit of this service "
+                "(AMERS_JOB_SECONDS)",
+            )
         except OSError as error:
             if not is_no_room(error):
                 raise
@@ -109,21 +113,26 @@ class Attempts:
             self._settle(job, code)
 
     def _settle(self, job: Job, code: int) -> None:
-        """A bug, a crash or an outage is tried again after a while, until it has happened too often."""
+        """Fail a job or schedule another attempt: after a bug, crash or outage up to a number of times."""
         if code == 0:
             return
-        log.error("job %s: attempt %d ended with code %d", job.id, job.attempt, code)
+        log.error("job %s: attempt %d ended with exit code %d", job.id, job.attempt, code)
         failures = job.failures + 1
         if code == OUT_OF_MEMORY:
-            allowed = f"{self.settings.job_memory_bytes / 2**20:.0f} MiB"
-            self._fail(job, "Memory limit", f"needs more memory than the {allowed} that a job may take")
+            limit = f"{self.settings.job_memory_bytes / 2**20:.0f} MiB"
+            self._fail(
+                job,
+                "Memory limit",
+                f"the job needs more memory than {limit}, the limit of this service "
+                "(AMERS_JOB_MEMORY_BYTES)",
+            )
         elif failures >= FAILURES_ALLOWED and code == NO_ROOM:
-            self._fail(job, "No room", f"a disk of the service was full, {failures} attempts broke off")
+            self._fail(job, "No room", f"a disk of the service was full in {failures} attempts")
         elif failures >= FAILURES_ALLOWED:
             self._fail(
                 job,
                 "Internal error",
-                f"the work broke off {failures} times; the log of the worker says why",
+                f"{failures} attempts ended without an outcome; the log of the worker has the reasons",
             )
         else:
             with self.database.transaction() as connection:
@@ -137,7 +146,7 @@ class Attempts:
             attempts.fail(connection, job.id, job.attempt, error)
 
     def _run(self, job: Job) -> int:
-        """Exit code of the attempt's process; however this ends, the process is gone.
+        """The exit code of the attempt's process; the process has ended whenever this returns or raises.
 
         Raises:
             Stopped, TooLong, LostJob
@@ -157,7 +166,7 @@ class Attempts:
                 _kill(process)
 
     def _installation(self) -> dict[str, str]:
-        """Where the process finds the database, which this worker keeps running, and the files."""
+        """Variables that lead the process to the database, which this worker keeps running, and the files."""
         ingest = self.settings.ingest_folder
         return {
             "AMERS_DATABASE_URL": self.database.dsn,
@@ -166,7 +175,7 @@ class Attempts:
         }
 
     def _watch(self, job: Job, process: "subprocess.Popen[bytes]") -> int:
-        """Keep the lease alive until the process ends or has to."""
+        """Renew the lease until the process ends or must end."""
         lease_s = self.settings.lease_seconds
         beat_s = min(lease_s / 3.0, LONGEST_BEAT_S)
         started = renewed = time.monotonic()
@@ -180,12 +189,12 @@ class Attempts:
             if now - started > self.settings.job_seconds:
                 raise TooLong
             if now - renewed > lease_s:
-                raise LostJob(f"job {job.id}: attempt {job.attempt} could not renew its lease")
+                raise LostJob(f"job {job.id}: the lease of attempt {job.attempt} expired unrenewed")
             if now - renewed > beat_s and self._renew(job):
                 renewed = now
 
     def _renew(self, job: Job) -> bool:
-        """Renew the lease; False when the database cannot be reached."""
+        """Renew the lease; returns False when the database cannot be reached."""
         try:
             with self.database.transaction() as connection:
                 attempts.renew(connection, job.id, job.attempt, self.settings.lease_seconds)
@@ -196,7 +205,7 @@ class Attempts:
 
 
 def _kill(process: "subprocess.Popen[bytes]") -> None:
-    """End the process and everything it started; harmless when it has ended."""
+    """Kill the process and everything it started; does nothing when it has ended."""
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()

@@ -1,4 +1,4 @@
-"""A worker: takes job ids from the queue, one after the other, until it is told to stop."""
+"""A worker: takes job ids from the queue and does these jobs, one after the other, until a signal."""
 
 import asyncio
 import logging
@@ -24,25 +24,25 @@ from app.worker.sweep import Sweeper
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0
-"""The queue notifies its workers; this is how soon they find an entry that was put off until a time."""
+"""Longest time until a delayed entry of the queue is found; of new entries the queue notifies workers."""
 PAUSE_S = 2.0
-"""Before the queue is asked again after an outage of the database."""
+"""Pause before the queue is read again after an outage of the database."""
 
 log = logging.getLogger(__name__)
 
 
 def run_worker(settings: Settings) -> None:
-    """Work until SIGTERM or SIGINT; a job under way then goes back to the queue.
+    """Do jobs until SIGTERM or SIGINT; a job under way then goes back to the queue.
 
-    From the first moment a signal is noted, not raised: an exception thrown into whatever runs while the
-    worker starts can be lost there, and the worker would live on.
+    Signals set a flag from the start. An exception raised in the middle of the start-up could be lost
+    there, and the worker would run on.
     """
     stop = threading.Event()
     for number in ENDING:
         signal.signal(number, lambda *_: stop.set())
     with engine.opened(settings) as database, _sweeping(database, settings, stop):
         loop = asyncio.new_event_loop()
-        # Not asyncio.run, which waits without end for a task of the queue that lost its cancellation.
+        # Not asyncio.run: it waits for ever when a task of the queue swallows its cancellation.
         loop.run_until_complete(_Worker(database, settings, stop).run())
 
 
@@ -66,7 +66,7 @@ class _Worker:
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
 
     async def run(self) -> None:
-        """Fetch and do jobs; an outage of the database ends a round, not the worker."""
+        """Fetch and do jobs until a signal; an outage of the database does not end the worker."""
         rounds = asyncio.create_task(self._rounds())
         loop = asyncio.get_running_loop()
         for number in ENDING:
@@ -85,7 +85,7 @@ class _Worker:
             try:
                 await self._work()
             except (procrastinate.exceptions.ConnectorException, psycopg.Error) as outage:
-                log.warning("the queue does not answer: %s", outage)
+                log.warning("the queue cannot be read: %s", outage)
             await asyncio.sleep(PAUSE_S)
 
     async def _work(self) -> None:

@@ -2,8 +2,8 @@
 
 Started as `python -m app.worker.run JOB ATTEMPT WORKER_PID MEMORY_BYTES`.
 
-Exit codes: 0 the outcome is written or no longer wanted, 77 out of memory, 78 a disk is
-full, anything else: it broke off.
+Exit codes: 0 the outcome is written or no longer needed, 77 out of memory, 78 a disk is full, others for
+a crash or an outage.
 """
 
 import ctypes
@@ -38,10 +38,10 @@ def main(arguments: list[str]) -> int:
     die_with(int(worker_pid))
     settings = read_settings()
     logs.configure(settings)
-    assert settings.database_url is not None, "the worker names its database"
-    doing = Origin(actor_name=f"worker {worker_pid}", job_id=UUID(job_id))
+    assert settings.database_url is not None, "the worker sets AMERS_DATABASE_URL"
+    origin = Origin(actor_name=f"worker {worker_pid}", job_id=UUID(job_id))
     try:
-        with working_for(doing), pooled(settings.database_url.get_secret_value(), settings) as database:
+        with working_for(origin), pooled(settings.database_url.get_secret_value(), settings) as database:
             limit_memory(int(memory_bytes))
             do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:
@@ -61,15 +61,15 @@ def main(arguments: list[str]) -> int:
 
 
 def die_with(worker_pid: int) -> None:
-    """Have the kernel end this process when its worker ends, however that ends."""
+    """Make the kernel kill this process when its worker ends, for whatever reason."""
     if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl")
     if os.getppid() != worker_pid:
-        sys.exit("the worker is gone")
+        sys.exit("the worker has ended")
 
 
 def limit_memory(extra_bytes: int) -> None:
-    """Let this process allocate so much beyond what its libraries have reserved by now."""
+    """Limit what this process may allocate in addition to what its libraries have already reserved."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + extra_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -1,7 +1,7 @@
-"""What every worker puts right from time to time: jobs of dead workers, files that no row names.
+"""The sweeper of a worker: takes over the jobs of dead workers, and removes files without rows.
 
 It runs in a thread of its own, not as a periodic task of the queue: such a task needs a free worker, and
-the workers may all be busy for an hour.
+all workers may be busy for an hour.
 """
 
 import logging
@@ -23,24 +23,23 @@ from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
-"""A worker of the queue beats every ten seconds; after this long without, its entries are dead."""
+"""A worker of the queue sends a heartbeat every ten seconds; without one for this long it is dead."""
 FILES_EVERY_S = 3600.0
 MOST_BETWEEN_S = 2 * FILES_EVERY_S
-"""Believed to have passed between two sweeps of files; a clock that says more has jumped."""
+"""Longest credible time between two sweeps of files; a clock that shows more has jumped."""
 LONGEST_UPLOAD_S = 3600.0 * scenes.LONGEST_UPLOAD_HOURS
 LONGEST_WAIT_S = 5
-"""For ingestions to end: meanwhile this thread takes no job back, and new ingestions queue behind it."""
+"""Longest wait for ingestions to end: this thread takes over no jobs meanwhile, and new ingestions wait."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Sweeper:
-    """Puts things right until it is told to stop.
+    """Sweeps jobs and files until `stop` is set.
 
     Attributes:
-        database, storage: of the installation.
-        settings: how long a lease is.
+        database, storage, settings: of the installation.
         stop: ends the thread.
     """
 
@@ -50,47 +49,47 @@ class Sweeper:
     stop: threading.Event
 
     def run(self) -> None:
-        """Sweep jobs several times a lease, files every hour."""
-        files_at = time.monotonic()
+        """Sweep jobs three times per lease, and files every hour."""
+        next_files_at = time.monotonic()
         while not self.stop.wait(self.settings.lease_seconds / 3.0):
             try:
                 sweep_jobs(self.database, self.settings.lease_seconds)
-                if time.monotonic() > files_at:
-                    files_at += FILES_EVERY_S
+                if time.monotonic() > next_files_at:
+                    next_files_at += FILES_EVERY_S
                     sweep_results(self.database, self.settings.result_days)
                     sweep_files(self.database, self.storage, self.settings.job_seconds)
             except psycopg.OperationalError as outage:
-                log.warning("could not sweep: %s", outage)
+                log.warning("the sweep failed and is repeated: %s", outage)
             except Exception:
-                log.exception("could not sweep")
+                log.exception("the sweep failed and is repeated")
 
 
 def sweep_jobs(database: Database, lease_s: float) -> None:
-    """Take back the jobs of dead workers, and put into the queue what was lost from it."""
+    """Take the jobs of dead workers back, and put jobs that the queue has lost into it again."""
     with database.transaction() as connection:
         if not queue.may_sweep(connection):
             return
         for job_id in attempts.take_back(connection, FAILURES_ALLOWED):
-            log.warning("job %s: taken back from a worker that gave no sign of life", job_id)
+            log.warning("job %s: taken back from a worker whose lease expired", job_id)
         for job_id in queue.enqueue_forgotten(connection, lease_s):
-            log.warning("job %s: was not in the queue any more", job_id)
+            log.warning("job %s: was missing in the queue and is queued again", job_id)
         queue.forget_dead_entries(connection, SILENT_WORKER_S)
 
 
 def sweep_results(database: Database, result_days: float | None) -> None:
-    """Give up the results of jobs that ended so many days ago; None keeps all of them."""
+    """Mark the results of jobs that ended this many days ago as removed; None keeps all results."""
     if result_days is None:
         return
     with working_for(Origin(actor_name="retention")), database.transaction() as connection:
         for job_id in jobs.remove_old_results(connection, 86_400.0 * result_days):
-            log.info("job %s: its results are older than %g days: removed", job_id, result_days)
+            log.info("job %s: removed its results, which are older than %g days", job_id, result_days)
 
 
 def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> None:
-    """Remove the files of uploads, attempts and ingestions that came to nothing.
+    """Remove the files of abandoned uploads, attempts and ingestions.
 
     Raises:
-        psycopg.errors.LockNotAvailable: an ingestion is under way; its files are swept another time.
+        psycopg.errors.LockNotAvailable: an ingestion is under way; the next sweep removes the rest.
     """
     with database.transaction() as connection:
         uptime.advance(connection, MOST_BETWEEN_S)
@@ -104,4 +103,4 @@ def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> N
         removed += remove_unnamed_chips(connection, storage)
         removed += remove_expired_archives(connection, storage)
     for name in removed:
-        log.info("removed %s, which nothing names", name)
+        log.info("removed the file %s, which no row refers to", name)
