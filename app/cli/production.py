@@ -1,4 +1,4 @@
-"""`amers production`: new blocks of points out of images."""
+"""`amers production`: make new blocks of points from images."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,59 +18,59 @@ from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
-app = typer.Typer(help="New blocks of points out of images.", no_args_is_help=True)
+app = typer.Typer(help="Make new blocks of points from images.", no_args_is_help=True)
 
 _DEFAULT = ProductionOptions()
 
 
-@app.callback()
-def group() -> None:
-    """New blocks of points out of images."""
-
-
 @app.command()
 def run(
+    *,
     images: Annotated[
-        list[Path], typer.Option("--images", help="Image with its model; repeat for each.")
+        list[Path], typer.Option("--images", help="Image with its model; repeat for every image.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the block; must not exist.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     block_id: Annotated[
-        str | None, typer.Option("--id", help="Of the block; else the folder's.")
+        str | None, typer.Option("--id", help="Id of the block; by default the folder's name.")
     ] = None,
-    version: Annotated[str, typer.Option(help="Of the block.")] = "1",
-    title: Annotated[str, typer.Option(help="For people.")] = "",
-    license_name: Annotated[str, typer.Option("--license", help="SPDX identifier.")] = "proprietary",
-    gsd_m: Annotated[str, typer.Option(help="Ground samplings of the chips: FINE,COARSE in metres.")] = (
+    version: Annotated[str, typer.Option(help="Version of the block.")] = "1",
+    title: Annotated[str, typer.Option(help="Title of the block.")] = "",
+    license_name: Annotated[
+        str, typer.Option("--license", help="Licence: SPDX identifier.")
+    ] = "proprietary",
+    gsd_m: Annotated[str, typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres.")] = (
         f"{_DEFAULT.fine_gsd_m:g},{_DEFAULT.coarse_gsd_m:g}"
     ),
-    points: Annotated[int, typer.Option(help="How many to aim at, without --spacing-m.", min=6)] = (
-        _DEFAULT.points
-    ),
+    points: Annotated[
+        int, typer.Option(help="Desired number of points; --spacing-m overrides it.", min=6)
+    ] = (_DEFAULT.points),
     spacing_m: Annotated[
-        float | None, typer.Option(help="One point a square of this side.", min=1.0)
+        float | None, typer.Option(help="One point per square of this side, metres.", min=1.0)
     ] = None,
     min_views: Annotated[
-        int, typer.Option(help="Images that must see a point.", min=2)
+        int, typer.Option(help="Least number of images that see a point.", min=2)
     ] = _DEFAULT.min_views,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the models, metres.", min=0.01)
+        float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make control points with chips out of two or more overlapping images."""
+    """Make control points with chips from two or more overlapping images."""
     fine_m, coarse_m = _pair(gsd_m)
     options = ProductionOptions(
         fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views
     )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
-        made = run_production(images, output, identity, options, sigma_m=sigma_m, progress=progress)
-    relative = made.relative_accuracy
+        production = run_production(
+            images, output, identity, options, sigma_m=sigma_m, progress=progress
+        )
+    relative = production.relative_accuracy
     show_one(
         {
             "block": output,
-            "points": len(made.points),
-            "views": int(made.points.views.start[-1]),
+            "points": len(production.points),
+            "views": int(production.points.views.start[-1]),
             "tie_points": relative.tie_points,
             "ray_residual_delivered_px": round(relative.before_px, 3),
             "ray_residual_adjusted_px": round(relative.after_px, 3),
@@ -84,46 +84,52 @@ def run(
 @app.command()
 def ortho(
     image: Annotated[Path, typer.Argument(help="GeoTIFF (or COG) or JPEG 2000 on a map.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the block; must not exist.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     dem: Annotated[Path | None, typer.Option(help="GeoTIFF with the heights of the ground.")] = None,
     vertical: Annotated[
         str | None,
-        typer.Option(help="What the heights are counted from: ellipsoid, EGM96, EGM2008, EPSG:…"),
+        typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…"),
     ] = None,
     geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     height_m: Annotated[
-        float | None, typer.Option(help="One height above the ellipsoid, instead of --dem.")
+        float | None,
+        typer.Option(help="Height of flat ground above the ellipsoid, metres; replaces --dem."),
     ] = None,
     height_sigma_m: Annotated[
         float | None,
-        typer.Option(help="Of the heights; by default a tenth of the terrain's step.", min=0.01),
+        typer.Option(
+            help="Sigma of the heights, metres; by default 0.1 of the terrain's step.", min=0.01
+        ),
     ] = None,
     block_id: Annotated[
-        str | None, typer.Option("--id", help="Of the block; else the folder's.")
+        str | None, typer.Option("--id", help="Id of the block; by default the folder's name.")
     ] = None,
-    version: Annotated[str, typer.Option(help="Of the block.")] = "1",
-    title: Annotated[str, typer.Option(help="For people.")] = "",
-    license_name: Annotated[str, typer.Option("--license", help="SPDX identifier.")] = "proprietary",
+    version: Annotated[str, typer.Option(help="Version of the block.")] = "1",
+    title: Annotated[str, typer.Option(help="Title of the block.")] = "",
+    license_name: Annotated[
+        str, typer.Option("--license", help="Licence: SPDX identifier.")
+    ] = "proprietary",
     gsd_m: Annotated[
         str | None,
-        typer.Option(help="Ground samplings of the chips: FINE,COARSE in metres; else the image's."),
+        typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres; by default the image's."),
     ] = None,
-    points: Annotated[int, typer.Option(help="How many to aim at, without --spacing-m.", min=6)] = (
-        _DEFAULT.points
-    ),
+    points: Annotated[
+        int, typer.Option(help="Desired number of points; --spacing-m overrides it.", min=6)
+    ] = (_DEFAULT.points),
     spacing_m: Annotated[
-        float | None, typer.Option(help="One point a square of this side.", min=1.0)
+        float | None, typer.Option(help="One point per square of this side, metres.", min=1.0)
     ] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the image on the map, metres.", min=0.01)
+        float | None, typer.Option(help="Accuracy of the image on the map, one sigma, metres.", min=0.01)
     ] = None,
-    bands: Annotated[str | None, typer.Option(help="Looked at: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
+    bands: Annotated[str | None, typer.Option(help="Bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Image that is not zero where no point shall be.")
+        Path | None, typer.Option(help="Image of the same ground; no points where it is not 0.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make control points with chips out of one ortho-image and the heights of its ground."""
+    """Make control points with chips from one ortho-image and the heights of its ground."""
     fine_m, coarse_m = (None, None) if gsd_m is None else _pair(gsd_m)
     options = OrthoPointOptions(
         fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points
@@ -132,13 +138,13 @@ def ortho(
     files = OrthoFiles(image, terrain, height_m, height_sigma_m, sigma_m, bands, mask)
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
-        made = run_ortho_production(files, output, identity, options, progress)
+        production = run_ortho_production(files, output, identity, options, progress)
     show_one(
         {
             "block": output,
-            "points": len(made.points),
-            "views": int(made.points.views.start[-1]),
-            "chip_gsds_m": list(made.gsds_m),
+            "points": len(production.points),
+            "views": int(production.points.views.start[-1]),
+            "chip_gsds_m": list(production.gsds_m),
         },
         as_json=as_json,
     )
@@ -149,7 +155,7 @@ def _pair(text: str) -> tuple[float, float]:
     try:
         fine_m, coarse_m = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f"--gsd-m: {text!r} is not FINE,COARSE, as 2,20") from None
+        raise InputError(f"--gsd-m: {text!r} found, FINE,COARSE such as 2,20 expected") from None
     if not 0.0 < fine_m < coarse_m:
-        raise InputError(f"--gsd-m: {text!r}: two lengths are expected, the finer first")
+        raise InputError(f"--gsd-m: {text!r} found, two lengths in metres with the finer first expected")
     return fine_m, coarse_m

@@ -21,8 +21,8 @@ class _OpenChipFile:
 class StoredChips:
     """A `services.types.ChipSource` of the chip files in the storage, which are named by their keys.
 
-    Files stay open with their headers parsed, so that a read is one `pread` or one range request. Threads
-    may share it.
+    Files stay open with their headers parsed, so that a read is one `pread` or one range request.
+    Threads may share it.
     """
 
     def __init__(self, storage: Storage) -> None:
