@@ -40,8 +40,7 @@ class Settings(BaseSettings):
         job_memory_bytes, job_seconds: limits of one job on memory and time.
         result_days: days until the result files of a job are removed; None keeps them.
         lease_seconds: time after which another worker takes over the job of a silent worker.
-        storage_url: bucket of S3-compatible storage for the files, `s3://BUCKET/PREFIX`; None for the data
-            folder.
+        storage_url: S3-compatible bucket for the files, `s3://BUCKET/PREFIX`; None for the data folder.
         scene_folder: scenes below it can be registered without an upload; None allows none.
         reference_folder: reference images and terrains below it can be added; None allows none.
         ingest_folder: block folders below it can be ingested through the API; None allows none.

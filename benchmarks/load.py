@@ -73,8 +73,15 @@ def run(folder: Path, clients: int, seconds: float, seed: int) -> dict[str, Any]
         if not (until(service.is_ready) and until(service.workers)):
             raise TimeoutError("the service did not start")
         secret, first_id = _fill(service, folder)
-        (worker,) = service.workers()
-        return _loaded(service, worker, folder, secret, first_id, clients, seconds, seed)
+        return _measure(
+            service,
+            folder,
+            secret=secret,
+            first_id=first_id,
+            clients=clients,
+            seconds=seconds,
+            seed=seed,
+        )
     finally:
         service.process.terminate()
         service.process.wait(timeout=60)
@@ -100,16 +107,18 @@ def _fill(service: Service, folder: Path) -> tuple[str, int]:
     return secret, int(row["id"])
 
 
-def _loaded(
+def _measure(
     service: Service,
-    worker: int,
     folder: Path,
+    *,
     secret: str,
     first_id: int,
     clients: int,
     seconds: float,
     seed: int,
 ) -> dict[str, Any]:
+    """Send requests from many clients and jobs beside them; returns times, errors and memory."""
+    (worker,) = service.workers()
     load, stop, lock = Load(), threading.Event(), threading.Lock()
     memory: dict[str, list[int]] = {"api": [], "worker": []}
 

@@ -113,7 +113,7 @@ class Attempts:
             self._settle(job, code)
 
     def _settle(self, job: Job, code: int) -> None:
-        """Fail a job or schedule another attempt: after a bug, crash or outage up to a number of times."""
+        """Fail a job, or schedule another attempt after one of its first bugs, crashes or outages."""
         if code == 0:
             return
         log.error("job %s: attempt %d ended with exit code %d", job.id, job.attempt, code)
@@ -166,7 +166,7 @@ class Attempts:
                 _kill(process)
 
     def _installation(self) -> dict[str, str]:
-        """Variables that lead the process to the database, which this worker keeps running, and the files."""
+        """Variables with the places of the files and of the database that this worker keeps running."""
         ingest = self.settings.ingest_folder
         return {
             "AMERS_DATABASE_URL": self.database.dsn,

@@ -24,7 +24,7 @@ from app.worker.sweep import Sweeper
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0
-"""Longest time until a delayed entry of the queue is found; of new entries the queue notifies workers."""
+"""Longest time until a delayed entry of the queue is found; new entries notify the workers."""
 PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
 

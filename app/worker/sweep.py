@@ -29,7 +29,7 @@ MOST_BETWEEN_S = 2 * FILES_EVERY_S
 """Longest credible time between two sweeps of files; a clock that shows more has jumped."""
 LONGEST_UPLOAD_S = 3600.0 * scenes.LONGEST_UPLOAD_HOURS
 LONGEST_WAIT_S = 5
-"""Longest wait for ingestions to end: this thread takes over no jobs meanwhile, and new ingestions wait."""
+"""Longest wait for the end of ingestions; meanwhile no jobs are taken over and new ingestions wait."""
 
 log = logging.getLogger(__name__)
 
