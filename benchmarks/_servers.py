@@ -17,6 +17,7 @@ from urllib.parse import quote
 from psycopg.conninfo import conninfo_to_dict
 
 from app.db.engine import Connection
+from tests.statements import run_sql
 
 PATIENCE_S = 120.0
 PEER_SCHEMA = "peer"
@@ -57,8 +58,8 @@ class Server:
 
 def show_to_peers(connection: Connection) -> None:
     """The same table as others can read it: positions in EPSG:4326 with an index, only what we tell."""
-    connection.execute(VIEW)
-    connection.execute("analyze point")
+    run_sql(connection, VIEW)
+    run_sql(connection, "analyze point")
 
 
 @contextmanager

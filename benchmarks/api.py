@@ -35,6 +35,7 @@ from benchmarks._filled import Ground, fill
 from benchmarks._measuring import keep
 from benchmarks._servers import Server
 from tests.factories import make_block
+from tests.statements import run_sql
 
 FOOTPRINT_POINTS = 1_800
 PAGE_POINTS = 15_000
@@ -276,8 +277,9 @@ def throughput(
 def chips(store: Store, repeats: int) -> Times:
     """The chips of 250 points, 2,000 views, as one archive."""
     with engine.connect(store.dsn) as connection:
-        rows = connection.execute(
-            "select p.id from point p join block b on b.number = p.block_number where b.id = 'chips'"
+        rows = run_sql(
+            connection,
+            "select p.id from point p join block b on b.number = p.block_number where b.id = 'chips'",
         ).fetchall()
     ids = np.array([row["id"] for row in rows])
     open_one, taken, size = store.server.connect(), [], 0

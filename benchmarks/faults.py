@@ -33,6 +33,7 @@ from benchmarks._measuring import keep
 from benchmarks._siege import LEASE_S, Siege
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block
+from tests.statements import run_sql
 
 OPEN_AT_ONCE = 4
 LONGEST_RUN_S = 1800.0
@@ -169,14 +170,15 @@ def looked_over(dsn: str, siege: Siege, caller: Caller) -> dict[str, Any]:
     with engine.pooled(dsn, settings) as database:
         with database.transaction() as connection:
             # Uploads that were cut off are given up after a day: let it pass.
-            connection.execute(
-                "update scene set created_at = created_at - interval '2 days' where state = 'uploading'"
+            run_sql(
+                connection,
+                "update scene set created_at = created_at - interval '2 days' where state = 'uploading'",
             )
-            connection.execute("update uptime set elapsed_s = elapsed_s + 2 * 86400")
+            run_sql(connection, "update uptime set elapsed_s = elapsed_s + 2 * 86400")
         sweep_files(database, storage, settings.job_seconds)
         storage.sweep_unfinished(0.0, spare="upload-")
         with database.transaction() as connection:
-            jobs = connection.execute("select * from job").fetchall()
+            jobs = run_sql(connection, "select * from job").fetchall()
             wrong = [
                 *caller.unexpected,
                 *wrong_jobs(connection, jobs, caller),
@@ -197,13 +199,14 @@ def wrong_jobs(connection: Connection, jobs: list[dict[str, Any]], caller: Calle
     known = {str(job["id"]): job for job in jobs}
     wrong = [f"job {job} is gone" for job in caller.jobs if job not in known]
     for name, job in known.items():
-        ends = connection.execute(
+        ends = run_sql(
+            connection,
             "select count(*) as n from audit where kind = 'job' and subject = %s"
             " and after ->> 'state' = any(%s) and before ->> 'state' <> after ->> 'state'",
             [name, list(ENDED)],
         ).fetchone()
-        results = connection.execute(
-            "select count(*) as n from registration where job_id = %s", [name]
+        results = run_sql(
+            connection, "select count(*) as n from registration where job_id = %s", [name]
         ).fetchone()
         assert ends is not None
         assert results is not None
@@ -221,7 +224,7 @@ def wrong_scenes(connection: Connection, storage: Storage, caller: Caller) -> li
     """Promised uploads that are gone or are not what was sent."""
     wrong = []
     for scene, sha256 in caller.scenes.items():
-        row = connection.execute("select file_key, state from scene where id = %s", [scene]).fetchone()
+        row = run_sql(connection, "select file_key, state from scene where id = %s", [scene]).fetchone()
         if row is None or row["state"] != "uploaded" or not storage.exists(row["file_key"]):
             wrong.append(f"scene {scene} is gone: {row}")
         elif hashlib.sha256(storage.path(row["file_key"]).read_bytes()).hexdigest() != sha256:
@@ -236,14 +239,15 @@ def wrong_blocks(connection: Connection, jobs: list[dict[str, Any]]) -> list[str
         for job in jobs
         if job["kind"] == "ingest-block"
     }
-    rows = connection.execute(
+    rows = run_sql(
+        connection,
         """select b.id, b.state,
                (select count(*) from point p where p.block_number = b.number) as points,
                (select count(*) from view v join point p on p.id = v.point_id
                 where p.block_number = b.number) as views,
                (select count(*) from image i where i.block_number = b.number) as images,
                (select count(*) from chip_file c where c.block_number = b.number) as files
-           from block b where b.id like 'faults-%'"""
+           from block b where b.id like 'faults-%'""",
     ).fetchall()
     whole = {
         "state": "published",
@@ -266,12 +270,13 @@ def wrong_files(connection: Connection, storage: Storage) -> list[str]:
     """Files that no row names, rows whose file is missing, chips that are not what their name says."""
     named = {
         row["key"]
-        for row in connection.execute(
+        for row in run_sql(
+            connection,
             """select storage_key as key from chip_file
                union select file_key from scene where state = 'uploaded' and file_key is not null
                union select file.value from job,
                    lateral jsonb_each_text(coalesce(results -> 'files', '{}')) as file
-               union select file_key from upload where file_key is not null"""
+               union select file_key from upload where file_key is not null""",
         ).fetchall()
     }
     stored = {

@@ -27,6 +27,7 @@ from app.usecases.features.items import find_collection, page
 from app.usecases.features.query import FeatureQuery, resolve
 from benchmarks._filled import Ground, fill
 from benchmarks._measuring import keep
+from tests.statements import run_sql
 
 SECRET = b"of pages"
 
@@ -109,7 +110,7 @@ def in_database(connection: Connection, box: Box) -> bytes:
 def in_rows(connection: Connection, box: Box) -> bytes:
     """The same reply from rows."""
     west, south, east, north = box.west, box.south, box.east, box.north
-    rows = connection.execute(ROWS, [west, south, east, north, west, east, south, north]).fetchall()
+    rows = run_sql(connection, ROWS, [west, south, east, north, west, east, south, north]).fetchall()
     features = []
     for row in rows:
         point_id, lon, lat, h = row.pop("id"), row.pop("lon"), row.pop("lat"), row.pop("h")

@@ -35,6 +35,7 @@ from benchmarks._measuring import keep
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block
 from tests.serving import Service, until
+from tests.statements import run_sql
 
 BOX = (5.2, 43.2, 5.6, 43.6)
 POINTS, IMAGES = 6_000, 2
@@ -101,7 +102,7 @@ def _fill(service: Service, folder: Path) -> tuple[str, int]:
     with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
         block = ingest_block(connection, Storage(service.folder / "storage"), made.folder).block
         publish_block(connection, str(block.number))
-        row = connection.execute("select min(id) as id from point").fetchone()
+        row = run_sql(connection, "select min(id) as id from point").fetchone()
         secret = create_token(connection, "load", ["admin"]).secret
     assert row is not None
     return secret, int(row["id"])

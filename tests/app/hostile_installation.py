@@ -23,6 +23,7 @@ from app.usecases.jobs import do_attempt
 from app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, FlatWorld
 from tests.factories import make_block
+from tests.statements import run_sql
 
 CANARY = "canary-7f3a91-must-never-be-seen"
 LIMIT_BYTES = 5_000_000
@@ -63,17 +64,19 @@ class Installation:
     def digest(self, without: tuple[str, ...] = ("audit",)) -> dict[str, str]:
         """Checksums of all tables and all files."""
         with self.database.transaction() as connection:
-            tables = connection.execute(
+            tables = run_sql(
+                connection,
                 "select tablename as name from pg_tables"
-                " where schemaname = 'public' and tablename <> 'spatial_ref_sys' order by 1"
+                " where schemaname = 'public' and tablename <> 'spatial_ref_sys' order by 1",
             ).fetchall()
-            sums = connection.execute(
+            sums = run_sql(
+                connection,
                 " union all ".join(
                     f"select '{name}' as name, md5(string_agg(t::text, '|' order by t::text)) as sum"
                     f" from {name} t"
                     for name in (table["name"] for table in tables)
                     if name not in without
-                )
+                ),
             ).fetchall()
         found = {row["name"]: str(row["sum"]) for row in sums}
         folder = self.settings.data_folder / "storage"
@@ -139,10 +142,12 @@ def hostile_installation(dsn: str, folder: Path, world: FlatWorld) -> Iterator[I
             scope = "register" if role == "other" else role
             headers[role] = _bearer(create_token(connection, role, [scope]).secret)
         revoked = create_token(connection, "revoked", ["admin"])
-        connection.execute("update token set revoked_at = now() where id = %s", [revoked.token.id])
+        run_sql(connection, "update token set revoked_at = now() where id = %s", [revoked.token.id])
         expired = create_token(connection, "expired", ["admin"], 1)
-        connection.execute(
-            "update token set expires_at = now() - interval '1 second' where id = %s", [expired.token.id]
+        run_sql(
+            connection,
+            "update token set expires_at = now() - interval '1 second' where id = %s",
+            [expired.token.id],
         )
     headers |= {"nobody": {}, "revoked": _bearer(revoked.secret), "expired": _bearer(expired.secret)}
     app = create_app(settings)

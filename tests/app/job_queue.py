@@ -5,6 +5,7 @@ from uuid import UUID, uuid4
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
 from app.db.jobs.jobs import Job
+from tests.statements import run_sql
 
 LEASE_S = 30.0
 
@@ -36,14 +37,17 @@ def state_of(database: Database, job_id: UUID) -> Job:
 def let_lease_lapse(database: Database, job_id: UUID) -> None:
     """As if the worker had been silent for too long."""
     with database.transaction() as connection:
-        connection.execute(
-            "update job set lease_until = now() - interval '1 second' where id = %s", [job_id]
+        run_sql(
+            connection,
+            "update job set lease_until = now() - interval '1 second' where id = %s",
+            [job_id],
         )
 
 
 def queue_entries(connection: Connection, job_id: UUID) -> int:
     """How many entries of the queue wait to be fetched for a job."""
-    row = connection.execute(
+    row = run_sql(
+        connection,
         "select count(*) as n from procrastinate_jobs where status = 'todo' and args ->> 'job_id' = %s",
         [str(job_id)],
     ).fetchone()

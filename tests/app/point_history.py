@@ -1,6 +1,7 @@
 """Time that passes for a store: what was written down lies further back."""
 
 from app.db.engine import Connection
+from tests.statements import run_sql
 
 MOVED = (
     "update upload set expires_at = expires_at - make_interval(hours => %s)",
@@ -12,12 +13,14 @@ MOVED = (
 def jump(connection: Connection, hours: int) -> None:
     """The clock of the database is so far ahead of what it was, all of a sudden; or behind."""
     for statement in MOVED:
-        connection.execute(statement, [hours])
+        run_sql(connection, statement, [hours])
 
 
 def let_pass(connection: Connection, hours: int) -> None:
     """So many hours go by in which the service runs."""
     jump(connection, hours)
-    connection.execute(
-        "update uptime set elapsed_s = elapsed_s + 3600 * %s, advanced_at = clock_timestamp()", [hours]
+    run_sql(
+        connection,
+        "update uptime set elapsed_s = elapsed_s + 3600 * %s, advanced_at = clock_timestamp()",
+        [hours],
     )

@@ -11,6 +11,7 @@ from app.errors import AmersError, ComputationError, Conflict, InputError, NotAl
 from app.main import create_app
 from app.usecases.tokens import create_token, list_tokens
 from services.errors import NotEnoughPoints
+from tests.statements import run_sql
 
 SCOPES = {"read": Reader, "register": Registrar, "admin": Admin}
 
@@ -26,7 +27,7 @@ def app(settings):
     @app.get("/number/{number}")
     def number(number: int, database: DatabaseDep) -> int:
         with database.reading() as connection:
-            return connection.execute("select %s / nullif(%s, 0) as it", [10, number]).fetchone()["it"]
+            return run_sql(connection, "select %s / nullif(%s, 0) as it", [10, number]).fetchone()["it"]
 
     @app.post("/echo")
     def echo(body: dict) -> dict:
@@ -47,7 +48,7 @@ def app(settings):
     @app.get("/slow")
     def slow(database: DatabaseDep) -> None:
         with database.reading() as connection:
-            connection.execute("select pg_sleep(20)")
+            run_sql(connection, "select pg_sleep(20)")
 
     return app
 
@@ -91,7 +92,9 @@ def test_a_ready_service_has_a_database_that_answers(client):
 def test_connections_that_the_database_has_closed_are_replaced_before_use(client, dsn):
     ours = "datname = current_database() and pid <> pg_backend_pid()"
     with engine.connect(dsn) as connection:
-        connection.execute(f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}")
+        run_sql(
+            connection, f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}"
+        )
     for _ in range(5):
         assert client.get("/readyz").json() == {"status": "ready"}
 

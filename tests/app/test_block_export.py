@@ -22,6 +22,7 @@ from services.formats.block.document import rectangle
 from services.types import point_chips
 from tests.app.job_queue import new_job
 from tests.factories import BOX, make_block
+from tests.statements import run_sql
 
 COLUMNS = """st_asewkb(geom) as place, sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north,
     corr_east_up, corr_north_up, n_views, saliency, typology, first_view, last_view, chip_count"""
@@ -37,10 +38,11 @@ def chips(storage):
 
 
 def rows(connection, number: int) -> list:
-    points = connection.execute(
-        f"select {COLUMNS} from point where block_number = %s order by id", [number]
+    points = run_sql(
+        connection, f"select {COLUMNS} from point where block_number = %s order by id", [number]
     ).fetchall()
-    views = connection.execute(
+    views = run_sql(
+        connection,
         """select v.view, v.gsd_m, v.incidence_deg, v.azimuth_deg, i.image_id, i.sensor, i.acquired_at
            from view v join image i on i.block_number = v.point_id >> 26 and i.image = v.image
            where v.point_id >> 26 = %s order by v.point_id, v.view""",

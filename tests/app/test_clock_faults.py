@@ -20,6 +20,7 @@ from app.usecases.tokens import create_token
 from tests.app.flat_world import make_flat_world
 from tests.app.workers import ended, running_worker, scene_to_register, under_way, wait_until
 from tests.serving import free_port
+from tests.statements import run_sql
 
 LEASE_S = 3.0
 PASSES = 40
@@ -124,7 +125,7 @@ def test_a_worker_whose_clock_jumps_keeps_its_job(
         done = ended(client, job, me)
     assert done["status"] == "successful", done
     with engine.connect(dsn) as connection:
-        row = connection.execute("select attempt, failures from job").fetchone()
+        row = run_sql(connection, "select attempt, failures from job").fetchone()
     assert row == {"attempt": 1, "failures": 0}
 
 
@@ -136,8 +137,10 @@ def test_tokens_expire_by_the_clock_of_the_database(
     with engine.connect(dsn) as connection:
         valid = create_token(connection, "valid for a day", ["read"], 1).secret
         expired = create_token(connection, "expired", ["read"], 1)
-        connection.execute(
-            "update token set expires_at = now() - interval '1 hour' where id = %s", [expired.token.id]
+        run_sql(
+            connection,
+            "update token set expires_at = now() - interval '1 hour' where id = %s",
+            [expired.token.id],
         )
     port = free_port()
     environment = (

@@ -13,6 +13,7 @@ from app.db import superseding
 from app.usecases.blocks import lifecycle
 from app.usecases.features import items
 from tests.factories import make_block
+from tests.statements import run_sql
 
 ITEMS = "/collections/points/items"
 TILES = "/collections/{}/tiles/WebMercatorQuad/{}/{}/{}"
@@ -124,7 +125,7 @@ def test_density_is_what_is_published_and_goes_when_it_is_withdrawn(get, connect
     lifecycle.withdraw_block(connection, "calanques")
     connection.commit()
     assert get("/collections/density/items").json()["features"] == []
-    levels = connection.execute("select count(*) as n from density_cell").fetchone()
+    levels = run_sql(connection, "select count(*) as n from density_cell").fetchone()
     assert levels == {"n": 0}
 
 
@@ -137,15 +138,17 @@ def test_density_counts_points_that_are_served(get, connection):
         ).content
 
     whole = counted()
-    connection.execute(
-        "update point set suspended_at = now(), suspended_because = 'gone' where id < %s", [2**26 + 7]
+    run_sql(
+        connection,
+        "update point set suspended_at = now(), suspended_because = 'gone' where id < %s",
+        [2**26 + 7],
     )
     superseding.count_unserved(connection)
     connection.commit()
     fewer = counted()
     assert (whole[0], fewer[0]) == (60, 53)
     assert fewer[1] != whole[1]
-    connection.execute("update point set suspended_at = null, suspended_because = null")
+    run_sql(connection, "update point set suspended_at = null, suspended_because = null")
     superseding.count_unserved(connection)
     connection.commit()
     assert counted()[0] == 60
@@ -205,7 +208,7 @@ def test_tilesets_are_described_and_tiles_that_are_not_there_are_not_found(get):
 
 
 def test_pages_for_people_show_no_more_than_text(get, connection):
-    connection.execute("update block set title = '<script>alert(1)</script>'")
+    run_sql(connection, "update block set title = '<script>alert(1)</script>'")
     connection.commit()
     page = get("/collections/blocks/items", f="html").text
     assert "&lt;script&gt;" in page

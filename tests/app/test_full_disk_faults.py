@@ -20,6 +20,7 @@ from app.usecases.blocks import lifecycle
 from app.usecases.garbage_collection import remove_unnamed_chips
 from tests.app.workers import ended, running_worker
 from tests.factories import make_block
+from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
@@ -163,8 +164,8 @@ def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is
             engine.upgrade(dsn)
             with engine.connect(dsn) as connection:
                 # A fresh segment of the log, begun: what has no room is the table.
-                connection.execute("select pg_switch_wal()")
-                connection.execute("checkpoint")
+                run_sql(connection, "select pg_switch_wal()")
+                run_sql(connection, "checkpoint")
             ballast = disk.folder / "ballast"
             free = shutil.disk_usage(disk.folder).free
             ballast.write_bytes(bytes(free - MEBIBYTE // 2))

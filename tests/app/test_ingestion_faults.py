@@ -23,6 +23,7 @@ from app.usecases.blocks import lifecycle
 from app.usecases.garbage_collection import remove_unnamed_chips
 from services.errors import FormatError
 from tests.factories import make_block
+from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
@@ -33,7 +34,7 @@ PATIENCE_S = 30.0
 def rows(connection) -> dict[str, int]:
     """How many rows of blocks there are."""
     return {
-        table: connection.execute(f"select count(*) as n from {table}").fetchone()["n"]
+        table: run_sql(connection, f"select count(*) as n from {table}").fetchone()["n"]
         for table in TABLES
     }
 

@@ -16,6 +16,7 @@ from app.storage import Storage
 from app.worker.attempt import FAILURES_ALLOWED
 from app.worker.sweep import sweep_files, sweep_jobs
 from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, queue_entries, state_of
+from tests.statements import run_sql
 
 
 def test_a_job_is_claimed_by_one_worker_only(database: Database):
@@ -108,8 +109,10 @@ def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):
 def test_a_job_that_the_queue_has_lost_is_put_back_into_it(database: Database):
     lost, queued = new_job(database), new_job(database)
     with database.transaction() as connection:
-        connection.execute("delete from procrastinate_jobs where args ->> 'job_id' = %s", [str(lost.id)])
-        connection.execute("update job set updated_at = now() - interval '1 hour'")
+        run_sql(
+            connection, "delete from procrastinate_jobs where args ->> 'job_id' = %s", [str(lost.id)]
+        )
+        run_sql(connection, "update job set updated_at = now() - interval '1 hour'")
     sweep_jobs(database, LEASE_S)
     sweep_jobs(database, LEASE_S)
     with database.transaction() as connection:
@@ -120,16 +123,18 @@ def test_a_job_that_the_queue_has_lost_is_put_back_into_it(database: Database):
 def test_entries_of_the_queue_that_died_with_their_worker_are_forgotten(database: Database):
     new_job(database)
     with database.transaction() as connection:
-        connection.execute(
-            "insert into procrastinate_workers (last_heartbeat) values (now() - interval '1 h')"
+        run_sql(
+            connection,
+            "insert into procrastinate_workers (last_heartbeat) values (now() - interval '1 h')",
         )
-        connection.execute(
+        run_sql(
+            connection,
             "update procrastinate_jobs set status = 'doing',"
-            " worker_id = (select id from procrastinate_workers)"
+            " worker_id = (select id from procrastinate_workers)",
         )
     sweep_jobs(database, LEASE_S)
     with database.transaction() as connection:
-        assert connection.execute("select id from procrastinate_jobs").fetchall() == []
+        assert run_sql(connection, "select id from procrastinate_jobs").fetchall() == []
 
 
 def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Database, storage: Storage):

@@ -12,6 +12,7 @@ from app.db.jobs import attempts, jobs, progress
 from app.db.jobs.jobs import Job, JobFilter
 from app.storage import Storage
 from app.worker.sweep import sweep_files, sweep_results
+from tests.statements import run_sql
 
 LEASE_S = 30.0
 LONGEST_JOB_S = 3600.0
@@ -36,7 +37,8 @@ def done_in(connection: Connection, seconds: float, kind: str = "register-scene"
     """A job that succeeded so long after a worker had taken it."""
     job = begun(connection, kind)
     attempts.succeed(connection, job.id, job.attempt, {})
-    connection.execute(
+    run_sql(
+        connection,
         "update job set claimed_at = finished_at - make_interval(secs => %s) where id = %s",
         [seconds, job.id],
     )
@@ -46,7 +48,7 @@ def done_in(connection: Connection, seconds: float, kind: str = "register-scene"
 def wait_of(connection: Connection, job: Job) -> timedelta:
     """From now to the expected end of a job."""
     end = progress.expected_end(connection, job)
-    now = connection.execute("select clock_timestamp() as now").fetchone()
+    now = run_sql(connection, "select clock_timestamp() as now").fetchone()
     assert end is not None
     assert now is not None
     moment: datetime = now["now"]
@@ -82,8 +84,10 @@ def test_the_expected_end_is_the_median_of_past_jobs_of_its_process(connection: 
         done_in(connection, seconds)
     done_in(connection, 5, kind="ingest-block")
     assert abs(wait_of(connection, running) - timedelta(seconds=100)) < a_slow_machine
-    connection.execute(
-        "update job set claimed_at = claimed_at - interval '70 s' where id = %s", [running.id]
+    run_sql(
+        connection,
+        "update job set claimed_at = claimed_at - interval '70 s' where id = %s",
+        [running.id],
     )
     later = jobs.find(connection, running.id)
     assert later is not None
@@ -98,9 +102,10 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     waiting = asked(connection)
     asked(connection)
     assert abs(wait_of(connection, waiting) - timedelta(seconds=100 + 20 + 100)) < a_slow_machine
-    connection.execute(
+    run_sql(
+        connection,
         "insert into procrastinate_workers (last_heartbeat) values (now()), (now()),"
-        " (now() - interval '1 hour')"
+        " (now() - interval '1 hour')",
     )
     assert abs(wait_of(connection, waiting) - timedelta(seconds=(100 + 20) / 2 + 100)) < a_slow_machine
     ended = jobs.find(connection, done_in(connection, 1))
@@ -110,12 +115,12 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
 
 def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Connection):
     made = [asked(connection) for _ in range(6)]
-    queued = connection.execute(
-        "select args ->> 'job_id' as job from procrastinate_jobs order by id"
+    queued = run_sql(
+        connection, "select args ->> 'job_id' as job from procrastinate_jobs order by id"
     ).fetchall()
     assert [row["job"] for row in queued] == [str(job.id) for job in made]
     assert [progress.position(connection, job) for job in made] == [1, 2, 3, 4, 5, 6]
-    connection.execute("update job set created_at = %s", [made[0].created_at])
+    run_sql(connection, "update job set created_at = %s", [made[0].created_at])
     alike = [replace(job, created_at=made[0].created_at) for job in made]
     assert sorted(progress.position(connection, job) for job in alike) == [1, 2, 3, 4, 5, 6]
     pages = [jobs.newest(connection, None, JobFilter(), 2)]
@@ -139,7 +144,8 @@ def test_results_go_after_a_while_and_the_job_says_so(
             assert job is not None
             key = storage.put(f"results/{job.id}/1/report.json", [b"{}"]).key
             attempts.succeed(connection, job.id, 1, {"verdict": "good", "files": {"report.json": key}})
-            connection.execute(
+            run_sql(
+                connection,
                 "update job set finished_at = finished_at - make_interval(secs => %s) where id = %s",
                 [86_400.0 * age_days, job.id],
             )

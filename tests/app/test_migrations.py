@@ -19,6 +19,7 @@ from app.db.cluster import backup
 from app.db.engine import SchemaStatus
 from app.errors import Conflict, InputError
 from app.usecases.tokens import create_token, list_tokens
+from tests.statements import run_sql
 
 TABLES = "select tablename from pg_tables where schemaname = 'public'"
 OURS = {
@@ -57,7 +58,7 @@ def test_an_empty_database_gets_the_tables_of_the_store_and_the_queue(empty_dsn)
 def test_whoever_opens_a_new_database_reads_as_a_reader_at_once(empty_dsn, monkeypatch, tmp_path):
     monkeypatch.setattr(engine.embedded, "database", lambda settings: nullcontext(empty_dsn))
     with engine.opened(Settings(data_folder=tmp_path)) as database, database.reading() as connection:
-        row = connection.execute("select current_user as who").fetchone()
+        row = run_sql(connection, "select current_user as who").fetchone()
     assert row["who"] == engine.READER
 
 
@@ -99,7 +100,7 @@ def test_a_database_of_your_own_is_not_upgraded_behind_your_back(empty_dsn, tmp_
 
 def test_a_database_of_a_newer_amers_is_left_alone(dsn):
     with engine.connect(dsn) as connection:
-        connection.execute("update alembic_version set version_num = '9999'")
+        run_sql(connection, "update alembic_version set version_num = '9999'")
     with pytest.raises(InputError, match="newer than this Amers"):
         engine.upgrade(dsn)
 
@@ -113,17 +114,17 @@ def test_reading_connections_can_neither_write_nor_take_too_long(dsn, tmp_path):
     settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path, read_timeout_seconds=0.1)
     with engine.opened(settings) as database:
         with pytest.raises(psycopg.errors.ReadOnlySqlTransaction), database.reading() as connection:
-            connection.execute("delete from token")
+            run_sql(connection, "delete from token")
         with pytest.raises(psycopg.errors.QueryCanceled), database.reading() as connection:
-            connection.execute("select pg_sleep(5)")
+            run_sql(connection, "select pg_sleep(5)")
 
 
 def test_reading_connections_have_a_role_that_can_only_select(dsn, tmp_path):
     settings = Settings(database_url=SecretStr(dsn), data_folder=tmp_path)
     with engine.opened(settings) as database:
         with database.reading() as connection:
-            assert connection.execute("select current_user as me").fetchone()["me"] == engine.READER
-            assert connection.execute("select count(*) as n from audit").fetchone()["n"] == 0
+            assert run_sql(connection, "select current_user as me").fetchone()["me"] == engine.READER
+            assert run_sql(connection, "select count(*) as n from audit").fetchone()["n"] == 0
         forbidden = (
             "select pg_read_file('/etc/passwd')",
             "copy (select 1) to program 'true'",
@@ -136,11 +137,14 @@ def test_reading_connections_have_a_role_that_can_only_select(dsn, tmp_path):
                 ),
                 database.reading() as connection,
             ):
-                connection.execute(statement)
-        with database.reading() as connection, connection.transaction(force_rollback=True):
-            connection.execute("set transaction read write")
+                run_sql(connection, statement)
+        with (
+            database.reading() as connection,
+            engine.driver(connection).transaction(force_rollback=True),
+        ):
+            run_sql(connection, "set transaction read write")
             with pytest.raises(psycopg.errors.InsufficientPrivilege):
-                connection.execute("delete from token")
+                run_sql(connection, "delete from token")
 
 
 def test_a_transaction_is_kept_whole_or_not_at_all(dsn, tmp_path):
@@ -156,9 +160,10 @@ def test_a_transaction_is_kept_whole_or_not_at_all(dsn, tmp_path):
 
 def test_a_point_lies_in_the_range_of_its_block(connection):
     with pytest.raises(psycopg.errors.CheckViolation, match="point"):
-        connection.execute(
+        run_sql(
+            connection,
             "insert into point values (5, 1, st_setsrid(st_makepoint(0, 0, 0), 4979),"
-            " 1, 1, 1, 0, 0, 0, 2, 1, null, null, null, 1, 0, 2)"
+            " 1, 1, 1, 0, 0, 0, 2, 1, null, null, null, 1, 0, 2)",
         )
 
 

@@ -29,6 +29,7 @@ from tests.app.workers import (
     under_way,
     wait_until,
 )
+from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
@@ -160,9 +161,10 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
         assert worker.poll() is None
     assert client.get(job, headers=me).json() == done, "what came late changed nothing"
     with engine.connect(dsn) as connection:
-        rows = connection.execute(
+        rows = run_sql(
+            connection,
             "select attempt, (select count(*) from registration r where r.job_id = j.id) as results"
-            " from job j order by created_at"
+            " from job j order by created_at",
         ).fetchall()
     assert [(row["attempt"], row["results"]) for row in rows] == [(2, 1), (1, 1)]
     assert {key.split("/")[2] for key in storage.keys(f"results/{done['jobID']}")} == {"2"}

@@ -20,6 +20,7 @@ from app.usecases import quotas
 from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
 from tests.factories import make_block
+from tests.statements import run_sql
 
 
 def changes(connection, **chosen) -> list:
@@ -49,7 +50,7 @@ def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
 def test_the_record_only_grows(connection, statement):
     create_token(connection, "a", ["read"])
     with pytest.raises(psycopg.errors.InsufficientPrivilege, match="only grows"):
-        connection.execute(statement)
+        run_sql(connection, statement)
 
 
 def test_a_change_over_the_api_names_caller_and_request(client, connection, bearer):

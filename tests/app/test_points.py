@@ -26,6 +26,7 @@ from app.usecases.features.items import everything_in
 from app.usecases.features.query import FeatureQuery, condition_of
 from services.geodesy import east_north_up
 from tests.factories import make_block
+from tests.statements import run_sql
 
 ITEMS = "/collections/points/items"
 a_tenth_of_a_millimetre_deg = 1e-9
@@ -179,7 +180,7 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     lifecycle.publish_block(connection, "calanques")
     hidden = make_block(tmp_path / "hidden", count=3_000, n_images=2, gsds_m=(2.0,), name="hidden")
     lifecycle.ingest_block(connection, storage, hidden.folder)
-    connection.execute("analyze point")
+    run_sql(connection, "analyze point")
     lon = many.points.lon_lat_h[:, 0]
     ordered = np.sort(lon)
     middle = (ordered[9_999] + ordered[10_000]) / 2

@@ -40,6 +40,7 @@ from services.registration.options import RegistrationOptions
 from services.types import FloatImage
 from tests.app.buckets import running_bucket
 from tests.app.workers import ended, running_worker
+from tests.statements import run_sql
 
 SHIFT_PX = np.array([5.3, -3.6])
 A_TENTH_OF_A_PIXEL = 0.1
@@ -110,7 +111,7 @@ def registered(database: Database, settings: Settings, image: Path, output: Path
 
 def places(connection: Connection) -> list[tuple[int, int]]:
     """How often each place was looked for and found."""
-    rows = connection.execute("select attempts, successes from reference_point order by id").fetchall()
+    rows = run_sql(connection, "select attempts, successes from reference_point order by id").fetchall()
     return [(row["attempts"], row["successes"]) for row in rows]
 
 

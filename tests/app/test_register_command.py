@@ -28,6 +28,7 @@ from tests.app.registered import (
     write_mask,
 )
 from tests.app.running_service import running_service
+from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
@@ -155,8 +156,9 @@ def test_the_command_registers_with_the_store_and_remembers_the_measures(
     assert "verdict" in done.stdout
     assert_registered(folder, world)
     with engine.connect(dsn) as connection:
-        rows = connection.execute(
-            "select count(*) as n from registration join measure on registration_id = registration.id"
+        rows = run_sql(
+            connection,
+            "select count(*) as n from registration join measure on registration_id = registration.id",
         ).fetchone()
     assert rows == {"n": 40}
 

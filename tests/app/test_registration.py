@@ -29,6 +29,7 @@ from tests.app.registered import (
     write_mask,
 )
 from tests.app.workers import ended, running_worker
+from tests.statements import run_sql
 
 Bearer = Callable[[str], dict[str, str]]
 
@@ -122,10 +123,10 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     assert report["checks"][0]["accuracy"]["n"] == CHECK_POINTS
     assert_masked(folder)
     with engine.connect(dsn) as connection:
-        counts = connection.execute(
-            "select count(*) as tried, count(*) filter (where active) as active from measure"
+        counts = run_sql(
+            connection, "select count(*) as tried, count(*) filter (where active) as active from measure"
         ).fetchone()
-        used = connection.execute("select block_versions, options from registration").fetchone()
+        used = run_sql(connection, "select block_versions, options from registration").fetchone()
     assert counts == {
         "tried": report["point_counts"]["visible"],
         "active": report["point_counts"]["active"],

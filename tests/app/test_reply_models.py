@@ -9,6 +9,7 @@ from fastapi.testclient import TestClient
 
 from app.usecases.blocks import lifecycle
 from tests.factories import make_block
+from tests.statements import run_sql
 
 FIRST_POINT = 2**26
 
@@ -20,7 +21,7 @@ def check(client: TestClient, bearer, connection, storage, tmp_path) -> Check:
     """Gets a path of a store with a block and a scene; checks the reply against a schema of the API."""
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", count=20).folder)
     lifecycle.publish_block(connection, "calanques")
-    connection.execute("insert into point_history (point_id) select id from point limit 3")
+    run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
     connection.commit()
     headers = bearer("admin")
     assert client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=headers).is_success

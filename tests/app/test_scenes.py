@@ -21,6 +21,7 @@ from app.usecases.scenes import clean_name, folder_of
 from app.worker.sweep import sweep_files
 from tests.app.running_service import running_service
 from tests.app.workers import wait_until
+from tests.statements import run_sql
 
 TIFF = b"II*\0" + bytes(100_000)
 LIMIT_BYTES = 200_000
@@ -239,7 +240,8 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
     with database.transaction() as connection:
         arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", None)
         cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", None)
-        connection.execute(
+        run_sql(
+            connection,
             "update scene set created_at = now() - interval '2 days', created_at_uptime_s = -2 * 86400"
             " where id = %s",
             [cut_off],
@@ -258,7 +260,7 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
 def test_an_upload_survives_no_failure_of_the_database(settings: Settings, bearer: Bearer, dsn: str):
     me = bearer("register")
     with engine.connect(dsn) as connection:
-        connection.execute("alter table scene add constraint test_only check (state <> 'uploaded')")
+        run_sql(connection, "alter table scene add constraint test_only check (state <> 'uploaded')")
     with TestClient(create_app(settings), raise_server_exceptions=False) as client:
         reply = client.post("/scenes?name=a.tif", content=TIFF, headers=me)
         assert reply.status_code == 500
@@ -282,7 +284,7 @@ def test_an_upload_cut_off_by_its_sender_leaves_nothing(
 
         def forgotten() -> bool:
             with engine.connect(dsn) as connection:
-                row = connection.execute("select count(*) as n from scene").fetchone()
+                row = run_sql(connection, "select count(*) as n from scene").fetchone()
             return row == {"n": 0}
 
         wait_until(forgotten, "the scene is forgotten", 20.0)

@@ -15,6 +15,7 @@ from services.formats.block.document import AccuracyFigure
 from services.formats.block.writer import write_block
 from services.types import Array
 from tests.factories import BOX, control_points, metadata, noise_chips
+from tests.statements import run_sql
 
 metre_of_latitude_deg = 1.0 / 111_000.0
 
@@ -54,10 +55,11 @@ def ingest(connection, storage, tmp_path):
 
 def served(connection) -> dict[str, int]:
     """How many points of each block are served."""
-    rows = connection.execute(
+    rows = run_sql(
+        connection,
         """select b.id || '@' || b.version as name, count(*) as n, b.n_points - b.n_unserved as told
            from point p join block b on b.number = p.block_number
-           where b.state = 'published' and p.superseded_by is null group by b.number order by 1"""
+           where b.state = 'published' and p.superseded_by is null group by b.number order by 1""",
     ).fetchall()
     assert all(row["n"] == row["told"] for row in rows)
     return {row["name"]: row["n"] for row in rows}
@@ -72,9 +74,10 @@ def test_of_two_blocks_over_one_place_the_one_with_the_better_frame_is_served(
     for name in ("poor", "good"):
         lifecycle.publish_block(connection, name)
     assert served(connection) == {"good@1": 20, "poor@1": 10}
-    named = connection.execute(
+    named = run_sql(
+        connection,
         "select count(*) as n from point l join point w on w.id = l.superseded_by"
-        " where st_distancesphere(l.geom, w.geom) between 4.5 and 5.5"
+        " where st_distancesphere(l.geom, w.geom) between 4.5 and 5.5",
     ).fetchone()
     assert named["n"] == 20
 
@@ -124,11 +127,11 @@ def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, 
     for order in permutations(names):
         for name in order:
             lifecycle.publish_block(connection, name)
-        rows = connection.execute("select id, superseded_by from point order by id").fetchall()
+        rows = run_sql(connection, "select id, superseded_by from point order by id").fetchall()
         found.append([tuple(row.values()) for row in rows])
         for name in order[::-1]:
             lifecycle.withdraw_block(connection, name)
-        left = connection.execute("select count(superseded_by) as n from point").fetchone()
+        left = run_sql(connection, "select count(superseded_by) as n from point").fetchone()
         assert left["n"] == 0
     assert all(one == found[0] for one in found)
     assert any(superseded for _, superseded in found[0])
@@ -189,9 +192,10 @@ def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_pl
         ("b", "published"),
         ("c", "published"),
     ]
-    history = connection.execute(
+    history = run_sql(
+        connection,
         "select count(*) as n from audit where kind = 'block' and action = 'changed'"
-        " and before ->> 'state' = 'staged' and after ->> 'state' = 'published'"
+        " and before ->> 'state' = 'staged' and after ->> 'state' = 'published'",
     ).fetchone()
     assert history["n"] == len(wanted)
     connection.rollback()
@@ -200,7 +204,7 @@ def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_pl
 def test_publications_wait_for_each_other(dsn):
     with engine.connect(dsn) as one, engine.connect(dsn) as other:
         superseding.lock_publications(one)
-        other.execute("set local lock_timeout = '100ms'")
+        run_sql(other, "set local lock_timeout = '100ms'")
         with pytest.raises(Exception, match="lock timeout"):
             superseding.lock_publications(other)
         other.rollback()

@@ -14,6 +14,7 @@ from app.db.uploads import LIFE_HOURS
 from app.storage import Storage
 from app.worker.sweep import MOST_BETWEEN_S, sweep_files
 from tests.app.point_history import jump
+from tests.statements import run_sql
 
 JOB_S = 3600.0
 A_YEAR_H = 8760
@@ -97,7 +98,7 @@ def test_the_time_of_the_service_goes_on_by_a_little_at_a_jump_and_never_back(
 ):
     def elapsed_s() -> float:
         with database.transaction() as connection:
-            row = connection.execute("select uptime_s() as ran").fetchone()
+            row = run_sql(connection, "select uptime_s() as ran").fetchone()
         assert row is not None
         return float(row["ran"])
 

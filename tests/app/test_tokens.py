@@ -11,6 +11,7 @@ from app.auth import Scope, allows, authenticate, require
 from app.db import engine
 from app.errors import Conflict, InputError, NotAllowed, NotFound
 from app.usecases.tokens import create_token, list_tokens, revoke_token
+from tests.statements import run_sql
 
 ALLOWED = {
     "read": {Scope.READ},
@@ -31,7 +32,7 @@ def test_a_secret_opens_its_own_token(connection):
 
 def test_the_database_holds_no_secret(connection):
     new = create_token(connection, "survey office", ["read"])
-    row = connection.execute("select token::text as everything from token").fetchone()
+    row = run_sql(connection, "select token::text as everything from token").fetchone()
     assert new.secret not in row["everything"]
 
 
@@ -53,7 +54,7 @@ def test_a_revoked_token_is_refused_like_one_that_never_was(connection):
 
 def test_an_expired_token_is_refused(connection):
     new = create_token(connection, "survey office", ["read"], days=1)
-    connection.execute("update token set expires_at = now() - interval '1 second'")
+    run_sql(connection, "update token set expires_at = now() - interval '1 second'")
     with pytest.raises(NotAllowed):
         authenticate(connection, new.secret)
 

@@ -26,6 +26,7 @@ from tests.app.workers import (
     under_way,
     wait_until,
 )
+from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
@@ -83,8 +84,10 @@ def attempt_of(dsn: str, job_url: str) -> int:
 def results_of(dsn: str, job_url: str) -> int:
     """How many results the job has."""
     with engine.connect(dsn) as connection:
-        row = connection.execute(
-            "select count(*) as n from registration where job_id = %s", [job_url.rsplit("/", 1)[1]]
+        row = run_sql(
+            connection,
+            "select count(*) as n from registration where job_id = %s",
+            [job_url.rsplit("/", 1)[1]],
         ).fetchone()
     assert row is not None
     return int(row["n"])
@@ -279,9 +282,10 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(
     with running_worker(patient, log) as worker:
         under_way(client, job, me)
         with engine.connect(dsn) as connection:
-            connection.execute(
+            run_sql(
+                connection,
                 "select pg_terminate_backend(pid) from pg_stat_activity"
-                " where datname = current_database() and pid <> pg_backend_pid()"
+                " where datname = current_database() and pid <> pg_backend_pid()",
             )
         done = ended(client, job, me)
         other = ended(client, ask(1), me)

@@ -7,6 +7,7 @@ import pytest
 
 from app.usecases.blocks import lifecycle
 from tests.factories import make_block
+from tests.statements import run_sql
 
 
 @pytest.fixture
@@ -15,7 +16,7 @@ def made(connection, storage, tmp_path):
     made = make_block(tmp_path / "block", count=60)
     lifecycle.ingest_block(connection, storage, made.folder)
     lifecycle.publish_block(connection, "calanques")
-    connection.execute("insert into point_history (point_id) select id from point limit 3")
+    run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
     staged = make_block(tmp_path / "staged", count=10, seed=5, name="staged")
     lifecycle.ingest_block(connection, storage, staged.folder)
     connection.commit()

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tests.statements import run_sql
+
 COLLECTIONS = ("points", "blocks", "density", "point-history")
 a_tenth_of_a_millimetre_deg = 1e-9
 GEOJSON = "application/geo+json"
@@ -190,7 +192,7 @@ def test_req_core_http_not_found(get):
 
 def test_req_core_fc_links_next_page_while_data_change(get, connection, made):
     first = get("/collections/points/items", limit=25).json()
-    connection.execute("update block set state = 'published' where id = 'staged'")
+    run_sql(connection, "update block set state = 'published' where id = 'staged'")
     connection.commit()
     seen, page = [feature["id"] for feature in first["features"]], first
     while following := [item for item in page["links"] if item["rel"] == "next"]:

@@ -18,6 +18,7 @@ from app.storage import Storage
 from app.usecases import results
 from app.usecases.jobs import PROCESSES, error_details
 from services.errors import NotEnoughPoints
+from tests.statements import run_sql
 
 EXCEPTIONS = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 OGC = "http://www.opengis.net/def/rel/ogc/1.0/"
@@ -390,8 +391,10 @@ def test_req_job_list_parameters(get, ask, dsn):
     attempt = begun(dsn, ended["jobID"]).attempt
     with engine.connect(dsn) as connection:
         attempts.succeed(connection, UUID(ended["jobID"]), attempt, {})
-        connection.execute(
-            "update job set started_at = finished_at - interval '1 hour' where id = %s", [ended["jobID"]]
+        run_sql(
+            connection,
+            "update job set started_at = finished_at - interval '1 hour' where id = %s",
+            [ended["jobID"]],
         )
 
     def listed(**query: Any) -> list[str]:
