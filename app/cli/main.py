@@ -34,7 +34,7 @@ COMMANDS = {
     "demo": "Run the whole work on a simulated world.",
     "serve": "Run the API and one worker.",
     "worker": "Run a worker without the API.",
-    "audit": "Show the record of changes.",
+    "audit": "Show the audit trail.",
 }
 """Groups of commands and single commands with their help, each in the module of its name."""
 

@@ -1,4 +1,4 @@
-"""Operations of an installation: its figures, and the audit record of changes."""
+"""Operations of an installation: its figures and its audit trail."""
 
 import shutil
 from dataclasses import dataclass
