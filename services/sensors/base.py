@@ -1,4 +1,4 @@
-"""What every sensor model can do."""
+"""The interface of all sensor models."""
 
 from typing import Protocol
 
@@ -8,7 +8,7 @@ from services.types import Array
 class SensorModel(Protocol):
     """The relation between image positions and ground positions of one image.
 
-    Models never change: a corrected model is a new object. Rows that cannot be computed are NaN.
+    Models are immutable: a corrected model is a new object. Rows that cannot be computed are NaN.
     """
 
     @property
@@ -25,7 +25,7 @@ class SensorModel(Protocol):
         ...
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
-        """Ground position of image points at known heights: (n, 2) and (n,) to (n, 3)."""
+        """Ground position of image points at given heights: (n, 2) and (n,) to (n, 3)."""
         ...
 
     def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""A correction in image space, and the model that carries it."""
+"""Corrections of sensor models in image space."""
 
 from dataclasses import dataclass, replace
 
@@ -11,15 +11,15 @@ from services.types import Array
 
 @dataclass(frozen=True)
 class ImageCorrection:
-    """An affine displacement of image positions: from where the model says to where things are.
+    """An affine displacement of image positions, from those of a model to the true ones.
 
     With `t = (line_sample - centre) / half_size`, a position moves by
-    `parameters @ (1, t_line, t_sample)`. A shift fills the first column only, a drift adds the
-    diagonal (line by line, sample by sample), an affine fills everything.
+    `parameters @ (1, t_line, t_sample)`. A shift has nonzero parameters in the first column only, a
+    drift also on the diagonal (line by line, sample by sample), an affine everywhere.
 
     Attributes:
-        parameters: (2, 3) pixels; rows line and sample; constant, along lines, along samples. The last
-            two are displacements at the edge of the image.
+        parameters: (2, 3) pixels; rows line and sample; columns constant, along lines, along samples.
+            The last two are displacements at the edge of the image.
         centre, half_size: (2,) pixels.
     """
 
@@ -33,7 +33,7 @@ class ImageCorrection:
         return np.asarray(line_sample + self.parameters[:, 0] + t @ self.parameters[:, 1:].T)
 
     def invert(self, line_sample: Array) -> Array:
-        """Positions (n, 2) the uncorrected model would give for corrected ones (n, 2)."""
+        """Positions (n, 2) of the uncorrected model for corrected positions (n, 2)."""
         moved = line_sample - self.centre - self.parameters[:, 0]
         return np.asarray(self.centre + moved @ np.linalg.inv(self.jacobian).T)
 
@@ -44,7 +44,7 @@ class ImageCorrection:
 
 
 def no_correction(shape: tuple[int, int]) -> ImageCorrection:
-    """The correction that changes nothing, for an image of the given lines and samples."""
+    """The zero correction of an image with the given lines and samples."""
     size = np.array(shape, dtype=np.float64)
     return ImageCorrection(np.zeros((2, 3)), (size - 1.0) / 2.0, size / 2.0)
 
@@ -54,8 +54,8 @@ class CorrectedModel:
     """A sensor model followed by a correction in image space.
 
     Attributes:
-        base: the model as delivered.
-        correction: from its image positions to the true ones.
+        base: the delivered model.
+        correction: from image positions of the delivered model to the true ones.
     """
 
     base: SensorModel
@@ -75,7 +75,7 @@ class CorrectedModel:
         return np.asarray(self.correction.jacobian @ self.base.project_derivative(lon_lat_h))
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
-        """Ground position of image points at known heights: (n, 2) and (n,) to (n, 3)."""
+        """Ground position of image points at given heights: (n, 2) and (n,) to (n, 3)."""
         return self.base.locate(self.correction.invert(line_sample), height_m)
 
     def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
@@ -84,17 +84,17 @@ class CorrectedModel:
 
 
 def fold_into_rpc(model: RpcModel, correction: ImageCorrection) -> RpcModel:
-    """The RPC that carries a shift or a drift exactly.
+    """The RPC that includes a shift or a drift exactly.
 
-    A displacement of each coordinate by itself is a change of its offset and scale, hence of its
-    numerator: `num' = m num + c den`.
+    A displacement of each coordinate separately changes its offset and scale, hence its numerator:
+    `num' = m num + c den`.
 
     Raises:
-        ValueError: when the correction mixes lines and samples; such a one has to be refitted.
+        ValueError: the correction mixes lines and samples; `refined_rpc` fits an RPC to it.
     """
     mixed_px = np.abs(correction.parameters[[0, 1], [2, 1]])
     if mixed_px.any():
-        raise ValueError("only corrections of each coordinate by itself fold into an RPC")
+        raise ValueError("a correction that mixes lines and samples does not fold into an RPC")
     gain = np.diag(correction.jacobian)
     constant = correction.apply(model.image_offset[None, :])[0] - model.image_offset
     numerators = [

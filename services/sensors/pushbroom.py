@@ -1,4 +1,4 @@
-"""The rigorous model of a line scanner: where it is, how it is turned, where each detector looks."""
+"""The rigorous model of a line scanner: orbit, attitude and look directions of the detectors."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from services.sensors.rpc import VALIDITY
 from services.types import Array
 
 _NODES = 8
-"""Samples of orbit and attitude an interpolation rests on: a polynomial of degree seven."""
+"""Samples of orbit and attitude in an interpolation, by a polynomial of degree seven."""
 
 _PROJECT_TOLERANCE_PX = 1e-7
 _PROJECT_ITERATIONS = 30
@@ -21,26 +21,26 @@ _LOCATE_ITERATIONS = 20
 
 @dataclass(frozen=True)
 class PushbroomModel:
-    """One row of detectors that sweeps the ground, line by line.
+    """One row of detectors that scans the ground, line by line.
 
     In the body frame x points forwards, y to the right and z to the ground. The detector of a sample
     looks along `(tan_along, tan_across, 1)`; both tangents are polynomials of
     `(sample - centre) / half_width`, -1 to 1 over the row.
 
-    Orbit and attitude are interpolated by Lagrange polynomials over eight samples; a quaternion is
-    normalised afterwards. The tables should reach half an image beyond the first and the last line,
-    where the model ends.
+    Orbit and attitude are interpolated by Lagrange polynomials over eight samples; the quaternion is
+    then normalised. The tables should extend half an image beyond the first and the last line, where
+    the model ends.
 
     Attributes:
         image_shape: lines and samples.
         first_line_s: time of the centre of the first line, seconds.
-        line_period_s: time from one line to the next.
-        orbit_s: (m,) times of the orbit, increasing, eight or more.
+        line_period_s: time from one line to the next, seconds.
+        orbit_s: (m,) times of the orbit samples, seconds, increasing, at least eight.
         position: (m, 3) ECEF metres.
-        attitude_s: (k,) times of the attitude, increasing, eight or more.
-        ecef_from_body: (k, 4) unit quaternions x, y, z, w, without jumps of sign.
+        attitude_s: (k,) times of the attitude samples, seconds, increasing, at least eight.
+        ecef_from_body: (k, 4) unit quaternions x, y, z, w, without changes of sign.
         look: (2, degree + 1) coefficients of `tan_along` and `tan_across`, constant first.
-        height_range_m: lowest and highest ground the model is meant for.
+        height_range_m: lowest and highest ground the model is meant for, metres above the ellipsoid.
     """
 
     image_shape: tuple[int, int]
@@ -54,7 +54,7 @@ class PushbroomModel:
     height_range_m: tuple[float, float]
 
     def project(self, lon_lat_h: Array) -> Array:
-        """Image position of ground points, by secant steps on the line to 1e-7 px.
+        """Image position of ground points, by secant steps on the line until 1e-7 px.
 
         Args:
             lon_lat_h: (n, 3) degrees, degrees, metres.
@@ -65,7 +65,7 @@ class PushbroomModel:
         return _project(_packed(self), np.ascontiguousarray(lon_lat_h, dtype=np.float64))
 
     def project_derivative(self, lon_lat_h: Array) -> Array:
-        """Derivative of `project` by the ground, from the implicit equations of the projection.
+        """Derivative of `project`, from the implicit equations of the projection.
 
         Returns:
             (n, 2, 3) pixels per metre east, north, up; NaN where `project` is.
@@ -75,7 +75,7 @@ class PushbroomModel:
         return _project_derivative(packed, ground, _project(packed, ground))
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
-        """Ground position of image points at known heights, by Newton steps along the line of sight.
+        """Ground position of image points at given heights, by Newton steps along the line of sight.
 
         Args:
             line_sample: (n, 2) pixels.
@@ -86,7 +86,7 @@ class PushbroomModel:
             an image beyond the border.
         """
         origin, direction = self.line_of_sight(line_sample)
-        return _meet_height(origin, direction, np.ascontiguousarray(height_m, dtype=np.float64))
+        return _intersect_height(origin, direction, np.ascontiguousarray(height_m, dtype=np.float64))
 
     def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
         """The exact lines of sight.
@@ -99,7 +99,7 @@ class PushbroomModel:
 
 
 def _packed(model: PushbroomModel) -> tuple[Any, ...]:
-    """The model as the kernels take it."""
+    """The model as a tuple of arrays for the kernels."""
     lines, samples = model.image_shape
     return (
         np.array([lines, samples, model.first_line_s, model.line_period_s], dtype=np.float64),
@@ -113,7 +113,7 @@ def _packed(model: PushbroomModel) -> tuple[Any, ...]:
 
 @njit(cache=True)
 def _interpolate(times: Array, values: Array, t: float, out: Array) -> None:
-    """Lagrange polynomial over the eight samples around t, into `out`."""
+    """Write into `out` the Lagrange polynomial over the eight samples around time t."""
     first = min(max(int(np.searchsorted(times, t)) - _NODES // 2, 0), len(times) - _NODES)
     out[:] = 0.0
     for i in range(first, first + _NODES):
@@ -127,7 +127,7 @@ def _interpolate(times: Array, values: Array, t: float, out: Array) -> None:
 
 @njit(cache=True)
 def _pose(model: Any, line: float, position: Array, rotation: Array) -> None:
-    """Position (3,) and ecef_from_body (3, 3) at a line, into the arrays given."""
+    """Write into `position` (3,) and `rotation` (3, 3) the position and ecef_from_body at a line."""
     scalars, orbit_s, orbit, attitude_s, attitude, _ = model
     t = scalars[2] + line * scalars[3]
     _interpolate(orbit_s, orbit, t, position)
@@ -147,7 +147,7 @@ def _pose(model: Any, line: float, position: Array, rotation: Array) -> None:
 
 @njit(cache=True)
 def _tangent(coefficients: Array, t: float) -> tuple[float, float]:
-    """One look polynomial and its derivative."""
+    """Value and derivative of one look polynomial."""
     value = 0.0
     slope = 0.0
     for c in coefficients[::-1]:
@@ -158,7 +158,7 @@ def _tangent(coefficients: Array, t: float) -> tuple[float, float]:
 
 @njit(cache=True)
 def _inside(position: float, size: float) -> bool:
-    """Whether a line or sample is within the model, half an image beyond the border."""
+    """Whether a line or sample is within the model, up to half an image beyond the border."""
     return abs(position - (size - 1.0) / 2.0) <= VALIDITY * size / 2.0
 
 
@@ -185,8 +185,8 @@ def _line_of_sight(model: Any, image: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def _meet_height(origin: Array, direction: Array, height: Array) -> Array:
-    """Where lines of sight come down to given heights above the ellipsoid."""
+def _intersect_height(origin: Array, direction: Array, height: Array) -> Array:
+    """Intersection (n, 3) of lines of sight with given heights above the ellipsoid."""
     out = np.full((len(origin), 3), np.nan)
     for i in range(len(origin)):
         ox, oy, oz = origin[i]
@@ -213,9 +213,9 @@ def _meet_height(origin: Array, direction: Array, height: Array) -> Array:
 def _row_misfit(
     model: Any, line: float, ground: Array, position: Array, rotation: Array
 ) -> tuple[float, float]:
-    """How far ahead of the row of detectors a ground point is seen at a line, and at which sample.
+    """Distance of a ground point ahead of the row of detectors, and its position along the row.
 
-    The first is a tangent, the second -1 to 1 over the row.
+    The first is a tangent; the second is -1 to 1 over the row.
     """
     look = model[5]
     _pose(model, line, position, rotation)

@@ -11,9 +11,9 @@ from services.geodesy import ecef_from_lon_lat_h, metres_per_degree
 from services.types import Array
 
 VALIDITY = 2.0
-"""How far a normalised ground coordinate may go: a model is used up to twice the range it was fitted on.
+"""Largest normalised ground coordinate: a model is used up to twice the range on which it was fitted.
 
-Image coordinates are not held to it: crops exist whose image scale is that of the crop."""
+There is no limit on image coordinates, because the image scale of some crops is that of the crop."""
 
 _LOCATE_TOLERANCE_PX = 1e-7
 _LOCATE_ITERATIONS = 20
@@ -29,7 +29,7 @@ class RpcModel:
         line_num, line_den, sample_num, sample_den: (20,) coefficients.
         image_offset, image_scale: (2,) line, sample in pixels.
         ground_offset, ground_scale: (3,) lon and lat in degrees, height in metres.
-        error_bias_m, error_random_m: the accuracy its producer states, NaN when it does not.
+        error_bias_m, error_random_m: accuracy stated by the producer, NaN when unknown.
     """
 
     line_num: Array
@@ -61,7 +61,7 @@ class RpcModel:
         return _project(_packed(self), np.ascontiguousarray(lon_lat_h, dtype=np.float64))
 
     def project_derivative(self, lon_lat_h: Array) -> Array:
-        """Derivative of `project` by the ground, analytic.
+        """Analytic derivative of `project`.
 
         Returns:
             (n, 2, 3) pixels per metre east, north, up; NaN outside the model's range.
@@ -69,14 +69,14 @@ class RpcModel:
         return _project_derivative(_packed(self), np.ascontiguousarray(lon_lat_h, dtype=np.float64))
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
-        """Ground position of image points at known heights, by Newton steps to 1e-7 px.
+        """Ground position of image points at given heights, by Newton steps until 1e-7 px.
 
         Args:
             line_sample: (n, 2) pixels.
             height_m: (n,) metres above the ellipsoid.
 
         Returns:
-            (n, 3) lon, lat, height; NaN outside the model's range or where the steps fail.
+            (n, 3) lon, lat, height; NaN outside the model's range or where the iteration fails.
         """
         return _locate(
             _packed(self),
@@ -85,10 +85,10 @@ class RpcModel:
         )
 
     def line_of_sight(self, line_sample: Array) -> tuple[Array, Array]:
-        """Lines of sight, as the chords between the lowest and the highest height of the model.
+        """Lines of sight as chords between the lowest and the highest height of the model.
 
         Returns:
-            Origin (n, 3) ECEF metres, on the upper height, and unit direction (n, 3) downwards.
+            Origin (n, 3) ECEF metres, at the upper height, and unit direction (n, 3) downwards.
         """
         low, high = self.height_range_m
         height = np.ones(len(line_sample))
@@ -99,17 +99,17 @@ class RpcModel:
 
 
 def check_rpc(model: RpcModel, source: str) -> RpcModel:
-    """The model itself, once it has shown to be usable.
+    """The model itself, after a check that it is usable.
 
-    Coefficients must be finite, scales positive, denominators away from zero over the whole range,
-    and a grid of image positions must come back through the ground.
+    Coefficients must be finite, scales positive, and denominators nonzero over the whole range;
+    `locate` and `project` must reproduce a grid of image positions.
 
     Args:
-        model: as read.
-        source: where it comes from, for the message.
+        model: the RPC as read.
+        source: name of its file, for messages.
 
     Raises:
-        FormatError: with the first thing that is wrong.
+        FormatError: the model is not usable; the message names the first reason.
     """
     numbers = np.concatenate(
         [
@@ -124,11 +124,14 @@ def check_rpc(model: RpcModel, source: str) -> RpcModel:
         ]
     )
     if not np.isfinite(numbers).all():
-        raise FormatError(f"{source}: the RPC has coefficients that are not finite numbers")
+        raise FormatError(f"{source}: the RPC has numbers that are not finite")
     if (model.image_scale <= 0).any() or (model.ground_scale <= 0).any():
         raise FormatError(f"{source}: the RPC has a scale that is zero or negative")
     if abs(model.ground_offset[1]) > 90.0 or abs(model.ground_offset[0]) > 360.0:
-        raise FormatError(f"{source}: the RPC is centred outside the Earth")
+        raise FormatError(
+            f"{source}: the centre of the RPC is outside the Earth: longitude "
+            f"{model.ground_offset[0]:g}, latitude {model.ground_offset[1]:g}"
+        )
     axis = np.linspace(-1.0, 1.0, 5)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     for name, den in (("line", model.line_den), ("sample", model.sample_den)):
@@ -141,11 +144,16 @@ def check_rpc(model: RpcModel, source: str) -> RpcModel:
     height_m = model.ground_offset[2] + grid[:, 2] * model.ground_scale[2]
     misfit_px = np.abs(model.project(model.locate(image, height_m)) - image)
     if not (misfit_px < 1e-6).all():
-        worst = np.nanmax(misfit_px) if np.isfinite(misfit_px).any() else math.nan
+        defined = misfit_px[np.isfinite(misfit_px)]
+        worst_misfit = (
+            f"the largest misfit is {defined.max():.3g} px"
+            if len(defined)
+            else "none of them is defined"
+        )
         raise FormatError(
             f"{source}: the RPC cannot be inverted over its own range: "
             f"{int((~(misfit_px < 1e-6)).any(axis=1).sum())} of {len(grid)} grid points fail, "
-            f"worst {worst:.3g} px"
+            f"{worst_misfit}"
         )
     return model
 
@@ -196,7 +204,7 @@ def cubic_terms(normalised: Array) -> Array:
 
 @njit(inline="always", error_model="numpy")
 def _cubic(c: Array, o: int, x: float, y: float, z: float) -> float:
-    """One polynomial, nested: x lon, y lat, z height, coefficients from `c[o]` on."""
+    """One polynomial in nested form: x lon, y lat, z height, coefficients from `c[o]` on."""
     return (
         c[o]
         + x
@@ -238,7 +246,7 @@ def _cubic_gradient(c: Array, o: int, x: float, y: float, z: float) -> tuple[flo
 
 @njit(inline="always")
 def _normalised_lon(lon: float, offset: float, scale: float) -> float:
-    """Normalised longitude, the short way round the antimeridian."""
+    """Normalised longitude, within 180 degrees of the offset."""
     d = lon - offset
     if d > 180.0:
         d -= 360.0
@@ -248,10 +256,10 @@ def _normalised_lon(lon: float, offset: float, scale: float) -> float:
 
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}
-"""What the compiler may do to compute a batch in vectors; NaN must keep its meaning."""
+"""Optimisations that let the compiler vectorise a batch; NaN keeps its meaning."""
 
 _BATCH = 256
-"""Points a kernel handles at once: their coordinates, side by side, stay in the nearest cache."""
+"""Points that a kernel computes at once: their coordinates fit in the first-level cache."""
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
@@ -288,7 +296,7 @@ def _project(packed: Array, ground: Array) -> Array:
 def _value_and_gradient(
     c: Array, o: int, x: float, y: float, z: float
 ) -> tuple[float, float, float, float]:
-    """One normalised ratio and its derivatives by x, y, z."""
+    """Value of one normalised ratio, and its derivatives by x, y, z."""
     num = _cubic(c, o, x, y, z)
     den = _cubic(c, o + 20, x, y, z)
     nx, ny, nz = _cubic_gradient(c, o, x, y, z)
@@ -337,16 +345,17 @@ def _project_derivative(packed: Array, ground: Array) -> Array:
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
-def _newton_step(
+def _newton_step(  # noqa: PLR0917 - tuples of arrays are compiled to other roundings
     c: Array, u: Array, v: Array, z: Array, x: Array, y: Array, miss: Array, size: int
 ) -> int:
-    """Move a batch of points by one step; how many were not there yet.
+    """Move the ground positions of a batch by one step; returns the number that had not converged.
 
-    Points that leave become NaN. `miss` is the distance before the step, 1 at the tolerance.
+    All coordinates are normalised. Positions that leave the range become NaN. `miss` becomes the
+    distance before the step, 1 at the tolerance.
     """
     per_line = c[82] / _LOCATE_TOLERANCE_PX
     per_sample = c[83] / _LOCATE_TOLERANCE_PX
-    left = 0
+    moving = 0
     for i in range(size):
         line, lx, ly, _lz = _value_and_gradient(c, 0, x[i], y[i], z[i])
         sample, sx, sy, _sz = _value_and_gradient(c, 40, x[i], y[i], z[i])
@@ -355,12 +364,12 @@ def _newton_step(
         inverse = 1.0 / (lx * sy - ly * sx)
         moved_x = x[i] + (du * sy - dv * ly) * inverse
         moved_y = y[i] + (dv * lx - du * sx) * inverse
-        kept = abs(moved_x) <= 2.0 * VALIDITY and abs(moved_y) <= 2.0 * VALIDITY
-        x[i] = moved_x if kept else np.nan
+        inside = abs(moved_x) <= 2.0 * VALIDITY and abs(moved_y) <= 2.0 * VALIDITY
+        x[i] = moved_x if inside else np.nan
         y[i] = moved_y
         miss[i] = max(abs(du) * per_line, abs(dv) * per_sample)
-        left += 1 if kept and miss[i] > 1.0 else 0
-    return left
+        moving += 1 if inside and miss[i] > 1.0 else 0
+    return moving
 
 
 @njit(cache=True, fastmath=_FAST, error_model="numpy")
@@ -387,10 +396,10 @@ def _locate(packed: Array, image: Array, height: Array) -> Array:
             if _newton_step(c, u, v, z, x, y, miss, size) == 0:
                 break
         for i in range(size):
-            found = abs(x[i]) <= VALIDITY and abs(y[i]) <= VALIDITY and miss[i] <= 1.0
+            located = abs(x[i]) <= VALIDITY and abs(y[i]) <= VALIDITY and miss[i] <= 1.0
             lon = c[84] + x[i] * c[87]
             lon -= 360.0 if lon > 180.0 else (-360.0 if lon < -180.0 else 0.0)
-            out[first + i, 0] = lon if found else np.nan
-            out[first + i, 1] = c[85] + y[i] * c[88] if found else np.nan
-            out[first + i, 2] = height[first + i] if found else np.nan
+            out[first + i, 0] = lon if located else np.nan
+            out[first + i, 1] = c[85] + y[i] * c[88] if located else np.nan
+            out[first + i, 2] = height[first + i] if located else np.nan
     return out

@@ -1,32 +1,39 @@
-"""Fitting a rational polynomial model to any other sensor model."""
+"""Least-squares fit of a rational polynomial model to another sensor model."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from services.errors import CoverageError
+from services.geodesy import longitudes_near
 from services.sensors.base import SensorModel
 from services.sensors.rpc import RpcModel, cubic_terms
 from services.types import Array
 
 RIDGES = (1e-5, 1e-3, 1e-1)
-"""Dampings of a coefficient against a misfit of one normalised unit; without them the 39 coefficients of
-a smooth model are not determined. The one that fits best is kept: where a model is not smooth, a weak
-damping lets the denominators vanish."""
+"""Dampings of the coefficients relative to a misfit of one normalised unit, without which the 39
+coefficients of a smooth model are not determined. The damping with the best fit is used: where a model
+is not smooth, a weak damping lets the denominators vanish."""
 
-_ROUNDS = 8
+_ITERATIONS = 8
+_NODES = (16, 16, 8)
+"""Lines, samples and heights of the grid of points of a fit."""
 _MARGIN = 1.02
+"""Extent of the grid of points, relative to the image."""
+_CHECK_NODES = (37, 37, 7)
+"""Lines, samples and heights of the grid of check points, most of them between the nodes."""
 _CHECK_MARGIN = 0.98
+"""Extent of the grid of check points, relative to the image."""
 
 
 @dataclass(frozen=True)
 class RpcFit:
-    """A fitted model and how far it is from what it was fitted to.
+    """A fitted RPC and its distance from the original model.
 
     Attributes:
         model: the rational polynomials.
-        max_error_px, rms_error_px: distance in the image, over a finer grid of points that were not
-            used by the fit; infinite where the fitted model says nothing.
+        max_error_px, rms_error_px: distance in the image over a finer grid of check points, which the
+            fit does not use; infinite where the RPC is undefined.
     """
 
     model: RpcModel
@@ -34,32 +41,25 @@ class RpcFit:
     rms_error_px: float
 
 
-def fit_rpc(
-    model: SensorModel,
-    shape: tuple[int, int],
-    height_range_m: tuple[float, float],
-    nodes: tuple[int, int, int] = (16, 16, 8),
-) -> RpcFit:
-    """Fit an RPC to a sensor model over an image and a range of heights.
+def fit_rpc(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[float, float]) -> RpcFit:
+    """The RPC that fits a sensor model over an image and a range of heights.
 
     Each coordinate is a ratio with its own denominator. The ratio is multiplied out and solved by
-    linear least squares, weighted by the denominator of the round before and damped around the
-    coefficients of the round before, so that the damping leaves no bias.
+    linear least squares. Each iteration is weighted by the denominator of the previous one and damped
+    around its coefficients, so that the damping causes no bias.
 
     Source: Tao and Hu (2001), "A comprehensive study of the rational function model".
 
     Args:
-        model: what to fit.
+        model: the model to fit.
         shape: lines and samples of the image.
-        height_range_m: lowest and highest ground; becomes the range of the fitted model.
-        nodes: lines, samples and heights of the grid of points.
+        height_range_m: lowest and highest ground; also the height range of the RPC.
 
     Raises:
-        CoverageError: when the model cannot locate the whole image over the range of heights.
+        CoverageError: the model cannot locate the whole image over the range of heights.
     """
-    between = (2 * nodes[0] + 5, 2 * nodes[1] + 5, nodes[2] - 1)
-    image, ground = _grid(model, shape, height_range_m, nodes, _MARGIN)
-    check_image, check_ground = _grid(model, shape, height_range_m, between, _CHECK_MARGIN)
+    image, ground = _grid(model, shape, height_range_m, _NODES, _MARGIN)
+    check_image, check_ground = _grid(model, shape, height_range_m, _CHECK_NODES, _CHECK_MARGIN)
     fits = []
     for ridge in RIDGES:
         fitted = _fit(image, ground, shape, height_range_m, ridge)
@@ -72,13 +72,13 @@ def fit_rpc(
 
 @dataclass(frozen=True)
 class GroundFit:
-    """An RPC turned round: from normalised (sample, line, height) to normalised longitude and latitude.
+    """The inverse of an RPC: from normalised (sample, line, height) to normalised longitude, latitude.
 
     Attributes:
-        lon_num, lon_den, lat_num, lat_den: (20,) in the order of RPC00B, sample in the place of
-            longitude and line in that of latitude; normalised by the offsets and scales of the RPC.
-        max_error_px: largest distance in the image between a place and where the RPC sees its ground;
-            infinite where there is none.
+        lon_num, lon_den, lat_num, lat_den: (20,) in the order of RPC00B, with sample instead of
+            longitude and line instead of latitude; normalised by the offsets and scales of the RPC.
+        max_error_px: largest distance in the image between a check position and the projection of its
+            ground by the RPC; infinite where the ground is undefined.
     """
 
     lon_num: Array
@@ -88,31 +88,30 @@ class GroundFit:
     max_error_px: float
 
 
-def fit_to_ground(model: RpcModel, nodes: tuple[int, int, int] = (16, 16, 8)) -> GroundFit:
-    """Fit rational polynomials from the image to the ground to an RPC, over its whole range.
+def fit_to_ground(model: RpcModel) -> GroundFit:
+    """The rational polynomials from the image to the ground that invert an RPC over its whole range.
 
-    What a DIMAP file holds beside the RPC. Fitted as `fit_rpc` is, checked between its nodes.
+    A DIMAP file contains them beside the RPC. They are fitted by the method of `fit_rpc` and checked
+    between its nodes.
 
     Args:
-        model: its offsets and scales are kept.
-        nodes: lines, samples and heights of the grid of points.
+        model: the RPC, whose offsets and scales also normalise the inverse.
     """
-    between = (2 * nodes[0] + 5, 2 * nodes[1] + 5, nodes[2] - 1)
-    places, ground = _normalised_pairs(model, nodes, _MARGIN)
-    check, _ = _normalised_pairs(model, between, _CHECK_MARGIN)
+    positions, ground = _normalised_pairs(model, _NODES, _MARGIN)
+    check, _ = _normalised_pairs(model, _CHECK_NODES, _CHECK_MARGIN)
     expected_px = model.image_offset + check[:, [1, 0]] * model.image_scale
     fits = []
     for ridge in RIDGES:
         polynomials = [
-            part for k in range(2) for part in _fit_ratio(cubic_terms(places), ground[:, k], ridge)
+            part for k in range(2) for part in _fit_ratio(cubic_terms(positions), ground[:, k], ridge)
         ]
         lon_num, lon_den, lat_num, lat_den = polynomials
         terms = cubic_terms(check)
         located = np.column_stack(
             [terms @ lon_num / (terms @ lon_den), terms @ lat_num / (terms @ lat_den), check[:, 2]]
         )
-        seen_px = model.project(model.ground_offset + located * model.ground_scale)
-        error_px = np.linalg.norm(seen_px - expected_px, axis=1)
+        projected_px = model.project(model.ground_offset + located * model.ground_scale)
+        error_px = np.linalg.norm(projected_px - expected_px, axis=1)
         worst_px = float(np.nan_to_num(error_px, nan=np.inf).max(initial=0.0)) if len(check) else np.inf
         fits.append(GroundFit(lon_num, lon_den, lat_num, lat_den, worst_px))
     return min(fits, key=lambda fit: fit.max_error_px)
@@ -121,21 +120,19 @@ def fit_to_ground(model: RpcModel, nodes: tuple[int, int, int] = (16, 16, 8)) ->
 def _normalised_pairs(
     model: RpcModel, nodes: tuple[int, int, int], extent: float
 ) -> tuple[Array, Array]:
-    """Normalised (sample, line, height) over the range of an RPC, and the ground seen there.
+    """Normalised (sample, line, height) over the range of an RPC, and their normalised ground.
 
-    Places whose ground lies beyond the range of the RPC are left out.
+    Positions whose ground is outside the range of the RPC are omitted.
     """
     line, sample, height = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in nodes))
     )
-    places = np.column_stack([extent * sample, extent * line, min(extent, 1.0) * height])
-    image = model.image_offset + places[:, [1, 0]] * model.image_scale
-    ground = model.locate(image, model.ground_offset[2] + places[:, 2] * model.ground_scale[2])
-    ground[:, 0] = (
-        model.ground_offset[0] + (ground[:, 0] - model.ground_offset[0] + 180.0) % 360.0 - 180.0
-    )
-    seen = np.isfinite(ground).all(axis=1)
-    return places[seen], ((ground - model.ground_offset) / model.ground_scale)[seen]
+    positions = np.column_stack([extent * sample, extent * line, min(extent, 1.0) * height])
+    image = model.image_offset + positions[:, [1, 0]] * model.image_scale
+    ground = model.locate(image, model.ground_offset[2] + positions[:, 2] * model.ground_scale[2])
+    ground[:, 0] = longitudes_near(ground[:, 0], model.ground_offset[0])
+    valid = np.isfinite(ground).all(axis=1)
+    return positions[valid], ((ground - model.ground_offset) / model.ground_scale)[valid]
 
 
 def _fit(
@@ -145,10 +142,10 @@ def _fit(
     height_range_m: tuple[float, float],
     ridge: float,
 ) -> RpcModel:
-    """The model (line and sample each by itself) of image positions (n, 2) and ground points (n, 3)."""
+    """The RPC fitted to image positions (n, 2) of ground points (n, 3), line and sample separately."""
     size = np.array(shape, dtype=np.float64)
     image_offset, image_scale = (size - 1.0) / 2.0, size / 2.0
-    lon = ground[0, 0] + (ground[:, 0] - ground[0, 0] + 180.0) % 360.0 - 180.0
+    lon = longitudes_near(ground[:, 0], ground[0, 0])
     low = np.array([lon.min(), ground[:, 1].min(), height_range_m[0]])
     high = np.array([lon.max(), ground[:, 1].max(), height_range_m[1]])
     ground_offset, ground_scale = (low + high) / 2.0, (high - low) / 2.0
@@ -175,7 +172,7 @@ def _grid(
     nodes: tuple[int, int, int],
     extent: float,
 ) -> tuple[Array, Array]:
-    """Image positions (n, 2) over an image times `extent`, and what is seen there at all heights."""
+    """Image positions (n, 2) over an image scaled by `extent`, and their ground (n, 3)."""
     size = np.array(shape, dtype=np.float64)
     centre, half = (size - 1.0) / 2.0, extent * size / 2.0
     middle = sum(height_range_m) / 2.0
@@ -188,21 +185,22 @@ def _grid(
     )
     image = np.column_stack([line.ravel(), sample.ravel()])
     ground = model.locate(image, height.ravel())
-    lost = int(np.isnan(ground).any(axis=1).sum())
-    if lost:
+    undefined = int(np.isnan(ground).any(axis=1).sum())
+    if undefined:
         raise CoverageError(
-            f"the model locates only {len(image) - lost} of {len(image)} points over "
-            f"{shape[0]} x {shape[1]} px and heights {height_range_m[0]:g} to {height_range_m[1]:g} m"
+            f"the model locates only {len(image) - undefined} of {len(image)} positions over "
+            f"{shape[0]} x {shape[1]} px and heights {height_range_m[0]:g} to {height_range_m[1]:g} m, "
+            "all of them expected"
         )
     return image, ground
 
 
 def _fit_ratio(terms: Array, value: Array, ridge: float) -> tuple[Array, Array]:
-    """Numerator and denominator (20,) of one coordinate; the denominator starts with one."""
+    """Numerator and denominator (20,) of one coordinate; the first term of the denominator is 1."""
     design = np.hstack([terms, -value[:, None] * terms[:, 1:]])
     coefficients = np.zeros(39)
     damping = ridge * np.sqrt(len(value)) * np.eye(39)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         weight = 1.0 / (1.0 + terms[:, 1:] @ coefficients[20:])
         misfit = weight * (value - design @ coefficients)
         stacked = np.vstack([weight[:, None] * design, damping])
