@@ -1,4 +1,4 @@
-"""Rays from many images to one ground point, with its covariance."""
+"""Intersection of the rays from several images: ground points with their covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Intersection:
         lon_lat_h: (n, 3); NaN for points with fewer than two usable rays, or parallel ones.
         covariance_m2: (n, 3, 3) of east, north, up, from the a priori sigmas of the observations.
         residual_px: (m, 2) observed minus computed.
-        rays: (n,) int64, how many observations were usable.
+        rays: (n,) int64, number of usable observations.
         angle_deg: (n,) largest angle between two of the rays.
     """
 
@@ -33,16 +33,16 @@ class Intersection:
 
 
 def intersect(models: Sequence[SensorModel], observations: Observations, n_points: int) -> Intersection:
-    """Intersect the rays of all points at once.
+    """The ground points where the rays of observations intersect, all points at once.
 
     The least-squares intersection of the lines of sight, `[sum(I - v v^T)]^-1 sum((I - v v^T) s)`, is
-    the start; Gauss-Newton steps on the image residuals follow, so that the result is the most likely
+    the start. Gauss-Newton steps on the image residuals follow, so that the result is the most likely
     point for the given image sigmas.
 
     Args:
         models: one per image.
         observations: m image positions; `point` below `n_points`, ascending.
-        n_points: how many points there are.
+        n_points: number of points.
     """
     origin, direction = _lines_of_sight(models, observations)
     ecef, rays, angle = _meeting_points(observations.point, origin, direction, n_points)
@@ -60,7 +60,7 @@ def intersect(models: Sequence[SensorModel], observations: Observations, n_point
 def residuals_and_derivatives(
     models: Sequence[SensorModel], observations: Observations, lon_lat_h: Array
 ) -> tuple[Array, Array]:
-    """Observed minus computed image positions, and how the computed ones move with the ground.
+    """Observed minus computed image positions, and the derivative of the computed positions.
 
     Args:
         models: one per image.
@@ -93,7 +93,7 @@ def _lines_of_sight(models: Sequence[SensorModel], observations: Observations) -
 def _meeting_points(
     point: IntArray, origin: Array, direction: Array, n_points: int
 ) -> tuple[Array, IntArray, Array]:
-    """Nearest points to bundles of lines, in ECEF, with the rays used and their largest angle."""
+    """Nearest points to bundles of lines, in ECEF, with the number of rays and their largest angle."""
     ecef = np.full((n_points, 3), np.nan)
     rays = np.zeros(n_points, dtype=np.int64)
     angle = np.full(n_points, np.nan)
@@ -133,7 +133,7 @@ def _meeting_points(
 def _gauss_newton_step(
     point: IntArray, sigma_px: Array, residual: Array, derivative: Array, n_points: int
 ) -> tuple[Array, Array]:
-    """Metres east, north, up to move every point by, and the covariance it will then have."""
+    """Step of every point in metres east, north, up, and its covariance after the step."""
     normal = np.zeros((n_points, 3, 3))
     right = np.zeros((n_points, 3))
     for i in range(len(point)):

@@ -1,4 +1,4 @@
-"""How large errors are: sample quantiles with what the sample allows to say about them."""
+"""Accuracy of positions: sample quantiles with their confidence intervals, moments, predicted CE90."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,8 +8,15 @@ from scipy.special import bdtr, erf, gammaincinv
 
 from services.types import Array
 
-FEW_POINTS = 30
-"""ASPRS (Positional Accuracy Standards, edition 2) asks for at least as many check points."""
+MIN_CHECK_POINTS = 30
+"""Smallest number of check points by ASPRS (Positional Accuracy Standards, edition 2)."""
+
+QUANTILE_PROBABILITY = 0.9
+"""CE90 and LE90 hold 90 % of the errors."""
+QUANTILE_CONFIDENCE = 0.9
+"""Confidence of the intervals of CE90 and LE90."""
+NORMALISED_CONFIDENCE = 0.95
+"""Confidence of the interval of an honest normalised error."""
 
 CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
 """CE90 of a circular normal law of unit sigma (2.1460)."""
@@ -17,16 +24,16 @@ CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
 
 @dataclass(frozen=True)
 class Quantile:
-    """A quantile of a sample with a confidence interval that assumes no law.
+    """A quantile of a sample with a confidence interval that assumes no distribution.
 
     Attributes:
         value: estimate; NaN without a sample.
         lower, upper: bounds of the true quantile, order statistics of the sample; NaN where the sample
-            is too small to bound it on that side.
+            is too small for a bound on that side.
         n: size of the sample.
         probability: which quantile, 0.9 for CE90 and LE90.
-        confidence: of the interval; the true one is at least this.
-        note: what a small sample does not allow to say; "" when there is nothing to add.
+        confidence: smallest confidence of the interval.
+        note: limits of a small sample, as a sentence; "" when there are none.
     """
 
     value: float
@@ -40,7 +47,7 @@ class Quantile:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Moments of one coordinate.
+    """Moments of the errors of one coordinate.
 
     Attributes:
         n: finite values.
@@ -57,13 +64,13 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of points against something better.
+    """Errors of points against a better source.
 
     Attributes:
         n: points.
         bias_m, std_m, rmse_m: east, north and, when known, up.
         ce90_m: of the horizontal distance.
-        le90_m: of the height error without its sign; None when heights were not compared.
+        le90_m: of the absolute height error; None when heights were not compared.
     """
 
     n: int
@@ -80,8 +87,8 @@ class NormalisedError:
 
     Attributes:
         mean_square: above 1, errors are larger than stated; below 1, smaller.
-        lower, upper: where it lies, with the given confidence, when errors are as large as stated.
-        n: rows.
+        lower, upper: interval of the mean square when the stated precision is honest.
+        n: number of errors.
         confidence: of the interval.
     """
 
@@ -102,19 +109,19 @@ def statistics(values: Array) -> Statistics:
     return Statistics(n, float(finite.mean()), std, float(np.sqrt(np.mean(finite**2))))
 
 
-def sample_quantile(values: Array, probability: float = 0.9, confidence: float = 0.9) -> Quantile:
-    """A quantile of a sample and its distribution-free confidence interval.
+def sample_quantile(values: Array) -> Quantile:
+    """The 90 % quantile of a sample and its distribution-free confidence interval.
 
-    The number of values below the true quantile is binomial whatever the law, so order statistics
+    The number of values below the true quantile is binomial for any distribution, so order statistics
     bound it (Dolloff and Carr, Computation of scalar accuracy metrics LE, CE and SE as both predictive
     and sample-based statistics, ASPRS 2016). Half of the risk is given to each side: at 90 % confidence
     the 90 % quantile has an upper bound from 29 values on. The estimate is the median-unbiased one
-    (Hyndman and Fan, type 8): no law is assumed, and small samples do not flatter.
+    (Hyndman and Fan, type 8): it assumes no distribution, and small samples give no optimistic value.
 
     Args:
         values: (n,) any order; values that are not finite are left out.
-        probability, confidence: between 0 and 1.
     """
+    probability, confidence = QUANTILE_PROBABILITY, QUANTILE_CONFIDENCE
     ordered = np.sort(values[np.isfinite(values)])
     n = len(ordered)
     if n == 0:
@@ -136,60 +143,59 @@ def sample_quantile(values: Array, probability: float = 0.9, confidence: float =
 
 
 def _small_sample_note(n: int, bounded: bool) -> str:
-    """What a sample of n does not allow to say."""
-    if n >= FEW_POINTS:
-        return "" if bounded else f"{n} points do not bound it from above"
-    note = f"{n} points; {FEW_POINTS} are needed for a statement of accuracy"
-    return note if bounded else f"{note}, so few do not bound it from above"
+    """The limits of a sample of n values, as a sentence."""
+    if n >= MIN_CHECK_POINTS:
+        return "" if bounded else f"{n} points give no upper bound"
+    note = f"{n} points; {MIN_CHECK_POINTS} are needed for a statement of accuracy"
+    return note if bounded else f"{note}, and so few give no upper bound"
 
 
-def accuracy(error_m: Array, confidence: float = 0.9) -> Accuracy:
-    """Accuracy of points whose errors are known.
+def accuracy(error_m: Array) -> Accuracy:
+    """Accuracy of points with known errors.
 
     Args:
         error_m: (n, 2) east, north or (n, 3) east, north, up; rows with a NaN are left out.
-        confidence: of the intervals of CE90 and LE90.
     """
-    kept = error_m[np.isfinite(error_m).all(axis=1)]
-    axes = [statistics(column) for column in kept.T]
+    error_m = error_m[np.isfinite(error_m).all(axis=1)]
+    axes = [statistics(column) for column in error_m.T]
     return Accuracy(
-        n=len(kept),
+        n=len(error_m),
         bias_m=tuple(axis.mean for axis in axes),
         std_m=tuple(axis.std for axis in axes),
         rmse_m=tuple(axis.rms for axis in axes),
-        ce90_m=sample_quantile(np.hypot(kept[:, 0], kept[:, 1]), 0.9, confidence),
-        le90_m=sample_quantile(np.abs(kept[:, 2]), 0.9, confidence) if kept.shape[1] > 2 else None,
+        ce90_m=sample_quantile(np.hypot(error_m[:, 0], error_m[:, 1])),
+        le90_m=sample_quantile(np.abs(error_m[:, 2])) if error_m.shape[1] > 2 else None,
     )
 
 
-def normalised_error(error: Array, covariance: Array, confidence: float = 0.95) -> NormalisedError:
-    """Whether errors are as large as their covariances say.
+def normalised_error(error: Array, covariance: Array) -> NormalisedError:
+    """Mean square of errors in units of their covariances: near 1 when the covariances are honest.
 
     Args:
         error: (n, k); rows with a NaN, in the error or its covariance, are left out.
         covariance: (n, k, k) stated for them, same units squared.
-        confidence: of the interval of an honest statement, by the chi-square law.
     """
-    kept = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    rows, k = int(kept.sum()), error.shape[1]
+    confidence = NORMALISED_CONFIDENCE
+    finite = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    rows, k = int(finite.sum()), error.shape[1]
     if rows == 0:
         return NormalisedError(np.nan, np.nan, np.nan, 0, confidence)
-    weighted = np.linalg.solve(covariance[kept], error[kept][:, :, None])[:, :, 0]
+    weighted = np.linalg.solve(covariance[finite], error[finite][:, :, None])[:, :, 0]
     freedom = rows * k
     tails = [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0]
     lower, upper = 2.0 * gammaincinv(freedom / 2.0, tails) / freedom
-    mean_square = float(np.sum(weighted * error[kept]) / freedom)
+    mean_square = float(np.sum(weighted * error[finite]) / freedom)
     return NormalisedError(mean_square, float(lower), float(upper), rows, confidence)
 
 
 def normal_ce90(covariance: Array) -> Array:
-    """CE90 of normal errors without bias: a prediction, not a measurement.
+    """CE90 of normal errors without bias, predicted by their covariance.
 
     Args:
         covariance: (n, 2, 2).
 
     Returns:
-        (n,) radius that holds 90 %, in the square root of the covariance's unit; NaN where it is NaN.
+        (n,) radius that holds 90 %, in the square root of the covariance's unit; NaN for a NaN.
     """
     finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     variance = np.linalg.eigvalsh(np.where(finite[:, None, None], covariance, 0.0))
@@ -200,7 +206,7 @@ def normal_ce90(covariance: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def _ce90_of_ratio() -> tuple[Array, Array]:
-    """CE90 of a normal law of standard deviations 1 and ratio, by bisection of its integral."""
+    """CE90 of normal laws of standard deviations 1 and a ratio, by bisection of their integral."""
     ratio = np.linspace(0.0, 1.0, 129)
     nodes, weights = np.polynomial.legendre.leggauss(128)
     angle = nodes * np.pi / 2.0

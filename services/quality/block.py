@@ -1,4 +1,4 @@
-"""What can be said of a block without looking beyond it: density, views, stated precision."""
+"""Quality figures of a block from its own points: density, views, stated precision."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,7 +15,7 @@ QUARTER_PER_KM2 = 0.25
 
 @dataclass(frozen=True)
 class Distribution:
-    """Values of one kind in five figures."""
+    """Five figures of the distribution of a value over the points."""
 
     minimum: float
     median: float
@@ -29,12 +29,12 @@ class BlockQuality:
     """The quality figures of a block.
 
     Attributes:
-        points: how many there are.
+        points: number of points.
         area_km2: of the block's outline.
         points_per_km2: over the whole outline.
-        share_reaching_half, share_reaching_quarter: part of the 0.1 degree cells, weighted by their area
-            inside the outline, that reach 1 point for 2 km2 and for 4 km2.
-        images_per_point, views_per_point: different images, and chips.
+        share_reaching_half, share_reaching_quarter: share of the 0.1 degree cells, weighted by their
+            area inside the outline, with at least 1 point for 2 km2 and for 4 km2.
+        images_per_point, views_per_point: numbers of different images, and of chips.
         sigma_horizontal_m: stated standard deviation, sqrt((east^2 + north^2) / 2).
         sigma_up_m: the same of the height.
         cells: the density itself.
@@ -57,7 +57,7 @@ def block_quality(points: ControlPoints, images_per_point: IntArray, outline: Ar
 
     Args:
         points: of the block.
-        images_per_point: (n,) different images that see each.
+        images_per_point: (n,) number of different images that show each point.
         outline: (k, 2) lon, lat of the block, as for `density_cells`.
     """
     cells = density_cells(points.lon_lat_h[:, :2], outline)
@@ -78,7 +78,7 @@ def block_quality(points: ControlPoints, images_per_point: IntArray, outline: Ar
 
 
 def distribution(values: Array | IntArray) -> Distribution:
-    """Five figures of (n,) values, n > 0."""
+    """Five figures of the distribution of (n,) values, n > 0."""
     return Distribution(
         minimum=float(values.min()),
         median=float(np.median(values)),
@@ -96,7 +96,7 @@ def quality_document(quality: BlockQuality) -> dict[str, Any]:
 
 
 def parse_quality_document(document: Mapping[str, Any]) -> BlockQuality:
-    """The figures out of what `quality_document` made."""
+    """The figures from a document of `quality_document`."""
     cells = np.array(document["cells"], dtype=np.float64).reshape(-1, 4)
     figures: dict[str, Any] = {
         name: Distribution(**value) if isinstance(value, dict) else value

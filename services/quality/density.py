@@ -1,4 +1,4 @@
-"""How densely control points cover the ground, in cells of a tenth of a degree."""
+"""Density of control points on the ground, in cells of 0.1 degree."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ CELLS_PER_DEGREE = 10
 
 @dataclass(frozen=True)
 class DensityCells:
-    """Cells of 0.1 x 0.1 degree that an outline meets.
+    """Cells of 0.1 x 0.1 degree that intersect an outline.
 
     Attributes:
         lon_lat: (n, 2) south-west corners; longitudes are those of the outline.
         area_km2: (n,) part of the cell's area inside the outline.
-        points: (n,) int64, how many points lie in the cell.
+        points: (n,) int64, number of points in the cell.
     """
 
     lon_lat: Array
@@ -33,7 +33,7 @@ class DensityCells:
 
 
 def density_cells(lon_lat: Array, outline: Array) -> DensityCells:
-    """Count points in the cells an outline meets.
+    """Numbers of points in the cells that intersect an outline.
 
     Args:
         lon_lat: (m, 2) points, degrees.
@@ -52,30 +52,30 @@ def density_cells(lon_lat: Array, outline: Array) -> DensityCells:
     cell = np.floor(np.column_stack([lon, lon_lat[:, 1]]) * CELLS_PER_DEGREE).astype(np.int64) - low
     cell = np.clip(cell, 0, shape - 1)
     count = np.bincount(cell[:, 0] * shape[1] + cell[:, 1], minlength=len(grid)).astype(np.int64)
-    kept = area_km2 > 0.0
-    return DensityCells(corner[kept], area_km2[kept], count[kept])
+    inside = area_km2 > 0.0
+    return DensityCells(corner[inside], area_km2[inside], count[inside])
 
 
 def share_reaching(cells: DensityCells, points_per_km2: float) -> float:
-    """Part of the cells, 0 to 1, that have a density or more.
+    """Share of the cells, 0 to 1, with at least a given density.
 
-    A cell counts by its area inside the outline, so that slivers along the outline do not weigh as much
-    as whole cells do.
+    A cell counts by its area inside the outline: a sliver along the outline weighs less than a whole
+    cell.
     """
     reached = cells.points_per_km2 >= points_per_km2
     return float(cells.area_km2[reached].sum() / cells.area_km2.sum())
 
 
 def _area_inside_km2(corner: Array, opposite: Array, outline: Array) -> Array:
-    """Area of cells inside an outline: that of the whole cell on the ellipsoid, by the part inside."""
+    """Area (n,) of cells inside an outline: area of the cell on the ellipsoid times the share inside."""
     area_km2 = box_area_km2(corner, opposite)
     polygon = shapely.Polygon(outline)
     boxes = shapely.box(corner[:, 0], corner[:, 1], opposite[:, 0], opposite[:, 1])
     shapely.prepare(polygon)
-    part = np.ones(len(boxes))
+    share = np.ones(len(boxes))
     edge = ~shapely.contains_properly(polygon, boxes)
-    part[edge] = shapely.area(shapely.intersection(polygon, boxes[edge])) * CELLS_PER_DEGREE**2
-    return np.where(part > 1e-9, area_km2 * part, 0.0)
+    share[edge] = shapely.area(shapely.intersection(polygon, boxes[edge])) * CELLS_PER_DEGREE**2
+    return np.where(share > 1e-9, area_km2 * share, 0.0)
 
 
 def box_area_km2(corner: Array, opposite: Array) -> npt.NDArray[np.float64]:

@@ -13,11 +13,13 @@ from services.formats.vector.residual_layers import exaggeration_for, write_resi
 from services.reports.document import format_report
 from services.reports.html import format_html
 from services.reports.report import RegistrationReport
+from services.reports.tables import format_tables
 from services.types import Array, ControlPoints, Measures
 
 OUTPUTS = {
     "report.json": "The report as a document.",
     "report.html": "The report as a page.",
+    "report.txt": "The tables of the report as plain text.",
     "control_points.geojson": "The measure of each control point, with its status.",
     "control_points.gcp": "The active control points for the Ames Stereo Pipeline.",
     "control_points.points": "The control points for the georeferencer of QGIS.",
@@ -63,6 +65,7 @@ def write_outputs(
     texts = {
         "report.json": format_report(report),
         "report.html": format_html(report),
+        "report.txt": format_tables(report),
         "control_points.geojson": format_measures(measures, image, sigma_m),
         **_exchange_formats(measures, image, sigma_m),
     }
