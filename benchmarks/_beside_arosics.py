@@ -1,4 +1,4 @@
-"""An ortho pair of simulated ground by AROSICS and by the dense method, on grids as dense."""
+"""An ortho pair of simulated ground, matched by AROSICS and by registration on a reference image."""
 
 import json
 import subprocess
@@ -98,7 +98,7 @@ def make_pair(folder: Path, size: int) -> None:
 
 
 def register_pair(folder: Path, repeats: int) -> TiePoints:
-    """Tie points of the pair by the dense method as it is by default."""
+    """Tie points of the pair by registration on a reference image with default options."""
     start_mib = memory_mib("VmRSS")
     taken_s = []
     for _ in range(1 + repeats):
@@ -106,10 +106,11 @@ def register_pair(folder: Path, repeats: int) -> TiePoints:
         base = read_scene(folder / "ortho_0.tif", sigma_m=1.0)
         scene = read_scene(folder / "ortho_1.tif", sigma_m=largest_shift_m() / 3.0)
         reference = Reference(base.image, base.model, None, 0.5 * GSD_M, 0.0, 0.1 * GSD_M)
-        found = register_on_reference(scene, reference)
+        registration = register_on_reference(scene, reference)
         taken_s.append(time.process_time() - start)
-    active = found.measures.active
-    line, sample = (found.measures.predicted - found.measures.line_sample)[active].T
+    measures = registration.measures
+    active = measures.active
+    line, sample = (measures.predicted - measures.line_sample)[active].T
     shift_m = GSD_M * np.column_stack([sample, -line])
     return TiePoints(
         tried=len(active),

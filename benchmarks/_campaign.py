@@ -1,4 +1,4 @@
-"""Scenes under all that makes registration hard, and what became of them, held against the truth."""
+"""Scenes under difficult conditions, registered and compared with the truth."""
 
 import time
 from dataclasses import dataclass, replace
@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks._trials import Trial
 from benchmarks._worlds import FINE_GSD_M, Block, Place, world_of
-from services.adjustment.intersection import move_metres
 from services.errors import AmersError
+from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.quality.accuracy import CIRCULAR_CE90, accuracy, normalised_error
 from services.registration.on_points import Registration, register_scene
@@ -23,25 +23,26 @@ from services.types import Array, ControlPoints
 
 FRAME_SIGMA_M = 0.5
 LE90_OF_CE90 = 5.0 / 3.0
-"""Of the points: SRP's 5 m to 3 m."""
+"""Ratio of the points: 5 m to 3 m in SRP."""
 WRONG = 3.0
-"""A result is wrong when its CE90 is more than so many times the predicted one."""
+"""A result is wrong when its CE90 exceeds the predicted CE90 this many times."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scene.
+    """The outcome of one scene.
 
     Attributes:
         verdict: "good", "usable" or "failed"; "refused" when there is no result.
-        reason: why there is none.
-        visible, matched, active: points.
+        reason: the unmet criteria, or why there is no result.
+        visible, matched, active: numbers of points.
+        order: of the correction.
         ce90_before_m, ce90_m: against the truth in the frame of the block, over the whole image.
         ground_ce90_m: against the truth on the Earth.
         predicted_m, predicted_worst_m: CE90 as stated, median and worst over the image.
         normalised: mean square of true errors over stated deviations, over the image.
-        displacement_m: stability test, largest of the corners' medians.
-        cpu_s: of the registration with what it renders.
+        displacement_m: stability test, largest of the medians of the corners and the centre.
+        cpu_s: of the registration, with the rendering of the pixels that it reads.
     """
 
     verdict: str
@@ -61,7 +62,7 @@ class Outcome:
 
     @property
     def delivered(self) -> bool:
-        """Whether the registration says that its model may be used."""
+        """Whether the verdict allows the use of the model."""
         return self.verdict in ("good", "usable")
 
     @property
@@ -72,7 +73,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene as it is handed over, and its truth."""
+    """A scene and points with errors, and the truth."""
 
     scene: Scene
     points: ControlPoints
@@ -81,7 +82,7 @@ class Prepared:
 
 
 def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
-    """Take the scene of a trial and spoil its model and its points."""
+    """The scene of a trial, with errors in its model and in the points."""
     world = world_of(place)
     rng = np.random.default_rng([seed, trial.number, 1])
     lon, lat = world.centre_lon_lat.tolist()
@@ -109,7 +110,7 @@ def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
 def _spoiled(
     points: ControlPoints, trial: Trial, shift_m: Array, rng: np.random.Generator
 ) -> ControlPoints:
-    """Points with the errors of a trial: all shifted, each displaced, some moved, some vanished."""
+    """Points with the errors of a trial: a common shift, noise, moved points, vanished chips."""
     n = len(points)
     sigma_m = trial.point_ce90_m * np.array(
         [1.0 / CIRCULAR_CE90, 1.0 / CIRCULAR_CE90, LE90_OF_CE90 / 1.6449]
@@ -134,7 +135,7 @@ def _spoiled(
 def attempt(
     place: Place, trial: Trial, block: Block, seed: int, options: RegistrationOptions
 ) -> Outcome:
-    """Register the scene of a trial and hold the result against the truth."""
+    """The outcome of registering the scene of a trial."""
     prepared = prepare(place, trial, block, seed)
     world = world_of(place)
     start_s = time.process_time()
@@ -154,7 +155,7 @@ def attempt(
 
 
 def _judged(world: World, prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:
-    """Figures of a registration against the true sensor, on a grid over the whole image."""
+    """The errors of a registration against the true sensor, on a grid over the whole image."""
     shape = prepared.scene.image.shape
     axes = [np.linspace(0.0, size - 1.0, 12) for size in shape]
     line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -1,15 +1,16 @@
-"""A chip of 101 px found in a window of 181 px: `find_chip` and plain loops over `cv2.matchTemplate`.
+"""A chip of 101 px in a window of 181 px: `find_chip` compared with loops over `cv2.matchTemplate`.
 
-The plain loops are normalised correlation (TM_CCOEFF_NORMED) with the place of the largest value, and
-the same with a parabola along each axis. `find_chip` also gives a sigma and the reason when it does not
-believe its peak. All run on the same chips and windows of a simulated ground, rendered at 1 m from
-images of 0.5 m; windows are centred up to 35 px away from the chip's place, by fractions of a pixel, so
-that the true displacement is known. Cases: another image with the same light (other noise only), another
-day with the same direction of view (light, shadows and fields differ), and windows that do not show the
-chip at all, where every answer is wrong.
+The loops compute the normalised correlation (TM_CCOEFF_NORMED) and take the place of the largest value,
+or the top of a parabola along each axis. `find_chip` also returns a sigma, and the reason when it
+rejects its peak. All use the same chips and windows of a simulated ground, rendered at 1 m from images
+of 0.5 m. The windows are centred up to 35 px away from the place of the chip, by fractions of a pixel,
+so that the true displacement is known. Cases: another image with the same light (only the noise
+differs), another day with the same direction of view (light, shadows and fields differ), and windows
+that do not show the chip, where every answer is wrong.
 
-Then the time of `match_points` a point, with the rendering of the scene into the geometry of its two
-chips, from memory and from a compressed file. CPU time of one thread, medians of runs taken in turn.
+The second table is the time of `match_points` for a point, with the rendering of the scene into the
+geometry of its two chips, from memory and from a compressed file. All times are CPU times of one thread,
+medians of runs taken in turn.
 Run: python -m benchmarks.correlation
 """
 
@@ -29,9 +30,9 @@ from rich.table import Table
 
 from benchmarks._measuring import cpu_medians_s, keep
 from benchmarks._simulated import lay_points
-from services.adjustment.intersection import move_metres
 from services.conventions import CHIP_SIZE
 from services.formats.images.raster import open_raster, write_raster
+from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource, render_chip
 from services.matching.control_points import ChipSearch, MatchingOptions, chip_pixels, match_points
@@ -52,10 +53,11 @@ OPTIONS = CorrelationOptions()
 
 @dataclass(frozen=True)
 class Pair:
-    """A chip, a window, and where the one is in the other.
+    """A chip, a window, and the place of the chip in the window.
 
     Attributes:
-        row_col: (2,) true displacement from the centre of the window; NaN where it is not there.
+        row_col: (2,) true displacement from the centre of the window; NaN where the window does not
+            show the chip.
     """
 
     chip: FloatImage
@@ -65,12 +67,12 @@ class Pair:
 
 @dataclass(frozen=True)
 class Outcome:
-    """One way on the pairs of one case; errors are those of the pairs it believes."""
+    """The result of one algorithm on the pairs of one case; errors are those of the accepted peaks."""
 
     case: str
     way: str
     pairs: int
-    believed: int
+    accepted: int
     cpu_ms: float
     median_error_px: float | None
     largest_error_px: float | None
@@ -80,7 +82,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class PointOutcome:
-    """What a point takes, or a part of it."""
+    """The CPU time of a point, or of a part of its search."""
 
     what: str
     cpu_ms: float
@@ -98,7 +100,7 @@ class MemoryChips:
 
 
 def main() -> None:
-    """Make, measure, print, keep."""
+    """Make the data, measure, print the tables, write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=300)
     parser.add_argument("--repeats", type=int, default=7)
@@ -141,11 +143,11 @@ def view(
 
 
 def cases(world: World, count: int) -> dict[str, list[Pair]]:
-    """Pairs whose truth is known."""
+    """Pairs with known displacements, by case."""
     first = view(world, 1, JUNE)
     noise, day = view(world, 2, JUNE), view(world, 3, JULY)
     rng = np.random.default_rng(5)
-    # Windows are north-up, images are not: their corners reach farther.
+    # Windows are north-up, images are not: the corners of a window reach further.
     margin_px = np.sqrt(2.0) * (CHIP_SIZE // 2 + RADIUS_PX + FARTHEST_PX + 5.0) * GSD_M / IMAGE_GSD_M
     line_sample = rng.uniform(margin_px, SIDE_PX - margin_px, (count, 2))
     ground = true_ground(first, world, line_sample)
@@ -169,13 +171,13 @@ def cases(world: World, count: int) -> dict[str, list[Pair]]:
 
 
 def farthest(pairs: list[Pair], ground: Array) -> list[Pair]:
-    """For each pair the one that lies farthest from it."""
+    """For each pair the pair that lies farthest from it."""
     distance = np.linalg.norm(ground[:, None, :2] - ground[None, :, :2], axis=2)
     return [pairs[k] for k in distance.argmax(axis=1)]
 
 
 def rendered(image: SimulatedView, point: Array, size: int) -> FloatImage:
-    """What an image shows around a point."""
+    """The pixels of an image around a point, on a north-up grid."""
     return render_chip(image.image, image.geometry.rpc, point, GSD_M, size)
 
 
@@ -198,12 +200,12 @@ def with_parabola(patch: FloatImage, chip: FloatImage) -> Array:
 
 
 def top(before: float, at: float, after: float) -> float:
-    """Where a parabola through three values is highest, from the middle one."""
+    """Position of the maximum of a parabola through three values, relative to the middle one."""
     return (before - after) / (2.0 * (before - 2.0 * at + after))
 
 
 def measure(case: str, pairs: list[Pair], repeats: int) -> list[Outcome]:
-    """Time the three ways in turn on the same pairs, and hold them against the truth."""
+    """Times and errors of the three algorithms on the same pairs."""
     ways: dict[str, Callable[[FloatImage, FloatImage], object]] = {
         "matchTemplate": plain,
         "with parabola": with_parabola,
@@ -241,20 +243,20 @@ def measure(case: str, pairs: list[Pair], repeats: int) -> list[Outcome]:
 
 
 def run(way: Callable[[FloatImage, FloatImage], object], pairs: list[Pair]) -> None:
-    """One way on all pairs."""
+    """Run one algorithm on all pairs."""
     for pair in pairs:
         way(pair.patch, pair.chip)
 
 
 def error_over_sigma(error: Array, peaks: Sequence[Peak]) -> float:
-    """Root mean square of errors over their sigmas; 1 where sigmas are honest."""
-    found = np.array([peak.reason == FOUND for peak in peaks])
-    sigma = np.array([peak.sigma_px for peak in peaks])[found, None]
-    return float(np.sqrt(np.mean((error[found] / sigma) ** 2)))
+    """Root mean square of errors over their sigmas; 1 for honest sigmas."""
+    accepted = np.array([peak.reason == FOUND for peak in peaks])
+    sigma = np.array([peak.sigma_px for peak in peaks])[accepted, None]
+    return float(np.sqrt(np.mean((error[accepted] / sigma) ** 2)))
 
 
 def measure_points(world: World, repeats: int) -> list[PointOutcome]:
-    """Time `match_points` and its parts on points with two chips each."""
+    """Times of `match_points` and its parts on points with two chips each."""
     references = [view(world, 11, JUNE, 10.0, 100.0), view(world, 12, JULY, 10.0, 290.0)]
     scene = view(world, 13, datetime(2024, 6, 30, 10, 25, tzinfo=UTC), 14.0, 200.0)
     rng = np.random.default_rng(6)
@@ -291,7 +293,7 @@ def measure_points(world: World, repeats: int) -> list[PointOutcome]:
 
 
 def matched(image: ImageSource, scene: SimulatedView, points: ControlPoints, chips: MemoryChips) -> None:
-    """Search all points in an image."""
+    """Search all points in an image; most must be found."""
     options = MatchingOptions()
     search = ChipSearch(image, scene.geometry.rpc, scene.geometry.acquisition, GSD_M, RADIUS_PX)
     matches = match_points(search, points, chips, options)
@@ -304,7 +306,7 @@ def show(outcomes: list[Outcome]) -> None:
         "case",
         "way",
         "CPU",
-        "believed",
+        "accepted",
         "median error",
         "largest",
         "error / sigma",
@@ -316,7 +318,7 @@ def show(outcomes: list[Outcome]) -> None:
             o.case,
             o.way,
             f"{o.cpu_ms:.3f} ms",
-            str(o.believed),
+            str(o.accepted),
             "" if o.median_error_px is None else f"{o.median_error_px:.3f} px",
             "" if o.largest_error_px is None else f"{o.largest_error_px:.3f} px",
             "" if o.error_over_sigma is None else f"{o.error_over_sigma:.2f}",

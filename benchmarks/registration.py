@@ -1,20 +1,21 @@
-"""Time, memory and profile of registering large scenes, and AROSICS beside it.
+"""Time, memory and profile of the registration of large scenes, with AROSICS for comparison.
 
-A scene of 0.5 m is delivered 15 m wrong and with a drift of 2 px, as a tiled, compressed GeoTIFF with
-RPC tags. It is rendered around the points only; between them a piece of it is repeated, so that reading
-costs what it costs in a whole image. The block has chips of 2 m cut from six views of other days and
-directions whose models are true: points are measured on chips in all of them, intersected, and keep the
-covariance of the intersection. 200 points are tried, each with its six views, in two passes.
+A scene of 0.5 m has a model with an error of 15 m and a drift of 2 px. It is a tiled, compressed
+GeoTIFF with RPC tags. Only the surroundings of the points are rendered; one piece of them is repeated
+in between, so that reading costs as much as in a whole image. The block has chips of 2 m from six views
+of other days
+and directions with true models: points are measured on chips in all views, intersected, and have the
+covariance of the intersection. 200 points are tried, each with its six views, in two fine stages.
 
-All of that is made in a process of its own, and each registration runs in another one, from the files.
-Told are the CPU time (all threads; imports left out) of the first registration of the process, which
-loads compiled code, and the median of those after it; the peak of resident memory, with what the process
-had before beside it; and where the time goes, as CPU time under a profiler. CE90 is that of a grid of
-25 x 25 places of the image, between where the registered model locates them and what they truly show.
+One process makes the data, and each registration runs in another process, from the files. The tables
+report the CPU time (all threads, without imports) of the first registration of the process, which loads
+compiled code, and the median of the following ones; the resident memory before and at its peak; and the
+CPU time by stage, under a profiler. CE90 compares a grid of 25 x 25 places of the image, as the
+registered model locates them, with the ground that the image truly shows there.
 
-When an interpreter is given that has AROSICS, its local co-registration finds tie points in an ortho
-pair of simulated ground, on a grid as dense as the places at which the dense method registers the same
-pair by default. Errors of the accepted tie points are told against the shift that was put in.
+With an interpreter that has AROSICS, its local co-registration finds tie points in an ortho pair of
+simulated ground, on a grid as dense as the places of a registration on a reference image. The errors of
+the accepted tie points are those against the simulated shift.
 Run: python -m benchmarks.registration [--sizes 5000,40000] [--arosics PYTHON]
 """
 
@@ -55,20 +56,20 @@ PAIR_SIZE = 5_000
 
 STAGES = (
     ("reading the scene", "raster.py", "read", ""),
-    ("rendering it as chips", "imagery.py", "render_chip", "reading the scene"),
+    ("rendering it as chips", "source.py", "render_chip", "reading the scene"),
     ("correlating", "correlate.py", "find_chip", ""),
     ("reading chips", "types.py", "point_chips", ""),
-    ("combining views", "points.py", "_combined", ""),
-    ("adjusting, also for the stability test", "scene.py", "adjust_scene", ""),
+    ("combining views", "control_points.py", "_combined", ""),
+    ("adjusting, also for the stability test", "image_correction.py", "adjust_scene", ""),
 )
-"""What is told, the function whose time it is, and the stage within it that is told by itself."""
+"""A stage, the file and the function whose time it is, and the stage within it that is subtracted."""
 
 Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
 class Registered:
-    """What one process tells of its registrations."""
+    """The measurements of one process about its registrations."""
 
     correction: ImageCorrection
     tried: int
@@ -85,7 +86,7 @@ class Registered:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The scene of one size."""
+    """The measurements of the scene of one size."""
 
     size_px: int
     file_mb: float
@@ -105,7 +106,7 @@ class Outcome:
 
 
 def main() -> None:
-    """Make, measure, print, keep."""
+    """Make the data, measure, print the tables, write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", default=",".join(map(str, SIZES)), help="lines of the scenes")
     parser.add_argument("--repeats", type=int, default=3)
@@ -116,52 +117,52 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
             outcomes.append(measure(Path(name), size, arguments.repeats))
     show(outcomes)
-    kept: dict[str, object] = {"scenes": [asdict(outcome) for outcome in outcomes]}
+    results: dict[str, object] = {"scenes": [asdict(outcome) for outcome in outcomes]}
     if arguments.arosics is None:
-        print("AROSICS was not run: --arosics names an interpreter that has it")
+        print("AROSICS was not run: name an interpreter that has it with --arosics")
     else:
         with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
             apart(make_pair, Path(name), PAIR_SIZE)
             ours = apart(register_pair, Path(name), arguments.repeats)
             theirs = find_tie_points(arguments.arosics, Path(name), PAIR_SIZE)
         show_beside(outcomes, ours, theirs)
-        kept |= {"pair": asdict(ours), "pair_arosics": asdict(theirs)}
-    keep("registration", kept)
+        results |= {"pair": asdict(ours), "pair_arosics": asdict(theirs)}
+    keep("registration", results)
 
 
 def apart(work: Callable[..., Made], *arguments: object) -> Made:
-    """Do a piece of work in a process that did nothing else before and ends after."""
+    """The result of a function, run in a new process that ends afterwards."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()
 
 
 def measure(folder: Path, size: int, repeats: int) -> Outcome:
-    """Make a scene, register it some times, and hold the result against the truth."""
+    """The measurements of a scene of some size, registered several times and compared with the truth."""
     made_s = apart(timed_make, folder, size)
-    done = apart(register_often, folder, repeats)
+    measured = apart(register_often, folder, repeats)
     scene = read_scene(folder / "scene.tif", sigma_m=SIGMA_M)
     with np.load(folder / "truth.npz") as truth:
         line_sample, shown = truth["line_sample"], truth["lon_lat_h"]
-    refined = CorrectedModel(scene.model, done.correction)
-    told = {name: value for name, value in vars(done).items() if name != "correction"}
+    refined = CorrectedModel(scene.model, measured.correction)
+    figures = {name: value for name, value in vars(measured).items() if name != "correction"}
     return Outcome(
         size_px=size,
         file_mb=(folder / "scene.tif").stat().st_size / 1e6,
         made_s=made_s,
         ce90_before_m=ce90_m(scene.model.locate(line_sample, shown[:, 2]), shown),
         ce90_m=ce90_m(refined.locate(line_sample, shown[:, 2]), shown),
-        **told,
+        **figures,
     )
 
 
 def timed_make(folder: Path, size: int) -> float:
-    """CPU time of making a case."""
+    """CPU time that a case takes to make, seconds."""
     make_case(folder, size)
     return time.process_time()
 
 
 def register_often(folder: Path, repeats: int) -> Registered:
-    """Register one scene from its file on the block in its folder, as a process of its own."""
+    """The measurements of registering the scene of a folder on its block, in this process."""
     start_mib = memory_mib("VmRSS")
     taken_s = []
     for _ in range(1 + repeats):
@@ -188,7 +189,7 @@ def register_often(folder: Path, repeats: int) -> Registered:
 
 
 def register(folder: Path) -> Registration:
-    """Register the scene of a folder."""
+    """The registration of the scene of a folder."""
     scene = read_scene(folder / "scene.tif", sigma_m=SIGMA_M)
     options = RegistrationOptions(max_points=POINTS, matching=MatchingOptions(max_views=VIEWS))
     with FolderChips(folder / "block") as chips:
@@ -196,7 +197,7 @@ def register(folder: Path) -> Registration:
 
 
 def stages_s(profile: cProfile.Profile) -> dict[str, float]:
-    """CPU time of the stages, and of all the rest."""
+    """CPU time of the stages and of the rest, seconds."""
     stats = pstats.Stats(profile)
     taken: dict[str, float] = {}
     for stage, file, function, within in STAGES:
@@ -210,11 +211,11 @@ def stages_s(profile: cProfile.Profile) -> dict[str, float]:
     return taken
 
 
-def ce90_m(found: Array, true: Array) -> float:
-    """CE90 of ground positions against true ones."""
+def ce90_m(located: Array, true: Array) -> float:
+    """CE90 of ground positions against the truth, metres."""
     east_north = [
         (a[:2] - b[:2]) * metres_per_degree(float(b[1]), float(b[2]))
-        for a, b in zip(found, true, strict=True)
+        for a, b in zip(located, true, strict=True)
     ]
     return accuracy(np.array(east_north)).ce90_m.value
 
@@ -222,8 +223,8 @@ def ce90_m(found: Array, true: Array) -> float:
 def show(outcomes: list[Outcome]) -> None:
     """Print the tables."""
     table = Table("", *(f"{o.size_px:,}²" for o in outcomes), title="registration of one scene")
-    for name, tell in ROWS:
-        table.add_row(name, *(tell(o) for o in outcomes))
+    for name, value_of in ROWS:
+        table.add_row(name, *(value_of(o) for o in outcomes))
     profile = Table("profile", *(f"{o.size_px:,}²" for o in outcomes))
     for stage in outcomes[0].stages_s:
         shares = (o.stages_s[stage] / sum(o.stages_s.values()) for o in outcomes)
@@ -241,7 +242,7 @@ ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
     ("memory before", lambda o: f"{o.start_mib:.0f} MiB"),
     ("peak", lambda o: f"{o.peak_mib:.0f} MiB"),
     ("points tried", lambda o: str(o.tried)),
-    ("views tried, agreed, last pass", lambda o: f"{o.views}, {o.agreed}"),
+    ("views tried, in agreement, last stage", lambda o: f"{o.views}, {o.agreed}"),
     ("active", lambda o: str(o.active)),
     ("CE90 before", lambda o: f"{o.ce90_before_m:.1f} m"),
     ("CE90 after", lambda o: f"{o.ce90_m:.2f} m"),
@@ -250,16 +251,16 @@ ROWS: tuple[tuple[str, Callable[[Outcome], str]], ...] = (
 
 
 def show_beside(scenes: list[Outcome], ours: TiePoints, theirs: TiePoints) -> None:
-    """Print the ortho pair by both, and what points of the scenes cost beside tie points of AROSICS."""
+    """Print the ortho pair by both, and the time of a point of the scenes and of AROSICS."""
     pair = Table(
         "",
         "AROSICS",
         "Amers",
         title=f"tie points of one ortho pair of {PAIR_SIZE:,}² px",
-        caption="errors: of accepted tie points against the shift put in",
+        caption="errors of the accepted tie points against the simulated shift",
     )
-    for name, tell in PAIR_ROWS:
-        pair.add_row(name, tell(theirs), tell(ours))
+    for name, value_of in PAIR_ROWS:
+        pair.add_row(name, value_of(theirs), value_of(ours))
     each_s = theirs.cpu_s / theirs.accepted
     ours_s = (ours.cpu_s / ours.accepted, ours.again_s / ours.accepted)
     pair.add_row(
@@ -267,11 +268,11 @@ def show_beside(scenes: list[Outcome], ours: TiePoints, theirs: TiePoints) -> No
     )
     table = Table("of a scene", "found", "CPU", "CPU each", "a tie point of AROSICS takes")
     for scene in scenes:
-        for what, found in (("views", scene.agreed), (f"points of {VIEWS} views", scene.active)):
-            own_s = scene.again_s / max(found, 1)
+        for what, count in (("views", scene.agreed), (f"points of {VIEWS} views", scene.active)):
+            own_s = scene.again_s / max(count, 1)
             table.add_row(
                 f"{what}, {scene.size_px:,}²",
-                str(found),
+                str(count),
                 f"{scene.again_s:.1f} s",
                 f"{1e3 * own_s:.1f} ms",
                 f"{each_s / own_s:.1f} times as long",

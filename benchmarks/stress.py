@@ -1,15 +1,16 @@
-"""How often registration succeeds, and whether it knows when it does not.
+"""Success rate of registration under difficult conditions, and honesty of the stated accuracy.
 
-Scenes of twelve simulated worlds, from 0.2 m to 20 m, vary in all that makes registration hard, each
-in a few factors over their whole range and in the others mildly; ten more have the conditions SRP is
-described by. A result is held against the true sensor over the whole image. Three figures matter: how
-often a result is delivered ("good" or "usable") and right; whether one called "good" is wrong by more
-than three times the accuracy it states; and the mean square of true errors over stated deviations, 1
-when they are honest.
+Scenes of twelve simulated worlds, from 0.2 m to 20 m, vary in all factors that make registration
+difficult: a few factors over their whole range, the others mildly. Ten more scenes have the conditions
+that SRP is described by. Each result is compared with the true sensor over the whole image. Three
+figures
+matter: how often a result is delivered ("good" or "usable") and right; whether a "good" result is wrong
+by more than three times its stated accuracy; and the mean square of true errors over stated standard
+deviations, 1 when these are honest.
 
-Every scene follows from the seed and its number. What is done is kept line by line and not done again,
-as long as the sources it came from are the same; blocks of points are kept until their files are
-removed. Run: python -m benchmarks.stress [--scenes 500]
+Every scene follows from the seed and its number. The outcome of each scene is appended to a file. A
+scene is not repeated as long as the sources are the same; blocks of points are reused until their files
+are removed. Run: python -m benchmarks.stress [--scenes 500]
 """
 
 import argparse
@@ -59,21 +60,23 @@ FACTORS: dict[str, tuple[float, ...]] = {
 
 
 def main() -> None:
-    """Run what is missing, print, keep, draw."""
+    """Run the missing scenes, print the tables, write the results, draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=500)
     parser.add_argument("--nominal", type=int, default=10, help="scenes in nominal conditions")
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--folder", type=Path, default=RESULTS / "stress", help="what is done so far")
-    parser.add_argument("--any-code", action="store_true", help="count what older sources did, too")
+    parser.add_argument(
+        "--folder", type=Path, default=RESULTS / "stress", help="outcomes and blocks of earlier runs"
+    )
+    parser.add_argument("--any-code", action="store_true", help="include outcomes of older sources")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     file = arguments.folder / f"outcomes_{arguments.seed}.jsonl"
     code = fingerprint()
-    done = read_outcomes(file, None if arguments.any_code else code)
-    run_missing(arguments, file, code, done)
-    results = [done[name] for name in sorted(done) if name.startswith("trial")]
-    nominal = [done[name] for name in sorted(done) if name.startswith("nominal")]
+    outcomes = read_outcomes(file, None if arguments.any_code else code)
+    run_missing(arguments, file, code, outcomes)
+    results = [outcomes[name] for name in sorted(outcomes) if name.startswith("trial")]
+    nominal = [outcomes[name] for name in sorted(outcomes) if name.startswith("nominal")]
     show(results, nominal)
     keep(
         "stress",
@@ -84,7 +87,7 @@ def main() -> None:
 
 
 def fingerprint() -> str:
-    """What the sources of the science are, in a few letters."""
+    """A short hash of all sources of `services`."""
     digest = hashlib.sha256()
     for path in sorted((ROOT / "services").rglob("*.py")):
         digest.update(path.read_bytes())
@@ -92,20 +95,22 @@ def fingerprint() -> str:
 
 
 def read_outcomes(file: Path, code: str | None) -> dict[str, Result]:
-    """What was done by the same sources, by any when None; a line that was cut off is left out."""
-    done: dict[str, Result] = {}
+    """Outcomes by name, of the sources with a fingerprint, or of all when None; without broken lines."""
+    outcomes: dict[str, Result] = {}
     for line in file.read_text().splitlines() if file.exists() else ():
         try:
-            kept = json.loads(line)
+            record = json.loads(line)
         except json.JSONDecodeError:
             continue
-        if code in (None, kept["code"]):
-            done[kept["name"]] = Trial(**kept["trial"]), Outcome(**kept["outcome"])
-    return done
+        if code in (None, record["code"]):
+            outcomes[record["name"]] = Trial(**record["trial"]), Outcome(**record["outcome"])
+    return outcomes
 
 
-def run_missing(arguments: argparse.Namespace, file: Path, code: str, done: dict[str, Result]) -> None:
-    """Register the scenes that were not yet, world by world."""
+def run_missing(
+    arguments: argparse.Namespace, file: Path, code: str, outcomes: dict[str, Result]
+) -> None:
+    """Register the scenes that have no outcome yet, world by world, and add their outcomes."""
     work = [("nominal", number) for number in range(arguments.nominal)]
     work += [("trial", number) for number in in_order_of_places(range(arguments.scenes), PLACES)]
     columns = (
@@ -118,9 +123,9 @@ def run_missing(arguments: argparse.Namespace, file: Path, code: str, done: dict
         task = progress.add_task("scenes", total=len(work))
         for kind, number in work:
             name = f"{kind}_{number:05d}"
-            if name not in done:
-                done[name] = run(kind, number, arguments.seed, arguments.folder)
-                trial, outcome = (asdict(part) for part in done[name])
+            if name not in outcomes:
+                outcomes[name] = run(kind, number, arguments.seed, arguments.folder)
+                trial, outcome = (asdict(part) for part in outcomes[name])
                 line = {"name": name, "code": code, "trial": trial, "outcome": outcome}
                 out.write(json.dumps(line) + "\n")
                 out.flush()
@@ -128,7 +133,7 @@ def run_missing(arguments: argparse.Namespace, file: Path, code: str, done: dict
 
 
 def run(kind: str, number: int, seed: int, folder: Path) -> Result:
-    """One scene."""
+    """The trial and the outcome of one scene."""
     place = NOMINAL if kind == "nominal" else PLACES[number % len(PLACES)]
     trial = nominal_trial(seed, number) if kind == "nominal" else draw_trial(seed, number)
     options = NOMINAL_OPTIONS if kind == "nominal" else OPTIONS
@@ -166,12 +171,12 @@ def summary(results: list[Result]) -> dict[str, Any]:
 
 
 def mean(values: list[float]) -> float | None:
-    """The mean, or None of nothing."""
+    """The mean; None without values."""
     return float(np.mean(values)) if values else None
 
 
 def quantiles(values: np.ndarray) -> list[float]:
-    """Median, 90 % and largest."""
+    """Median, 90 % quantile and maximum of the finite values."""
     finite = values[np.isfinite(values)]
     return [float(v) for v in np.quantile(finite, [0.5, 0.9, 1.0])] if len(finite) else []
 
