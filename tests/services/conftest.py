@@ -1,4 +1,4 @@
-"""A registration whose truth is known, small enough to make anew in every test."""
+"""A registration with a known truth, small enough to be made in every test."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class FlatModel:
 
 @dataclass(frozen=True)
 class Registered:
-    """Measures of a scene, their adjustment, and the way to redo it."""
+    """Measures of a scene, their adjustment, and the function that repeats it."""
 
     measures: Measures
     adjustment: SceneAdjustment
@@ -55,7 +55,7 @@ class Registered:
     gsd_m: float = GSD_M
 
     def adjusted(self, refit: Callable[[BoolArray], SceneAdjustment] | None = None) -> AdjustedScene:
-        """The scene as its quality is judged, with its own way to redo the adjustment or another."""
+        """The scene after its adjustment, repeated by its own function or another."""
         return AdjustedScene(self.measures, self.adjustment, self.shape, self.gsd_m, refit or self.refit)
 
 
@@ -65,7 +65,7 @@ def register(
     """Register a scene on n visible points.
 
     Args:
-        n: visible points, `lost` of them not found and `wrong` of them found elsewhere.
+        n: visible points, `lost` of them not matched and `wrong` of them matched elsewhere.
         noise_px: of the measures.
         extent: part of each side of the image where points are.
         seed: of the random numbers.

@@ -1,4 +1,4 @@
-"""Small simulated worlds and what was made of them, each made once for all tests that read it."""
+"""Small simulated worlds, views, blocks and productions, each made once for all tests."""
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -32,7 +32,7 @@ def world(seed: int = 1) -> World:
 
 @cache
 def block_views() -> tuple[SimulatedView, ...]:
-    """Three views of the middle of the world, each some 3 m wrong."""
+    """Three views of the middle of the world, each with an error of about 3 m."""
     rng = np.random.default_rng(2)
     return tuple(simulate_block(world(), rng, 3, SHAPE, GSD_M, BLOCK_SIGMA_M, 20.0))
 
@@ -55,14 +55,14 @@ class MemoryChips:
 
 @cache
 def block() -> tuple[ControlPoints, MemoryChips]:
-    """The points and their chips as a registration meets them."""
+    """The points and their chips, as a registration receives them."""
     made = production()
     chips = np.concatenate([made.chips(row) for row in range(len(made.points))])
     return made.points, MemoryChips(chips)
 
 
 def plan(name: str = "scene", **changes: object) -> ViewPlan:
-    """A view of the middle of the world from where none of the block's was taken."""
+    """A view of the middle of the world, from a direction that no view of the block has."""
     lon, lat = (float(v) for v in world().centre_lon_lat)
     base = ViewPlan(
         name,

@@ -70,7 +70,7 @@ def registration_of(trial: Trial, block: Block) -> Registration:
     )
 
 
-def test_no_scene_that_is_delivered_is_wrong_by_more_than_it_says(hard: list, clear: list) -> None:
+def test_no_scene_that_is_delivered_is_wrong_by_more_than_stated(hard: list, clear: list) -> None:
     assert not [trial.number for trial, outcome in hard + clear if outcome.delivered and outcome.wrong]
 
 
@@ -84,7 +84,7 @@ def test_most_hard_scenes_are_delivered_too(hard: list) -> None:
     assert sum(outcome.delivered for _, outcome in hard) > SCENES / 2
 
 
-def test_errors_are_as_large_as_they_are_said_to_be(hard: list, clear: list) -> None:
+def test_errors_are_as_large_as_stated(hard: list, clear: list) -> None:
     squares = [outcome.normalised for _, outcome in hard + clear if outcome.delivered]
     low, high = chi2.interval(0.999, FREE_ERRORS * len(squares)) / np.float64(FREE_ERRORS * len(squares))
     assert low < np.mean(squares) < high
@@ -99,15 +99,15 @@ def test_nominal_conditions_give_a_model_five_times_better_than_its_points(block
     assert outcome.displacement_m < what_srp_publishes_for_corners_m
 
 
-def test_inverted_contrast_is_found_by_its_edges_and_told(block: Block) -> None:
-    found = registration_of(clear_trial(1, inverted=True), block)
-    assert found.qualification.verdict != "failed"
-    assert found.measures.by_gradient[found.measures.active].all()
+def test_inverted_contrast_is_found_by_its_gradient_and_reported(block: Block) -> None:
+    result = registration_of(clear_trial(1, inverted=True), block)
+    assert result.qualification.verdict != "failed"
+    assert result.measures.by_gradient[result.measures.active].all()
     as_it_was = registration_of(clear_trial(1), block).measures
     assert as_it_was.by_gradient[as_it_was.active].mean() < 0.1
 
 
-def test_points_that_clouds_hide_are_said_to_be_under_a_cloud(block: Block) -> None:
+def test_points_that_clouds_hide_are_reported_under_a_cloud(block: Block) -> None:
     without = registration_of(clear_trial(1), block).measures
     below = registration_of(clear_trial(1, cloud_cover=0.4), block).measures
     hidden = without.matched & ~below.matched
@@ -127,7 +127,7 @@ def test_a_scene_follows_from_the_seed_and_its_number(block: Block) -> None:
     np.testing.assert_array_equal(first.scene.image.read(window), again.scene.image.read(window))
 
 
-def test_points_are_wrong_by_as_much_as_the_trial_says(block: Block) -> None:
+def test_points_have_the_errors_of_the_trial(block: Block) -> None:
     calm = replace(nominal_trial(SEED, 1, SMALL), point_ce90_m=3.0, understated=2.0)
     prepared = prepare(SMALL, calm, block, SEED)
     degrees = prepared.points.lon_lat_h[:, 1] - block.points.lon_lat_h[:, 1]
@@ -137,7 +137,7 @@ def test_points_are_wrong_by_as_much_as_the_trial_says(block: Block) -> None:
     assert north_m.std() == pytest.approx(2.0 * declared_m, rel=few)
 
 
-def test_what_was_done_is_read_again_and_a_cut_off_line_is_not(tmp_path: Path) -> None:
+def test_outcomes_are_read_again_without_a_broken_line(tmp_path: Path) -> None:
     trial = draw_trial(SEED, 0, (SMALL,))
     nothing = float("nan")
     outcome = Outcome("refused", "why", 0, 0, 0, "", *[nothing] * 7, 1.5)
@@ -146,9 +146,9 @@ def test_what_was_done_is_read_again_and_a_cut_off_line_is_not(tmp_path: Path) -
     )
     file = tmp_path / "outcomes.jsonl"
     file.write_text(line + "\n" + line[: len(line) // 2])
-    done = read_outcomes(file, "a")
-    assert list(done) == ["trial_00000"]
-    assert done["trial_00000"][0] == trial
+    outcomes = read_outcomes(file, "a")
+    assert list(outcomes) == ["trial_00000"]
+    assert outcomes["trial_00000"][0] == trial
     assert read_outcomes(file, "b") == {}
 
 

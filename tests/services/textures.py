@@ -1,4 +1,4 @@
-"""Periodic noise of a known smoothness, and the same moved by any fraction of a pixel."""
+"""Periodic noise of known smoothness, and the same noise moved by any fraction of a pixel."""
 
 import numpy as np
 from scipy import fft

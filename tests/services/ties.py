@@ -1,4 +1,4 @@
-"""Tie points between simulated views, without pixels: what is seen and what is true."""
+"""Tie points between simulated views, without pixels: observations and truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from tests.services.simulated import world
 
 @dataclass(frozen=True)
 class Ties:
-    """Image positions of points whose ground is known.
+    """Image positions of points with known ground.
 
     Attributes:
         lon_lat_h: (p, 3) where the points are.
@@ -35,15 +35,15 @@ def make_ties(
     shift_px: Array | None = None,
     seen: float = 1.0,
 ) -> Ties:
-    """See points in images.
+    """Observations of points in images, with noise and blunders.
 
     Args:
-        geometries: the images; their RPCs say where points are seen.
+        geometries: the images; their RPCs project the points.
         rng: places, noise and blunders.
         count: points.
         noise_px: of every coordinate; it is also the stated sigma.
         blunders: share of observations that are up to 30 px away.
-        shift_px: (n, 2) by how much each image shows everything elsewhere than its RPC says.
+        shift_px: (n, 2) error of the RPC of each image.
         seen: share of the images that see a point; two do in any case.
     """
     n_images, shape = len(geometries), np.array(geometries[0].plan.shape)
@@ -69,7 +69,7 @@ def make_ties(
 
 
 def difference_m(lon_lat_h: Array, truth: Array) -> Array:
-    """Metres (n, 3) east, north and up from true points to found ones."""
+    """Metres (n, 3) east, north and up from true to computed points."""
     east, north = metres_per_degree(float(truth[0, 1]), float(truth[0, 2]))
     return np.asarray((lon_lat_h - truth) * [east, north, 1.0])
 

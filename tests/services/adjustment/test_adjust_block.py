@@ -1,4 +1,4 @@
-"""Images are brought together by tie points alone, and the block says how well."""
+"""Tie points alone bring the images of a block together, with an honest covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ def five() -> list[ViewGeometry]:
 
 @dataclass(frozen=True)
 class Trial:
-    """One block: what was put into it and what came out."""
+    """One block: its ties and shifts, and its adjustment."""
 
     ties: Ties
     shift_px: Array
@@ -84,11 +84,11 @@ def test_shifts_are_recovered_within_their_stated_covariance(trials: list[Trial]
     for trial in trials:
         error = (trial.found_px - trial.shift_px).ravel()
         squares.append(error @ np.linalg.solve(trial.block.covariance_px2, error) / len(error))
-    # Robust weights discard a little of what is known, and blunders widen the scale: 0.76 on average.
+    # Robust weights discard a little information, and blunders increase the scale: 0.76 on average.
     assert 0.6 < np.mean(squares) < 1.3
 
 
-def test_what_tie_points_can_tell_of_the_shifts_is_told_to_a_tenth_of_a_pixel(
+def test_shifts_that_tie_points_determine_are_found_to_a_tenth_of_a_pixel(
     five: list[ViewGeometry], trials: list[Trial]
 ) -> None:
     gauge = np.concatenate([_per_metre(g) for g in five])
@@ -119,7 +119,7 @@ def test_the_block_moves_as_a_whole_by_what_the_priors_say(five: list[ViewGeomet
 
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.2, 0.8])
-def test_where_the_block_lies_is_as_well_known_as_the_priors_whatever_the_noise(
+def test_the_position_of_the_block_is_as_precise_as_the_priors_whatever_the_noise(
     five: list[ViewGeometry], noise_px: float
 ) -> None:
     ties = make_ties(five, np.random.default_rng(4), 300, noise_px)
@@ -132,7 +132,7 @@ def test_where_the_block_lies_is_as_well_known_as_the_priors_whatever_the_noise(
     np.testing.assert_allclose(found_m, expected_m, rtol=0.05)
 
 
-def test_an_image_that_is_known_exactly_holds_the_block(five: list[ViewGeometry]) -> None:
+def test_an_image_with_an_exact_model_fixes_the_block(five: list[ViewGeometry]) -> None:
     rng = np.random.default_rng(1)
     shift_px = np.zeros((5, 2))
     shift_px[2:] = rng.normal(0.0, PRIOR_PX, (3, 2))
@@ -216,8 +216,8 @@ def test_a_pair_meets_across_its_rays_and_keeps_its_parallax_as_the_priors_say()
 
 def test_corrected_models_are_those_the_points_refer_to(trials: list[Trial]) -> None:
     trial = trials[0]
-    kept = trial.ties.observations.take(trial.block.active)
-    again = intersect(trial.block.models, kept, 300)
+    used = trial.ties.observations.take(trial.block.active)
+    again = intersect(trial.block.models, used, 300)
     both = np.isfinite(again.lon_lat_h[:, 0])
     error_m = difference_m(again.lon_lat_h[both], trial.block.lon_lat_h[both])
     assert np.abs(error_m).max() < a_centimetre

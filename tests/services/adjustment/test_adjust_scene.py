@@ -1,4 +1,4 @@
-"""A correction is found with the precision it states, in the right order, whatever a few points say."""
+"""A correction has the precision it states and the right order, even with a few blunders."""
 
 from dataclasses import dataclass, replace
 
@@ -66,11 +66,11 @@ def with_blunders(points: Seen, count: int, rng: np.random.Generator, size_px: f
     return replace(points, line_sample=line_sample)
 
 
-def normalised_square(found: SceneAdjustment, truth: Array) -> float:
+def normalised_square(result: SceneAdjustment, truth: Array) -> float:
     """Mean square of the errors of the free parameters, whitened by their covariance."""
-    free = np.flatnonzero(np.diag(found.covariance) > 0.0)
-    error = (found.correction.parameters - truth).ravel()[free]
-    return float(error @ np.linalg.solve(found.covariance[np.ix_(free, free)], error) / len(free))
+    free = np.flatnonzero(np.diag(result.covariance) > 0.0)
+    error = (result.correction.parameters - truth).ravel()[free]
+    return float(error @ np.linalg.solve(result.covariance[np.ix_(free, free)], error) / len(free))
 
 
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
@@ -87,18 +87,18 @@ def test_without_noise_the_correction_is_exact() -> None:
     for order, parameters in TRUTH.items():
         points = seen(parameters, np.random.default_rng(0), noise_px=0.0)
         points = replace(points, sigma_px=np.full(40, NOISE_PX))
-        found = points.adjust(AdjustmentOptions(order=order))
-        np.testing.assert_allclose(found.correction.parameters, parameters, atol=a_millipixel)
-        np.testing.assert_allclose(found.residual_px, 0.0, atol=a_millipixel)
-        assert found.active.all()
+        result = points.adjust(AdjustmentOptions(order=order))
+        np.testing.assert_allclose(result.correction.parameters, parameters, atol=a_millipixel)
+        np.testing.assert_allclose(result.residual_px, 0.0, atol=a_millipixel)
+        assert result.active.all()
 
 
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
-def test_the_order_is_that_of_the_truth_and_the_covariance_holds_with_it(order: Order) -> None:
+def test_the_order_is_that_of_the_truth_and_its_covariance_is_honest(order: Order) -> None:
     rng = np.random.default_rng(2)
-    found = [seen(TRUTH[order], rng).adjust() for _ in range(TRIALS // 2)]
-    right = [f for f in found if f.order == order]
-    assert len(right) >= 0.9 * len(found)
+    result = [seen(TRUTH[order], rng).adjust() for _ in range(TRIALS // 2)]
+    right = [f for f in result if f.order == order]
+    assert len(right) >= 0.9 * len(result)
     assert 0.75 < np.mean([normalised_square(f, TRUTH[order]) for f in right]) < 1.25
 
 
@@ -108,9 +108,9 @@ def test_a_skew_of_two_pixels_asks_for_an_affine() -> None:
     assert all(seen(skewed, rng).adjust().order == "affine" for _ in range(TRIALS // 4))
 
 
-def test_every_order_that_was_tried_is_told_with_its_validation() -> None:
-    found = seen(TRUTH["affine"], np.random.default_rng(0)).adjust()
-    validation = dict(found.validation_px)
+def test_every_order_that_was_tried_is_reported_with_its_validation() -> None:
+    result = seen(TRUTH["affine"], np.random.default_rng(0)).adjust()
+    validation = dict(result.validation_px)
     assert list(validation) == ["shift", "drift", "affine"]
     assert validation["affine"] < validation["drift"] < validation["shift"]
     # Four fifths of the nearest: a normal law in two dimensions leaves 0.77 of its rms of sqrt(2) sigma.
@@ -130,8 +130,8 @@ def test_points_in_a_corner_carry_a_shift_only() -> None:
 
 
 def test_few_points_do_not_carry_an_affine() -> None:
-    found = seen(TRUTH["affine"], np.random.default_rng(0), n=10).adjust()
-    assert [order for order, _ in found.validation_px] == ["shift", "drift"]
+    result = seen(TRUTH["affine"], np.random.default_rng(0), n=10).adjust()
+    assert [order for order, _ in result.validation_px] == ["shift", "drift"]
 
 
 @pytest.mark.parametrize("order", ["shift", "drift", "affine"])
@@ -139,10 +139,10 @@ def test_three_points_in_ten_may_be_wrong(order: Order) -> None:
     rng = np.random.default_rng(4)
     squares, kept_wrong, lost_right = [], 0, 0
     for _ in range(TRIALS // 4):
-        found = with_blunders(seen(TRUTH[order], rng), 12, rng).adjust(AdjustmentOptions(order=order))
-        squares.append(normalised_square(found, TRUTH[order]))
-        kept_wrong += int(found.active[:12].sum())
-        lost_right += int((~found.active[12:]).sum())
+        result = with_blunders(seen(TRUTH[order], rng), 12, rng).adjust(AdjustmentOptions(order=order))
+        squares.append(normalised_square(result, TRUTH[order]))
+        kept_wrong += int(result.active[:12].sum())
+        lost_right += int((~result.active[12:]).sum())
     assert np.mean(squares) < 1.4
     assert kept_wrong == 0
     assert lost_right < 0.02 * 28 * TRIALS / 4
@@ -150,19 +150,19 @@ def test_three_points_in_ten_may_be_wrong(order: Order) -> None:
 
 def test_two_points_in_ten_may_be_wrong_when_the_order_is_chosen_too() -> None:
     rng = np.random.default_rng(5)
-    found = [with_blunders(seen(TRUTH["affine"], rng), 8, rng).adjust() for _ in range(TRIALS // 4)]
-    assert all(f.order == "affine" for f in found)
-    assert not any(f.active[:8].any() for f in found)
-    assert np.mean([normalised_square(f, TRUTH["affine"]) for f in found]) < 1.4
+    result = [with_blunders(seen(TRUTH["affine"], rng), 8, rng).adjust() for _ in range(TRIALS // 4)]
+    assert all(f.order == "affine" for f in result)
+    assert not any(f.active[:8].any() for f in result)
+    assert np.mean([normalised_square(f, TRUTH["affine"]) for f in result]) < 1.4
 
 
 def test_a_measure_that_left_still_has_its_residual() -> None:
     rng = np.random.default_rng(6)
     points = with_blunders(seen(TRUTH["shift"], rng), 3, rng)
-    found = points.adjust(AdjustmentOptions(order="shift"))
-    expected = points.line_sample - found.correction.apply(FlatModel().project(points.lon_lat_h))
-    np.testing.assert_allclose(found.residual_px, expected, atol=a_millipixel)
-    assert np.hypot(*found.residual_px[:3].T).min() > 4.0
+    result = points.adjust(AdjustmentOptions(order="shift"))
+    expected = points.line_sample - result.correction.apply(FlatModel().project(points.lon_lat_h))
+    np.testing.assert_allclose(result.residual_px, expected, atol=a_millipixel)
+    assert np.hypot(*result.residual_px[:3].T).min() > 4.0
 
 
 def test_measures_without_a_position_and_those_held_out_are_not_used() -> None:
@@ -171,10 +171,10 @@ def test_measures_without_a_position_and_those_held_out_are_not_used() -> None:
     line_sample = points.line_sample.copy()
     line_sample[:5] = np.nan
     line_sample[30:] += 50.0
-    found = replace(points, line_sample=line_sample).adjust(usable=np.arange(40) < 30)
-    assert not found.active[:5].any()
-    assert not found.active[30:].any()
-    np.testing.assert_allclose(found.correction.parameters[:, 0], [12.0, -7.0], atol=3.0 * NOISE_PX)
+    result = replace(points, line_sample=line_sample).adjust(usable=np.arange(40) < 30)
+    assert not result.active[:5].any()
+    assert not result.active[30:].any()
+    np.testing.assert_allclose(result.correction.parameters[:, 0], [12.0, -7.0], atol=3.0 * NOISE_PX)
 
 
 def test_sigmas_that_were_too_small_are_made_good() -> None:
@@ -182,9 +182,9 @@ def test_sigmas_that_were_too_small_are_made_good() -> None:
     squares = []
     for _ in range(TRIALS):
         points = seen(TRUTH["shift"], rng)
-        found = replace(points, sigma_px=points.sigma_px / 4.0).adjust(AdjustmentOptions(order="shift"))
-        squares.append(normalised_square(found, TRUTH["shift"]))
-        assert found.sigma0 == pytest.approx(4.0, rel=0.5)
+        result = replace(points, sigma_px=points.sigma_px / 4.0).adjust(AdjustmentOptions(order="shift"))
+        squares.append(normalised_square(result, TRUTH["shift"]))
+        assert result.sigma0 == pytest.approx(4.0, rel=0.5)
     assert 0.75 < np.mean(squares) < 1.4
 
 
@@ -199,7 +199,7 @@ def test_sigmas_that_were_too_large_are_not_made_smaller() -> None:
     )
 
 
-def test_points_known_badly_weigh_little() -> None:
+def test_imprecise_points_weigh_little() -> None:
     rng = np.random.default_rng(10)
     sigma_m = np.where(np.arange(40) < 20, 5.0, 0.05)
     squares, errors = [], []
@@ -208,11 +208,11 @@ def test_points_known_badly_weigh_little() -> None:
         moved_m = rng.normal(0.0, 1.0, (40, 2)) * sigma_m[:, None]
         line_sample = points.line_sample + np.column_stack([-moved_m[:, 1], moved_m[:, 0]]) / GSD_M
         covariance = sigma_m[:, None, None] ** 2 * np.diag([1.0, 1.0, 0.0])
-        found = replace(points, line_sample=line_sample, covariance_m2=covariance).adjust(
+        result = replace(points, line_sample=line_sample, covariance_m2=covariance).adjust(
             AdjustmentOptions(order="shift")
         )
-        squares.append(normalised_square(found, TRUTH["shift"]))
-        errors.append(found.correction.parameters[:, 0] - [12.0, -7.0])
+        squares.append(normalised_square(result, TRUTH["shift"]))
+        errors.append(result.correction.parameters[:, 0] - [12.0, -7.0])
     assert 0.75 < np.mean(squares) < 1.3
     good_only_px = np.hypot(NOISE_PX, 0.05 / GSD_M) / np.sqrt(20.0)
     assert np.std(errors) < 1.2 * good_only_px
@@ -224,10 +224,10 @@ def test_a_point_s_covariance_is_seen_along_its_own_direction() -> None:
     line_sample = points.line_sample + rng.normal(0.0, 2.0, (40, 1)) / GSD_M * [0.0, 1.0]
     east_only = np.tile(np.diag([4.0, 0.0, 0.0]), (40, 1, 1))
     moved = replace(points, line_sample=line_sample, covariance_m2=east_only)
-    found = moved.adjust(AdjustmentOptions(order="shift"))
-    std_px = np.sqrt(np.diag(found.covariance)[[0, 3]]) / max(found.sigma0, 1.0)
-    expected = np.array([NOISE_PX, np.hypot(NOISE_PX, 2.0 / GSD_M)]) / np.sqrt(found.active.sum())
-    assert found.active.sum() >= 38
+    result = moved.adjust(AdjustmentOptions(order="shift"))
+    std_px = np.sqrt(np.diag(result.covariance)[[0, 3]]) / max(result.sigma0, 1.0)
+    expected = np.array([NOISE_PX, np.hypot(NOISE_PX, 2.0 / GSD_M)]) / np.sqrt(result.active.sum())
+    assert result.active.sum() >= 38
     np.testing.assert_allclose(std_px, expected, rtol=0.01)
 
 
@@ -266,41 +266,41 @@ def test_the_order_of_the_points_does_not_matter() -> None:
     np.testing.assert_array_equal(other.active, first.active[order])
 
 
-def test_what_could_not_be_tested_is_not_taken_for_known():
+def test_what_could_not_be_tested_stays_uncertain():
     """Points on a tenth of the image tell little of drift and skew; elsewhere these may be unseen."""
     rng = np.random.default_rng(8)
     points = seen(np.array([[3.0, 1.0, 0.0], [-2.0, 0.0, 1.0]]), rng, 400)
     near = (points.line_sample < np.array(SHAPE) * 0.3).all(axis=1)
-    found = points.adjust(usable=near)
-    assert found.order != "affine"
+    result = points.adjust(usable=near)
+    assert result.order != "affine"
     corners = np.array([[0.0, 0.0], np.array(SHAPE) - 1.0])
-    error = found.correction.apply(corners) - points.truth.apply(corners)
-    std = np.sqrt(np.diagonal(found.covariance_at(corners), axis1=1, axis2=2))
+    error = result.correction.apply(corners) - points.truth.apply(corners)
+    std = np.sqrt(np.diagonal(result.covariance_at(corners), axis1=1, axis2=2))
     assert (np.abs(error) < 3.0 * std).all()
     # What the measures alone would tell of the far corner: a plane through them, carried there. What is
     # expected of drift and skew beforehand makes it surer by at most its own information.
-    seen_at = (points.line_sample[near] - found.correction.centre) / found.correction.half_size
+    seen_at = (points.line_sample[near] - result.correction.centre) / result.correction.half_size
     plane = np.column_stack([np.ones(len(seen_at)), seen_at])
     far = np.array([1.0, 1.0, 1.0])
     expected = np.diag([0.0, 1.0, 1.0]) / DEFAULTS.prior_slope_sigma_px**2
-    told = far @ np.linalg.inv(plane.T @ plane / NOISE_PX**2 + expected) @ far
-    assert std[1].min() > 0.99 * np.sqrt(told)
+    predicted_variance = far @ np.linalg.inv(plane.T @ plane / NOISE_PX**2 + expected) @ far
+    assert std[1].min() > 0.99 * np.sqrt(predicted_variance)
     assert std[0].max() < 0.5 * std[1].min()
 
 
 def test_a_drift_too_small_to_be_seen_is_in_the_stated_accuracy():
-    """Points of several pixels hide a drift of one: what is stated holds for it all the same."""
+    """Points of several pixels hide a drift of 1 px; the stated covariance includes it all the same."""
     rng = np.random.default_rng(15)
     corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]) * (np.array(SHAPE) - 1.0)
     squares, orders = [], []
     for _ in range(TRIALS):
         slopes = rng.normal(0.0, DEFAULTS.prior_slope_sigma_px, (2, 2))
         points = seen(np.column_stack([[3.0, -2.0], slopes]), rng, 80, noise_px=4.0)
-        found = points.adjust()
-        error = found.correction.apply(corners) - points.truth.apply(corners)
-        weighted = np.linalg.solve(found.covariance_at(corners), error[:, :, None])[:, :, 0]
+        result = points.adjust()
+        error = result.correction.apply(corners) - points.truth.apply(corners)
+        weighted = np.linalg.solve(result.covariance_at(corners), error[:, :, None])[:, :, 0]
         squares.append((weighted * error).sum() / error.size)
-        orders.append(found.order)
+        orders.append(result.order)
     assert orders.count("shift") > TRIALS / 2
     assert np.mean(squares) == pytest.approx(1.0, abs=0.2)
 
@@ -324,17 +324,17 @@ def test_measures_less_sharp_than_others_stay_where_their_points_are_better_than
         sigma_px=sigma_px,
         covariance_m2=np.tile((3.0 * GSD_M) ** 2 * np.eye(3), (200, 1, 1)),
     )
-    found = points.adjust()
-    assert found.active.mean() > 0.95
-    assert np.abs(found.correction.parameters[:, 0] - TRUTH["shift"][:, 0]).max() < 5.0 * a_millipixel
+    result = points.adjust()
+    assert result.active.mean() > 0.95
+    assert np.abs(result.correction.parameters[:, 0] - TRUTH["shift"][:, 0]).max() < 5.0 * a_millipixel
     # What is declared of points is not made smaller by how well they fit.
-    assert found.covariance[0, 0] > 3.0**2 / 200
+    assert result.covariance[0, 0] > 3.0**2 / 200
 
 
 def test_wrong_measures_still_leave_where_points_are_better_than_declared() -> None:
     rng = np.random.default_rng(9)
     points = with_blunders(seen(TRUTH["shift"], rng, n=200, noise_px=0.05), 40, rng, size_px=0.5)
     declared = np.tile((3.0 * GSD_M) ** 2 * np.eye(3), (200, 1, 1))
-    found = replace(points, covariance_m2=declared).adjust()
-    assert not found.active[:40].any()
-    assert found.active[40:].mean() > 0.95
+    result = replace(points, covariance_m2=declared).adjust()
+    assert not result.active[:40].any()
+    assert result.active[40:].mean() > 0.95

@@ -89,7 +89,7 @@ def test_the_angle_is_that_between_the_flights() -> None:
     assert np.abs(found.angle_deg - 30.0).max() < 2.0 * a_tenth_of_a_degree
 
 
-def test_height_is_worse_known_the_narrower_the_angle() -> None:
+def test_height_is_less_precise_at_a_narrower_angle() -> None:
     std = []
     for incidence in (3.0, 15.0, 30.0):
         pair = ring_of_geometries(2, incidence)

@@ -32,7 +32,7 @@ def test_the_90_percent_quantile_is_bounded_above_from_29_values_on(n, bounded):
     assert ("do not bound" in quantile.note) == (not bounded)
 
 
-def test_the_interval_holds_the_true_quantile_as_often_as_it_says():
+def test_the_interval_holds_the_true_quantile_as_often_as_stated():
     rng = np.random.default_rng(5)
     trials, n, truth = 2000, 60, -np.log(0.1)
     inside = 0
@@ -68,10 +68,10 @@ def test_a_quantile_lies_within_its_interval_and_its_sample(values):
 
 
 def test_statistics_are_those_of_the_finite_values():
-    found = statistics(np.array([1.0, np.nan, 3.0]))
-    assert (found.n, found.mean) == (2, 2.0)
-    assert found.std == pytest.approx(np.sqrt(2.0))
-    assert found.rms == pytest.approx(np.sqrt(5.0))
+    result = statistics(np.array([1.0, np.nan, 3.0]))
+    assert (result.n, result.mean) == (2, 2.0)
+    assert result.std == pytest.approx(np.sqrt(2.0))
+    assert result.rms == pytest.approx(np.sqrt(5.0))
 
 
 def test_one_value_has_no_standard_deviation():
@@ -80,13 +80,13 @@ def test_one_value_has_no_standard_deviation():
 
 def test_accuracy_separates_bias_from_spread_on_each_axis():
     error_m = np.array([[1.0, 2.0, -3.0], [3.0, 2.0, -5.0], [np.nan, 0.0, 0.0]])
-    found = accuracy(error_m)
-    assert found.n == 2
-    assert found.bias_m == (2.0, 2.0, -4.0)
-    assert found.std_m == pytest.approx((np.sqrt(2.0), 0.0, np.sqrt(2.0)))
-    assert found.rmse_m == pytest.approx((np.sqrt(5.0), 2.0, np.sqrt(17.0)))
-    assert found.le90_m is not None
-    assert found.le90_m.value == pytest.approx(5.0)
+    result = accuracy(error_m)
+    assert result.n == 2
+    assert result.bias_m == (2.0, 2.0, -4.0)
+    assert result.std_m == pytest.approx((np.sqrt(2.0), 0.0, np.sqrt(2.0)))
+    assert result.rmse_m == pytest.approx((np.sqrt(5.0), 2.0, np.sqrt(17.0)))
+    assert result.le90_m is not None
+    assert result.le90_m.value == pytest.approx(5.0)
 
 
 def test_planimetric_errors_say_nothing_about_heights():
@@ -110,11 +110,11 @@ def test_an_honest_precision_has_normalised_errors_near_one():
     assert flattering.mean_square > flattering.upper
 
 
-def test_normalised_errors_leave_out_what_is_not_known():
+def test_normalised_errors_leave_out_missing_values():
     error = np.array([[1.0, 1.0], [np.nan, 1.0], [1.0, 1.0]])
     covariance = np.stack([np.eye(2), np.eye(2), np.full((2, 2), np.nan)])
-    found = normalised_error(error, covariance)
-    assert (found.n, found.mean_square) == (1, 1.0)
+    result = normalised_error(error, covariance)
+    assert (result.n, result.mean_square) == (1, 1.0)
     assert np.isnan(normalised_error(error[1:2], covariance[1:2]).mean_square)
 
 
@@ -130,6 +130,6 @@ def test_predicted_ce90_agrees_with_a_quadrature_of_its_own(ratio, factor):
 
 
 def test_predicted_ce90_of_an_unknown_covariance_is_unknown():
-    found = normal_ce90(np.stack([np.full((2, 2), np.nan), np.zeros((2, 2))]))
-    assert np.isnan(found[0])
-    assert found[1] == 0.0
+    result = normal_ce90(np.stack([np.full((2, 2), np.nan), np.zeros((2, 2))]))
+    assert np.isnan(result[0])
+    assert result[1] == 0.0

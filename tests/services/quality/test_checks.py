@@ -28,24 +28,24 @@ def checked(scene: Registered, points: CheckPoints, frame_sigma_m: float = float
     return check_model(model, scene.adjustment, points, frame_sigma_m)
 
 
-def test_honest_statements_give_residuals_of_the_size_they_let_expect(registered):
+def test_honest_statements_predict_the_size_of_the_residuals(registered):
     scene = registered()
-    found = checked(scene, check_points(scene, n=200, noise_px=0.3))
-    assert found.accuracy.n == found.residual_px.xy.n == 200
-    assert found.normalised.lower < found.normalised.mean_square < found.normalised.upper
-    assert found.accuracy.le90_m is None
+    result = checked(scene, check_points(scene, n=200, noise_px=0.3))
+    assert result.accuracy.n == result.residual_px.xy.n == 200
+    assert result.normalised.lower < result.normalised.mean_square < result.normalised.upper
+    assert result.accuracy.le90_m is None
 
 
 def test_the_accuracy_on_the_ground_is_that_of_the_marks_seen_through_the_model(registered):
     scene = registered(noise_px=0.01)
     moved_line_px, moved_sample_px = 2.0, -3.0
-    found = checked(scene, check_points(scene, 50, 1e-6, (moved_line_px, moved_sample_px)))
-    east_m, north_m = found.accuracy.bias_m
+    result = checked(scene, check_points(scene, 50, 1e-6, (moved_line_px, moved_sample_px)))
+    east_m, north_m = result.accuracy.bias_m
     model_px = 0.01
     assert east_m == pytest.approx(moved_sample_px * GSD_M, abs=model_px)
     assert north_m == pytest.approx(-moved_line_px * GSD_M, abs=model_px)
-    assert found.residual_px.y.mean == pytest.approx(moved_line_px, abs=model_px)
-    assert found.residual_px.x.mean == pytest.approx(moved_sample_px, abs=model_px)
+    assert result.residual_px.y.mean == pytest.approx(moved_line_px, abs=model_px)
+    assert result.residual_px.x.mean == pytest.approx(moved_sample_px, abs=model_px)
 
 
 def test_points_that_contradict_a_registration_take_its_verdict_of_good_away(registered):
@@ -73,11 +73,11 @@ def test_what_points_and_their_frame_state_is_expected_of_them(registered):
     assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)
 
 
-def test_marks_that_say_nothing_of_themselves_are_taken_for_those_of_a_person(registered):
+def test_marks_without_a_sigma_have_that_of_a_person(registered):
     scene = registered()
     points = check_points(scene, 200, MARKING_SIGMA_PX)
-    unsaid = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, np.full(200, np.nan))
-    assert checked(scene, unsaid) == checked(scene, points)
+    unstated = CheckPoints(points.lon_lat_h, points.line_sample, points.sigma_m, np.full(200, np.nan))
+    assert checked(scene, unstated) == checked(scene, points)
 
 
 def test_points_beside_the_scene_are_refused_by_number(registered):

@@ -33,9 +33,9 @@ def failed(qualification):
 
 
 def test_a_clean_registration_is_good(registered):
-    found = qualified(registered())
-    assert found.verdict == "good"
-    assert failed(found) == set()
+    result = qualified(registered())
+    assert result.verdict == "good"
+    assert failed(result) == set()
 
 
 def test_visible_matched_and_active_points_are_counted(registered):
@@ -57,19 +57,19 @@ def test_residuals_of_the_image_are_x_along_samples_and_y_along_lines(registered
     active = scene.measures.active
     residual = np.tile([3.0, -4.0], (60, 1))
     measures = replace(scene.measures, residual_px=residual, residual_m=residual[:, ::-1] / 2.0)
-    found = qualified(replace(scene, measures=measures))
-    assert (found.image_residuals_px.y.mean, found.image_residuals_px.x.mean) == (3.0, -4.0)
-    assert (found.image_residuals_px.xy.mean, found.image_residuals_px.xy.std) == (5.0, 0.0)
-    assert found.image_residuals_px.xy.n == active.sum()
-    assert (found.ground_residuals_m.east.mean, found.ground_residuals_m.north.mean) == (-2.0, 1.5)
-    assert found.ground_residuals_m.horizontal.mean == 2.5
+    result = qualified(replace(scene, measures=measures))
+    assert (result.image_residuals_px.y.mean, result.image_residuals_px.x.mean) == (3.0, -4.0)
+    assert (result.image_residuals_px.xy.mean, result.image_residuals_px.xy.std) == (5.0, 0.0)
+    assert result.image_residuals_px.xy.n == active.sum()
+    assert (result.ground_residuals_m.east.mean, result.ground_residuals_m.north.mean) == (-2.0, 1.5)
+    assert result.ground_residuals_m.horizontal.mean == 2.5
 
 
 def test_residuals_count_active_points_only(registered):
     scene = registered()
     residual = np.where(scene.measures.active[:, None], [0.1, 0.1], 1000.0)
-    found = qualified(replace(scene, measures=replace(scene.measures, residual_px=residual)))
-    assert found.image_residuals_px.x.mean == pytest.approx(0.1)
+    result = qualified(replace(scene, measures=replace(scene.measures, residual_px=residual)))
+    assert result.image_residuals_px.x.mean == pytest.approx(0.1)
 
 
 def test_held_out_residuals_have_the_size_of_the_noise(registered):
@@ -102,14 +102,14 @@ def test_displacements_are_those_of_the_corners_and_the_centre(registered):
         scene.adjustment.correction,
         parameters=scene.adjustment.correction.parameters + [[0.0, 0.3, 0.0], [0.4, 0.0, 0.0]],
     )
-    found = qualified(scene, refit=lambda mask: replace(scene.adjustment, correction=moved))
-    at = {place.place: place for place in found.stability.displacements}
+    result = qualified(scene, refit=lambda mask: replace(scene.adjustment, correction=moved))
+    at = {place.place: place for place in result.stability.displacements}
     assert at["centre"].median_px == pytest.approx(0.4, abs=a_millionth_px)
     assert at["top left"].max_px == pytest.approx(0.5, rel=1e-3)
     assert at["bottom right"].max_m == pytest.approx(0.25, rel=1e-3)
 
 
-def test_an_adjustment_that_cannot_be_redone_says_so(registered):
+def test_an_adjustment_that_cannot_be_redone_has_a_note(registered):
     def refit(mask):
         raise NotEnoughPoints(3, 4)
 
@@ -145,21 +145,21 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
     scene = registered()
     covariance = np.zeros((6, 6))
     covariance[0, 0] = covariance[3, 3] = 0.04
-    found = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 5, 2.0)
-    assert found.std_line_px == pytest.approx(np.full((5, 5), 0.2))
-    assert found.worst_px == pytest.approx(found.median_px)
-    assert found.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
-    assert found.frame_ce90_m == pytest.approx(2.0 * 2.1460, rel=1e-3)
+    result = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 5, 2.0)
+    assert result.std_line_px == pytest.approx(np.full((5, 5), 0.2))
+    assert result.worst_px == pytest.approx(result.median_px)
+    assert result.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
+    assert result.frame_ce90_m == pytest.approx(2.0 * 2.1460, rel=1e-3)
 
 
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     scene = registered()
     covariance = np.diag([0.01, 0.03, 0.0, 0.01, 0.0, 0.0])
-    found = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3)
-    assert found.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
-    assert found.std_line_px[1, 0] == pytest.approx(0.1)
-    assert found.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
-    assert np.isnan(found.frame_ce90_m)
+    result = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3)
+    assert result.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
+    assert result.std_line_px[1, 0] == pytest.approx(0.1)
+    assert result.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
+    assert np.isnan(result.frame_ce90_m)
 
 
 def test_coverage_is_the_share_of_cells_with_an_active_point():
@@ -187,17 +187,17 @@ def test_coverage_is_the_share_of_cells_with_an_active_point():
     ],
 )
 def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
-    found = qualified(registered(), replace(DEFAULT, **{field: limit}))
-    assert failed(found) == {lost}
-    assert found.verdict == ("usable" if lost[1] == "good" else "failed")
+    result = qualified(registered(), replace(DEFAULT, **{field: limit}))
+    assert failed(result) == {lost}
+    assert result.verdict == ("usable" if lost[1] == "good" else "failed")
 
 
 def test_points_coarser_than_the_pixels_allow_a_share_of_their_own_accuracy(registered):
     """Residuals of 3 px from points of 3 px are no fault of the model; from points of 1 px they are."""
     scene = registered(n=400, noise_px=3.0)
     for sigma_px, lost in ((3.0, set()), (1.0, {"residual_std_px"})):
-        known = replace(scene.adjustment, point_sigma_px=np.full(2, sigma_px))
-        criteria = qualified(replace(scene, adjustment=known)).criteria
+        adjustment = replace(scene.adjustment, point_sigma_px=np.full(2, sigma_px))
+        criteria = qualified(replace(scene, adjustment=adjustment)).criteria
         assert lost == {c.name for c in criteria if not c.met and c.name == "residual_std_px"}
         limit = {c.needed_for: c.limit for c in criteria if c.name == "predicted_ce90_px"}
         assert limit["good"] == pytest.approx(max(1.0, 0.25 * CIRCULAR_CE90 * sigma_px))
@@ -218,39 +218,39 @@ def test_two_consensuses_of_many_points_are_not_good(registered):
 
 def test_nineteen_active_points_are_never_good(registered):
     scene = registered(n=19, lost=0, wrong=0)
-    found = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
-    assert found.point_counts.active <= 19
-    assert ("active_points", "good") in failed(found)
-    assert found.verdict == "usable"
+    result = qualified(scene, replace(DEFAULT, good_coverage_percent=0.0))
+    assert result.point_counts.active <= 19
+    assert ("active_points", "good") in failed(result)
+    assert result.verdict == "usable"
 
 
 def test_points_in_a_corner_are_never_good(registered):
-    found = qualified(registered(n=100, extent=0.5))
-    assert found.coverage.percent == 36.0
-    assert ("coverage_percent", "good") in failed(found)
-    assert found.verdict != "good"
+    result = qualified(registered(n=100, extent=0.5))
+    assert result.coverage.percent == 36.0
+    assert ("coverage_percent", "good") in failed(result)
+    assert result.verdict != "good"
 
 
 def test_without_active_points_every_figure_is_absent_and_the_verdict_is_failed(registered):
     scene = registered()
     measures = replace(scene.measures, active=np.zeros(60, bool))
-    found = qualified(replace(scene, measures=measures))
-    assert found.verdict == "failed"
-    assert np.isnan(found.image_residuals_px.x.mean)
-    assert found.stability.note == "0 active points leave none to hold out"
-    assert ("residual_std_px", "usable") in failed(found)
+    result = qualified(replace(scene, measures=measures))
+    assert result.verdict == "failed"
+    assert np.isnan(result.image_residuals_px.x.mean)
+    assert result.stability.note == "0 active points leave none to hold out"
+    assert ("residual_std_px", "usable") in failed(result)
 
 
 def test_a_criterion_without_a_value_is_not_met(registered):
     unknown = replace(registered().adjustment, covariance=np.full((6, 6), np.nan))
-    found = qualified(replace(registered(), adjustment=unknown))
-    assert failed(found) == {("predicted_ce90_px", "good"), ("predicted_ce90_px", "usable")}
-    assert found.verdict == "failed"
+    result = qualified(replace(registered(), adjustment=unknown))
+    assert failed(result) == {("predicted_ce90_px", "good"), ("predicted_ce90_px", "usable")}
+    assert result.verdict == "failed"
 
 
 def test_the_verdict_is_recomputed_from_the_criteria_alone(registered):
-    found = qualified(registered(n=30))
-    assert verdict_of(found.criteria) == found.verdict
+    result = qualified(registered(n=30))
+    assert verdict_of(result.criteria) == result.verdict
 
 
 def test_the_same_seed_gives_the_same_figures(registered):

@@ -1,4 +1,4 @@
-"""A scene that may be far off is searched with what it should show, and found or refused."""
+"""A scene that may be far off is searched with the chips it should show, and found or refused."""
 
 from dataclasses import replace
 
@@ -37,23 +37,23 @@ def registered(coarse: CoarseOptions) -> Registration:
     )
 
 
-def left_over_px(found: Registration) -> Array:
-    """How far the registered model is from the true one, but for the frame of the block."""
+def left_over_px(result: Registration) -> Array:
+    """Distance of the registered model from the true model, without the frame of the block."""
     ground = block()[0].lon_lat_h
-    seen = found.model.project(ground) - far_view().geometry.true_model.project(ground)
+    seen = result.model.project(ground) - far_view().geometry.true_model.project(ground)
     return np.asarray(np.hypot(*(seen - np.median(seen, axis=0)).T))
 
 
 @pytest.mark.parametrize("max_search_px", [400, 100], ids=["with whole chips", "with degraded chips"])
 def test_a_scene_wrong_by_half_its_size_is_found(max_search_px: int) -> None:
-    found = registered(CoarseOptions(max_search_px=max_search_px))
-    first = found.search_stages[0]
+    result = registered(CoarseOptions(max_search_px=max_search_px))
+    first = result.search_stages[0]
     assert first.name == "coarse"
     assert first.displacement_rms_m == pytest.approx(np.hypot(*HALF_THE_SCENE_M), abs=20.0)
     assert first.search_radius_m >= 3.0 * SIGMA_M
     assert first.search_radius_m <= max_search_px * first.chip_gsd_m
-    assert left_over_px(found).max() < a_pixel
-    assert found.qualification.verdict == "good"
+    assert left_over_px(result).max() < a_pixel
+    assert result.qualification.verdict == "good"
 
 
 def test_a_scene_farther_off_than_it_says_is_refused_with_its_counts() -> None:
@@ -69,7 +69,7 @@ def empty_scene(lines: int, gsd_m: float, sigma_m: float) -> Scene:
     return Scene(blank, geometry.delivered, geometry.acquisition, sigma_m)
 
 
-def known_to(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
+def prediction_within(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
     """The delivered model's prediction of points, with a standard deviation."""
     model = CorrectedModel(scene.model, no_correction(scene.image.shape))
     return Prediction(model, np.full(len(points), sigma_m))
@@ -83,7 +83,7 @@ def with_coarse_chips() -> ControlPoints:
 def test_the_probability_of_being_shown_is_that_of_many_draws() -> None:
     points, scene, sigma_m = block()[0], empty_scene(700, 1.0, 120.0), 120.0
     line_sample = scene.model.project(points.lon_lat_h)
-    prediction = known_to(sigma_m, scene, points)
+    prediction = prediction_within(sigma_m, scene, points)
     probability = visibility_probability(scene, points, prediction, 1.0)
     derivative = np.abs(scene.model.project_derivative(points.lon_lat_h[:1])[0, :, :2])
     reach_px = CHIP_CENTRE * derivative.sum(axis=1)
@@ -103,7 +103,7 @@ def test_chips_are_as_coarse_as_the_scene_where_it_shows_them(
 ) -> None:
     points = with_coarse_chips()
     scene = empty_scene(lines, gsd_m, 5.0)
-    assert fine_gsd_m(scene, points, known_to(5.0, scene, points)) == expected_m
+    assert fine_gsd_m(scene, points, prediction_within(5.0, scene, points)) == expected_m
 
 
 def test_coarse_chips_of_few_points_are_left_for_the_finer_ones_of_all() -> None:
@@ -112,7 +112,7 @@ def test_coarse_chips_of_few_points_are_left_for_the_finer_ones_of_all() -> None
     without = np.flatnonzero(~has_chip(points, 4.0))
     scene = empty_scene(700, 4.0, 5.0)
     mixed = points.take(np.sort(np.concatenate([few, without])))
-    assert fine_gsd_m(scene, mixed, known_to(5.0, scene, mixed)) == 1.0
+    assert fine_gsd_m(scene, mixed, prediction_within(5.0, scene, mixed)) == 1.0
 
 
 @pytest.mark.parametrize("name", ["points", "max_search_px", "max_reduction"])

@@ -1,4 +1,4 @@
-"""Simulated scenes are registered on a simulated block as well as is said, or it is said why not."""
+"""Simulated scenes are registered with the stated accuracy, or refused with a reason."""
 
 from dataclasses import replace
 from functools import cache
@@ -45,9 +45,10 @@ def per_degree() -> Array:
 
 
 def errors_px(view: SimulatedView, registered: Registration) -> tuple[Array, Array]:
-    """Image positions all over a view, and by how much the registered model misses them.
+    """Image positions all over a view, and the errors of the registered model there.
 
-    The truth is that of the block's frame: the ground the true model sees, moved as the block is.
+    The truth is that of the frame of the block: the ground that the true model locates, moved as the
+    block is.
     """
     rng = np.random.default_rng(0)
     image = rng.uniform(0.03, 0.97, (400, 2)) * view.geometry.plan.shape
@@ -92,9 +93,9 @@ def test_a_skewed_scene_needs_an_affine() -> None:
 
 @names
 def test_the_predicted_spread_is_that_of_the_errors(name: str) -> None:
-    found = registration(name)
-    image, error_px = errors_px(view_of(name), found)
-    std_px = np.sqrt(np.diagonal(found.adjustment.covariance_at(image), axis1=1, axis2=2))
+    result = registration(name)
+    image, error_px = errors_px(view_of(name), result)
+    std_px = np.sqrt(np.diagonal(result.adjustment.covariance_at(image), axis1=1, axis2=2))
     ratio = np.sqrt((error_px**2).mean()) / np.sqrt((std_px**2).mean())
     assert 0.3 < ratio < 2.0
 
@@ -107,16 +108,16 @@ def test_a_scene_coarser_than_the_chips_is_registered_as_well() -> None:
 
 def test_a_view_of_the_block_itself_finds_the_block_s_own_model() -> None:
     view, model = block_views()[0], production().adjustment.models[0]
-    found = register_scene(view.as_scene(3.0), *block())
+    result = register_scene(view.as_scene(3.0), *block())
     ground = block()[0].lon_lat_h
-    difference_px = found.model.project(ground) - model.project(ground)
+    difference_px = result.model.project(ground) - model.project(ground)
     assert np.hypot(*difference_px.T).max() < a_quarter_of_a_pixel
 
 
 @names
-def test_measures_hold_together(name: str) -> None:
-    found = registration(name)
-    measures = found.measures
+def test_measures_are_consistent(name: str) -> None:
+    result = registration(name)
+    measures = result.measures
     assert not (measures.active & ~measures.matched).any()
     assert np.isfinite(measures.line_sample[measures.matched]).all()
     assert np.isnan(measures.line_sample[~measures.matched]).all()
@@ -132,8 +133,8 @@ def test_measures_hold_together(name: str) -> None:
 
 @names
 def test_every_view_that_was_tried_is_reported(name: str) -> None:
-    found = registration(name)
-    measures, views = found.measures, found.views
+    result = registration(name)
+    measures, views = result.measures, result.views
     assert (np.diff(views.point) >= 0).all()
     agreeing = np.bincount(views.point[views.agreed], minlength=len(measures.point_id))
     np.testing.assert_array_equal(agreeing[measures.matched], measures.views[measures.matched])
@@ -147,20 +148,20 @@ def test_every_view_that_was_tried_is_reported(name: str) -> None:
 
 @names
 def test_residuals_are_found_minus_computed(name: str) -> None:
-    found = registration(name)
-    measures = found.measures
-    computed = found.model.project(measures.lon_lat_h)
-    kept = measures.matched
+    result = registration(name)
+    measures = result.measures
+    computed = result.model.project(measures.lon_lat_h)
+    matched = measures.matched
     np.testing.assert_allclose(
-        measures.residual_px[kept], (measures.line_sample - computed)[kept], atol=a_micropixel
+        measures.residual_px[matched], (measures.line_sample - computed)[matched], atol=a_micropixel
     )
     np.testing.assert_allclose(
         measures.predicted, view_of(name).geometry.delivered.project(measures.lon_lat_h)
     )
     # On the ground: moved by its residual, a point is computed where it was found.
-    moved_m = np.column_stack([measures.residual_m, np.zeros(len(kept))])[kept]
-    moved = found.model.project(measures.lon_lat_h[kept] + moved_m / per_degree())
-    np.testing.assert_allclose(moved, measures.line_sample[kept], atol=1e-3)
+    moved_m = np.column_stack([measures.residual_m, np.zeros(len(matched))])[matched]
+    moved = result.model.project(measures.lon_lat_h[matched] + moved_m / per_degree())
+    np.testing.assert_allclose(moved, measures.line_sample[matched], atol=1e-3)
 
 
 @names
@@ -231,10 +232,10 @@ def test_points_beyond_the_scene_are_left_aside() -> None:
     rows = np.arange(2 * len(points)) % len(points)
     doubled = replace(points.take(rows), id=np.arange(len(rows)))
     doubled.lon_lat_h[len(points) :, 0] += 1.0
-    found = register_scene(view_of(FIRST).as_scene(SIGMA_M), doubled, chips)
-    assert found.measures.point_id.max() < len(points)
+    result = register_scene(view_of(FIRST).as_scene(SIGMA_M), doubled, chips)
+    assert result.measures.point_id.max() < len(points)
     np.testing.assert_allclose(
-        found.adjustment.correction.parameters,
+        result.adjustment.correction.parameters,
         registration(FIRST).adjustment.correction.parameters,
         atol=a_micropixel,
     )
@@ -252,12 +253,12 @@ def test_half_a_scene_under_clouds_is_registered_where_it_shows_and_not_called_g
     pixels = view_of(FIRST).pixels.astype(np.float64)
     cloud = np.random.default_rng(0).normal(3500.0, 100.0, (700, 350))
     pixels[:, :350] = cloud if kind == "bright" else np.nan
-    found = register_scene(with_pixels(pixels), *block())
-    assert found.qualification.verdict != "good"
-    image, error_px = errors_px(view_of(FIRST), found)
+    result = register_scene(with_pixels(pixels), *block())
+    assert result.qualification.verdict != "good"
+    image, error_px = errors_px(view_of(FIRST), result)
     clear = image[:, 1] > 400.0
     assert np.quantile(np.hypot(*error_px[clear].T), 0.9) < 3.0 * half_a_pixel
-    measures = found.measures
+    measures = result.measures
     covered = measures.predicted[:, 1] < 250.0
     assert not measures.active[covered].any()
     assert set(measures.reason[covered]) <= {"low_score", "nodata", "border_peak", "ambiguous"}
@@ -265,7 +266,7 @@ def test_half_a_scene_under_clouds_is_registered_where_it_shows_and_not_called_g
 
 
 @pytest.mark.parametrize("sigma_m", [1.0, 4.0, 8.0])
-def test_a_promise_far_better_than_the_model_is_not_kept_in_silence(sigma_m: float) -> None:
+def test_a_stated_sigma_far_below_the_error_of_the_model_is_an_error(sigma_m: float) -> None:
     # The model is 39 m wrong: outside three times each of these sigmas.
     with pytest.raises(ComputationError, match="tried"):
         register_scene(view_of(FIRST).as_scene(sigma_m), *block())

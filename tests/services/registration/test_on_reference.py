@@ -72,7 +72,7 @@ def registered() -> Registration:
 
 
 def error_px(registration: Registration) -> np.ndarray:
-    """Where the model puts what the image really shows, minus where it is: (n, 2)."""
+    """Errors (n, 2) of the model at the ground that the image really shows."""
     axis = np.linspace(60.0, 640.0, 12)
     shown = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     return registration.model.project(true_ground(spoiled_view(), world(), shown)) - shown
@@ -113,8 +113,8 @@ def test_all_places_lead_where_few_of_the_few_are_to_be_seen() -> None:
     hidden = reference().image.read(Window(0, 0, *reference().image.shape)).copy()
     hidden[:, hidden.shape[1] * 2 // 5 :] = np.nan
     scene = spoiled_view().as_scene(SIGMA_M)
-    found = register_on_reference(scene, replace(reference(), image=ArrayImage(hidden)), OPTIONS)
-    assert found.search_stages[0].tried > REFERENCE_OPTIONS.leading_places
+    result = register_on_reference(scene, replace(reference(), image=ArrayImage(hidden)), OPTIONS)
+    assert result.search_stages[0].tried > REFERENCE_OPTIONS.leading_places
 
 
 def test_the_last_search_is_one_that_hardly_moves_the_image() -> None:
@@ -147,9 +147,9 @@ def test_an_ortho_scene_needs_no_terrain() -> None:
     )
     view = spoiled_view().as_scene(SIGMA_M)
     scene = replace(view, image=first.image, model=OrthoModel(grid_off), sigma_m=6.0)
-    found = register_on_reference(scene, replace(first, terrain=None), OPTIONS)
-    # The image is the reference's own: a pixel says where it is, but for the shift.
-    shift = found.adjustment.correction.parameters[:, 0]
+    result = register_on_reference(scene, replace(first, terrain=None), OPTIONS)
+    # The image is the reference's own: only the shift of the grid is to be found.
+    shift = result.adjustment.correction.parameters[:, 0]
     assert np.abs(shift + moved_px).max() < MAP_ALLOWED_PX
 
 

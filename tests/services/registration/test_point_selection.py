@@ -1,4 +1,4 @@
-"""Points are tried where the scene should show enough of their chips, as far as its model is known."""
+"""Points are tried where the scene should show enough of their chips, within the error of its model."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ FEW = 8
 
 
 def small_scene() -> Scene:
-    """Where its model says it is."""
+    """A scene with its true model, and pixels that are not read."""
     geometry = plan_geometry(world(), plan(shape=(SIZE_PX, SIZE_PX)), np.random.default_rng(0))
     blank = ArrayImage(np.zeros((SIZE_PX, SIZE_PX), dtype=np.float32))
     return Scene(blank, geometry.true_model, geometry.acquisition, SIGMA_M)
@@ -37,34 +37,34 @@ def enough_shown(scene: Scene, line_sample: Array) -> BoolArray:
     return np.asarray(((line_sample > reach_px) & (line_sample < SIZE_PX - reach_px)).all(axis=1))
 
 
-def known_to(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
+def prediction_within(sigma_m: float, scene: Scene, points: ControlPoints) -> Prediction:
     """The delivered model's prediction of points, with a standard deviation."""
     model = CorrectedModel(scene.model, no_correction(scene.image.shape))
     return Prediction(model, np.full(len(points), sigma_m))
 
 
 def tried(scene: Scene, points: ControlPoints, sigma_m: float) -> ControlPoints:
-    rows = points_to_try(scene, points, known_to(sigma_m, scene, points), FEW)
+    rows = points_to_try(scene, points, prediction_within(sigma_m, scene, points), FEW)
     assert (np.diff(rows) > 0).all()
     return points.take(rows)
 
 
-def test_of_a_scene_that_is_known_well_only_points_are_tried_that_it_shows() -> None:
+def test_an_accurate_scene_is_tried_on_points_that_it_shows() -> None:
     scene, points = small_scene(), block()[0]
     chosen = tried(scene, points, 0.5)
     assert len(chosen) == FEW
     assert enough_shown(scene, scene.model.project(chosen.lon_lat_h)).all()
 
 
-def test_the_better_the_model_is_known_the_more_of_the_points_tried_are_shown() -> None:
+def test_the_better_the_model_the_more_of_the_points_tried_are_shown() -> None:
     scene, points = small_scene(), block()[0]
     true_place = scene.model.project
-    # The delivered model is a hundred metres off: it takes other points for those in the middle.
+    # The delivered model is 100 m off: it expects other points in the middle.
     shifted = replace(
         points, lon_lat_h=move_metres(points.lon_lat_h, np.tile([90.0, -60.0, 0.0], (len(points), 1)))
     )
-    before = points_to_try(scene, shifted, known_to(SIGMA_M, scene, shifted), FEW)
-    after = points_to_try(scene, points, known_to(0.5, scene, points), FEW)
+    before = points_to_try(scene, shifted, prediction_within(SIGMA_M, scene, shifted), FEW)
+    after = points_to_try(scene, points, prediction_within(0.5, scene, points), FEW)
     shown = [enough_shown(scene, true_place(points.lon_lat_h[rows])).sum() for rows in (before, after)]
     assert shown[0] < shown[1] == FEW
 

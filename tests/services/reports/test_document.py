@@ -62,9 +62,9 @@ def test_the_schema_refuses_what_a_report_cannot_say(report, spoil):
 def test_the_figures_are_those_of_the_registration(material):
     made = material()
     document = parsed(made.report())
-    measures, found = made.measures, made.registration.qualification
+    measures, qualification = made.measures, made.registration.qualification
     assert document["point_counts"]["active"] == int(measures.active.sum())
-    assert document["image_residuals_px"]["x"]["std"] == found.image_residuals_px.x.std
+    assert document["image_residuals_px"]["x"]["std"] == qualification.image_residuals_px.x.std
     assert (
         document["correction"]["parameters_px"]
         == made.registration.adjustment.correction.parameters.tolist()

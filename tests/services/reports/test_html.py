@@ -84,12 +84,12 @@ def test_the_page_asks_nothing_of_the_network(material):
     markup = page(material())
     assert "://" not in markup
     assert "@import" not in markup
-    found = Page(markup)
-    addresses = [value for name, value in found.attributes if name in ("src", "href", "xlink:href")]
+    parsed = Page(markup)
+    addresses = [value for name, value in parsed.attributes if name in ("src", "href", "xlink:href")]
     assert addresses
     assert [a for a in addresses if not a.startswith(("data:image/png;base64,", "#"))] == []
     assert re.findall(r"url\((?!#|&quot;#|'#)", markup) == []
-    assert found.tags.isdisjoint({"script", "link", "iframe", "object", "embed"})
+    assert parsed.tags.isdisjoint({"script", "link", "iframe", "object", "embed"})
 
 
 def test_the_verdict_comes_first_with_the_numbers_that_cost_it(material):
@@ -108,13 +108,13 @@ def test_a_good_page_lists_no_unmet_criterion(material):
 
 def test_the_page_shows_the_figures_of_the_report(material):
     made = material()
-    found = made.report()
+    report = made.report()
     texts = Page(page(made)).texts
     for shown in (
-        str(found.point_counts.active),
-        f"{found.coverage.percent:.0f} %",
-        f"{found.predicted.worst_m:.2f} m",
-        f"{found.image_residuals_px.x.std:.3f}",
+        str(report.point_counts.active),
+        f"{report.coverage.percent:.0f} %",
+        f"{report.predicted.worst_m:.2f} m",
+        f"{report.image_residuals_px.x.std:.3f}",
         "calanques, version 1",
     ):
         assert shown in texts
@@ -136,16 +136,16 @@ def test_hostile_names_are_shown_and_not_run(material):
         checks=checks,
     ).report()
     report = replace(report, correction=replace(report.correction, order_reason=HOSTILE))
-    found = Page(format_html(report))
-    assert "script" not in found.tags
-    assert HOSTILE in found.texts
+    parsed = Page(format_html(report))
+    assert "script" not in parsed.tags
+    assert HOSTILE in parsed.texts
 
 
 @pytest.mark.parametrize("poor", [without_points, nothing_active, one_active])
 def test_a_page_is_made_of_any_registration(material, poor):
-    found = Page(page(poor(material())))
-    assert "Registration report" in found.texts
-    assert [name for name, _ in found.attributes].count("aria-label") == len(FIGURES) + 2
+    parsed = Page(page(poor(material())))
+    assert "Registration report" in parsed.texts
+    assert [name for name, _ in parsed.attributes].count("aria-label") == len(FIGURES) + 2
 
 
 def test_a_page_of_thousands_of_points_stays_light(material):
