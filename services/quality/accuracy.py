@@ -145,9 +145,9 @@ def sample_quantile(values: Array) -> Quantile:
 def _small_sample_note(n: int, bounded: bool) -> str:
     """The limits of a sample of n values, as a sentence."""
     if n >= MIN_CHECK_POINTS:
-        return "" if bounded else f"{n} points give no upper bound"
+        return "" if bounded else f"{n} points do not bound the quantile from above"
     note = f"{n} points; {MIN_CHECK_POINTS} are needed for a statement of accuracy"
-    return note if bounded else f"{note}, and so few give no upper bound"
+    return note if bounded else f"{note}; so few do not bound the quantile from above"
 
 
 def accuracy(error_m: Array) -> Accuracy:
