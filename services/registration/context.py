@@ -1,5 +1,6 @@
 """What the stages of a registration share: the context of the work, and the current prediction."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -36,6 +37,11 @@ class RegistrationContext:
     def part(self, start: float, share: float) -> Self:
         """The same context for a part of the work, whose progress runs from `start` over `share`."""
         return replace(self, progress=part_of(self.progress, start, share))
+
+    def parts(self, start: float, share: float, count: int) -> Iterator[Self]:
+        """The same context for each of `count` equal parts of the work from `start` over `share`."""
+        for number in range(count):
+            yield self.part(start + share * number / count, share / count)
 
 
 @dataclass(frozen=True)

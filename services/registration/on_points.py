@@ -101,18 +101,17 @@ def register_scene(
     if needs_coarse_search(context, prediction):
         prediction, stage = search_coarsely(context.part(0.0, 0.3), prediction)
         stages.append(stage)
-    share = 0.6 / options.fine_stages
-    for number in range(options.fine_stages):
+    for part in context.parts(0.3, 0.6, options.fine_stages):
         rows = points_to_try(scene, points, prediction, options.max_points)
-        search = _search(context.part(0.3 + 0.6 * number / options.fine_stages, share), prediction, rows)
+        search = _match(part, prediction, rows)
         adjustment = adjust_search(scene, search, options.adjustment)
         prediction = predict(scene, points, adjustment)
         stages.append(search.stage)
     return build_registration(context, points, search, adjustment, tuple(stages))
 
 
-def _search(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
-    """A search of the points of some rows with the fine chips, within the error of the prediction."""
+def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
+    """A search of some of the points with the fine chips, within the error of their prediction."""
     options, gsd_m = context.options, context.fine_gsd_m
     points = context.points.take(rows)
     radius_px = search_radius_px(prediction.uncertainty_m[rows], gsd_m, options.coarse.max_search_px)

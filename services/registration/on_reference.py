@@ -109,9 +109,7 @@ def register_on_reference(
         search, adjustment = _search_few_places(part, level)
         level = _next_level(context, level, search, adjustment)
         stages.append(search.stage)
-    count = options.reference.fine_stages
-    for number in range(count):
-        part = context.part(0.5 + 0.45 * number / count, 0.45 / count)
+    for part in context.parts(0.5, 0.45, options.reference.fine_stages):
         before = level.model.correction
         search, adjustment = _search(part, level, options.reference.places, earlier_places)
         level = _next_level(context, level, search, adjustment)
