@@ -14,7 +14,7 @@ from app.db import binary_copy as binary
 from app.db import engine
 from app.db.blocks import ID_BITS
 from app.db.engine import Connection
-from app.db.ingestion import POINT_COLUMNS
+from app.db.schema import point
 from services.formats.block.hilbert import hilbert_order
 from services.geodesy import metres_per_degree
 from services.types import Array
@@ -95,22 +95,24 @@ def _fill_block(connection: Connection, number: int, low: Array, side_deg: Array
            overriding system value values (%s, %s, 'chips/0000.npy', 'chips/0', 'uint8', 0)""",
         [number, number],
     )
-    columns = [
-        binary.numbers((number << ID_BITS) + np.arange(count), "i8"),
-        binary.numbers(np.full(count, number), "i4"),
-        binary.points_z(lon_lat_h),
-        *(binary.numbers(rng.uniform(0.5, 3.0, count), "f4") for _ in range(3)),
-        *(binary.numbers(rng.uniform(-0.3, 0.3, count), "f4") for _ in range(3)),
-        binary.numbers(np.full(count, 8), "i2"),
-        binary.numbers(rng.uniform(0.0, 1.0, count), "f4"),
-        binary.texts(rng.choice(np.array(TYPOLOGIES, dtype=object), count)),
-        binary.dates(np.full(count, np.datetime64("2023-03-01"))),
-        binary.dates(np.full(count, np.datetime64("2024-06-09"))),
-        binary.numbers(np.full(count, number), "i4"),
-        binary.numbers(np.arange(count) * 8, "i8"),
-        binary.numbers(np.full(count, 8), "i2"),
-    ]
-    statement = f"copy point ({POINT_COLUMNS}) from stdin (format binary)"
-    with connection.cursor() as cursor, cursor.copy(statement) as copy:
-        for piece, _ in binary.copy_pieces(columns):
-            copy.write(piece)
+    c = point.c
+    columns = {
+        c.id: binary.numbers((number << ID_BITS) + np.arange(count), "i8"),
+        c.block_number: binary.numbers(np.full(count, number), "i4"),
+        c.geom: binary.points_z(lon_lat_h),
+        c.sigma_east_m: binary.numbers(rng.uniform(0.5, 3.0, count), "f4"),
+        c.sigma_north_m: binary.numbers(rng.uniform(0.5, 3.0, count), "f4"),
+        c.sigma_up_m: binary.numbers(rng.uniform(0.5, 3.0, count), "f4"),
+        c.corr_east_north: binary.numbers(rng.uniform(-0.3, 0.3, count), "f4"),
+        c.corr_east_up: binary.numbers(rng.uniform(-0.3, 0.3, count), "f4"),
+        c.corr_north_up: binary.numbers(rng.uniform(-0.3, 0.3, count), "f4"),
+        c.n_views: binary.numbers(np.full(count, 8), "i2"),
+        c.saliency: binary.numbers(rng.uniform(0.0, 1.0, count), "f4"),
+        c.typology: binary.texts(rng.choice(np.array(TYPOLOGIES, dtype=object), count)),
+        c.first_view: binary.dates(np.full(count, np.datetime64("2023-03-01"))),
+        c.last_view: binary.dates(np.full(count, np.datetime64("2024-06-09"))),
+        c.chip_file: binary.numbers(np.full(count, number), "i4"),
+        c.chip_row: binary.numbers(np.arange(count) * 8, "i8"),
+        c.chip_count: binary.numbers(np.full(count, 8), "i2"),
+    }
+    binary.copy_into_table(connection, columns)

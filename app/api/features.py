@@ -17,7 +17,7 @@ from app.api.streams import Streamed
 from app.auth import Scope, is_administrator, require
 from app.db.engine import Database
 from app.db.features.collection import Collection, Viewer
-from app.db.features.pages import Text
+from app.db.features.pages import TextFormat
 from app.usecases.features import items as features
 from app.usecases.features.items import FeaturePage
 from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
@@ -235,7 +235,7 @@ def _page_reply(page: PageRequest) -> Response:
             table, answer = features.table(connection, page.query, page.secret)
             body = FILES[page.form](table, page.collection.id)
         else:
-            kind: Text = "csv" if page.form == "csv" else "geojson"
+            kind: TextFormat = "csv" if page.form == "csv" else "geojson"
             answer = features.page(connection, page.query, kind, page.secret)
             body = answer.body
     links = _links(page, answer)

@@ -1,15 +1,19 @@
-"""PostgreSQL's binary COPY, from and to whole arrays: ten times faster than row by row.
+"""PostgreSQL's binary COPY of whole arrays, in both directions: ten times faster than row by row.
 
 Source: PostgreSQL documentation, COPY, "Binary Format"; PostGIS, "EWKB".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 from uuid import UUID
 
 import numpy as np
 import numpy.typing as npt
+import sqlalchemy
 
+from app.db.copy import copy_from_stdin
+from app.db.engine import Connection, driver
 from services.types import Array, IntArray
 
 HEADER = b"PGCOPY\n\xff\r\n\0" + b"\0" * 8
@@ -76,6 +80,24 @@ def points_z(lon_lat_h: Array) -> Column:
     data[:, 1:9] = _SRID_POINT_Z.view(np.uint8)
     data[:, 9:] = np.ascontiguousarray(lon_lat_h, dtype="<f8").view(np.uint8).reshape(-1, 24)
     return Column(data, np.full(len(lon_lat_h), 33))
+
+
+def copy_into_table(
+    connection: Connection,
+    columns: Mapping[sqlalchemy.Column[Any], Column],
+    sent: Callable[[int], None] = lambda rows: None,
+) -> None:
+    """Insert rows into a table.
+
+    Args:
+        columns: of one table, each with its values.
+        sent: called with the number of rows of each piece that was sent.
+    """
+    statement = copy_from_stdin(*columns)
+    with driver(connection).cursor() as cursor, cursor.copy(statement.sql) as copy:
+        for piece, rows in copy_pieces(tuple(columns.values())):
+            copy.write(piece)
+            sent(rows)
 
 
 def copy_pieces(columns: Sequence[Column]) -> Iterator[tuple[bytes, int]]:

@@ -7,12 +7,30 @@ from datetime import datetime
 from typing import Any
 
 import shapely
-from sqlalchemy import LargeBinary, Row, Text, and_, cast, func, literal, or_, select, update
+from sqlalchemy import (
+    ARRAY,
+    ColumnElement,
+    Integer,
+    LargeBinary,
+    Row,
+    Select,
+    Text,
+    and_,
+    any_,
+    cast,
+    func,
+    literal,
+    or_,
+    select,
+    update,
+)
 from sqlalchemy.dialects.postgresql import JSONB, insert
 
+from app.db.constants import text_constant
 from app.db.engine import Connection
 from app.db.rows import among, columns_of
 from app.db.schema import BlockState, block, chip_file, now, point
+from app.db.schema.base import Double
 from services.formats.block.reader import BlockContents
 from services.quality.block import BlockQuality, parse_quality_document, quality_document
 from services.types import Array, IntArray
@@ -20,7 +38,11 @@ from services.types import Array, IntArray
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""
 
-PUBLISHED = "select number from block where state = 'published'"
+_FRAME_SIGMA_PATH = '$."amers:accuracy"."absolute"[*] ? (@.name == "frame_sigma_m").value'
+FRAME_SIGMA_M = cast(
+    func.jsonb_path_query_first(block.c.metadata, text_constant(_FRAME_SIGMA_PATH), type_=JSONB), Double
+)
+"""Standard deviation a coordinate of the frame of a block on the Earth; null if unstated."""
 
 INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
@@ -58,6 +80,20 @@ class Block:
 COLUMNS = columns_of(Block, block, outline=func.ST_AsBinary(block.c.extent, type_=LargeBinary))
 
 
+def published_numbers() -> Select[Any]:
+    """SELECT of the numbers of the published blocks."""
+    return select(block.c.number).where(block.c.state == text_constant("published"))
+
+
+def in_published_block() -> ColumnElement[bool]:
+    """The predicate that the block of a point is published.
+
+    The numbers are one array, read once, so that the planner reads the points by their own indexes.
+    """
+    numbers = func.array(published_numbers().scalar_subquery(), type_=ARRAY(Integer))
+    return point.c.block_number == any_(numbers)
+
+
 def lock_ingestion(connection: Connection) -> None:
     """Keep the sweep away until the end of the transaction; ingestions do not exclude each other."""
     connection.execute(select(func.pg_advisory_xact_lock_shared(INGESTION_LOCK)))
@@ -71,6 +107,7 @@ def lock_sweep(connection: Connection) -> None:
 def insert_block(
     connection: Connection,
     contents: BlockContents,
+    *,
     document: str,
     checksum: str,
     quality: BlockQuality,

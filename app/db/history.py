@@ -1,4 +1,4 @@
-"""What registrations did with points and views, and what that says of them.
+"""The history of points and views: outcomes of registrations and what follows from them.
 
 The rows of a registration are added up once, in its own transaction, in the order of their keys, so that
 two registrations of one place wait for each other and never deadlock.
@@ -6,82 +6,126 @@ two registrations of one place wait for each other and never deadlock.
 
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cache
+from typing import Any
 from uuid import UUID
 
 import numpy as np
-from psycopg.rows import class_row
+from sqlalchemy import (
+    ARRAY,
+    BigInteger,
+    ColumnElement,
+    Integer,
+    any_,
+    bindparam,
+    case,
+    delete,
+    func,
+    select,
+    update,
+)
+from sqlalchemy.dialects.postgresql import insert
 
 from app.db import binary_copy as binary
-from app.db.blocks import PUBLISHED
-from app.db.engine import Connection
-from app.db.features.collection import Collection, Property
+from app.db.blocks import in_published_block
+from app.db.constants import integer_constant, real_constant, text_constant
+from app.db.engine import Connection, driver
+from app.db.features.collection import Collection, Property, column_property
+from app.db.rows import every, first
+from app.db.schema import measure, point, point_history, view_history, view_measure
+from app.db.schema.base import Double
+from app.db.statements import HotStatement, hot, named
 from services.types import HEALTH_PRIOR_TRIES, Array, IntArray, Measures, ViewMeasures, health
 
-SAYS_NOTHING = ("not_tried", "no_chip", "nodata", "cloud")
-"""Reasons that are no fault of a point: the scene did not show it, or nobody looked."""
+NOT_ATTRIBUTABLE = ("not_tried", "no_chip", "nodata", "cloud")
+"""Reasons that are no fault of a point: the scene did not show it, or the point was not tried."""
 
 SUSPECT_HEALTH = 0.5
 """A point of less health is proposed for suspension: it failed in six scenes where all others served,
 in twelve where half of them did."""
 
-HEALTH = f"""least(1.0, (coalesce(h.successes, 0) + {HEALTH_PRIOR_TRIES})
-    / (coalesce(h.expected, 0) + {HEALTH_PRIOR_TRIES}))"""
-"""`services.types.health` in SQL."""
-
 STATES = ("served", "proposed", "suspended")
-STATE = f"""case when p.suspended_at is not null then 'suspended'
-    when {HEALTH} < {SUSPECT_HEALTH} then 'proposed' else 'served' end"""
 
-FARED_OF_POINT = f"""{STATE} as state, coalesce(h.attempts, 0) as attempts,
-    coalesce(h.successes, 0) as successes, coalesce(h.expected, 0) as expected, {HEALTH} as health,
-    h.last_attempt, h.last_success, h.sum_residual_px / nullif(h.matched, 0) as mean_residual_px,
-    h.sum_east_m / nullif(h.matched, 0) as mean_east_m,
-    h.sum_north_m / nullif(h.matched, 0) as mean_north_m, p.suspended_at, p.suspended_because"""
-"""How a point `p` fared, by its row `h` of sums."""
+_SUMS = point_history.c
+_PRIOR = real_constant(HEALTH_PRIOR_TRIES)
+_SUCCESSES = func.coalesce(_SUMS.successes, integer_constant(0))
+_EXPECTED = func.coalesce(_SUMS.expected, integer_constant(0))
+# `services.types.health` in SQL.
+HEALTH = func.least(real_constant(1.0), (_SUCCESSES + _PRIOR) / (_EXPECTED + _PRIOR), type_=Double)
+STATE = case(
+    (point.c.suspended_at.is_not(None), text_constant("suspended")),
+    (real_constant(SUSPECT_HEALTH) > HEALTH, text_constant("proposed")),
+    else_=text_constant("served"),
+)
+
+
+def _mean(total: ColumnElement[Any]) -> ColumnElement[Any]:
+    """A sum by the number of matches, unknown without any."""
+    return total / func.nullif(_SUMS.matched, integer_constant(0), type_=Integer())
+
+
+OUTCOME: dict[str, ColumnElement[Any]] = {
+    "state": STATE,
+    "attempts": func.coalesce(_SUMS.attempts, integer_constant(0)),
+    "successes": _SUCCESSES,
+    "expected": _EXPECTED,
+    "health": HEALTH,
+    "last_attempt": _SUMS.last_attempt,
+    "last_success": _SUMS.last_success,
+    "mean_residual_px": _mean(_SUMS.sum_residual_px),
+    "mean_east_m": _mean(_SUMS.sum_east_m),
+    "mean_north_m": _mean(_SUMS.sum_north_m),
+    "suspended_at": point.c.suspended_at,
+    "suspended_because": point.c.suspended_because,
+}
+"""The attributes of `PointHistory` besides its id, of a row of `point` and its row of sums, if any."""
+
+
+def _property(name: str, title: str, unit: str = "", **options: Any) -> Property:
+    return Property(name, title, OUTCOME[name], unit, **options)
+
 
 HISTORY = Collection(
     id="point-history",
     title="History of points",
     description="Points that registrations have tried, how they fared, and which should be suspended.",
-    source=f"""(select p.id, {FARED_OF_POINT}, p.geom, p.block_number
-        from point_history h join point p on p.id = h.point_id) t""",
-    key=Property("id", "bigint", "Identifier of the point"),
+    source=point_history.join(point, point.c.id == point_history.c.point_id),
+    key=column_property(point.c.id, "Identifier of the point"),
     properties=(
-        Property("state", "text", "Served, proposed for suspension, or suspended", choices=STATES),
-        Property("attempts", "bigint", "Scenes that showed it and tried it"),
-        Property("successes", "bigint", "Scenes in which it was active at the end"),
-        Property("expected", "double precision", "Successes of an ordinary point in the same scenes"),
-        Property("health", "double precision", "Successes against those expected, 0 to 1"),
-        Property("last_attempt", "timestamptz", "When it was tried last", nullable=True),
-        Property("last_success", "timestamptz", "When it last served", nullable=True),
-        Property(
-            "mean_residual_px", "double precision", "Mean distance of its measures", "", "px", True
-        ),
-        Property("mean_east_m", "double precision", "Mean of its residuals eastwards", "", "m", True),
-        Property("mean_north_m", "double precision", "Mean of its residuals northwards", "", "m", True),
-        Property("suspended_at", "timestamptz", "When it was suspended", nullable=True),
-        Property("suspended_because", "text", "Why it was suspended", nullable=True),
-        Property("block_number", "bigint", "Number of its block"),
+        _property("state", "Served, proposed for suspension, or suspended", choices=STATES),
+        _property("attempts", "Scenes that showed it and tried it"),
+        _property("successes", "Scenes in which it was active at the end"),
+        _property("expected", "Successes of an ordinary point in the same scenes"),
+        _property("health", "Successes against those expected, 0 to 1"),
+        _property("last_attempt", "When it was tried last", nullable=True),
+        _property("last_success", "When it last served", nullable=True),
+        _property("mean_residual_px", "Mean distance of its measures", "px", nullable=True),
+        _property("mean_east_m", "Mean of its residuals eastwards", "m", nullable=True),
+        _property("mean_north_m", "Mean of its residuals northwards", "m", nullable=True),
+        _property("suspended_at", "When it was suspended", nullable=True),
+        _property("suspended_because", "Why it was suspended", nullable=True),
+        column_property(point.c.block_number, "Number of its block"),
     ),
     geometry_type="Point",
+    geometry=point.c.geom,
     has_height=True,
-    visible=f"t.block_number = any(array({PUBLISHED}))",
+    visible=in_published_block(),
     interval=("last_attempt", "last_attempt"),
 )
 
 
 @dataclass(frozen=True)
 class PointHistory:
-    """How a point fared in the scenes that tried it.
+    """The outcomes of a point in the scenes that tried it.
 
     Attributes:
         state: "served", "proposed" for suspension, or "suspended".
         attempts: scenes that showed it and tried it; each counts once.
         successes: scenes in which it was active at the end.
-        expected: what an ordinary point would have had: the sum of the shares of points that served.
+        expected: successes of an ordinary point: the sum of the shares of points that served.
         health: as `services.types.health`, of successes and those expected.
         last_attempt, last_success: None: never.
-        mean_residual_px: mean distance of its measures from the registered models; None: never found.
+        mean_residual_px: mean distance of its measures from the registered models; None: never matched.
         mean_east_m, mean_north_m: mean of its residuals on the ground: where it may really be.
         suspended_at, suspended_because: None unless suspended.
     """
@@ -101,109 +145,71 @@ class PointHistory:
     suspended_because: str | None
 
 
+def outcome_columns() -> list[ColumnElement[Any]]:
+    """The columns of `PointHistory` besides its id."""
+    return [expression.label(name) for name, expression in OUTCOME.items()]
+
+
 def insert_measures(connection: Connection, registration_id: UUID, measures: Measures) -> None:
-    """Store what happened to each point that a scene could show."""
-    columns = (
-        "registration_id, point_id, matched, active, reason, score, line, sample, sigma_px,"
-        " residual_line_px, residual_sample_px, residual_east_m, residual_north_m"
-    )
-    _copy(
+    """Store the outcome of each point that a scene could show."""
+    count = len(measures.point_id)
+    c = measure.c
+    binary.copy_into_table(
         connection,
-        f"measure ({columns})",
-        [
-            binary.uuids(registration_id, len(measures.point_id)),
-            binary.numbers(measures.point_id, "i8"),
-            binary.numbers(measures.matched, "i1"),
-            binary.numbers(measures.active, "i1"),
-            binary.texts(measures.reason.astype(object)),
-            binary.reals(measures.score, "f4"),
-            *(binary.reals(measures.line_sample[:, axis], "f8") for axis in (0, 1)),
-            binary.reals(measures.sigma_px, "f4"),
-            *(binary.reals(measures.residual_px[:, axis], "f4") for axis in (0, 1)),
-            *(binary.reals(measures.residual_m[:, axis], "f4") for axis in (0, 1)),
-        ],
+        {
+            c.registration_id: binary.uuids(registration_id, count),
+            c.point_id: binary.numbers(measures.point_id, "i8"),
+            c.matched: binary.numbers(measures.matched, "i1"),
+            c.active: binary.numbers(measures.active, "i1"),
+            c.reason: binary.texts(measures.reason.astype(object)),
+            c.score: binary.reals(measures.score, "f4"),
+            c.line: binary.reals(measures.line_sample[:, 0], "f8"),
+            c.sample: binary.reals(measures.line_sample[:, 1], "f8"),
+            c.sigma_px: binary.reals(measures.sigma_px, "f4"),
+            c.residual_line_px: binary.reals(measures.residual_px[:, 0], "f4"),
+            c.residual_sample_px: binary.reals(measures.residual_px[:, 1], "f4"),
+            c.residual_east_m: binary.reals(measures.residual_m[:, 0], "f4"),
+            c.residual_north_m: binary.reals(measures.residual_m[:, 1], "f4"),
+        },
     )
 
 
 def insert_views(
     connection: Connection, registration_id: UUID, measures: Measures, views: ViewMeasures
 ) -> None:
-    """Store what happened to each view that was tried."""
-    _copy(
+    """Store the outcome of each view that was tried."""
+    c = view_measure.c
+    binary.copy_into_table(
         connection,
-        "view_measure (registration_id, point_id, view, agreed, reason, score)",
-        [
-            binary.uuids(registration_id, len(views.point)),
-            binary.numbers(measures.point_id[views.point], "i8"),
-            binary.numbers(views.view, "i2"),
-            binary.numbers(views.agreed, "i1"),
-            binary.texts(views.reason.astype(object)),
-            binary.reals(views.score, "f4"),
-        ],
+        {
+            c.registration_id: binary.uuids(registration_id, len(views.point)),
+            c.point_id: binary.numbers(measures.point_id[views.point], "i8"),
+            c.view: binary.numbers(views.view, "i2"),
+            c.agreed: binary.numbers(views.agreed, "i1"),
+            c.reason: binary.texts(views.reason.astype(object)),
+            c.score: binary.reals(views.score, "f4"),
+        },
     )
-
-
-def _copy(connection: Connection, table: str, columns: list[binary.Column]) -> None:
-    statement = f"copy {table} from stdin (format binary)"
-    with connection.cursor() as cursor, cursor.copy(statement) as copy:
-        for piece, _ in binary.copy_pieces(columns):
-            copy.write(piece)
 
 
 def count_registration(connection: Connection, registration_id: UUID) -> None:
-    """Add the rows of a registration to what is known of its points and views.
+    """Add the rows of a registration to the sums of its points and views.
 
-    A point is expected to serve as often as the points tried by the same registration did. Of the
-    views only those of active points count, since only there it is known where they should be found.
+    A point is expected to succeed as often as the points tried by the same registration did. Of the
+    views only those of active points count, since only there the true position in the scene is known.
     """
-    connection.execute(
-        """with tried as (
-            select point_id, active, matched, residual_east_m, residual_north_m,
-                |/ (residual_line_px ^ 2 + residual_sample_px ^ 2) as residual_px
-            from measure where registration_id = %(id)s and reason <> all(%(nothing)s)
-        )
-        insert into point_history as h (point_id, attempts, successes, expected, matched,
-            sum_residual_px, sum_east_m, sum_north_m, last_attempt, last_success)
-        select point_id, 1, active::int, (select avg(active::int) from tried), matched::int,
-            coalesce(residual_px, 0), coalesce(residual_east_m, 0), coalesce(residual_north_m, 0),
-            now(), case when active then now() end
-        from tried order by point_id
-        on conflict (point_id) do update set attempts = h.attempts + 1,
-            successes = h.successes + excluded.successes, expected = h.expected + excluded.expected,
-            matched = h.matched + excluded.matched,
-            sum_residual_px = h.sum_residual_px + excluded.sum_residual_px,
-            sum_east_m = h.sum_east_m + excluded.sum_east_m,
-            sum_north_m = h.sum_north_m + excluded.sum_north_m,
-            last_attempt = excluded.last_attempt,
-            last_success = coalesce(excluded.last_success, h.last_success)""",
-        {"id": registration_id, "nothing": list(SAYS_NOTHING)},
-    )
-    connection.execute(
-        """with tried as (
-            select v.point_id, v.view, v.agreed
-            from view_measure v join measure m using (registration_id, point_id)
-            where v.registration_id = %(id)s and m.active and v.reason <> all(%(nothing)s)
-        )
-        insert into view_history as h (point_id, view, attempts, successes, expected)
-        select point_id, view, 1, agreed::int, (select avg(agreed::int) from tried)
-        from tried order by point_id, view
-        on conflict (point_id, view) do update set attempts = h.attempts + 1,
-            successes = h.successes + excluded.successes, expected = h.expected + excluded.expected""",
-        {"id": registration_id, "nothing": list(SAYS_NOTHING)},
-    )
+    parameters = {"registration_id": registration_id, "not_attributable": list(NOT_ATTRIBUTABLE)}
+    connection.execute(named("history.sql", "count_points"), parameters)
+    connection.execute(named("history.sql", "count_views"), parameters)
 
 
 def point_health(connection: Connection, ids: IntArray) -> Array:
     """Health (n,) of points of ascending ids; 1 without a history."""
-    rows = connection.execute(
-        """select point_id, successes, expected from point_history
-           where point_id = any(%s) order by point_id""",
-        [ids.tolist()],
-    ).fetchall()
-    found = np.ones(len(ids))
-    at = np.searchsorted(ids, np.array([row["point_id"] for row in rows], dtype=np.int64))
-    found[at] = health(*_tried_and_succeeded(rows))
-    return found
+    rows = _rows(connection, _point_sums(), ids)
+    values = np.ones(len(ids))
+    places = np.searchsorted(ids, _column(rows, 0).astype(np.int64))
+    values[places] = health(_column(rows, 1), _column(rows, 2))
+    return values
 
 
 def view_health(connection: Connection, ids: IntArray, start: IntArray) -> Array:
@@ -213,73 +219,89 @@ def view_health(connection: Connection, ids: IntArray, start: IntArray) -> Array
         ids: (n,) of the points.
         start: (n + 1,) where the views of each begin, in the order of their numbers.
     """
-    rows = connection.execute(
-        """select point_id, view, successes, expected from view_history
-           where point_id = any(%s) order by point_id, view""",
-        [ids.tolist()],
-    ).fetchall()
-    found = np.ones(int(start[-1]))
-    point = np.searchsorted(ids, np.array([row["point_id"] for row in rows], dtype=np.int64))
-    view = np.array([row["view"] for row in rows], dtype=np.int64)
-    found[start[point] + view] = health(*_tried_and_succeeded(rows))
-    return found
+    rows = _rows(connection, _view_sums(), ids)
+    values = np.ones(int(start[-1]))
+    point_places = np.searchsorted(ids, _column(rows, 0).astype(np.int64))
+    views = _column(rows, 3).astype(np.int64)
+    values[start[point_places] + views] = health(_column(rows, 1), _column(rows, 2))
+    return values
 
 
-def _tried_and_succeeded(rows: list[dict[str, float]]) -> tuple[Array, Array]:
-    return (
-        np.array([row["expected"] for row in rows], dtype=np.float64),
-        np.array([row["successes"] for row in rows], dtype=np.float64),
-    )
+@cache
+def _point_sums() -> HotStatement:
+    columns = (_SUMS.point_id, _SUMS.expected, _SUMS.successes)
+    return hot(select(*columns).where(_is_one_of(_SUMS.point_id)).order_by(_SUMS.point_id))
+
+
+@cache
+def _view_sums() -> HotStatement:
+    sums = view_history.c
+    columns = (sums.point_id, sums.expected, sums.successes, sums.view)
+    return hot(select(*columns).where(_is_one_of(sums.point_id)).order_by(sums.point_id, sums.view))
+
+
+def _is_one_of(column: ColumnElement[int]) -> ColumnElement[bool]:
+    return column == any_(bindparam("ids", None, ARRAY(BigInteger())))
+
+
+def _rows(connection: Connection, statement: HotStatement, ids: IntArray) -> list[tuple[float, ...]]:
+    parameters = statement.parameters({"ids": ids.tolist()})
+    return driver(connection).execute(statement.sql, parameters).fetchall()
+
+
+def _column(rows: list[tuple[float, ...]], place: int) -> Array:
+    return np.array([row[place] for row in rows], dtype=np.float64)
 
 
 def find_history(connection: Connection, point_id: int) -> PointHistory | None:
-    """How a point of any block fared; None when there is no such point."""
-    with connection.cursor(row_factory=class_row(PointHistory)) as cursor:
-        return cursor.execute(
-            f"""select p.id, {FARED_OF_POINT} from point p left join point_history h on h.point_id = p.id
-                where p.id = %s""",
-            [point_id],
-        ).fetchone()
+    """The history of a point of any block; None when there is no such point."""
+    statement = (
+        select(point.c.id, *outcome_columns())
+        .select_from(point.outerjoin(point_history, point_history.c.point_id == point.c.id))
+        .where(point.c.id == point_id)
+    )
+    return first(PointHistory, connection.execute(statement))
 
 
 def list_histories(connection: Connection, state: str, limit: int) -> list[PointHistory]:
     """The points of published blocks in a state, the worst first."""
-    with connection.cursor(row_factory=class_row(PointHistory)) as cursor:
-        return cursor.execute(
-            f"""select p.id, {FARED_OF_POINT} from point_history h join point p on p.id = h.point_id
-                where {STATE} = %s and p.block_number = any(array({PUBLISHED}))
-                order by health, attempts desc, p.id limit %s""",
-            [state, limit],
-        ).fetchall()
+    statement = (
+        select(point.c.id, *outcome_columns())
+        .select_from(HISTORY.source)
+        .where(literal(state, Text()) == STATE, in_published_block())
+        .order_by(HEALTH, OUTCOME["attempts"].desc(), point.c.id)
+        .limit(limit)
+    )
+    return every(PointHistory, connection.execute(statement))
 
 
 def suspend(connection: Connection, point_id: int, because: str) -> bool:
-    """Serve a point no longer; False when there is none that was served.
+    """Stop serving a point; False when it does not exist or is not served.
 
-    The point gets a history, so that it is found there.
+    The point gets a history, so that it is listed with the others.
     """
-    done = connection.execute(
-        """update point set suspended_at = now(), suspended_because = %s
-           where id = %s and suspended_at is null""",
-        [because, point_id],
+    suspended = connection.execute(
+        update(point)
+        .where(point.c.id == point_id, point.c.suspended_at.is_(None))
+        .values(suspended_at=func.now(), suspended_because=because)
     )
-    if done.rowcount:
-        connection.execute(
-            "insert into point_history (point_id) values (%s) on conflict do nothing", [point_id]
-        )
-    return done.rowcount == 1
+    if suspended.rowcount:
+        history = insert(point_history).values(point_id=point_id)
+        connection.execute(history.on_conflict_do_nothing())
+    return suspended.rowcount == 1
 
 
 def reinstate(connection: Connection, point_id: int) -> bool:
-    """Serve a suspended point again, its history forgotten; False when it was not suspended.
+    """Serve a suspended point again and delete its history; False when it was not suspended.
 
-    What made it fail may have been mended or have been wrong: it would be proposed again at once.
+    The cause of its failures may be repaired or may have been wrong: with its history the point would be
+    proposed again at once.
     """
-    done = connection.execute(
-        """update point set suspended_at = null, suspended_because = null
-           where id = %s and suspended_at is not null""",
-        [point_id],
+    reinstated = connection.execute(
+        update(point)
+        .where(point.c.id == point_id, point.c.suspended_at.is_not(None))
+        .values(suspended_at=None, suspended_because=None)
     )
-    if done.rowcount:
-        connection.execute("delete from point_history where point_id = %s", [point_id])
-    return done.rowcount == 1
+    if reinstated.rowcount:
+        connection.execute(delete(point_history).where(point_history.c.point_id == point_id))
+    return reinstated.rowcount == 1

@@ -1,11 +1,20 @@
-"""One control point: what is told of it, its views, and how registrations fared with it."""
+"""One control point with its views and its history."""
 
 from dataclasses import dataclass, fields
 from datetime import date, datetime
+from functools import cache
 from typing import Any
 
-from app.db.engine import Connection
-from app.db.history import FARED_OF_POINT, PointHistory
+from sqlalchemy import BigInteger, ColumnElement, bindparam, func, null, select
+from sqlalchemy.dialects.postgresql import aggregate_order_by
+from sqlalchemy.types import NullType
+
+from app.db.constants import text_constant
+from app.db.engine import Connection, driver
+from app.db.history import PointHistory, outcome_columns
+from app.db.rows import columns_of
+from app.db.schema import block, chip_file, image, point, point_history, view
+from app.db.statements import HotStatement, hot
 
 
 @dataclass(frozen=True)
@@ -25,10 +34,10 @@ class PointView:
 
 @dataclass(frozen=True)
 class PointDetail:
-    """One point with all that is known of it.
+    """One point with its block, its views and its history.
 
     Attributes:
-        chip_key: where the storage has its chips; `chip_row` is the first, `chip_count` their number.
+        chip_key: key of its chips in the storage; `chip_row` is the first, `chip_count` their number.
         history: how registrations fared with it.
     """
 
@@ -56,37 +65,82 @@ class PointDetail:
     history: PointHistory
 
 
-FARED = tuple(field.name for field in fields(PointHistory) if field.name != "id")
-POINT = f"""select p.id, st_x(geom) as lon_deg, st_y(geom) as lat_deg, st_z(geom) as height_m,
-        sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
-        p.n_views, saliency, typology, first_view, last_view, b.id as block,
-        b.version as block_version, f.storage_key as chip_key, chip_row, chip_count,
-        {FARED_OF_POINT},
-        (select coalesce(json_agg(one order by one.view), '[]')
-         from (select v.view, v.gsd_m, nullif(v.incidence_deg, 'NaN') as incidence_deg,
-                   nullif(v.azimuth_deg, 'NaN') as azimuth_deg, i.image_id, i.sensor, i.acquired_at,
-                   nullif(i.sun_elevation_deg, 'NaN') as sun_elevation_deg,
-                   nullif(i.sun_azimuth_deg, 'NaN') as sun_azimuth_deg
-               from view v join image i on i.block_number = p.block_number and i.image = v.image
-               where v.point_id = p.id) one) as views
-    from point p join block b on b.number = p.block_number join chip_file f on f.id = p.chip_file
-        left join point_history h on h.point_id = p.id
-    where p.id = %s and b.state = 'published'"""
-"""All that is told of a point, in one exchange with the database."""
+DETAIL_FIELDS = tuple(field.name for field in fields(PointDetail))
 
 
 def find_point(connection: Connection, point_id: int) -> PointDetail | None:
-    """One published point."""
-    row = connection.execute(POINT, [point_id]).fetchone()
+    """One published point; None when there is none of that id."""
+    statement = _point_statement()
+    parameters = statement.parameters({"point_id": point_id})
+    row = driver(connection).execute(statement.sql, parameters).fetchone()
     if row is None:
         return None
-    views = tuple(_view(view) for view in row.pop("views"))
-    history = PointHistory(row["id"], **{name: row.pop(name) for name in FARED})
-    return PointDetail(**row, views=views, history=history)
+    values = dict(zip(DETAIL_FIELDS, row, strict=False))
+    values["views"] = tuple(map(_view, values["views"]))
+    values["history"] = PointHistory(values["id"], *row[len(DETAIL_FIELDS) :])
+    return PointDetail(**values)
 
 
-def _view(said: dict[str, Any]) -> PointView:
-    acquired_at = said.pop("acquired_at")
-    return PointView(
-        **said, acquired_at=None if acquired_at is None else datetime.fromisoformat(acquired_at)
+def _known(column: ColumnElement[Any]) -> ColumnElement[Any]:
+    return func.nullif(column, text_constant("NaN"), type_=column.type)
+
+
+@cache
+def _point_statement() -> HotStatement:
+    """A point with all that belongs to it, in one exchange with the database."""
+    one_view = (
+        select(
+            *columns_of(
+                PointView,
+                view,
+                incidence_deg=_known(view.c.incidence_deg),
+                azimuth_deg=_known(view.c.azimuth_deg),
+                image_id=image.c.image_id,
+                sensor=image.c.sensor,
+                acquired_at=image.c.acquired_at,
+                sun_elevation_deg=_known(image.c.sun_elevation_deg),
+                sun_azimuth_deg=_known(image.c.sun_azimuth_deg),
+            )
+        )
+        .select_from(view.join(image, image.c.image == view.c.image))
+        .where(image.c.block_number == point.c.block_number, view.c.point_id == point.c.id)
+        .correlate(point)
+        .subquery("one_view")
     )
+    views = select(
+        func.coalesce(
+            func.json_agg(aggregate_order_by(one_view.table_valued(), one_view.c.view)),
+            text_constant("[]"),
+            type_=NullType(),
+        )
+    ).scalar_subquery()
+    columns = columns_of(
+        PointDetail,
+        point,
+        lon_deg=func.st_x(point.c.geom),
+        lat_deg=func.st_y(point.c.geom),
+        height_m=func.st_z(point.c.geom),
+        block=block.c.id,
+        block_version=block.c.version,
+        chip_key=chip_file.c.storage_key,
+        views=views,
+        history=null(),
+    )
+    return hot(
+        select(*columns, *outcome_columns())
+        .select_from(
+            point.join(block, block.c.number == point.c.block_number)
+            .join(chip_file, chip_file.c.id == point.c.chip_file)
+            .outerjoin(point_history, point_history.c.point_id == point.c.id)
+        )
+        .where(
+            point.c.id == bindparam("point_id", None, BigInteger()),
+            block.c.state == text_constant("published"),
+        )
+    )
+
+
+def _view(document: dict[str, Any]) -> PointView:
+    acquired_at = document.pop("acquired_at")
+    taken = None if acquired_at is None else datetime.fromisoformat(acquired_at)
+    return PointView(**document, acquired_at=taken)

@@ -2,100 +2,142 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import shapely
-from psycopg import sql
+from sqlalchemy import (
+    ARRAY,
+    BigInteger,
+    ColumnElement,
+    LargeBinary,
+    Select,
+    and_,
+    any_,
+    bindparam,
+    cast,
+    func,
+    or_,
+    select,
+    true,
+)
 
 from app.db.binary_copy import parse_copy
-from app.db.blocks import ID_BITS, PUBLISHED
+from app.db.blocks import FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
+from app.db.constants import integer_constant, text_constant
+from app.db.copy import copy_to_stdout
 from app.db.density import points_in_box
-from app.db.engine import Connection
+from app.db.engine import Connection, driver
 from app.db.features.antimeridian import on_the_map
-from app.db.features.collection import Collection, Property
+from app.db.features.collection import Collection, column_property
+from app.db.features.predicates import meets_box
+from app.db.features.query import AFTER_KEY, LIMIT
 from app.db.history import point_health, view_health
+from app.db.rows import columns_of, every
+from app.db.schema import block, chip_file, image, point, view
+from app.db.statements import HotStatement
 from services.formats.block.tables import covariance_from_sigmas
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
-SERVED = "t.superseded_by is null and t.suspended_at is null"
-VISIBLE = f"{SERVED} and t.block_number = any(array({PUBLISHED}))"
-"""Points of published blocks, but for those that a better block has at the same place, and for those
-that an administrator has suspended."""
+SERVED = and_(point.c.superseded_by.is_(None), point.c.suspended_at.is_(None))
+"""Neither a better block has the point, nor an administrator has suspended it."""
+VISIBLE = and_(SERVED, in_published_block())
+IDS = bindparam("ids", None, ARRAY(BigInteger()))
 
-# Block by block along the primary key. Asked for more simply, the planner may read all unpublished
-# points on its way to the published ones.
-EVERYTHING = f"""select t.* from ({PUBLISHED} and number >= %(after)s >> {ID_BITS}) b
-    cross join lateral (
-        select * from point t where id > %(after)s and id >= b.number::bigint << {ID_BITS}
-            and id < (b.number::bigint + 1) << {ID_BITS} and {SERVED} and {{condition}}
-        order by id limit %(limit)s + 1) t
-    order by b.number, t.id limit %(limit)s + 1"""
+
+def _block_by_block(
+    columns: Sequence[ColumnElement[Any]], predicate: ColumnElement[bool]
+) -> Select[Any]:
+    """All served points in the order of ids, block by block along the primary key.
+
+    Of a plainer statement the planner may read all unpublished points on its way to the published ones.
+    """
+    bits = integer_constant(ID_BITS)
+    blocks = published_numbers().where(block.c.number >= AFTER_KEY.op(">>")(bits)).subquery("blocks")
+    number = cast(blocks.c.number, BigInteger())
+    rows = (
+        select(*(column.label(f"column_{place}") for place, column in enumerate(columns)))
+        .add_columns(point.c.id.label("key"))
+        .where(
+            point.c.id > AFTER_KEY,
+            point.c.id >= number.op("<<")(bits),
+            point.c.id < (number + integer_constant(1)).op("<<")(bits),
+            SERVED,
+            predicate,
+        )
+        .order_by(point.c.id)
+        .limit(LIMIT + integer_constant(1))
+        .lateral("rows")
+    )
+    return (
+        select(*(rows.c[f"column_{place}"].label(column.key) for place, column in enumerate(columns)))
+        .select_from(blocks.join(rows, true()))
+        .order_by(blocks.c.number, rows.c.key)
+        .limit(LIMIT + integer_constant(1))
+    )
+
 
 POINTS = Collection(
     id="points",
     title="Control points",
     description="3D ground control points with image chips, of all published blocks.",
-    source="point t",
-    key=Property("id", "bigint", "Identifier"),
+    source=point,
+    key=column_property(point.c.id, "Identifier"),
     properties=(
-        Property("sigma_east_m", "real", "Standard deviation eastwards", unit="m"),
-        Property("sigma_north_m", "real", "Standard deviation northwards", unit="m"),
-        Property("sigma_up_m", "real", "Standard deviation of the height", unit="m"),
-        Property("corr_east_north", "real", "Correlation of east and north"),
-        Property("corr_east_up", "real", "Correlation of east and height"),
-        Property("corr_north_up", "real", "Correlation of north and height"),
-        Property("n_views", "bigint", "Images that see the point"),
-        Property("saliency", "real", "How well its chips can be located, 0 to 1"),
-        Property("typology", "text", "What it is on the ground", nullable=True),
-        Property("first_view", "date", "Date of the first view", nullable=True),
-        Property("last_view", "date", "Date of the last view", nullable=True),
-        Property("block_number", "bigint", "Number of its block"),
+        column_property(point.c.sigma_east_m, "Standard deviation eastwards", "m"),
+        column_property(point.c.sigma_north_m, "Standard deviation northwards", "m"),
+        column_property(point.c.sigma_up_m, "Standard deviation of the height", "m"),
+        column_property(point.c.corr_east_north, "Correlation of east and north"),
+        column_property(point.c.corr_east_up, "Correlation of east and height"),
+        column_property(point.c.corr_north_up, "Correlation of north and height"),
+        column_property(point.c.n_views, "Images that see the point"),
+        column_property(point.c.saliency, "How well its chips can be located, 0 to 1"),
+        column_property(point.c.typology, "What it is on the ground"),
+        column_property(point.c.first_view, "Date of the first view"),
+        column_property(point.c.last_view, "Date of the last view"),
+        column_property(point.c.block_number, "Number of its block"),
     ),
     geometry_type="Point",
+    geometry=point.c.geom,
     has_height=True,
     visible=VISIBLE,
     interval=("first_view", "last_view"),
-    everything=EVERYTHING,
-    total=(
-        "select coalesce(sum(n_points - n_unserved), 0)::bigint as n from block"
-        " where state = 'published'"
-    ),
-    in_box=points_in_box,
+    full_scan=_block_by_block,
+    total=select(
+        cast(
+            func.coalesce(func.sum(block.c.n_points - block.c.n_unserved), integer_constant(0)),
+            BigInteger(),
+        )
+    ).where(block.c.state == text_constant("published")),
+    estimate_in_box=points_in_box,
 )
 
-POINT_KINDS = (
-    ("id", "i8"),
-    ("lon", "f8"),
-    ("lat", "f8"),
-    ("h", "f8"),
-    ("sigma_east", "f4"),
-    ("sigma_north", "f4"),
-    ("sigma_up", "f4"),
-    ("corr_east_north", "f4"),
-    ("corr_east_up", "f4"),
-    ("corr_north_up", "f4"),
-    ("saliency", "f4"),
-    ("chip_file", "i4"),
-    ("chip_row", "i8"),
+# Columns of points and views as arrays: name, kind in `binary_copy`, expression.
+POINT_ARRAYS: tuple[tuple[str, str, ColumnElement[Any]], ...] = (
+    ("id", "i8", point.c.id),
+    ("lon", "f8", func.st_x(point.c.geom)),
+    ("lat", "f8", func.st_y(point.c.geom)),
+    ("h", "f8", func.st_z(point.c.geom)),
+    ("sigma_east", "f4", point.c.sigma_east_m),
+    ("sigma_north", "f4", point.c.sigma_north_m),
+    ("sigma_up", "f4", point.c.sigma_up_m),
+    ("corr_east_north", "f4", point.c.corr_east_north),
+    ("corr_east_up", "f4", point.c.corr_east_up),
+    ("corr_north_up", "f4", point.c.corr_north_up),
+    ("saliency", "f4", point.c.saliency),
+    ("chip_file", "i4", point.c.chip_file),
+    ("chip_row", "i8", point.c.chip_row),
 )
-POINT_COLUMNS = sql.SQL(
-    """id, st_x(geom) as lon, st_y(geom) as lat, st_z(geom) as h,
-    sigma_east_m, sigma_north_m, sigma_up_m, corr_east_north, corr_east_up, corr_north_up,
-    saliency, chip_file, chip_row"""
+VIEW_ARRAYS: tuple[tuple[str, str, ColumnElement[Any]], ...] = (
+    ("point_id", "i8", view.c.point_id),
+    ("image", "i4", view.c.image),
+    ("gsd", "f4", view.c.gsd_m),
+    ("incidence", "f4", view.c.incidence_deg),
+    ("azimuth", "f4", view.c.azimuth_deg),
 )
-IN_PUBLISHED = sql.SQL("block_number = any(array(select number from block where state = 'published'))")
-VIEW_KINDS = (
-    ("point_id", "i8"),
-    ("image", "i4"),
-    ("gsd", "f4"),
-    ("incidence", "f4"),
-    ("azimuth", "f4"),
-)
-
-
-_FRAME_SIGMA = '$."amers:accuracy"."absolute"[*] ? (@.name == "frame_sigma_m").value'
+Arrays = tuple[tuple[str, str, ColumnElement[Any]], ...]
 
 
 @dataclass(frozen=True)
@@ -103,7 +145,8 @@ class BlockVersion:
     """A version of a block that points came from.
 
     Attributes:
-        frame_sigma_m: how well its frame is known, standard deviation a coordinate; None if unsaid.
+        frame_sigma_m: how well its frame is known on the Earth, standard deviation a coordinate; None if
+            its producer gives none.
     """
 
     number: int
@@ -114,7 +157,7 @@ class BlockVersion:
 
 @dataclass(frozen=True)
 class StoredPoints:
-    """Control points out of the store.
+    """Control points of the store.
 
     Attributes:
         points: their `chip_files` are keys of the storage.
@@ -137,86 +180,109 @@ def control_points(connection: Connection, outline: Array, limit: int | None = N
     Returns:
         Points in the order of their ids.
     """
-    place = shapely.set_srid(on_the_map(shapely.make_valid(shapely.Polygon(outline))), 4979)
-    area = sql.Literal(shapely.to_wkb(place, include_srid=True, hex=True))
-    return _with_views(connection, _points_query(area, limit))
+    area = shapely.to_wkb(on_the_map(shapely.make_valid(shapely.Polygon(outline))))
+    if limit is None:
+        return _with_views(connection, _points_inside(), {"area": area})
+    return _with_views(connection, _some_points_inside(), {"area": area, "limit": limit})
 
 
 def points_of_ids(connection: Connection, ids: Sequence[int]) -> StoredPoints:
     """The published points of some ids, with their views, as arrays.
 
     Returns:
-        Points in the order of their ids; those that there are not are left out.
+        Points in the order of their ids, without those that do not exist.
     """
-    query = sql.SQL("select {} from point where id = any({}) and {} order by id").format(
-        POINT_COLUMNS, sql.Literal(list(ids)), IN_PUBLISHED
+    return _with_views(connection, _points_of_ids(), {"ids": list(ids)})
+
+
+@cache
+def _points_inside() -> HotStatement:
+    return copy_to_stdout(_select_inside().order_by(point.c.id), "binary")
+
+
+@cache
+def _some_points_inside() -> HotStatement:
+    """Of n points inside, the rows where `rank * limit / n` steps up."""
+    rank = (func.row_number().over(order_by=point.c.id) - integer_constant(1)).label("rank")
+    count = func.count().over().label("n")
+    ranked = _select_inside().add_columns(rank, count).subquery("ranked")
+    limit = bindparam("limit", None, BigInteger())
+    place, place_before = (
+        ((row * limit).op("/")(ranked.c.n))
+        for row in (ranked.c.rank, ranked.c.rank - integer_constant(1))
     )
-    return _with_views(connection, query)
+    steps = or_(ranked.c.rank == integer_constant(0), place > place_before)
+    columns = (ranked.c[name] for name, _, _ in POINT_ARRAYS)
+    return copy_to_stdout(select(*columns).where(steps).order_by(ranked.c.id), "binary")
 
 
-def _with_views(connection: Connection, points_query: sql.Composed) -> StoredPoints:
-    point = _read(connection, points_query, POINT_KINDS)
-    ids = point["id"].astype(np.int64)
-    views_query = sql.SQL(
-        "select point_id, image, gsd_m, incidence_deg, azimuth_deg from view"
-        " where point_id = any({}) order by point_id, view"
-    ).format(sql.Literal(ids.tolist()))
-    view = _read(connection, views_query, VIEW_KINDS)
+def _select_inside() -> Select[Any]:
+    srid = integer_constant(POINTS.storage_crs.srid)
+    area = func.st_geomfromwkb(bindparam("area", None, LargeBinary()), srid)
+    inside = (meets_box(point.c.geom, area), func.st_intersects(point.c.geom, area))
+    return _select_arrays(POINT_ARRAYS).where(*inside, VISIBLE)
+
+
+@cache
+def _points_of_ids() -> HotStatement:
+    rows = _select_arrays(POINT_ARRAYS).where(point.c.id == any_(IDS), in_published_block())
+    return copy_to_stdout(rows.order_by(point.c.id), "binary")
+
+
+@cache
+def _views_of_points() -> HotStatement:
+    rows = _select_arrays(VIEW_ARRAYS).where(view.c.point_id == any_(IDS))
+    return copy_to_stdout(rows.order_by(view.c.point_id, view.c.view), "binary")
+
+
+def _select_arrays(arrays: Arrays) -> Select[Any]:
+    return select(*(expression.label(name) for name, _, expression in arrays))
+
+
+def _with_views(
+    connection: Connection, points_statement: HotStatement, parameters: dict[str, Any]
+) -> StoredPoints:
+    points = _read(connection, points_statement, parameters, POINT_ARRAYS)
+    ids = points["id"].astype(np.int64)
+    views = _read(connection, _views_of_points(), {"ids": ids.tolist()}, VIEW_ARRAYS)
     numbers = np.unique(ids >> ID_BITS)
     images, first_image = _images(connection, numbers)
-    chip_file, chip_files = _chip_files(connection, point["chip_file"].astype(np.int64))
-    owner = view["point_id"].astype(np.int64)
+    chip_files, storage_keys = _chip_files(connection, points["chip_file"].astype(np.int64))
+    owner = views["point_id"].astype(np.int64)
     start = np.searchsorted(owner, np.append(ids, np.iinfo(np.int64).max)).astype(np.int64)
     block_of_view = np.searchsorted(numbers, owner >> ID_BITS)
-    points = ControlPoints(
+    control = ControlPoints(
         id=ids,
-        lon_lat_h=_columns(point, "lon", "lat", "h"),
+        lon_lat_h=_columns(points, "lon", "lat", "h"),
         covariance_m2=covariance_from_sigmas(
-            _columns(point, "sigma_east", "sigma_north", "sigma_up"),
-            _columns(point, "corr_east_north", "corr_east_up", "corr_north_up"),
+            _columns(points, "sigma_east", "sigma_north", "sigma_up"),
+            _columns(points, "corr_east_north", "corr_east_up", "corr_north_up"),
         ),
-        saliency=_columns(point, "saliency")[:, 0],
+        saliency=_columns(points, "saliency")[:, 0],
         health=point_health(connection, ids),
         views=Views(
             start=start,
-            gsd_m=_as_written(view["gsd"]),
-            image=first_image[block_of_view] + view["image"].astype(np.int64),
-            incidence_deg=_columns(view, "incidence")[:, 0],
-            azimuth_deg=_columns(view, "azimuth")[:, 0],
+            gsd_m=_as_written(views["gsd"]),
+            image=first_image[block_of_view] + views["image"].astype(np.int64),
+            incidence_deg=_columns(views, "incidence")[:, 0],
+            azimuth_deg=_columns(views, "azimuth")[:, 0],
             health=view_health(connection, ids, start),
             images=images,
         ),
-        chip_file=chip_file,
-        chip_row=point["chip_row"].astype(np.int64),
-        chip_files=chip_files,
+        chip_file=chip_files,
+        chip_row=points["chip_row"].astype(np.int64),
+        chip_files=storage_keys,
     )
-    return StoredPoints(points, _versions(connection, numbers))
-
-
-def _points_query(area: sql.Literal, limit: int | None) -> sql.Composed:
-    """Points inside an area; with a limit, the rows where `rank * limit / count` steps up."""
-    inside = sql.SQL(
-        """select {columns}
-           from point where geom && {area}::geometry and st_intersects(geom, {area}::geometry)
-               and superseded_by is null and suspended_at is null and {published}"""
-    ).format(columns=POINT_COLUMNS, area=area, published=IN_PUBLISHED)
-    if limit is None:
-        return inside + sql.SQL(" order by id")
-    return sql.SQL(
-        """select id, lon, lat, h, sigma_east_m, sigma_north_m, sigma_up_m,
-               corr_east_north, corr_east_up, corr_north_up, saliency, chip_file, chip_row
-           from (select p.*, row_number() over (order by id) - 1 as rank, count(*) over () as found
-                 from ({inside}) p) ranked
-           where rank = 0 or rank * {limit} / found > (rank - 1) * {limit} / found order by id"""
-    ).format(inside=inside, limit=sql.Literal(limit))
+    return StoredPoints(control, _versions(connection, numbers))
 
 
 def _read(
-    connection: Connection, query: sql.Composed, kinds: tuple[tuple[str, str], ...]
+    connection: Connection, statement: HotStatement, parameters: dict[str, Any], arrays: Arrays
 ) -> npt.NDArray[np.void]:
-    statement = sql.SQL("copy ({}) to stdout (format binary)").format(query)
-    with connection.cursor() as cursor, cursor.copy(statement) as copy:
-        return parse_copy(b"".join(bytes(piece) for piece in copy), kinds)
+    values = statement.parameters(parameters)
+    with driver(connection).cursor() as cursor, cursor.copy(statement.sql, values) as copy:
+        data = b"".join(bytes(piece) for piece in copy)
+    return parse_copy(data, [(name, kind) for name, kind, _ in arrays])
 
 
 def _columns(rows: npt.NDArray[np.void], *names: str) -> Array:
@@ -229,33 +295,46 @@ def _as_written(values: npt.NDArray[Any]) -> Array:
     return np.array([float(str(value)) for value in distinct], dtype=np.float64)[inverse]
 
 
+def _nan_if_null(column: ColumnElement[Any]) -> ColumnElement[Any]:
+    return func.coalesce(column, text_constant("NaN"))
+
+
+_IMAGE_COLUMNS = columns_of(
+    Acquisition,
+    image,
+    incidence_deg=_nan_if_null(image.c.incidence_deg),
+    azimuth_deg=_nan_if_null(image.c.azimuth_deg),
+    sun_elevation_deg=_nan_if_null(image.c.sun_elevation_deg),
+    sun_azimuth_deg=_nan_if_null(image.c.sun_azimuth_deg),
+)
+_IMAGE_FIELDS = tuple(column.key for column in _IMAGE_COLUMNS)
+_VERSION_COLUMNS = columns_of(BlockVersion, block, frame_sigma_m=FRAME_SIGMA_M)
+_IMAGES = (
+    select(image.c.block_number.label("block_number"), *_IMAGE_COLUMNS)
+    .where(image.c.block_number == any_(IDS))
+    .order_by(image.c.block_number, image.c.image)
+)
+_STORAGE_KEYS = (
+    select(chip_file.c.storage_key).where(chip_file.c.id == any_(IDS)).order_by(chip_file.c.id)
+)
+_VERSIONS = select(*_VERSION_COLUMNS).where(block.c.number == any_(IDS)).order_by(block.c.number)
+
+
 def _images(connection: Connection, numbers: IntArray) -> tuple[tuple[Acquisition, ...], IntArray]:
     """The images of blocks, one block after the other, and where those of each block begin."""
-    rows = connection.execute(
-        """select block_number, image_id, sensor, acquired_at,
-               coalesce(incidence_deg, 'NaN') as incidence_deg,
-               coalesce(azimuth_deg, 'NaN') as azimuth_deg,
-               coalesce(sun_elevation_deg, 'NaN') as sun_elevation_deg,
-               coalesce(sun_azimuth_deg, 'NaN') as sun_azimuth_deg
-           from image where block_number = any(%s) order by block_number, image""",
-        [numbers.tolist()],
-    ).fetchall()
-    blocks = np.array([row.pop("block_number") for row in rows], dtype=np.int64)
-    return tuple(Acquisition(**row) for row in rows), np.searchsorted(blocks, numbers)
+    rows = connection.execute(_IMAGES, {"ids": numbers.tolist()}).mappings().all()
+    blocks = np.array([row["block_number"] for row in rows], dtype=np.int64)
+    images = [{name: row[name] for name in _IMAGE_FIELDS} for row in rows]
+    return tuple(Acquisition(**one) for one in images), np.searchsorted(blocks, numbers)
 
 
-def _chip_files(connection: Connection, file: IntArray) -> tuple[IntArray, tuple[str, ...]]:
-    ids, rows = np.unique(file, return_inverse=True)
-    found = connection.execute(
-        "select storage_key from chip_file where id = any(%s) order by id", [ids.tolist()]
-    ).fetchall()
-    return rows.astype(np.int64), tuple(row["storage_key"] for row in found)
+def _chip_files(connection: Connection, files: IntArray) -> tuple[IntArray, tuple[str, ...]]:
+    """The place of each file in the list of distinct files, and their keys in the storage."""
+    ids, places = np.unique(files, return_inverse=True)
+    storage_keys = connection.execute(_STORAGE_KEYS, {"ids": ids.tolist()}).scalars()
+    return places.astype(np.int64), tuple(storage_keys)
 
 
 def _versions(connection: Connection, numbers: IntArray) -> tuple[BlockVersion, ...]:
-    rows = connection.execute(
-        "select number, id, version, jsonb_path_query_first(metadata, %s)::float8 as frame_sigma_m"
-        " from block where number = any(%s) order by number",
-        [_FRAME_SIGMA, numbers.tolist()],
-    ).fetchall()
-    return tuple(BlockVersion(**row) for row in rows)
+    rows = connection.execute(_VERSIONS, {"ids": numbers.tolist()})
+    return tuple(every(BlockVersion, rows))

@@ -1,118 +1,198 @@
 """Vector tiles, made by the database: points, density cells, outlines of blocks."""
 
-from app.db.density import COARSEST, SERVED
-from app.db.engine import Connection
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from sqlalchemy import (
+    REAL,
+    ColumnElement,
+    Float,
+    FromClause,
+    Integer,
+    LargeBinary,
+    Numeric,
+    SmallInteger,
+    and_,
+    bindparam,
+    cast,
+    extract,
+    func,
+    select,
+    true,
+)
+from sqlalchemy.types import NullType
+
+from app.db.constants import integer_constant, text_constant
+from app.db.density import AREA_KM2, COARSEST, SERVED
+from app.db.engine import Connection, driver
 from app.db.features.collection import Viewer
 from app.db.features.outlines import BLOCKS
+from app.db.features.predicates import meets_box
 from app.db.points import POINTS
+from app.db.schema import audit, block, density_cell, point
+from app.db.schema.base import Double
+from app.db.statements import HotStatement, hot
 
 EXTENT = 4096
 BUFFER = 64
+WORLD_M = 2.0 * 20037508.342789244
+"""Side of the world in EPSG:3857."""
 FIRST_POINT_ZOOM = 8
-"""Below, a tile of points would hold more than can be told apart: it holds cells instead."""
-
-TILE = "st_tileenvelope(%(z)s, %(x)s, %(y)s)"
-TILE_LON_LAT = f"st_transform(st_expand({TILE}, %(margin_m)s), 4326)"
-CELL_FIELDS = (
-    f"{SERVED} as n_points, t.n_blocks,"
-    " round(least(t.outline_km2, t.cell_km2)::numeric, 3)::float8 as area_km2,"
-    f" ({SERVED} / least(t.outline_km2, t.cell_km2))::real as points_per_km2"
-)
+"""Below, a tile of points would contain more than a map can show apart: it contains cells instead."""
 NOBODY = Viewer()
-POINT_FIELDS = (
-    "t.id, t.n_views, t.saliency, t.block_number,"
-    " sqrt((t.sigma_east_m ^ 2 + t.sigma_north_m ^ 2) / 2)::real as sigma_horizontal_m"
+
+LEVEL = bindparam("level", None, SmallInteger())
+TILE = func.st_tileenvelope(*(bindparam(name, None, Integer()) for name in ("z", "x", "y")))
+TILE_LON_LAT = func.st_transform(
+    func.st_expand(TILE, bindparam("margin_m", None, Float())), integer_constant(4326)
+)
+CELL_FIELDS: tuple[ColumnElement[Any], ...] = (
+    SERVED.label("n_points"),
+    density_cell.c.n_blocks,
+    cast(func.round(cast(AREA_KM2, Numeric()), integer_constant(3)), Double).label("area_km2"),
+    cast(SERVED / AREA_KM2, REAL()).label("points_per_km2"),
+)
+_VARIANCE_EAST_M2, _VARIANCE_NORTH_M2 = (
+    func.power(sigma, integer_constant(2), type_=Double)
+    for sigma in (point.c.sigma_east_m, point.c.sigma_north_m)
+)
+SIGMA_HORIZONTAL_M: ColumnElement[float] = cast(
+    func.sqrt((_VARIANCE_EAST_M2 + _VARIANCE_NORTH_M2) / integer_constant(2)), REAL()
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """The features of a tile.
+
+    Attributes:
+        name: of the layer.
+        geometry: drawn; longitude and latitude.
+        indexed: the geometry that has an index.
+        box: of the tile with its margin, in the reference system of `indexed`.
+        fields: of each feature.
+        visible: which rows are drawn.
+    """
+
+    name: str
+    source: FromClause
+    geometry: ColumnElement[Any]
+    indexed: ColumnElement[Any]
+    fields: tuple[ColumnElement[Any], ...]
+    visible: ColumnElement[bool]
+    box: ColumnElement[Any] = TILE_LON_LAT
+
+
+POINT_LAYER = Layer(
+    name="points",
+    source=point,
+    geometry=func.st_setsrid(func.st_force2d(point.c.geom), integer_constant(4326)),
+    indexed=point.c.geom,
+    fields=(
+        point.c.id,
+        point.c.n_views,
+        point.c.saliency,
+        point.c.block_number,
+        SIGMA_HORIZONTAL_M.label("sigma_horizontal_m"),
+    ),
+    visible=POINTS.visible,
+    box=func.st_setsrid(TILE_LON_LAT, integer_constant(4979)),
+)
+POINT_CELL_LAYER = Layer(
+    name="points",
+    source=density_cell,
+    geometry=func.st_centroid(density_cell.c.geom),
+    indexed=density_cell.c.geom,
+    fields=(true().label("aggregated"), *CELL_FIELDS),
+    visible=and_(density_cell.c.level == LEVEL, integer_constant(0) < SERVED),
+)
+DENSITY_LAYER = Layer(
+    name="density",
+    source=density_cell,
+    geometry=density_cell.c.geom,
+    indexed=density_cell.c.geom,
+    fields=(density_cell.c.level, density_cell.c.id, *CELL_FIELDS),
+    visible=density_cell.c.level == LEVEL,
+)
+BLOCK_LAYER = Layer(
+    name="blocks",
+    source=block,
+    geometry=BLOCKS.geometry,
+    indexed=BLOCKS.geometry,
+    fields=(block.c.number, block.c.id, block.c.version, block.c.title, block.c.state, block.c.n_points),
+    visible=BLOCKS.visible,
 )
 
 
 def point_tile(connection: Connection, z: int, x: int, y: int) -> bytes:
-    """Published points, each with its id; below zoom 8 the centres of density cells that hold some."""
-    if z < FIRST_POINT_ZOOM:
-        where = f"t.level = {_level(z)} and {SERVED} > 0"
-        fields = f"true as aggregated, {CELL_FIELDS}"
-        return _tile(
-            connection,
-            "points",
-            "density_cell t",
-            "st_centroid(t.geom)",
-            "t.geom",
-            fields,
-            where,
-            z,
-            x,
-            y,
-        )
-    geometry = "st_setsrid(st_force2d(t.geom), 4326)"
-    box = f"st_setsrid({TILE_LON_LAT}, 4979)"
-    return _tile(
-        connection, "points", "point t", geometry, "t.geom", POINT_FIELDS, POINTS.visible, z, x, y, box
-    )
+    """Published points, each with its id; below zoom 8 the centres of density cells that have some."""
+    layer = POINT_CELL_LAYER if z < FIRST_POINT_ZOOM else POINT_LAYER
+    return _tile(connection, layer, z, x, y)
 
 
 def density_tile(connection: Connection, z: int, x: int, y: int) -> bytes:
     """Density cells: of 0.1 degree from zoom 6 on, twice as wide for each zoom before."""
-    fields = f"{_level(z)} as level, t.id, {CELL_FIELDS}"
-    where = f"t.level = {_level(z)}"
-    return _tile(connection, "density", "density_cell t", "t.geom", "t.geom", fields, where, z, x, y)
+    return _tile(connection, DENSITY_LAYER, z, x, y)
 
 
 def block_tile(connection: Connection, z: int, x: int, y: int, viewer: Viewer) -> bytes:
     """Outlines of the blocks that the viewer may see."""
-    fields = "t.number, t.id, t.version, t.title, t.state, t.n_points"
-    return _tile(
-        connection,
-        "blocks",
-        BLOCKS.source,
-        BLOCKS.geometry,
-        BLOCKS.geometry,
-        fields,
-        BLOCKS.visible,
-        z,
-        x,
-        y,
-        viewer=viewer,
-    )
+    return _tile(connection, BLOCK_LAYER, z, x, y, viewer=viewer)
 
 
 def version(connection: Connection) -> str:
-    """Changes whenever a block is published, withdrawn, or becomes another, or a point is suspended."""
-    row = connection.execute(
-        """select count(*) || '-' || coalesce(extract(epoch from max(state_changed_at)), 0)
-               || '-' || coalesce((select max(id) from audit where kind = 'point'), 0) as it
-           from block"""
-    ).fetchone()
+    """A text that changes when a block is published, withdrawn or replaced, or a point suspended."""
+    statement = _version_statement()
+    row = driver(connection).execute(statement.sql, statement.parameters({})).fetchone()
     assert row is not None
-    return str(row["it"])
-
-
-def _level(z: int) -> int:
-    return max(0, COARSEST - z)
+    return str(row[0])
 
 
 def _tile(
-    connection: Connection,
-    layer: str,
-    source: str,
-    geometry: str,
-    indexed: str,
-    fields: str,
-    where: str,
-    z: int,
-    x: int,
-    y: int,
-    box: str = TILE_LON_LAT,
-    viewer: Viewer = NOBODY,
+    connection: Connection, layer: Layer, z: int, x: int, y: int, *, viewer: Viewer = NOBODY
 ) -> bytes:
-    # Without `offset 0`, which keeps the inner query apart, geometries are projected and clipped twice.
-    margin_m = 2.0 * 20037508.342789244 / 2**z * BUFFER / EXTENT
-    row = connection.execute(
-        f"""select st_asmvt(tile, '{layer}', {EXTENT}, 'geom') as tile from (
-                select st_asmvtgeom(st_transform({geometry}, 3857), {TILE}, {EXTENT}, {BUFFER}) as geom,
-                    {fields}
-                from {source} where {indexed} && {box} and {where} offset 0) tile
-            where geom is not null""",
-        {"z": z, "x": x, "y": y, "margin_m": margin_m, "viewer": viewer.token, "admin": viewer.is_admin},
-        prepare=False,
-    ).fetchone()
+    statement = _tile_statement(layer)
+    place = {"z": z, "x": x, "y": y, "level": max(0, COARSEST - z)}
+    parameters = {**place, "margin_m": WORLD_M / 2**z * BUFFER / EXTENT, **viewer.parameters}
+    with driver(connection).cursor() as cursor:
+        cursor.execute(statement.sql, statement.parameters(parameters), prepare=False)
+        row = cursor.fetchone()
     assert row is not None
-    return bytes(row["tile"])
+    return bytes(row[0])
+
+
+@cache
+def _tile_statement(layer: Layer) -> HotStatement:
+    extent, buffer = integer_constant(EXTENT), integer_constant(BUFFER)
+    projected = func.st_transform(layer.geometry, integer_constant(3857))
+    drawn = func.st_asmvtgeom(projected, TILE, extent, buffer, type_=NullType())
+    # Without `offset 0`, which keeps the inner query apart, geometries are projected and clipped twice.
+    features = (
+        select(drawn.label("geom"), *layer.fields)
+        .select_from(layer.source)
+        .where(meets_box(layer.indexed, layer.box), layer.visible)
+        .offset(integer_constant(0))
+        .subquery("tile")
+    )
+    name, geometry = text_constant(layer.name), text_constant("geom")
+    tile = func.st_asmvt(features.table_valued(), name, extent, geometry, type_=LargeBinary())
+    return hot(select(tile).where(features.c.geom.is_not(None)))
+
+
+@cache
+def _version_statement() -> HotStatement:
+    dash, none = text_constant("-"), integer_constant(0)
+    changed_s = extract("epoch", func.max(block.c.state_changed_at))
+    suspended = select(func.max(audit.c.id)).where(audit.c.kind == text_constant("point"))
+    return hot(
+        select(
+            func.concat(
+                func.count(),
+                dash,
+                func.coalesce(changed_s, none),
+                dash,
+                func.coalesce(suspended.scalar_subquery(), none),
+            )
+        ).select_from(block)
+    )

@@ -259,7 +259,7 @@ def test_the_health_of_points_and_views_is_read_with_them(
     expected = np.where(stored.measures.active, 1.0, health(2 * share * np.ones(40), np.zeros(40)))
     np.testing.assert_allclose(read.health, expected)
     views, active = stored.views, stored.measures.active
-    shown = ~np.isin(views.reason, history.SAYS_NOTHING)
+    shown = ~np.isin(views.reason, history.NOT_ATTRIBUTABLE)
     disagreed = active[views.point] & ~views.agreed & shown
     rows = read.views.start[views.point] + views.view
     lower = set(np.flatnonzero(read.views.health < 1.0).tolist())

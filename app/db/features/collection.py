@@ -1,13 +1,31 @@
-"""What a collection of features is: declared once for each, asked for by `app.db.features.pages`.
+"""The declaration of a collection of features: its columns, its geometry and who sees which rows.
 
-SQL in a declaration calls the row `t`, and may use `%(admin)s` and `%(viewer)s`: whether the caller is
-an administrator, and the id of the caller's token.
+Expressions of a declaration are over the tables of `app.db.schema`. They may contain the bind parameters
+`IS_ADMIN` and `VIEWER` (the caller) and `REFERENCE` (the text that names one feature).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 from uuid import UUID
+
+from sqlalchemy import (
+    REAL,
+    Boolean,
+    Column,
+    ColumnElement,
+    Date,
+    DateTime,
+    Float,
+    FromClause,
+    Integer,
+    Select,
+    Text,
+    Uuid,
+    bindparam,
+    true,
+)
+from sqlalchemy.types import TypeEngine
 
 from app.db.engine import Connection
 from app.db.features.bbox import Box
@@ -15,45 +33,63 @@ from app.db.features.crs import CRS84, CRS84H, FLAT, WITH_HEIGHT, Crs
 
 SqlType = Literal["bigint", "real", "double precision", "text", "date", "timestamptz", "boolean"]
 
+# The first that a type is an instance of: REAL is a Float.
+SQL_TYPES: tuple[tuple[type[TypeEngine[Any]], SqlType], ...] = (
+    (Integer, "bigint"),
+    (REAL, "real"),
+    (Float, "double precision"),
+    (Text, "text"),
+    (Date, "date"),
+    (DateTime, "timestamptz"),
+    (Boolean, "boolean"),
+)
+
+IS_ADMIN = bindparam("is_admin", None, Boolean())
+VIEWER = bindparam("viewer", None, Uuid())
+REFERENCE = bindparam("reference", None, Text())
+
 
 @dataclass(frozen=True)
 class Viewer:
-    """Who asks: the id of a token, None without one, and whether it is an administrator's."""
+    """The caller: the id of a token, None without one, and whether it is an administrator's."""
 
     token: UUID | None = None
     is_admin: bool = False
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Values of the bind parameters of `Collection.visible`."""
+        return {"viewer": self.token, "is_admin": self.is_admin}
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Property:
     """A property of the features of a collection.
 
     Attributes:
         name: in replies, filters and files.
-        type: of its SQL.
-        title: what it is, in a few words.
-        sql: the column of that name if not given.
-        unit: as conventions name it, "" when it has none.
-        nullable: whether it may be unknown.
-        choices: all values there are, when there are few.
+        title: its meaning in a few words.
+        expression: its value; the type of the expression is the type of the property.
+        unit: as in the conventions, "" without one.
+        nullable: whether values may be unknown.
+        choices: all possible values, when they are few.
     """
 
     name: str
-    type: SqlType
     title: str
-    sql: str = ""
+    expression: ColumnElement[Any]
     unit: str = ""
     nullable: bool = False
     choices: tuple[str, ...] = ()
 
     @property
-    def expression(self) -> str:
-        """Its SQL."""
-        return self.sql or f"t.{self.name}"
+    def type(self) -> SqlType:
+        """Its type in SQL, of the few that replies distinguish."""
+        return next(name for kind, name in SQL_TYPES if isinstance(self.expression.type, kind))
 
     @property
     def is_number(self) -> bool:
-        """Whether values can be calculated with."""
+        """Whether values are numbers."""
         return self.type in ("bigint", "real", "double precision")
 
     @property
@@ -62,58 +98,63 @@ class Property:
         return self.type in ("date", "timestamptz")
 
 
-@dataclass(frozen=True)
+def column_property(
+    column: Column[Any], title: str, unit: str = "", *, name: str = "", choices: tuple[str, ...] = ()
+) -> Property:
+    """The property of a column of a table, nullable as the column is; of the same name unless given."""
+    return Property(name or column.name, title, column, unit, bool(column.nullable), choices)
+
+
+@dataclass(frozen=True, eq=False)
 class Collection:
     """Features of one kind.
 
     Attributes:
         id, title, description: for people.
-        source: what stands after FROM, with alias t.
-        key: the property that tells features apart, by which they are ordered unless asked otherwise.
+        source: the table or the join of its rows.
+        key: the property that identifies a feature; features are ordered by it unless asked otherwise.
         properties: the others, in the order of replies.
         geometry_type: as GeoJSON names it.
-        geometry: SQL, longitude and latitude (SRID 4326), or with height (4979).
+        geometry: longitude and latitude (SRID 4326), or with height (4979).
         has_height: whether positions have a height.
-        visible: condition that the caller may see the row.
-        interval: names of the properties between which a feature lies in time; none: timeless.
-        found_by: condition that the text `%(key)s` means the row; the key alone if not given.
-        everything: SELECT of all visible rows that meet `{condition}` in the order of keys beyond
-            `%(after)s`, at most `%(limit)s` + 1, where that is quicker than asking plainly.
-        total: SELECT of `n`, how many visible rows there are, where that is quicker than counting.
-        in_box: about how many features a box holds for anybody, where counts are kept.
-        members: SQL of text that follows the properties of a feature in GeoJSON, beginning with a comma.
-        is_open: whether it is open to everybody where points are.
+        visible: whether the caller may see a row.
+        interval: names of the properties between which a feature lies in time; None: timeless.
+        named_by: whether `REFERENCE` names the row; None: the key as text equals it.
+        full_scan: SELECT of given columns of all visible rows that meet a predicate, in the order of
+            keys beyond `AFTER_KEY`, of `LIMIT` rows and one more; None: the plain statement is as fast.
+        total: SELECT of the number of visible rows, where that is faster than counting.
+        estimate_in_box: about how many features a box contains for anybody, where cells are counted.
+        is_open: whether everybody may list it where points are public.
     """
 
     id: str
     title: str
     description: str
-    source: str
+    source: FromClause
     key: Property
     properties: tuple[Property, ...]
     geometry_type: str
-    geometry: str = "t.geom"
+    geometry: ColumnElement[Any]
     has_height: bool = False
-    visible: str = "true"
+    visible: ColumnElement[bool] = true()  # noqa: RUF009, an immutable constant of SQLAlchemy
     interval: tuple[str, str] | None = None
-    found_by: str = ""
-    everything: str = ""
-    total: str = ""
-    in_box: Callable[[Connection, Box], int] | None = None
-    members: str = ""
+    named_by: ColumnElement[bool] | None = None
+    full_scan: Callable[[Sequence[ColumnElement[Any]], ColumnElement[bool]], Select[Any]] | None = None
+    total: Select[Any] | None = None
+    estimate_in_box: Callable[[Connection, Box], int] | None = None
     is_open: bool = True
 
     @property
     def crs(self) -> tuple[Crs, ...]:
-        """Reference systems it can be asked for in."""
+        """Reference systems in which its features can be requested."""
         return WITH_HEIGHT if self.has_height else FLAT
 
     @property
     def storage_crs(self) -> Crs:
-        """The one it is kept in, which is also the one of replies unless asked otherwise."""
+        """The reference system of the stored geometries, and of replies unless asked otherwise."""
         return CRS84H if self.has_height else CRS84
 
     @property
     def queryables(self) -> dict[str, Property]:
-        """What a filter may name, beside the geometry."""
+        """The properties that a filter may name, by name; the geometry comes beside them."""
         return {item.name: item for item in (self.key, *self.properties)}

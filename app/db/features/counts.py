@@ -1,87 +1,146 @@
-"""How many features are selected, where they lie and when they were: exact, or about."""
+"""The number, the extent and the period of the selected features: exact, or estimated."""
 
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from typing import Any
 
 import psycopg
+from sqlalchemy import ColumnElement, Select, func, select
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.expression import ClauseElement, Executable
+from sqlalchemy.types import NullType
 
-from app.db.engine import Connection
+from app.db.constants import integer_constant, text_constant
+from app.db.engine import Connection, driver
 from app.db.features.bbox import WORLD
 from app.db.features.collection import Collection, Viewer
-from app.db.features.predicates import ANYTHING
-from app.db.features.query import Selection, from_where, viewer_parameters
+from app.db.features.predicates import ANYTHING, BoxShape, height_predicate
+from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible
+from app.db.statements import HotStatement, hot
 
 EXACT_COUNT = 10_000
 COUNTING_MS = 1_000
-"""Longest time spent on counting what a filter leaves; beyond, the number is estimated."""
+"""Time limit for counting what a filter leaves; beyond it, the number is estimated."""
+LIMIT_TIME = hot(
+    select(
+        func.set_config(
+            text_constant("statement_timeout"), text_constant(str(COUNTING_MS)), text_constant("true")
+        )
+    )
+)
 
 
 @dataclass(frozen=True)
 class Count:
-    """How many features; an estimate beyond 10,000 unless `exact`."""
+    """A number of features; an estimate beyond 10,000 unless `exact`."""
 
     number: int
     exact: bool
 
 
+class _Explain(Executable, ClauseElement):
+    """EXPLAIN of a statement: its plan as JSON."""
+
+    inherit_cache = False
+
+    def __init__(self, statement: Select[Any]) -> None:
+        self.statement = statement
+
+
+@compiles(_Explain)
+def _compile_explain(element: _Explain, compiler: SQLCompiler, **options: Any) -> str:
+    return f"EXPLAIN (FORMAT json) {compiler.process(element.statement, **options)}"
+
+
 def count(connection: Connection, selection: Selection) -> Count:
-    """How many features are selected: exact up to 10,000, an estimate beyond."""
+    """The number of selected features: exact up to 10,000, an estimate beyond."""
     collection = selection.collection
-    if selection.condition is ANYTHING and collection.total:
-        row = connection.execute(collection.total, viewer_parameters(selection.viewer)).fetchone()
-        assert row is not None
-        return Count(row["n"], exact=True)
-    parameters = {**selection.condition.parameters, **viewer_parameters(selection.viewer)}
-    few = f"select 1 from {from_where(selection)} limit {EXACT_COUNT + 1}"
+    if selection.condition is ANYTHING and collection.total is not None:
+        total = connection.execute(collection.total, selection.viewer.parameters).scalar_one()
+        return Count(int(total), exact=True)
     try:
-        with connection.transaction():
-            connection.execute(f"set local statement_timeout = {COUNTING_MS}")
-            row = connection.execute(
-                f"select count(*) as n from ({few}) few", parameters, prepare=False
-            ).fetchone()
-        assert row is not None
-        if row["n"] <= EXACT_COUNT:
-            return Count(row["n"], exact=True)
+        with driver(connection).transaction():
+            driver(connection).execute(LIMIT_TIME.sql, LIMIT_TIME.constants)
+            number = _count_few(connection, selection)
+        if number <= EXACT_COUNT:
+            return Count(number, exact=True)
         least = EXACT_COUNT + 1
     except psycopg.errors.QueryCanceled:
         least = 1
-    return Count(max(least, _estimate(connection, selection, parameters)), exact=False)
+    return Count(max(least, _estimate(connection, selection)), exact=False)
 
 
-def _estimate(connection: Connection, selection: Selection, parameters: dict[str, Any]) -> int:
+def _count_few(connection: Connection, selection: Selection) -> int:
+    """The number of selected features, at most one more than is counted exactly."""
+    predicate = selection.condition.non_bbox_predicate
+    if predicate is not None:
+        few = select_visible(selection.collection, selection.box_shape, integer_constant(1))
+        few = few.where(predicate).limit(integer_constant(EXACT_COUNT + 1))
+        return int(connection.execute(_counted(few), selection.parameters).scalar_one())
+    statement = _few_statement(selection.collection, selection.box_shape)
+    with driver(connection).cursor() as cursor:
+        cursor.execute(statement.sql, statement.parameters(selection.parameters), prepare=False)
+        row = cursor.fetchone()
+    assert row is not None
+    return int(row[0])
+
+
+@lru_cache(KEPT_STATEMENTS)
+def _few_statement(collection: Collection, box: BoxShape | None) -> HotStatement:
+    few = select_visible(collection, box, integer_constant(1))
+    return hot(_counted(few.limit(integer_constant(EXACT_COUNT + 1))))
+
+
+def _counted(few: Select[Any]) -> Select[Any]:
+    return select(func.count()).select_from(few.subquery("few"))
+
+
+def _estimate(connection: Connection, selection: Selection) -> int:
     """About how many features are selected.
 
-    Where counts are kept, by them for the box, and by what the planner knows of all rows for the rest.
+    Where cells are counted, from the cells for the box, and from the statistics of the planner on all
+    rows for the other conditions.
     """
     collection, condition = selection.collection, selection.condition
-    if collection.in_box is None:
-        return _planned(connection, from_where(selection), parameters)
-    number = collection.in_box(connection, condition.box or WORLD)
-    if not condition.beside:
+    one, parameters = integer_constant(1), selection.parameters
+    if collection.estimate_in_box is None:
+        statement = select_visible(collection, selection.box_shape, one)
+        if condition.non_bbox_predicate is not None:
+            statement = statement.where(condition.non_bbox_predicate)
+        return _planned(connection, statement, parameters)
+    number = collection.estimate_in_box(connection, condition.box or WORLD)
+    predicates: list[ColumnElement[bool]] = []
+    if selection.box_shape is not None and selection.box_shape.bounds_height:
+        predicates.append(height_predicate(collection))
+    if condition.non_bbox_predicate is not None:
+        predicates.append(condition.non_bbox_predicate)
+    if not predicates:
         return number
-    meeting = _planned(connection, f"{collection.source} where {condition.beside}", parameters)
-    return round(number * meeting / max(1, _planned(connection, collection.source, parameters)))
+    every_row = select(one).select_from(collection.source)
+    meeting = _planned(connection, every_row.where(*predicates), parameters)
+    return round(number * meeting / max(1, _planned(connection, every_row, {})))
 
 
-def _planned(connection: Connection, source: str, parameters: dict[str, Any]) -> int:
-    """How many rows the planner expects."""
-    plan = connection.execute(
-        f"explain (format json) select 1 from {source}", parameters, prepare=False
-    ).fetchone()
+def _planned(connection: Connection, statement: Select[Any], parameters: dict[str, Any]) -> int:
+    """The number of rows that the planner expects."""
+    explain = hot(_Explain(statement))
+    with driver(connection).cursor() as cursor:
+        cursor.execute(explain.sql, explain.parameters(parameters), prepare=False)
+        plan = cursor.fetchone()
     assert plan is not None
-    return int(plan["QUERY PLAN"][0]["Plan"]["Plan Rows"])
+    return int(plan[0][0]["Plan"]["Plan Rows"])
 
 
 def extent(connection: Connection, collection: Collection, viewer: Viewer) -> tuple[float, ...] | None:
     """West, south, east, north of all that the viewer may see, None without any."""
-    row = connection.execute(
-        f"""select st_xmin(e) as w, st_ymin(e) as s, st_xmax(e) as e, st_ymax(e) as n
-            from (select st_extent({collection.geometry}) as e from {collection.source}
-                  where {collection.visible}) box""",
-        viewer_parameters(viewer),
-    ).fetchone()
-    return None if row is None or row["w"] is None else (row["w"], row["s"], row["e"], row["n"])
+    whole = func.st_extent(collection.geometry, type_=NullType())
+    box = select_visible(collection, None, whole.label("extent")).subquery("box")
+    sides = (func.st_xmin, func.st_ymin, func.st_xmax, func.st_ymax)
+    statement = select(*(side(box.c.extent) for side in sides))
+    row = connection.execute(statement, viewer.parameters).one()
+    return None if row[0] is None else tuple(row)
 
 
 def period(
@@ -90,9 +149,6 @@ def period(
     """The first and the last time of all that the viewer may see; None without any."""
     assert collection.interval is not None
     start, end = (collection.queryables[name].expression for name in collection.interval)
-    row = connection.execute(
-        f"select min({start}) as first, max({end}) as last"
-        f" from {collection.source} where {collection.visible}",
-        viewer_parameters(viewer),
-    ).fetchone()
-    return (None, None) if row is None else (row["first"], row["last"])
+    statement = select_visible(collection, None, func.min(start), func.max(end))
+    first, last = connection.execute(statement, viewer.parameters).one().tuple()
+    return first, last

@@ -1,22 +1,25 @@
-"""Reference systems that coordinates can be asked for in, named as OGC names them."""
+"""Reference systems of coordinates in requests and replies, named by their OGC URI."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from sqlalchemy import ColumnElement, func
 
+from app.db.constants import integer_constant
 from services.types import Array
 
 EARTH_RADIUS_M = 6_378_137.0
-"""Of the sphere that EPSG:3857 takes the Earth for."""
+"""Radius of the sphere of EPSG:3857."""
 OGC = "http://www.opengis.net/def/crs/"
 
 
 @dataclass(frozen=True)
 class Crs:
-    """A reference system of replies and of questions.
+    """A reference system of requests and replies.
 
     Attributes:
-        uri: as OGC names it.
+        uri: its OGC name.
         srid: of the same in PostGIS, whose order of axes is always longitude or east first.
         lat_first: whether its own order is latitude first.
         has_height: whether positions carry the height above the ellipsoid.
@@ -41,27 +44,22 @@ WITH_HEIGHT = (CRS84H, CRS84, EPSG_4979, EPSG_4326, EPSG_3857)
 EVERY = {crs.uri: crs for crs in WITH_HEIGHT}
 
 
-def from_storage(geometry: str, crs: Crs) -> str:
-    """SQL of a stored geometry (longitude, latitude and perhaps height) in a reference system.
-
-    Args:
-        geometry: SQL of the geometry.
-        crs: asked for.
-    """
+def from_storage(geometry: ColumnElement[Any], crs: Crs) -> ColumnElement[Any]:
+    """A stored geometry (longitude, latitude and perhaps height) in a reference system."""
     if not crs.has_height:
-        geometry = f"st_setsrid(st_force2d({geometry}), 4326)"
+        geometry = func.st_setsrid(func.st_force2d(geometry), integer_constant(EPSG_4326.srid))
     if crs.srid == EPSG_3857.srid:
-        geometry = f"st_transform({geometry}, 3857)"
+        geometry = func.st_transform(geometry, integer_constant(EPSG_3857.srid))
     return geometry
 
 
-def in_own_order(geometry: str, crs: Crs) -> str:
-    """SQL of a geometry with the axes in the order of the reference system itself."""
-    return f"st_flipcoordinates({geometry})" if crs.lat_first else geometry
+def in_own_order(geometry: ColumnElement[Any], crs: Crs) -> ColumnElement[Any]:
+    """A geometry with the axes in the order of the reference system itself."""
+    return func.st_flipcoordinates(geometry) if crs.lat_first else geometry
 
 
 def lon_lat_from_mercator(east_north_m: Array) -> Array:
-    """Positions (n, 2) in EPSG:3857 as longitude and latitude; longitudes go on beyond 180 degrees."""
+    """Positions (n, 2) in EPSG:3857 as longitude and latitude; longitudes may exceed 180 degrees."""
     east, north = (east_north_m / EARTH_RADIUS_M).T
     lon_lat: Array = np.degrees(np.column_stack([east, np.arctan(np.sinh(north))]))
     return lon_lat

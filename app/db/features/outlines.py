@@ -1,88 +1,115 @@
 """Blocks and scenes as collections of their outlines."""
 
-from app.db.features.collection import Collection, Property
+from typing import get_args
 
-STATES = ("staged", "published", "withdrawn")
+from sqlalchemy import Numeric, Text, and_, cast, func, or_, select
+
+from app.db.constants import integer_constant, text_constant
+from app.db.features.collection import (
+    IS_ADMIN,
+    REFERENCE,
+    VIEWER,
+    Collection,
+    Property,
+    column_property,
+)
+from app.db.schema import BlockState, SceneState, block, registration, scene
+from app.db.schema.base import Real
+
+_BLOCK_VISIBLE = or_(block.c.state == text_constant("published"), IS_ADMIN)
 
 BLOCKS = Collection(
     id="blocks",
     title="Blocks",
     description="Productions of points, published as a whole; an administrator sees all of them.",
-    source="block t",
-    key=Property("number", "bigint", "Number of this version"),
+    source=block,
+    key=column_property(block.c.number, "Number of this version"),
     properties=(
-        Property("id", "text", "Name of the block"),
-        Property("version", "text", "Version"),
-        Property("title", "text", "Title"),
-        Property("state", "text", "State", choices=STATES),
-        Property("priority", "bigint", "Which block comes first over one place"),
-        Property("n_points", "bigint", "Points"),
-        Property(
-            "n_unserved", "bigint", "Points not served: superseded by a better block, or suspended"
+        column_property(block.c.id, "Name of the block"),
+        column_property(block.c.version, "Version"),
+        column_property(block.c.title, "Title"),
+        column_property(block.c.state, "State", choices=get_args(BlockState)),
+        column_property(block.c.priority, "Which block comes first over one place"),
+        column_property(block.c.n_points, "Points"),
+        column_property(
+            block.c.n_unserved, "Points not served: superseded by a better block, or suspended"
         ),
-        Property("n_views", "bigint", "Views"),
-        Property("created_at", "timestamptz", "When it was ingested"),
-        Property("state_changed_at", "timestamptz", "When its state changed last"),
+        column_property(block.c.n_views, "Views"),
+        column_property(block.c.created_at, "When it was ingested"),
+        column_property(block.c.state_changed_at, "When its state changed last"),
     ),
     geometry_type="Polygon",
-    geometry="t.extent_on_map",
-    visible="(t.state = 'published' or %(admin)s::boolean)",
+    geometry=block.c.extent_on_map,
+    visible=_BLOCK_VISIBLE,
     interval=("created_at", "created_at"),
-    found_by="(t.number::text = %(key)s or t.id || '@' || t.version = %(key)s"
-    " or (t.id = %(key)s and (t.state = 'published' or %(admin)s::boolean)))",
+    named_by=or_(
+        cast(block.c.number, Text()) == REFERENCE,
+        block.c.id + text_constant("@") + block.c.version == REFERENCE,
+        and_(block.c.id == REFERENCE, _BLOCK_VISIBLE),
+    ),
+)
+
+_LAST_VERDICT = (
+    select(registration.c.verdict)
+    .where(registration.c.scene_id == scene.c.id)
+    .order_by(registration.c.created_at.desc())
+    .limit(integer_constant(1))
+    .scalar_subquery()
+)
+# STAC looks from the sensor, the store from the ground.
+_AZIMUTH_FROM_SENSOR = cast(
+    func.mod(
+        cast(scene.c.azimuth_deg + integer_constant(180), Numeric()),
+        integer_constant(360),
+        type_=Numeric(),
+    ),
+    Real,
 )
 
 SCENES = Collection(
     id="scenes",
     title="Scenes",
-    description="Images that were uploaded to be registered, as STAC items; an owner sees his own.",
-    source="scene t",
-    key=Property("id", "text", "Identifier", sql="t.id::text"),
+    description="Images that were uploaded to be registered, as STAC items; owners see their own.",
+    source=scene,
+    key=Property("id", "Identifier", cast(scene.c.id, Text())),
     properties=(
         Property(
             "datetime",
-            "timestamptz",
             "When it was taken; when it was uploaded as long as that is not known",
-            sql="coalesce(t.acquired_at, t.created_at)",
+            func.coalesce(scene.c.acquired_at, scene.c.created_at),
         ),
-        Property("title", "text", "Name", sql="t.name"),
-        Property("created", "timestamptz", "When it was uploaded", sql="t.created_at"),
-        Property("platform", "text", "Platform or instrument", sql="t.sensor", nullable=True),
-        Property("gsd", "real", "Ground sampling", sql="t.gsd_m", unit="m", nullable=True),
-        Property("view:incidence_angle", "real", "Incidence", "t.incidence_deg", "deg", True),
+        column_property(scene.c.name, "Name", name="title"),
+        column_property(scene.c.created_at, "When it was uploaded", name="created"),
+        column_property(scene.c.sensor, "Platform or instrument", name="platform"),
+        column_property(scene.c.gsd_m, "Ground sampling", "m", name="gsd"),
+        column_property(scene.c.incidence_deg, "Incidence", "deg", name="view:incidence_angle"),
         Property(
             "view:azimuth",
-            "real",
             "Azimuth from below the sensor to the scene: 180 degrees from that of a view",
-            # STAC looks from the sensor, the store from the ground.
-            sql="mod((t.azimuth_deg + 180.0)::numeric, 360)::real",
+            _AZIMUTH_FROM_SENSOR,
             unit="deg",
             nullable=True,
         ),
-        Property("view:sun_elevation", "real", "Sun's elevation", "t.sun_elevation_deg", "deg", True),
-        Property("view:sun_azimuth", "real", "Sun's azimuth", "t.sun_azimuth_deg", "deg", True),
-        Property(
-            "amers:state", "text", "State", "t.state", choices=("uploading", "uploaded", "removed")
+        column_property(scene.c.sun_elevation_deg, "Sun's elevation", "deg", name="view:sun_elevation"),
+        column_property(scene.c.sun_azimuth_deg, "Sun's azimuth", "deg", name="view:sun_azimuth"),
+        column_property(scene.c.state, "State", name="amers:state", choices=get_args(SceneState)),
+        column_property(scene.c.acquired_at, "When it was taken", name="amers:acquired"),
+        column_property(
+            scene.c.sigma_m, "Stated standard deviation of its model", "m", name="amers:sigma_m"
         ),
-        Property("amers:acquired", "timestamptz", "When it was taken", "t.acquired_at", nullable=True),
-        Property(
-            "amers:sigma_m", "real", "Stated standard deviation of its model", "t.sigma_m", "m", True
-        ),
-        Property("amers:lines", "bigint", "Lines", "t.lines", "px", True),
-        Property("amers:samples", "bigint", "Samples", "t.samples", "px", True),
+        column_property(scene.c.lines, "Lines", "px", name="amers:lines"),
+        column_property(scene.c.samples, "Samples", "px", name="amers:samples"),
         Property(
             "amers:verdict",
-            "text",
             "Verdict on its last registration",
-            sql="(select r.verdict from registration r where r.scene_id = t.id"
-            " order by r.created_at desc limit 1)",
+            _LAST_VERDICT,
             nullable=True,
             choices=("good", "usable", "failed"),
         ),
     ),
     geometry_type="Polygon",
-    geometry="t.footprint_on_map",
-    visible="(%(admin)s::boolean or t.owner = %(viewer)s::uuid)",
+    geometry=scene.c.footprint_on_map,
+    visible=or_(IS_ADMIN, scene.c.owner == VIEWER),
     interval=("datetime", "datetime"),
     is_open=False,
 )

@@ -1,26 +1,41 @@
-"""Features of any collection: pages of them in several formats, one by one.
+"""Pages of features of any collection in several formats, and single features.
 
-Each feature is made into text by the database: five times faster than rows that become dictionaries and
-JSON. Statements are never prepared: the best way to a box depends on its size.
+The database makes each feature into text: five times faster than rows that become dictionaries and JSON.
+Statements of pages are never prepared: the best plan for a box depends on its size.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
 from itertools import islice
 from typing import Any, Literal
 
-from psycopg.rows import tuple_row
+from sqlalchemy import ColumnElement, Text, cast, func, select
 
-from app.db.engine import Connection
-from app.db.features.collection import Property
+from app.db.constants import integer_constant, text_constant
+from app.db.copy import copy_to_stdout
+from app.db.engine import Connection, driver
+from app.db.features.collection import REFERENCE
 from app.db.features.crs import from_storage
-from app.db.features.query import Key, Selection, chosen_rows, sortable, viewer_parameters
+from app.db.features.query import (
+    KEPT_STATEMENTS,
+    Columns,
+    Key,
+    Layout,
+    Selection,
+    hot_page,
+    page_parameters,
+    page_select,
+    sortable,
+)
 from app.db.features.serialization import csv_text, feature_text, plain_value
+from app.db.schema import installation
+from app.db.statements import HotStatement, hot
 
 ROWS_AT_ONCE = 2_000
 
-Text = Literal["geojson", "csv"]
+TextFormat = Literal["geojson", "csv"]
 
 
 @dataclass(frozen=True)
@@ -28,9 +43,9 @@ class Page:
     """Some features in a format.
 
     Attributes:
-        body: without what stands around features.
-        returned: how many.
-        last: where the next page goes on: the values that order features, of the last one; None when
+        body: the features without what stands around them.
+        returned: their number.
+        last: where the next page begins: the values that order features, of the last one; None when
             there are no more.
     """
 
@@ -41,7 +56,7 @@ class Page:
 
 @dataclass
 class Reading:
-    """What a reader of many rows has learnt when it is through.
+    """The outcome of reading many rows, complete when the reader is through.
 
     Attributes:
         returned, last: as in `Page`.
@@ -52,7 +67,7 @@ class Reading:
 
 
 def page(
-    connection: Connection, selection: Selection, kind: Text, after: Key | None, limit: int
+    connection: Connection, selection: Selection, kind: TextFormat, after: Key | None, limit: int
 ) -> Page:
     """A page of features, in one piece.
 
@@ -61,22 +76,21 @@ def page(
         after: `last` of the page before, None for the first.
         limit: most features.
     """
-    with connection.cursor(row_factory=tuple_row) as cursor:
-        cursor.execute(*_texts(selection, kind, after, limit), prepare=False)
-        rows = cursor.fetchall()
+    rows = _rows(connection, selection, TEXT_COLUMNS[kind], after, limit)
     separator = "," if kind == "geojson" else "\r\n"
     body = separator.join([row[0] for row in rows[:limit]]).encode()
-    last = rows[limit - 1][1:] if len(rows) > limit else None
+    last = tuple(rows[limit - 1][1:]) if len(rows) > limit else None
     return Page(body, min(len(rows), limit), last)
 
 
 def stream_geojson(
     connection: Connection, selection: Selection, after: Key | None, limit: int, reading: Reading
 ) -> Iterator[bytes]:
-    """Features separated by commas, in pieces of some thousand; what was read is known at the end."""
-    with connection.cursor(row_factory=tuple_row) as cursor:
-        statement, parameters = _texts(selection, "geojson", after, limit)
-        rows = cursor.stream(statement, parameters, size=ROWS_AT_ONCE)
+    """Features separated by commas, in pieces of some thousand; `reading` is complete at the end."""
+    statement = hot_page(selection, _geojson_columns, after)
+    parameters = statement.parameters(page_parameters(selection, after, limit))
+    with driver(connection).cursor() as cursor:
+        rows = cursor.stream(statement.sql, parameters, size=ROWS_AT_ONCE)
         while piece := list(islice(rows, min(ROWS_AT_ONCE, limit - reading.returned))):
             separator = ",\n" if reading.returned else ""
             reading.returned += len(piece)
@@ -91,22 +105,10 @@ def copy_csv(connection: Connection, selection: Selection, after: Key | None, li
     Columns are the values that order features (a JSON text); longitude or east, latitude or north, and
     height of points, else the geometry as hexadecimal WKB; the key and the properties.
     """
-    chosen, parameters = chosen_rows(selection, after, limit)
-    crs = selection.crs
-    geometry = from_storage(selection.collection.geometry, crs)
-    if selection.collection.geometry_type == "Point":
-        height = ", st_z(g) as h" if crs.has_height else ""
-        position = f"st_x(g) as x, st_y(g) as y{height}"
-    else:
-        position = "encode(st_asbinary(g), 'hex') as wkb"
-    columns = ", ".join(
-        f"{plain_value(item)} as {_quoted(item.name)}"
-        for item in (selection.collection.key, *selection.properties)
-    )
-    statement = f"""copy (select {keys_text(selection)} as keys, {position}, {columns}
-        from ({chosen}) t, lateral (select {geometry} as g) geometry) to stdout (format csv, header)"""
+    statement = copy_to_stdout(page_select(selection, _file_columns, after), "csv")
     out = BytesIO()
-    with connection.cursor() as cursor, cursor.copy(statement, parameters) as copy:
+    parameters = statement.parameters(page_parameters(selection, after, limit))
+    with driver(connection).cursor() as cursor, cursor.copy(statement.sql, parameters) as copy:
         for piece in copy:
             out.write(piece)
     out.seek(0)
@@ -114,53 +116,85 @@ def copy_csv(connection: Connection, selection: Selection, after: Key | None, li
 
 
 def keys(connection: Connection, selection: Selection, limit: int) -> list[Any]:
-    """The keys of the features selected, in their order; one beyond the limit where there are more."""
-    chosen, parameters = chosen_rows(selection, None, limit)
-    statement = f"select {selection.collection.key.expression} as key from ({chosen}) t"
-    rows = connection.execute(statement, parameters, prepare=False).fetchall()
-    return [row["key"] for row in rows]
+    """The keys of the selected features, in their order; one beyond the limit where there are more."""
+    return [row[0] for row in _rows(connection, selection, _key_columns, None, limit)]
 
 
 def find(connection: Connection, selection: Selection, reference: str) -> str | None:
-    """One feature as GeoJSON, of the properties selected; None when there is none for the viewer."""
-    collection = selection.collection
-    means = collection.found_by or f"{collection.key.expression}::text = %(key)s"
-    row = connection.execute(
-        f"""select {feature_text(selection)} as feature from {collection.source}
-            where {collection.visible} and ({means}) limit 1""",
-        {**viewer_parameters(selection.viewer), "key": reference},
-    ).fetchone()
-    return None if row is None else str(row["feature"])
+    """One feature as GeoJSON, of the selected properties; None when the viewer can see none."""
+    statement = _feature_statement(selection.layout)
+    parameters = {**selection.viewer.parameters, "reference": reference}
+    row = driver(connection).execute(statement.sql, statement.parameters(parameters)).fetchone()
+    return None if row is None else str(row[0])
 
 
 def page_secret(connection: Connection) -> bytes:
-    """What the installation signs the links to further pages with."""
-    row = connection.execute("select page_secret from installation").fetchone()
-    assert row is not None
-    return bytes(row["page_secret"])
+    """The secret with which the installation signs links to further pages."""
+    return bytes(connection.execute(select(installation.c.page_secret)).scalar_one())
 
 
-def _texts(
-    selection: Selection, kind: Text, after: Key | None, limit: int
-) -> tuple[str, dict[str, Any]]:
-    """SELECT of a page and one row more: a feature as text, then the values that order it.
+def _rows(
+    connection: Connection, selection: Selection, columns: Columns, after: Key | None, limit: int
+) -> Sequence[Sequence[Any]]:
+    """The rows of a page and one row more.
 
     Row by row: one text of all features would be twice as long on the way, most of it spent on memory.
     """
-    chosen, parameters = chosen_rows(selection, after, limit)
-    text = feature_text(selection) if kind == "geojson" else csv_text(selection)
-    keys = ", ".join(key_value(item.property) for item in selection.orders)
-    return f"select {text}, {keys} from ({chosen}) t", parameters
+    parameters = page_parameters(selection, after, limit)
+    if selection.condition.non_bbox_predicate is not None:
+        # SQLAlchemy keeps the text of statements that differ in values only.
+        return connection.execute(page_select(selection, columns, after), parameters).fetchall()
+    statement = hot_page(selection, columns, after)
+    with driver(connection).cursor() as cursor:
+        cursor.execute(statement.sql, statement.parameters(parameters), prepare=False)
+        return cursor.fetchall()
 
 
-def key_value(item: Property) -> str:
-    """A value that orders features as a link to the next page holds it."""
-    return plain_value(item) if item.is_time else sortable(item)
+@lru_cache(KEPT_STATEMENTS)
+def _feature_statement(layout: Layout) -> HotStatement:
+    collection = layout.collection
+    named = collection.named_by
+    if named is None:
+        named = cast(collection.key.expression, Text()) == REFERENCE
+    statement = select(feature_text(layout)).select_from(collection.source)
+    return hot(statement.where(collection.visible, named).limit(integer_constant(1)))
 
 
-def keys_text(selection: Selection) -> str:
-    return f"json_build_array({', '.join(sortable(item.property) for item in selection.orders)})"
+def _geojson_columns(layout: Layout) -> list[ColumnElement[Any]]:
+    return [feature_text(layout), *_link_values(layout)]
 
 
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', "") + '"'
+def _csv_columns(layout: Layout) -> list[ColumnElement[Any]]:
+    return [csv_text(layout), *_link_values(layout)]
+
+
+def _key_columns(layout: Layout) -> list[ColumnElement[Any]]:
+    return [layout.collection.key.expression]
+
+
+def _file_columns(layout: Layout) -> list[ColumnElement[Any]]:
+    order_values = (sortable(order.property) for order in layout.orders)
+    geometry = from_storage(layout.collection.geometry, layout.crs)
+    position: list[ColumnElement[Any]]
+    if layout.collection.geometry_type == "Point":
+        position = [func.st_x(geometry).label("x"), func.st_y(geometry).label("y")]
+        if layout.crs.has_height:
+            position.append(func.st_z(geometry).label("h"))
+    else:
+        position = [func.encode(func.st_asbinary(geometry), text_constant("hex")).label("wkb")]
+    properties = (layout.collection.key, *layout.properties)
+    return [
+        func.json_build_array(*order_values).label("keys"),
+        *position,
+        *(plain_value(item).label(item.name) for item in properties),
+    ]
+
+
+def _link_values(layout: Layout) -> Iterator[ColumnElement[Any]]:
+    """The values that order features, as a link to the next page carries them."""
+    for order in layout.orders:
+        item = order.property
+        yield plain_value(item) if item.is_time else sortable(item)
+
+
+TEXT_COLUMNS: dict[TextFormat, Columns] = {"geojson": _geojson_columns, "csv": _csv_columns}

@@ -1,83 +1,164 @@
-"""Conditions in SQL that features of any collection can be asked to meet: a box, a span of time."""
+"""Conditions on the features of any collection: a box, a span of time, a filter."""
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from sqlalchemy import (
+    ARRAY,
+    ColumnElement,
+    DateTime,
+    Float,
+    Text,
+    and_,
+    any_,
+    bindparam,
+    cast,
+    false,
+    func,
+    literal,
+    or_,
+)
+
+from app.db.constants import integer_constant, text_constant
 from app.db.features.bbox import Box
-from app.db.features.collection import Collection
+from app.db.features.collection import Collection, Property
+from app.db.schema.base import Timestamp
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition in SQL.
+    """A box and a predicate, both of which features have to meet.
+
+    The box stands apart because its statements are kept: its numbers are values of bind parameters.
 
     Attributes:
-        sql: over a row `t`.
-        parameters: by the names that it uses.
-        spatial: whether it keeps to a place, so that the index of geometries serves it.
-        box: that it keeps to, if it says so.
-        beside: what it says beside the box, in SQL.
+        box: None for the whole world.
+        non_bbox_predicate: what is required beside the box; None: nothing. Its literals are bind
+            parameters.
+        has_spatial_predicate: whether `non_bbox_predicate` confines features to a place, so that the
+            index of geometries serves it.
     """
 
-    sql: str
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    spatial: bool = False
     box: Box | None = None
-    beside: str = ""
+    non_bbox_predicate: ColumnElement[bool] | None = None
+    has_spatial_predicate: bool = False
+
+    @property
+    def spatial(self) -> bool:
+        """Whether the index of geometries serves the condition."""
+        return self.box is not None or self.has_spatial_predicate
 
     def __and__(self, other: "Condition") -> "Condition":
+        if self.box is not None and other.box is not None:
+            raise ValueError("both conditions have a box: intersect the boxes first")
+        predicates = [
+            predicate
+            for predicate in (self.non_bbox_predicate, other.non_bbox_predicate)
+            if predicate is not None
+        ]
         return Condition(
-            f"{self.sql} and {other.sql}",
-            {**self.parameters, **other.parameters},
-            self.spatial or other.spatial,
             self.box or other.box,
-            " and ".join(said for said in (self.beside, other.beside) if said),
+            and_(*predicates) if predicates else None,
+            self.has_spatial_predicate or other.has_spatial_predicate,
         )
 
 
-ANYTHING = Condition("true")
+ANYTHING = Condition()
 
 
-def in_box(collection: Collection, box: Box) -> Condition:
-    """The condition that a feature meets a box: by the index, which is coarser, then exactly.
+@dataclass(frozen=True)
+class BoxShape:
+    """What the predicate of a box depends on: its number of longitude ranges and its heights."""
 
-    The exact part is wrapped in `coalesce`, where the planner does not look: it would take four ranges
-    of unknown values for very selective, and read all the world to find its first hundred points.
+    ranges: int
+    bounds_height: bool
+
+    @staticmethod
+    def of(box: Box, collection: Collection) -> "BoxShape":
+        """The shape of a box; heights count only where positions have one."""
+        return BoxShape(len(box.longitude_ranges), collection.has_height and box.bounds_height)
+
+
+def box_predicate(collection: Collection, shape: BoxShape) -> ColumnElement[bool]:
+    """The predicate that a feature meets a box: by the index, which is coarser, then exactly.
+
+    The exact part is wrapped in `coalesce`, which the planner does not look into. It would estimate that
+    four comparisons with unknown values are very selective, and read the whole world for a first page.
+
+    Returns:
+        A predicate with the bind parameters of `box_parameters`.
     """
     geometry = collection.geometry
-    srid = 4979 if collection.has_height else 4326
-    ranges = [(box.west, 180.0), (-180.0, box.east)] if box.east < box.west else [(box.west, box.east)]
-    parameters: dict[str, Any] = {"south": box.south, "north": box.north}
-    near, exact = [], []
-    for i, (west, east) in enumerate(ranges):
-        parameters |= {f"west{i}": west, f"east{i}": east}
-        envelope = f"st_makeenvelope(%(west{i})s, %(south)s, %(east{i})s, %(north)s, {srid})"
-        near.append(f"{geometry} && {envelope}")
+    is_point = collection.geometry_type == "Point"
+    srid = integer_constant(collection.storage_crs.srid)
+    near: list[ColumnElement[bool]] = []
+    exact: list[ColumnElement[bool]] = []
+    for i in range(shape.ranges):
+        west, east = _number(f"west{i}"), _number(f"east{i}")
+        envelope = func.st_makeenvelope(west, _number("south"), east, _number("north"), srid)
+        near.append(meets_box(geometry, envelope))
         exact.append(
-            f"st_x({geometry}) between %(west{i})s and %(east{i})s"
-            if collection.geometry_type == "Point"
-            else f"st_intersects({geometry}, {envelope})"
+            func.st_x(geometry).between(west, east)
+            if is_point
+            else func.st_intersects(geometry, envelope)
         )
-    sql = f"({' or '.join(near)}) and coalesce(({' or '.join(exact)})"
-    if collection.geometry_type == "Point":
-        sql += f" and st_y({geometry}) between %(south)s and %(north)s"
-    if collection.has_height and box.low_m > -math.inf:
-        parameters |= {"low": box.low_m, "high": box.high_m}
-        sql += f" and st_z({geometry}) between %(low)s and %(high)s"
-    beside = "" if box.low_m == -math.inf else f"st_z({geometry}) between %(low)s and %(high)s"
-    return Condition(f"{sql}, false)", parameters, spatial=True, box=box, beside=beside)
+    parts: list[ColumnElement[bool]] = [or_(*exact)]
+    if is_point:
+        parts.append(func.st_y(geometry).between(_number("south"), _number("north")))
+    if shape.bounds_height:
+        parts.append(height_predicate(collection))
+    return and_(or_(*near), func.coalesce(and_(*parts), false()))
+
+
+def height_predicate(collection: Collection) -> ColumnElement[bool]:
+    """The predicate that a point's height is between the bind parameters `low` and `high`."""
+    return func.st_z(collection.geometry).between(_number("low"), _number("high"))
+
+
+def box_parameters(box: Box) -> dict[str, float]:
+    """Values of the bind parameters of `box_predicate`."""
+    ends = {"south": box.south, "north": box.north, "low": box.low_m, "high": box.high_m}
+    for i, (west, east) in enumerate(box.longitude_ranges):
+        ends |= {f"west{i}": west, f"east{i}": east}
+    return ends
 
 
 def in_time(collection: Collection, since: datetime | None, until: datetime | None) -> Condition:
     """The condition that a feature's time meets an interval; None for an open end."""
     if collection.interval is None:
         return ANYTHING
-    start, end = (collection.queryables[name].expression for name in collection.interval)
-    sql = (
-        f"({start}::timestamp at time zone 'UTC' <= coalesce(%(until)s::timestamptz, 'infinity')"
-        f" and {end}::timestamp at time zone 'UTC' >= coalesce(%(since)s::timestamptz, '-infinity'))"
+    start, end = (instant_of(collection.queryables[name]) for name in collection.interval)
+    return Condition(
+        non_bbox_predicate=and_(
+            start <= (infinity() if until is None else literal(until, Timestamp)),
+            end >= (infinity("-") if since is None else literal(since, Timestamp)),
+        )
     )
-    return Condition(sql, {"since": since, "until": until}, beside=sql)
+
+
+def key_among(collection: Collection, references: tuple[str, ...]) -> Condition:
+    """The condition that the key of a feature, as text, is one of some texts."""
+    key = cast(collection.key.expression, Text())
+    return Condition(non_bbox_predicate=key == any_(literal(list(references), ARRAY(Text()))))
+
+
+def instant_of(item: Property) -> ColumnElement[Any]:
+    """A time as an instant; a date is its first moment, UTC."""
+    if item.type == "date":
+        return func.timezone(text_constant("UTC"), cast(item.expression, DateTime()), type_=Timestamp)
+    return item.expression
+
+
+def infinity(sign: str = "") -> ColumnElement[Any]:
+    """The instant after all others; before all others with the sign "-"."""
+    return cast(text_constant(f"{sign}infinity"), Timestamp)
+
+
+def meets_box(geometry: ColumnElement[Any], envelope: ColumnElement[Any]) -> ColumnElement[bool]:
+    """Whether the bounding boxes of two geometries meet, which the index of geometries finds."""
+    return geometry.bool_op("&&")(envelope)
+
+
+def _number(name: str) -> ColumnElement[float]:
+    return bindparam(name, None, Float())

@@ -1,12 +1,40 @@
-"""What is asked of a collection, and the SQL that chooses its rows, a page of them."""
+"""Which features of a collection a request selects, and the statements of a page of them.
 
-from collections.abc import Sequence
+A statement is built once for each layout and shape of a request; boxes, keys and limits are values of
+its bind parameters. Only the predicate of a user's filter is added to it request by request.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Select,
+    Text,
+    and_,
+    bindparam,
+    cast,
+    or_,
+    select,
+    true,
+)
+
+from app.db.constants import integer_constant
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.crs import Crs
-from app.db.features.predicates import ANYTHING, Condition
+from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
+from app.db.schema.base import Double
+from app.db.statements import HotStatement, hot
+
+KEPT_STATEMENTS = 512
+"""Statements kept for each step: of the layouts and orders that users ask for."""
+
+LIMIT = bindparam("limit", None, BigInteger())
+AFTER_KEY = bindparam("after_key", None, BigInteger())
+BEFORE_ALL_KEYS = -1
 
 Key = tuple[Any, ...]
 """The values that order features, of one of them."""
@@ -21,16 +49,33 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Selection:
-    """What is asked of a collection.
+class Layout:
+    """What a statement of features depends on besides their selection.
 
     Attributes:
-        collection: asked.
-        viewer: who asks.
+        orders: by these, the last of which is the key.
+    """
+
+    collection: Collection
+    properties: tuple[Property, ...]
+    crs: Crs
+    orders: tuple[Order, ...]
+
+
+Columns = Callable[[Layout], Sequence[ColumnElement[Any]]]
+"""The columns of a row of a page."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The features that a request selects, and how they are replied.
+
+    Attributes:
+        viewer: the caller.
+        crs: of the reply.
+        properties: of each feature, in this order.
         condition: that features meet.
         order: by these, then by the key.
-        properties: of each feature, in this order.
-        crs: of the reply.
     """
 
     collection: Collection
@@ -45,55 +90,135 @@ class Selection:
         """The order, made definite by the key."""
         return (*self.order, Order(self.collection.key))
 
+    @property
+    def layout(self) -> Layout:
+        """What its statements depend on."""
+        return Layout(self.collection, self.properties, self.crs, self.orders)
 
-def chosen_rows(selection: Selection, after: Key | None, limit: int) -> tuple[str, dict[str, Any]]:
-    """SELECT of a page and one row more, in order."""
-    collection, condition = selection.collection, selection.condition
-    parameters = {**condition.parameters, **viewer_parameters(selection.viewer), "limit": limit}
-    if collection.everything and not selection.order and not condition.spatial:
-        parameters["after"] = -1 if after is None else after[0]
-        return collection.everything.replace("{condition}", condition.sql), parameters
-    where = from_where(selection)
+    @property
+    def box_shape(self) -> BoxShape | None:
+        """The shape of the box of its condition."""
+        box = self.condition.box
+        return None if box is None else BoxShape.of(box, self.collection)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Values of the bind parameters of its condition: the caller and the box."""
+        box = self.condition.box
+        return {**self.viewer.parameters, **({} if box is None else box_parameters(box))}
+
+
+def page_select(selection: Selection, columns: Columns, after: Key | None) -> Select[Any]:
+    """SELECT of a page and of one row more, in order.
+
+    Args:
+        selection: of the rows.
+        columns: of each row.
+        after: the values that order features, of the last feature before the page; None for the first.
+
+    Returns:
+        A statement with the bind parameters of `page_parameters`. It is kept for all selections of the
+        same layout but for the predicate of a user's filter, which is added to it.
+    """
+    layout, condition = selection.layout, selection.condition
+    unknown_after = None if after is None else tuple(value is None for value in after)
+    predicate = condition.non_bbox_predicate
+    if layout.collection.full_scan and not selection.order and not condition.spatial:
+        if predicate is None:
+            return _kept_full_scan(layout, columns)
+        return layout.collection.full_scan(kept_columns(layout, columns), predicate)
+    statement = _kept_select(layout, columns, selection.box_shape, unknown_after)
+    return statement if predicate is None else statement.where(predicate)
+
+
+def hot_page(selection: Selection, columns: Columns, after: Key | None) -> HotStatement:
+    """`page_select` compiled; kept unless a user's filter is part of it."""
+    if selection.condition.non_bbox_predicate is not None:
+        return hot(page_select(selection, columns, after))
+    return _kept_hot(page_select(selection, columns, after))
+
+
+def page_parameters(selection: Selection, after: Key | None, limit: int) -> dict[str, Any]:
+    """Values of the bind parameters of `page_select`.
+
+    Args:
+        limit: most features on the page.
+    """
+    parameters = {**selection.parameters, "limit": limit}
+    parameters["after_key"] = BEFORE_ALL_KEYS if after is None else after[-1]
     if after is not None:
-        where += f" and {_beyond(selection.orders, after, parameters)}"
-    order = ", ".join(
-        f"{sortable(item.property)} {'desc' if item.descending else 'asc'} nulls last"
-        if item.property.nullable
-        else f"{sortable(item.property)} {'desc' if item.descending else 'asc'}"
-        for item in selection.orders
-    )
-    return f"select t.* from {where} order by {order} limit %(limit)s + 1", parameters
+        parameters |= {_after_name(place): value for place, value in enumerate(after)}
+    return parameters
 
 
-def from_where(selection: Selection) -> str:
-    collection = selection.collection
-    return f"{collection.source} where {collection.visible} and {selection.condition.sql}"
+def select_visible(
+    collection: Collection, box: BoxShape | None, *columns: ColumnElement[Any]
+) -> Select[Any]:
+    """SELECT of columns of the rows that the caller may see and that meet a box, in no order."""
+    statement = select(*columns).select_from(collection.source).where(collection.visible)
+    return statement if box is None else statement.where(box_predicate(collection, box))
 
 
-def _beyond(orders: Sequence[Order], after: Key, parameters: dict[str, Any]) -> str:
-    """The condition that a row comes after the one of these values; unknown values come last."""
-    first, rest = orders[0], orders[1:]
-    sql, value, name = sortable(first.property), after[0], f"after{len(orders)}"
-    if value is None:
-        return f"({sql} is null and {_beyond(rest, after[1:], parameters)})"
-    parameters[name] = value
-    bound = f"%({name})s::{_sort_type(first.property)}"
-    further = f"{sql} {'<' if first.descending else '>'} {bound}"
-    if not rest:
+@lru_cache(KEPT_STATEMENTS)
+def kept_columns(layout: Layout, columns: Columns) -> tuple[ColumnElement[Any], ...]:
+    """The columns of a page, built once."""
+    return tuple(columns(layout))
+
+
+@lru_cache(KEPT_STATEMENTS)
+def _kept_select(
+    layout: Layout, columns: Columns, box: BoxShape | None, unknown_after: tuple[bool, ...] | None
+) -> Select[Any]:
+    rows = select_visible(layout.collection, box, *kept_columns(layout, columns))
+    if unknown_after is not None:
+        rows = rows.where(_beyond(layout.orders, unknown_after, 0))
+    orders = (_ordering(order) for order in layout.orders)
+    return rows.order_by(*orders).limit(LIMIT + integer_constant(1))
+
+
+@lru_cache(KEPT_STATEMENTS)
+def _kept_full_scan(layout: Layout, columns: Columns) -> Select[Any]:
+    assert layout.collection.full_scan is not None
+    return layout.collection.full_scan(kept_columns(layout, columns), true())
+
+
+@lru_cache(KEPT_STATEMENTS)
+def _kept_hot(statement: Select[Any]) -> HotStatement:
+    return hot(statement)
+
+
+def _ordering(order: Order) -> ColumnElement[Any]:
+    value = sortable(order.property)
+    directed = value.desc() if order.descending else value.asc()
+    return directed.nulls_last() if order.property.nullable else directed
+
+
+def _beyond(orders: Sequence[Order], unknown_after: tuple[bool, ...], place: int) -> ColumnElement[bool]:
+    """The predicate that a row comes after the row of the bound values; unknown values come last."""
+    order, is_last = orders[place], place == len(orders) - 1
+    value = sortable(order.property)
+    if unknown_after[place]:
+        return and_(value.is_(None), _beyond(orders, unknown_after, place + 1))
+    bound = _after_value(order.property, place)
+    further: ColumnElement[bool] = value < bound if order.descending else value > bound
+    if is_last:
         return further
-    if first.property.nullable:
-        further = f"({further} or {sql} is null)"
-    return f"({further} or ({sql} = {bound} and {_beyond(rest, after[1:], parameters)}))"
+    if order.property.nullable:
+        further = or_(further, value.is_(None))
+    return or_(further, and_(value == bound, _beyond(orders, unknown_after, place + 1)))
 
 
-def _sort_type(item: Property) -> str:
-    """The type in which values go to a link and come back the same."""
-    return "double precision" if item.type == "real" else item.type
+def _after_value(item: Property, place: int) -> ColumnElement[Any]:
+    """A value of `after`: a number, or a text of another type, as JSON carries them."""
+    value = sortable(item)
+    kind = value.type if item.is_number else Text()
+    return cast(bindparam(_after_name(place), None, kind), value.type)
 
 
-def sortable(item: Property) -> str:
-    return f"({item.expression})::double precision" if item.type == "real" else item.expression
+def _after_name(place: int) -> str:
+    return f"after{place}"
 
 
-def viewer_parameters(viewer: Viewer) -> dict[str, Any]:
-    return {"viewer": viewer.token, "admin": viewer.is_admin}
+def sortable(item: Property) -> ColumnElement[Any]:
+    """The value of a property that features are ordered by, which comes back from a link the same."""
+    return cast(item.expression, Double) if item.type == "real" else item.expression

@@ -1,79 +1,89 @@
-"""A feature as a text made by the database: GeoJSON or a line of CSV."""
+"""A feature as a text that the database makes: GeoJSON or a line of CSV."""
 
 import json
+from typing import Any
 
+from sqlalchemy import ColumnElement, Text, cast, func
+
+from app.db.constants import integer_constant, text_constant
 from app.db.features.collection import Property
 from app.db.features.crs import from_storage, in_own_order
-from app.db.features.query import Selection
+from app.db.features.query import Layout, Selection
 
 DEGREE_DIGITS = 9
 """Decimals of a degree in replies: a tenth of a millimetre."""
 METRE_DIGITS = 4
+QUOTE = text_constant('"')
 
 
-def feature_text(selection: Selection) -> str:
-    """SQL of one feature as GeoJSON text; texts and dates are quoted by to_json, numbers are finite."""
-    collection = selection.collection
-    digits = DEGREE_DIGITS if selection.crs.in_degrees else METRE_DIGITS
-    geometry = in_own_order(from_storage(collection.geometry, selection.crs), selection.crs)
+def feature_text(layout: Layout) -> ColumnElement[str]:
+    """One feature as GeoJSON text; texts and dates are quoted by to_json, numbers are finite."""
+    collection, crs = layout.collection, layout.crs
+    digits = integer_constant(DEGREE_DIGITS if crs.in_degrees else METRE_DIGITS)
+    geometry = in_own_order(from_storage(collection.geometry, crs), crs)
     parts = [
-        """'{"type":"Feature","id":'""",
+        text_constant('{"type":"Feature","id":'),
         _json(collection.key),
-        """',"geometry":'""",
-        f"coalesce(st_asgeojson({geometry}, {digits}, 0), 'null')",
-        """',"properties":{'""",
+        text_constant(',"geometry":'),
+        func.coalesce(
+            func.st_asgeojson(geometry, digits, integer_constant(0), type_=Text()), text_constant("null")
+        ),
+        text_constant(',"properties":{'),
     ]
-    for number, item in enumerate(selection.properties):
-        parts += [f"'{',' if number else ''}{json.dumps(item.name)}:'", _json(item)]
-    parts += ["'}'", *([collection.members] if collection.members else []), "'}'"]
-    return f"concat({', '.join(parts)})"
+    for place, item in enumerate(layout.properties):
+        comma = "," if place else ""
+        parts += [text_constant(f"{comma}{json.dumps(item.name)}:"), _json(item)]
+    return func.concat(*parts, text_constant("}}"), type_=Text())
 
 
 def csv_header(selection: Selection) -> str:
     """The names of the columns of CSV."""
-    names = [selection.collection.key.name, *_position_names(selection)]
+    names = [selection.collection.key.name, *_position_names(selection.layout)]
     return ",".join([*names, *(item.name for item in selection.properties)])
 
 
-def _position_names(selection: Selection) -> tuple[str, ...]:
-    if selection.collection.geometry_type != "Point":
+def _position_names(layout: Layout) -> tuple[str, ...]:
+    if layout.collection.geometry_type != "Point":
         return ("wkt",)
-    if not selection.crs.in_degrees:
+    if not layout.crs.in_degrees:
         return ("east_m", "north_m")
-    return ("lon_deg", "lat_deg", "height_m") if selection.crs.has_height else ("lon_deg", "lat_deg")
+    return ("lon_deg", "lat_deg", "height_m") if layout.crs.has_height else ("lon_deg", "lat_deg")
 
 
-def csv_text(selection: Selection) -> str:
-    """SQL of a line of CSV; columns are named, so longitude is first whatever the reference system."""
-    collection = selection.collection
-    geometry = from_storage(collection.geometry, selection.crs)
+def csv_text(layout: Layout) -> ColumnElement[str]:
+    """A line of CSV; columns are named, so longitude is first whatever the reference system."""
+    collection = layout.collection
+    geometry = from_storage(collection.geometry, layout.crs)
+    position: list[ColumnElement[Any]]
     if collection.geometry_type == "Point":
-        axes = ("st_x", "st_y", "st_z")[: len(_position_names(selection))]
-        position = [f"{axis}({geometry})::text" for axis in axes]
+        axes = (func.st_x, func.st_y, func.st_z)[: len(_position_names(layout))]
+        position = [cast(axis(geometry), Text()) for axis in axes]
     else:
-        position = [f"'\"' || st_astext({geometry}, {DEGREE_DIGITS}) || '\"'"]
-    values = [_csv(collection.key), *position, *(_csv(item) for item in selection.properties)]
-    return f"concat_ws(',', {', '.join(values)})"
+        wkt = func.st_astext(geometry, integer_constant(DEGREE_DIGITS), type_=Text())
+        position = [QUOTE.concat(wkt).concat(QUOTE)]
+    values = [_csv(collection.key), *position, *(_csv(item) for item in layout.properties)]
+    return func.concat_ws(text_constant(","), *values, type_=Text())
 
 
-def _json(item: Property) -> str:
-    sql = item.expression
-    if item.type == "boolean":
-        sql = f"({sql})::text"
-    elif not item.is_number:
-        sql = f"to_json({sql})::text"
-    return f"coalesce(({sql})::text, 'null')" if item.nullable else sql
+def _json(item: Property) -> ColumnElement[Any]:
+    value = item.expression
+    if not item.is_number and item.type != "boolean":
+        value = func.to_json(value)
+    if item.nullable:
+        return func.coalesce(cast(value, Text()), text_constant("null"))
+    return value if item.is_number else cast(value, Text())
 
 
-def _csv(item: Property) -> str:
-    sql = f"({plain_value(item)})::text"
+def _csv(item: Property) -> ColumnElement[str]:
+    text: ColumnElement[str] = cast(plain_value(item), Text())
     if item.type == "text":
-        sql = f"'\"' || replace({sql}, '\"', '\"\"') || '\"'"
-    return f"coalesce({sql}, '')" if item.nullable else sql
+        doubled = func.replace(text, QUOTE, text_constant('""'), type_=Text())
+        text = QUOTE.concat(doubled).concat(QUOTE)
+    return func.coalesce(text, text_constant("")) if item.nullable else text
 
 
-def plain_value(item: Property) -> str:
+def plain_value(item: Property) -> ColumnElement[Any]:
     """A value of the few types that files of all formats have: dates are text in ISO 8601."""
     if item.is_time:
-        return f"(to_json({item.expression}) #>> '{{}}')"
+        return func.to_json(item.expression).op("#>>")(text_constant("{}"))
     return item.expression

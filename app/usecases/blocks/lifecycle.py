@@ -100,7 +100,12 @@ def ingest_block(
     with connection.begin_nested():
         blocks.lock_ingestion(connection)
         block = blocks.insert_block(
-            connection, contents, document.decode(), sha256(document).hexdigest(), quality, priority
+            connection,
+            contents,
+            document=document.decode(),
+            checksum=sha256(document).hexdigest(),
+            quality=quality,
+            priority=priority,
         )
         if block is None:
             raise Conflict(

@@ -20,7 +20,7 @@ from app.db.features.counts import Count
 from app.db.features.cql2 import geometry_condition, translate
 from app.db.features.cql2_bounds import check_size, parse_instant, parse_json, parse_text
 from app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
-from app.db.features.predicates import ANYTHING, Condition, in_box, in_time
+from app.db.features.predicates import ANYTHING, Condition, in_time, key_among
 from app.db.features.query import Key, Order, Selection
 from app.errors import InvalidParameter
 from app.usecases.features.page_tokens import parse_token
@@ -203,7 +203,7 @@ def condition_of(
 def _filter_conditions(collection: Collection, query: FeatureFilter) -> Iterator[Condition]:
     if query.bbox is not None:
         crs = crs_of("bbox-crs", query.bbox_crs, None) if query.bbox_crs else CRS84
-        yield in_box(collection, parse_bbox(query.bbox, crs))
+        yield Condition(box=parse_bbox(query.bbox, crs))
     if query.datetime is not None:
         yield in_time(collection, *parse_interval(query.datetime))
     if query.intersects is not None:
@@ -215,13 +215,12 @@ def _filter_conditions(collection: Collection, query: FeatureFilter) -> Iterator
 
 
 def _restriction_conditions(collection: Collection, restriction: Restriction) -> Iterator[Condition]:
-    for rank, (name, value) in enumerate(restriction.equal):
+    for name, value in restriction.equal:
         literal = _literal(collection.queryables[name], value)
         equal = {"op": "=", "args": [{"property": name}, literal]}
-        yield translate(equal, collection, CRS84, prefix=f"e{rank}_")
+        yield translate(equal, collection, CRS84)
     if restriction.ids is not None:
-        key = f"{collection.key.expression}::text"
-        yield Condition(f"{key} = any(%(ids)s)", {"ids": list(restriction.ids)})
+        yield key_among(collection, restriction.ids)
 
 
 def _parsed_filter(query: FeatureFilter) -> Any:
