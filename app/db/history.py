@@ -16,11 +16,13 @@ from sqlalchemy import (
     BigInteger,
     ColumnElement,
     Integer,
+    Text,
     any_,
     bindparam,
     case,
     delete,
     func,
+    literal,
     select,
     update,
 )

@@ -150,5 +150,5 @@ def period(
     assert collection.interval is not None
     start, end = (collection.queryables[name].expression for name in collection.interval)
     statement = select_visible(collection, None, func.min(start), func.max(end))
-    first, last = connection.execute(statement, viewer.parameters).one().tuple()
-    return first, last
+    rows: list[Any] = list(connection.execute(statement, viewer.parameters))
+    return rows[0][0], rows[0][1]
