@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import sqlalchemy
 
-from app.db.copy import copy_from_stdin
+from app.db.copy_statements import copy_from_stdin
 from app.db.engine import Connection, driver
 from services.types import Array, IntArray
 

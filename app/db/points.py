@@ -27,12 +27,12 @@ from sqlalchemy import (
 from app.db.binary_copy import parse_copy
 from app.db.blocks import FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
 from app.db.constants import integer_constant, text_constant
-from app.db.copy import copy_to_stdout
+from app.db.copy_statements import copy_to_stdout
 from app.db.density import points_in_box
 from app.db.engine import Connection, driver
 from app.db.features.antimeridian import on_the_map
 from app.db.features.collection import Collection, column_property
-from app.db.features.predicates import meets_box
+from app.db.features.predicates import geometry_from_wkb, meets_box
 from app.db.features.query import AFTER_KEY, LIMIT
 from app.db.history import point_health, view_health
 from app.db.rows import columns_of, every
@@ -217,8 +217,7 @@ def _some_points_inside() -> HotStatement:
 
 
 def _select_inside() -> Select[Any]:
-    srid = integer_constant(POINTS.storage_crs.srid)
-    area = func.st_geomfromwkb(bindparam("area", None, LargeBinary()), srid)
+    area = geometry_from_wkb(bindparam("area", None, LargeBinary()), POINTS.storage_crs.srid)
     inside = (meets_box(point.c.geom, area), func.st_intersects(point.c.geom, area))
     return _select_arrays(POINT_ARRAYS).where(*inside, VISIBLE)
 

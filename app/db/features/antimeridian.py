@@ -8,7 +8,11 @@ TURNS_DEG = (-360.0, 0.0, 360.0)
 
 
 def on_the_map(shape: shapely.Geometry) -> shapely.Geometry:
-    """A geometry with continuous longitudes, -540 to 540 degrees, as its parts between -180 and 180."""
+    """The parts of a geometry between -180 and 180 degrees.
+
+    Args:
+        shape: with continuous longitudes, -540 to 540 degrees.
+    """
     if not (np.abs(shapely.get_coordinates(shape)[:, 0]) > 180.0).any():
         return shape
     pieces: list[shapely.Geometry] = []
@@ -16,6 +20,6 @@ def on_the_map(shape: shapely.Geometry) -> shapely.Geometry:
         for turn in TURNS_DEG:
             turned = shapely.transform(part, lambda lon_lat, turn=turn: lon_lat + [turn, 0.0])
             pieces += shapely.get_parts(shapely.intersection(turned, WORLD)).tolist()
-    # Where a part only touches 180 degrees, its edge there is no part of it.
+    # Where a part only touches 180 degrees, the common edge is no part of the result.
     dimension = shapely.get_dimensions(shape)
     return shapely.union_all([piece for piece in pieces if shapely.get_dimensions(piece) == dimension])

@@ -33,7 +33,7 @@ from app.db.constants import integer_constant
 from app.db.features.collection import Collection, Property
 from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_instant
 from app.db.features.crs import CRS84, Crs
-from app.db.features.predicates import Condition, infinity, instant_of
+from app.db.features.predicates import Condition, geometry_from_wkb, infinity, instant_of
 from app.db.schema.base import Double, Timestamp
 from app.errors import InvalidParameter
 
@@ -358,8 +358,7 @@ class _Translator:
 
 
 def _geometry_literal(collection: Collection, wkb: bytes) -> Expression:
-    srid = integer_constant(collection.storage_crs.srid)
-    return func.st_geomfromwkb(literal(wkb, LargeBinary()), srid)
+    return geometry_from_wkb(literal(wkb, LargeBinary()), collection.storage_crs.srid)
 
 
 def _expression(item: Property) -> tuple[Expression, str]:

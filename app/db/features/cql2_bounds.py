@@ -1,4 +1,4 @@
-"""Filters read within bounds before anything in them is used: CQL2 by its library, geometries, times.
+"""Parsing of filters within limits of size: CQL2 by its library, geometries, times.
 
 Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946, RFC 3339.
 """
@@ -17,9 +17,9 @@ from app.db.features.crs import Crs, lon_lat_from_mercator
 from app.errors import InvalidParameter
 
 LONGEST_TEXT = 4_000
-"""Characters of a filter in text; the parser works them off recursively."""
+"""Characters of a filter in text; the parser is recursive."""
 DEEPEST_TEXT = 10
-"""Parentheses in each other in text: each doubles the parser's time on a wrong filter, 10 ms here."""
+"""Levels of parentheses in text: each doubles the time of the parser on a wrong filter, 10 ms here."""
 DEEPEST_JSON = 32
 MOST_NODES = 1_000
 MOST_VERTICES = 10_000
@@ -27,10 +27,10 @@ QUOTED = re.compile(r"'(?:[^'\\]|\\.|'')*'|\"[^\"]*\"")
 
 
 def parse_text(text: str) -> Any:
-    """A filter in CQL2 text as CQL2 JSON.
+    """The CQL2 JSON of a filter in CQL2 text.
 
     Raises:
-        InvalidParameter: it is not CQL2, too long or too deep.
+        InvalidParameter: the text is not CQL2, too long or too deep.
     """
     if len(text) > LONGEST_TEXT:
         raise InvalidParameter(
@@ -50,24 +50,24 @@ def parse_text(text: str) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """A filter in CQL2 JSON, checked by the library.
+    """The parsed document of a filter in CQL2 JSON, checked by the library.
 
     Raises:
-        InvalidParameter: it is not CQL2, too large or too deep.
+        InvalidParameter: the text is not CQL2, too large or too deep.
     """
     try:
-        found = json.loads(text)
+        document = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InvalidParameter(f"filter: not JSON: {error!s:.200}") from None
-    check_size(found, "filter")
+    check_size(document, "filter")
     return _parsed(cql2.parse_json, text)
 
 
 def check_size(document: Any, where: str) -> None:
-    """Refuse a document that is too deep or has too many parts, without recursion.
+    """Raise an error for a document that is too deep or has too many parts; the check does not recurse.
 
     Raises:
-        InvalidParameter: with the limit, and `where` the document stood.
+        InvalidParameter: the document exceeds a limit; the message names it and `where` it stood.
     """
     level, vertices, nodes = [document], 0, 0
     for _ in range(DEEPEST_JSON):
@@ -90,15 +90,15 @@ def check_size(document: Any, where: str) -> None:
 
 
 def parse_instant(text: Any, where: str) -> datetime:
-    """An instant out of RFC 3339; a date is its first moment, UTC.
+    """The instant of a text in RFC 3339; a date is its first moment, UTC.
 
     Raises:
-        InvalidParameter: naming the value and `where` it stood.
+        InvalidParameter: the text is no time; the message names it and `where` it stood.
     """
     try:
         if not isinstance(text, str) or len(text) > 40:
             raise ValueError
-        # GDAL asks for a date as `2024-05-06T`.
+        # GDAL sends a date as `2024-05-06T`.
         text = text.removesuffix("T")
         if len(text) == 10:
             day = date.fromisoformat(text)
@@ -112,14 +112,14 @@ def parse_instant(text: Any, where: str) -> datetime:
 
 
 def parse_geometry(node: Any, crs: Crs, where: str) -> bytes:
-    """A GeoJSON geometry, or a bbox, as WKB with longitude first, cut at 180 degrees.
+    """The WKB of a GeoJSON geometry or a bbox, with longitude first, cut at 180 degrees.
 
     Args:
-        crs: of its coordinates; longitudes may go on beyond 180 degrees.
+        crs: of its coordinates; longitudes may exceed 180 degrees.
 
     Raises:
-        InvalidParameter: it is not a valid geometry within the bounds of its reference system; naming
-            `where` it stood.
+        InvalidParameter: the geometry is invalid or outside the bounds of its reference system; the
+            message names `where` it stood.
     """
     if not isinstance(node, dict):
         raise InvalidParameter(f"{where}: a geometry expected, {json.dumps(node)!s:.60} found")
@@ -159,5 +159,5 @@ def _parsed(parse: Callable[[str], Any], text: str) -> Any:
         return parse(text).to_json()
     except (cql2.ParseError, cql2.ValidationError, ValueError, OverflowError) as error:
         lines = [line.strip() for line in str(error).splitlines()]
-        said = " ".join(line for line in lines if line and line not in ("|", "^---"))
-        raise InvalidParameter(f"filter: not CQL2: {said:.300}") from None
+        reason = " ".join(line for line in lines if line and line not in ("|", "^---"))
+        raise InvalidParameter(f"filter: not CQL2: {reason:.300}") from None

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, Text, cast, func, select
 
 from app.db.constants import integer_constant, text_constant
-from app.db.copy import copy_to_stdout
+from app.db.copy_statements import copy_to_stdout
 from app.db.engine import Connection, driver
 from app.db.features.collection import REFERENCE
 from app.db.features.crs import from_storage

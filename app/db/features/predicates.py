@@ -19,6 +19,7 @@ from sqlalchemy import (
     literal,
     or_,
 )
+from sqlalchemy.types import NullType
 
 from app.db.constants import integer_constant, text_constant
 from app.db.features.bbox import Box
@@ -158,6 +159,16 @@ def infinity(sign: str = "") -> ColumnElement[Any]:
 def meets_box(geometry: ColumnElement[Any], envelope: ColumnElement[Any]) -> ColumnElement[bool]:
     """Whether the bounding boxes of two geometries meet, which the index of geometries finds."""
     return geometry.bool_op("&&")(envelope)
+
+
+def geometry_from_wkb(wkb: ColumnElement[bytes], srid: int) -> ColumnElement[Any]:
+    """A geometry of a value in WKB.
+
+    The function `geometry` is PostGIS's cast from bytes. GeoAlchemy2 compiles `st_geomfromwkb` with the
+    reference system in the text, which SQLAlchemy would then keep for other values.
+    """
+    geometry = func.geometry(wkb, type_=NullType())
+    return func.st_setsrid(geometry, integer_constant(srid))
 
 
 def _number(name: str) -> ColumnElement[float]:
