@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import psycopg
 from rich.console import Console
 
 from app.db import binary_copy as binary
@@ -72,11 +73,9 @@ def fill(dsn: str, count: int, console: Console | None = None) -> Ground:
         connection.execute("select setval(pg_get_serial_sequence('block', 'number'), %s)", [blocks])
         connection.execute("select setval(pg_get_serial_sequence('chip_file', 'id'), %s)", [blocks])
         connection.execute("create index point_geom on point using gist (geom)")
-    with engine.connect(dsn) as connection:
-        connection.commit()
-        connection.autocommit = True
-        connection.execute("vacuum analyze point")
-        connection.execute("vacuum analyze block")
+    with psycopg.connect(dsn, autocommit=True) as alone:
+        alone.execute("vacuum analyze point")
+        alone.execute("vacuum analyze block")
     return Ground(np.array([WEST_DEG, south_deg]), side_deg * [blocks, 1], count)
 
 

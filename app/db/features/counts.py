@@ -17,7 +17,7 @@ from app.db.engine import Connection, driver
 from app.db.features.bbox import WORLD
 from app.db.features.collection import Collection, Viewer
 from app.db.features.predicates import ANYTHING, BoxShape, height_predicate
-from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible
+from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible, unprepared
 from app.db.statements import HotStatement, hot
 
 EXACT_COUNT = 10_000
@@ -78,7 +78,8 @@ def _count_few(connection: Connection, selection: Selection) -> int:
     if predicate is not None:
         few = select_visible(selection.collection, selection.box_shape, integer_constant(1))
         few = few.where(predicate).limit(integer_constant(EXACT_COUNT + 1))
-        return int(connection.execute(_counted(few), selection.parameters).scalar_one())
+        with unprepared(connection):
+            return int(connection.execute(_counted(few), selection.parameters).scalar_one())
     statement = _few_statement(selection.collection, selection.box_shape)
     with driver(connection).cursor() as cursor:
         cursor.execute(statement.sql, statement.parameters(selection.parameters), prepare=False)

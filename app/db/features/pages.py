@@ -28,6 +28,7 @@ from app.db.features.query import (
     page_parameters,
     page_select,
     sortable,
+    unprepared,
 )
 from app.db.features.serialization import csv_text, feature_text, plain_value
 from app.db.schema import installation
@@ -143,7 +144,8 @@ def _rows(
     parameters = page_parameters(selection, after, limit)
     if selection.condition.non_bbox_predicate is not None:
         # SQLAlchemy keeps the text of statements that differ in values only.
-        return connection.execute(page_select(selection, columns, after), parameters).fetchall()
+        with unprepared(connection):
+            return connection.execute(page_select(selection, columns, after), parameters).fetchall()
     statement = hot_page(selection, columns, after)
     with driver(connection).cursor() as cursor:
         cursor.execute(statement.sql, statement.parameters(parameters), prepare=False)

@@ -4,7 +4,8 @@ A statement is built once for each layout and shape of a request; boxes, keys an
 its bind parameters. Only the predicate of a user's filter is added to it request by request.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -23,6 +24,7 @@ from sqlalchemy import (
 )
 
 from app.db.constants import integer_constant
+from app.db.engine import Connection, driver
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.crs import Crs
 from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
@@ -149,6 +151,20 @@ def page_parameters(selection: Selection, after: Key | None, limit: int) -> dict
     if after is not None:
         parameters |= {_after_name(place): value for place, value in enumerate(after)}
     return parameters
+
+
+@contextmanager
+def unprepared(connection: Connection) -> Iterator[Connection]:
+    """The connection, on which the driver prepares no statement until the end of the context.
+
+    The best plan for a box or a filter depends on its values.
+    """
+    own = driver(connection)
+    threshold, own.prepare_threshold = own.prepare_threshold, None
+    try:
+        yield connection
+    finally:
+        own.prepare_threshold = threshold
 
 
 def select_visible(
