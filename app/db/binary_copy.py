@@ -3,17 +3,16 @@
 Source: PostgreSQL documentation, COPY, "Binary Format"; PostGIS, "EWKB".
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 from uuid import UUID
 
 import numpy as np
 import numpy.typing as npt
-import sqlalchemy
+from sqlalchemy import Table
 
-from app.db.copy_statements import copy_from_stdin
 from app.db.engine import Connection, driver
+from app.db.statements import CopyIn, hot
 from services.types import Array, IntArray
 
 HEADER = b"PGCOPY\n\xff\r\n\0" + b"\0" * 8
@@ -82,22 +81,12 @@ def points_z(lon_lat_h: Array) -> Column:
     return Column(data, np.full(len(lon_lat_h), 33))
 
 
-def copy_into_table(
-    connection: Connection,
-    columns: Mapping[sqlalchemy.Column[Any], Column],
-    sent: Callable[[int], None] = lambda rows: None,
-) -> None:
-    """Insert rows into a table.
-
-    Args:
-        columns: of one table, each with its values.
-        sent: called with the number of rows of each piece that was sent.
-    """
-    statement = copy_from_stdin(*columns)
+def insert_rows(connection: Connection, table: Table, columns: Mapping[str, Column]) -> None:
+    """Insert rows into a table; the columns are given by name."""
+    statement = hot(CopyIn(table, columns))
     with driver(connection).cursor() as cursor, cursor.copy(statement.sql) as copy:
-        for piece, rows in copy_pieces(tuple(columns.values())):
+        for piece, _ in copy_pieces(list(columns.values())):
             copy.write(piece)
-            sent(rows)
 
 
 def copy_pieces(columns: Sequence[Column]) -> Iterator[tuple[bytes, int]]:

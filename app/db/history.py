@@ -155,23 +155,23 @@ def outcome_columns() -> list[ColumnElement[Any]]:
 def insert_measures(connection: Connection, registration_id: UUID, measures: Measures) -> None:
     """Store the outcome of each point that a scene could show."""
     count = len(measures.point_id)
-    c = measure.c
-    binary.copy_into_table(
+    binary.insert_rows(
         connection,
+        measure,
         {
-            c.registration_id: binary.uuids(registration_id, count),
-            c.point_id: binary.numbers(measures.point_id, "i8"),
-            c.matched: binary.numbers(measures.matched, "i1"),
-            c.active: binary.numbers(measures.active, "i1"),
-            c.reason: binary.texts(measures.reason.astype(object)),
-            c.score: binary.reals(measures.score, "f4"),
-            c.line: binary.reals(measures.line_sample[:, 0], "f8"),
-            c.sample: binary.reals(measures.line_sample[:, 1], "f8"),
-            c.sigma_px: binary.reals(measures.sigma_px, "f4"),
-            c.residual_line_px: binary.reals(measures.residual_px[:, 0], "f4"),
-            c.residual_sample_px: binary.reals(measures.residual_px[:, 1], "f4"),
-            c.residual_east_m: binary.reals(measures.residual_m[:, 0], "f4"),
-            c.residual_north_m: binary.reals(measures.residual_m[:, 1], "f4"),
+            "registration_id": binary.uuids(registration_id, count),
+            "point_id": binary.numbers(measures.point_id, "i8"),
+            "matched": binary.numbers(measures.matched, "i1"),
+            "active": binary.numbers(measures.active, "i1"),
+            "reason": binary.texts(measures.reason.astype(object)),
+            "score": binary.reals(measures.score, "f4"),
+            "line": binary.reals(measures.line_sample[:, 0], "f8"),
+            "sample": binary.reals(measures.line_sample[:, 1], "f8"),
+            "sigma_px": binary.reals(measures.sigma_px, "f4"),
+            "residual_line_px": binary.reals(measures.residual_px[:, 0], "f4"),
+            "residual_sample_px": binary.reals(measures.residual_px[:, 1], "f4"),
+            "residual_east_m": binary.reals(measures.residual_m[:, 0], "f4"),
+            "residual_north_m": binary.reals(measures.residual_m[:, 1], "f4"),
         },
     )
 
@@ -180,16 +180,16 @@ def insert_views(
     connection: Connection, registration_id: UUID, measures: Measures, views: ViewMeasures
 ) -> None:
     """Store the outcome of each view that was tried."""
-    c = view_measure.c
-    binary.copy_into_table(
+    binary.insert_rows(
         connection,
+        view_measure,
         {
-            c.registration_id: binary.uuids(registration_id, len(views.point)),
-            c.point_id: binary.numbers(measures.point_id[views.point], "i8"),
-            c.view: binary.numbers(views.view, "i2"),
-            c.agreed: binary.numbers(views.agreed, "i1"),
-            c.reason: binary.texts(views.reason.astype(object)),
-            c.score: binary.reals(views.score, "f4"),
+            "registration_id": binary.uuids(registration_id, len(views.point)),
+            "point_id": binary.numbers(measures.point_id[views.point], "i8"),
+            "view": binary.numbers(views.view, "i2"),
+            "agreed": binary.numbers(views.agreed, "i1"),
+            "reason": binary.texts(views.reason.astype(object)),
+            "score": binary.reals(views.score, "f4"),
         },
     )
 

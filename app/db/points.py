@@ -12,6 +12,7 @@ from sqlalchemy import (
     ARRAY,
     BigInteger,
     ColumnElement,
+    Label,
     LargeBinary,
     Select,
     and_,
@@ -27,7 +28,6 @@ from sqlalchemy import (
 from app.db.binary_copy import parse_copy
 from app.db.blocks import FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
 from app.db.constants import integer_constant, text_constant
-from app.db.copy_statements import copy_to_stdout
 from app.db.density import points_in_box
 from app.db.engine import Connection, driver
 from app.db.features.antimeridian import on_the_map
@@ -37,7 +37,7 @@ from app.db.features.query import AFTER_KEY, LIMIT
 from app.db.history import point_health, view_health
 from app.db.rows import columns_of, every
 from app.db.schema import block, chip_file, image, point, view
-from app.db.statements import HotStatement
+from app.db.statements import CopyOut, HotStatement, hot
 from services.formats.block.tables import covariance_from_sigmas
 from services.types import Acquisition, Array, ControlPoints, IntArray, Views
 
@@ -47,9 +47,7 @@ VISIBLE = and_(SERVED, in_published_block())
 IDS = bindparam("ids", None, ARRAY(BigInteger()))
 
 
-def _block_by_block(
-    columns: Sequence[ColumnElement[Any]], predicate: ColumnElement[bool]
-) -> Select[Any]:
+def _block_by_block(columns: Sequence[Label[Any]], predicate: ColumnElement[bool]) -> Select[Any]:
     """All served points in the order of ids, block by block along the primary key.
 
     Of a plainer statement the planner may read all unpublished points on its way to the published ones.
@@ -58,8 +56,7 @@ def _block_by_block(
     blocks = published_numbers().where(block.c.number >= AFTER_KEY.op(">>")(bits)).subquery("blocks")
     number = cast(blocks.c.number, BigInteger())
     rows = (
-        select(*(column.label(f"column_{place}") for place, column in enumerate(columns)))
-        .add_columns(point.c.id.label("key"))
+        select(*columns, point.c.id.label("key_of_scan"))
         .where(
             point.c.id > AFTER_KEY,
             point.c.id >= number.op("<<")(bits),
@@ -72,9 +69,9 @@ def _block_by_block(
         .lateral("rows")
     )
     return (
-        select(*(rows.c[f"column_{place}"].label(column.key) for place, column in enumerate(columns)))
+        select(*(rows.c[column.name] for column in columns))
         .select_from(blocks.join(rows, true()))
-        .order_by(blocks.c.number, rows.c.key)
+        .order_by(blocks.c.number, rows.c.key_of_scan)
         .limit(LIMIT + integer_constant(1))
     )
 
@@ -197,7 +194,7 @@ def points_of_ids(connection: Connection, ids: Sequence[int]) -> StoredPoints:
 
 @cache
 def _points_inside() -> HotStatement:
-    return copy_to_stdout(_select_inside().order_by(point.c.id), "binary")
+    return hot(CopyOut(_select_inside().order_by(point.c.id), "binary"))
 
 
 @cache
@@ -213,7 +210,7 @@ def _some_points_inside() -> HotStatement:
     )
     steps = or_(ranked.c.rank == integer_constant(0), place > place_before)
     columns = (ranked.c[name] for name, _, _ in POINT_ARRAYS)
-    return copy_to_stdout(select(*columns).where(steps).order_by(ranked.c.id), "binary")
+    return hot(CopyOut(select(*columns).where(steps).order_by(ranked.c.id), "binary"))
 
 
 def _select_inside() -> Select[Any]:
@@ -225,13 +222,13 @@ def _select_inside() -> Select[Any]:
 @cache
 def _points_of_ids() -> HotStatement:
     rows = _select_arrays(POINT_ARRAYS).where(point.c.id == any_(IDS), in_published_block())
-    return copy_to_stdout(rows.order_by(point.c.id), "binary")
+    return hot(CopyOut(rows.order_by(point.c.id), "binary"))
 
 
 @cache
 def _views_of_points() -> HotStatement:
     rows = _select_arrays(VIEW_ARRAYS).where(view.c.point_id == any_(IDS))
-    return copy_to_stdout(rows.order_by(view.c.point_id, view.c.view), "binary")
+    return hot(CopyOut(rows.order_by(view.c.point_id, view.c.view), "binary"))
 
 
 def _select_arrays(arrays: Arrays) -> Select[Any]:

@@ -6,6 +6,7 @@ Expressions of a declaration are over the tables of `app.db.schema`. They may co
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 from uuid import UUID
 
@@ -19,6 +20,7 @@ from sqlalchemy import (
     Float,
     FromClause,
     Integer,
+    Label,
     Select,
     Text,
     Uuid,
@@ -82,7 +84,7 @@ class Property:
     nullable: bool = False
     choices: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def type(self) -> SqlType:
         """Its type in SQL, of the few that replies distinguish."""
         return next(name for kind, name in SQL_TYPES if isinstance(self.expression.type, kind))
@@ -139,7 +141,7 @@ class Collection:
     visible: ColumnElement[bool] = true()  # noqa: RUF009, an immutable constant of SQLAlchemy
     interval: tuple[str, str] | None = None
     named_by: ColumnElement[bool] | None = None
-    full_scan: Callable[[Sequence[ColumnElement[Any]], ColumnElement[bool]], Select[Any]] | None = None
+    full_scan: Callable[[Sequence[Label[Any]], ColumnElement[bool]], Select[Any]] | None = None
     total: Select[Any] | None = None
     estimate_in_box: Callable[[Connection, Box], int] | None = None
     is_open: bool = True
@@ -154,7 +156,7 @@ class Collection:
         """The reference system of the stored geometries, and of replies unless asked otherwise."""
         return CRS84H if self.has_height else CRS84
 
-    @property
+    @cached_property
     def queryables(self) -> dict[str, Property]:
         """The properties that a filter may name, by name; the geometry comes beside them."""
         return {item.name: item for item in (self.key, *self.properties)}

@@ -14,7 +14,6 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, Text, cast, func, select
 
 from app.db.constants import integer_constant, text_constant
-from app.db.copy_statements import copy_to_stdout
 from app.db.engine import Connection, driver
 from app.db.features.collection import REFERENCE
 from app.db.features.crs import from_storage
@@ -32,7 +31,7 @@ from app.db.features.query import (
 )
 from app.db.features.serialization import csv_text, feature_text, plain_value
 from app.db.schema import installation
-from app.db.statements import HotStatement, hot
+from app.db.statements import CopyOut, HotStatement, hot
 
 ROWS_AT_ONCE = 2_000
 
@@ -106,7 +105,7 @@ def copy_csv(connection: Connection, selection: Selection, after: Key | None, li
     Columns are the values that order features (a JSON text); longitude or east, latitude or north, and
     height of points, else the geometry as hexadecimal WKB; the key and the properties.
     """
-    statement = copy_to_stdout(page_select(selection, _file_columns, after), "csv")
+    statement = hot(CopyOut(page_select(selection, _file_columns, after), "csv, header"))
     out = BytesIO()
     parameters = statement.parameters(page_parameters(selection, after, limit))
     with driver(connection).cursor() as cursor, cursor.copy(statement.sql, parameters) as copy:
@@ -145,7 +144,8 @@ def _rows(
     if selection.condition.non_bbox_predicate is not None:
         # SQLAlchemy keeps the text of statements that differ in values only.
         with unprepared(connection):
-            return connection.execute(page_select(selection, columns, after), parameters).fetchall()
+            result = connection.execute(page_select(selection, columns, after), parameters)
+            return result.cursor.fetchall()
     statement = hot_page(selection, columns, after)
     with driver(connection).cursor() as cursor:
         cursor.execute(statement.sql, statement.parameters(parameters), prepare=False)
@@ -162,41 +162,39 @@ def _feature_statement(layout: Layout) -> HotStatement:
     return hot(statement.where(collection.visible, named).limit(integer_constant(1)))
 
 
-def _geojson_columns(layout: Layout) -> list[ColumnElement[Any]]:
-    return [feature_text(layout), *_link_values(layout)]
+def _geojson_columns(layout: Layout) -> dict[str, ColumnElement[Any]]:
+    return {"feature": feature_text(layout), **_link_values(layout)}
 
 
-def _csv_columns(layout: Layout) -> list[ColumnElement[Any]]:
-    return [csv_text(layout), *_link_values(layout)]
+def _csv_columns(layout: Layout) -> dict[str, ColumnElement[Any]]:
+    return {"line": csv_text(layout), **_link_values(layout)}
 
 
-def _key_columns(layout: Layout) -> list[ColumnElement[Any]]:
-    return [layout.collection.key.expression]
+def _key_columns(layout: Layout) -> dict[str, ColumnElement[Any]]:
+    return {"key": layout.collection.key.expression}
 
 
-def _file_columns(layout: Layout) -> list[ColumnElement[Any]]:
+def _file_columns(layout: Layout) -> dict[str, ColumnElement[Any]]:
     order_values = (sortable(order.property) for order in layout.orders)
     geometry = from_storage(layout.collection.geometry, layout.crs)
-    position: list[ColumnElement[Any]]
+    columns: dict[str, ColumnElement[Any]] = {"keys": func.json_build_array(*order_values)}
     if layout.collection.geometry_type == "Point":
-        position = [func.st_x(geometry).label("x"), func.st_y(geometry).label("y")]
+        columns |= {"x": func.st_x(geometry), "y": func.st_y(geometry)}
         if layout.crs.has_height:
-            position.append(func.st_z(geometry).label("h"))
+            columns["h"] = func.st_z(geometry)
     else:
-        position = [func.encode(func.st_asbinary(geometry), text_constant("hex")).label("wkb")]
+        columns["wkb"] = func.encode(func.st_asbinary(geometry), text_constant("hex"))
     properties = (layout.collection.key, *layout.properties)
-    return [
-        func.json_build_array(*order_values).label("keys"),
-        *position,
-        *(plain_value(item).label(item.name) for item in properties),
-    ]
+    return columns | {item.name: plain_value(item) for item in properties}
 
 
-def _link_values(layout: Layout) -> Iterator[ColumnElement[Any]]:
+def _link_values(layout: Layout) -> dict[str, ColumnElement[Any]]:
     """The values that order features, as a link to the next page carries them."""
-    for order in layout.orders:
-        item = order.property
-        yield plain_value(item) if item.is_time else sortable(item)
+    properties = [order.property for order in layout.orders]
+    return {
+        f"last{place}": plain_value(item) if item.is_time else sortable(item)
+        for place, item in enumerate(properties)
+    }
 
 
 TEXT_COLUMNS: dict[TextFormat, Columns] = {"geojson": _geojson_columns, "csv": _csv_columns}

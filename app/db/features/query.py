@@ -4,7 +4,7 @@ A statement is built once for each layout and shape of a request; boxes, keys an
 its bind parameters. Only the predicate of a user's filter is added to it request by request.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +13,7 @@ from typing import Any
 from sqlalchemy import (
     BigInteger,
     ColumnElement,
+    Label,
     Select,
     Text,
     and_,
@@ -28,6 +29,7 @@ from app.db.engine import Connection, driver
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.crs import Crs
 from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
+from app.db.kept import kept
 from app.db.schema.base import Double
 from app.db.statements import HotStatement, hot
 
@@ -64,8 +66,8 @@ class Layout:
     orders: tuple[Order, ...]
 
 
-Columns = Callable[[Layout], Sequence[ColumnElement[Any]]]
-"""The columns of a row of a page."""
+Columns = Callable[[Layout], Mapping[str, ColumnElement[Any]]]
+"""The columns of a row of a page, by name."""
 
 
 @dataclass(frozen=True)
@@ -171,14 +173,21 @@ def select_visible(
     collection: Collection, box: BoxShape | None, *columns: ColumnElement[Any]
 ) -> Select[Any]:
     """SELECT of columns of the rows that the caller may see and that meet a box, in no order."""
-    statement = select(*columns).select_from(collection.source).where(collection.visible)
-    return statement if box is None else statement.where(box_predicate(collection, box))
+    return select(*columns).select_from(collection.source).where(_kept_predicate(collection, box))
 
 
 @lru_cache(KEPT_STATEMENTS)
-def kept_columns(layout: Layout, columns: Columns) -> tuple[ColumnElement[Any], ...]:
+def _kept_predicate(collection: Collection, box: BoxShape | None) -> ColumnElement[bool]:
+    """The predicate that the caller may see a row and that it meets a box."""
+    if box is None:
+        return kept(collection.visible)
+    return kept(and_(collection.visible, box_predicate(collection, box)))
+
+
+@lru_cache(KEPT_STATEMENTS)
+def kept_columns(layout: Layout, columns: Columns) -> tuple[Label[Any], ...]:
     """The columns of a page, built once."""
-    return tuple(columns(layout))
+    return tuple(kept(column).label(name) for name, column in columns(layout).items())
 
 
 @lru_cache(KEPT_STATEMENTS)

@@ -59,7 +59,9 @@ def find_collection(name: str) -> Collection:
     return collection
 
 
-def page(connection: Connection, query: ResolvedQuery, form: pages.TextFormat, secret: bytes) -> FeaturePage:
+def page(
+    connection: Connection, query: ResolvedQuery, form: pages.TextFormat, secret: bytes
+) -> FeaturePage:
     """A page in a text format that the database builds.
 
     Raises:
