@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_archive
-from tests.app.bad_requests import QUESTIONS
+from tests.app.bad_requests import BAD_REQUESTS
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.app.hostile_installation import (
@@ -349,4 +349,4 @@ def test_the_pattern_of_the_bad_blocks_is_good(store: Installation, block):
 def test_no_two_bad_files_have_one_name():
     names = [*(case.name for case in (*IMAGES, *MODELS)), *(case[0] for case in (*ARCHIVES, *BLOCKS))]
     assert len(set(names)) == len(names) >= 100
-    assert not set(names) & {case.name for case in QUESTIONS}
+    assert not set(names) & {case.name for case in BAD_REQUESTS}
