@@ -20,7 +20,7 @@ import psycopg
 from app.db.cluster.embedded import Cluster
 from app.db.engine import connect
 from app.usecases.tokens import create_token
-from tests.serving import free_port
+from tests.service_process import free_port
 
 LEASE_S = 2.0
 WORKERS = 2

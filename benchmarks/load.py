@@ -34,7 +34,7 @@ from app.usecases.tokens import create_token
 from benchmarks._measuring import keep
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block
-from tests.serving import Service, until
+from tests.service_process import Service, until
 from tests.statements import run_sql
 
 BOX = (5.2, 43.2, 5.6, 43.6)

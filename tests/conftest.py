@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from tests.runs import end_dead_runs, run_folder
+from tests.run_folders import end_dead_runs, run_folder
 
 settings.register_profile("amers", deadline=None)
 settings.load_profile("amers")

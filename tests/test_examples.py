@@ -11,7 +11,7 @@ import pytest
 
 from services.formats.block.reader import read_block
 from services.formats.sensor_models.rpc_files import read_rpc
-from tests.serving import Service, until
+from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
 

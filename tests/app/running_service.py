@@ -18,9 +18,9 @@ from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
 from services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
-from tests.app.workers import wait_until
+from tests.app.worker_processes import wait_until
 from tests.factories import make_block
-from tests.serving import free_port, until
+from tests.service_process import free_port, until
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, make_flat_world
-from tests.app.workers import wait_until
+from tests.app.worker_processes import wait_until
 from tests.factories import make_block
-from tests.serving import Service, until
+from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
 

@@ -12,7 +12,7 @@ from app.errors import InputError, NotFound, TooLarge
 from app.storage import Storage, StoredChips, chips_key, open_storage
 from services.conventions import CHIP_SIZE
 from services.errors import FormatError
-from tests.app.buckets import running_bucket
+from tests.app.s3_server import running_bucket
 
 SEVERAL_PARTS = 12_000_000
 """Bytes that are sent in parts."""

@@ -13,10 +13,10 @@ from app.main import create_app
 from app.storage import open_storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from services.formats.sensor_models.rpc_files import read_rpc
-from tests.app.buckets import running_bucket
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
-from tests.app.registered import A_TENTH_OF_A_PIXEL, largest_error_px
-from tests.app.workers import ended, running_worker
+from tests.app.registration_outputs import A_TENTH_OF_A_PIXEL, largest_error_px
+from tests.app.s3_server import running_bucket
+from tests.app.worker_processes import ended, running_worker
 
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"

@@ -18,8 +18,8 @@ from app.db import engine
 from app.storage import Storage
 from app.usecases.tokens import create_token
 from tests.app.flat_world import make_flat_world
-from tests.app.workers import ended, running_worker, scene_to_register, under_way, wait_until
-from tests.serving import free_port
+from tests.app.worker_processes import ended, running_worker, scene_to_register, under_way, wait_until
+from tests.service_process import free_port
 from tests.statements import run_sql
 
 LEASE_S = 3.0

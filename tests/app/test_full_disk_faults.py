@@ -18,7 +18,7 @@ from app.errors import is_no_room
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
 from app.usecases.garbage_collection import remove_unnamed_chips
-from tests.app.workers import ended, running_worker
+from tests.app.worker_processes import ended, running_worker
 from tests.factories import make_block
 from tests.statements import run_sql
 

@@ -20,7 +20,7 @@ from app.config import Settings
 from app.db import engine
 from app.storage import Storage
 from tests.app.flat_world import make_flat_world
-from tests.app.workers import (
+from tests.app.worker_processes import (
     alive,
     children,
     ended,

@@ -38,8 +38,8 @@ from services.imagery.source import ArrayImage, sample_image
 from services.map_grid import MapGrid, xy_of_lon_lat
 from services.registration.options import RegistrationOptions
 from services.types import FloatImage
-from tests.app.buckets import running_bucket
-from tests.app.workers import ended, running_worker
+from tests.app.s3_server import running_bucket
+from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
 SHIFT_PX = np.array([5.3, -3.6])

@@ -17,7 +17,7 @@ from app.storage import Storage
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
-from tests.app.registered import (
+from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,
     CHECK_POINTS,
     COMMON_FILES,

@@ -18,7 +18,7 @@ from services.formats.sensor_models.rpc_files import read_rpc
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
-from tests.app.registered import (
+from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,
     CHECK_POINTS,
     COMMON_FILES,
@@ -28,7 +28,7 @@ from tests.app.registered import (
     write_check_points,
     write_mask,
 )
-from tests.app.workers import ended, running_worker
+from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
 
 Bearer = Callable[[str], dict[str, str]]

@@ -20,7 +20,7 @@ from app.storage import KEY, Storage
 from app.usecases.scenes import clean_name, folder_of
 from app.worker.sweep import sweep_files
 from tests.app.running_service import running_service
-from tests.app.workers import wait_until
+from tests.app.worker_processes import wait_until
 from tests.statements import run_sql
 
 TIFF = b"II*\0" + bytes(100_000)

@@ -17,7 +17,7 @@ from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.tokens import create_token
 from tests.factories import make_block
-from tests.serving import Service, until, users_of
+from tests.service_process import Service, until, users_of
 
 pytestmark = pytest.mark.long
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from app.config import Settings
-from tests.app.workers import wait_until
+from tests.app.worker_processes import wait_until
 
 PATIENCE_S = 60
 STUBBORN = """

@@ -16,7 +16,7 @@ from app.db.jobs import jobs
 from app.main import create_app
 from app.storage import Storage
 from tests.app.flat_world import FlatWorld, make_flat_world
-from tests.app.workers import (
+from tests.app.worker_processes import (
     alive,
     children,
     ended,

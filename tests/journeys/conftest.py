@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import pytest
 
-from tests.serving import Service, until
+from tests.service_process import Service, until
 
 Amers = Callable[..., Any]
 

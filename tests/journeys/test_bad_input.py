@@ -16,7 +16,7 @@ import pytest
 from services.formats.block.reader import file_sha256
 from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from tests.app.flat_world import FlatWorld, make_flat_world
-from tests.serving import Service
+from tests.service_process import Service
 
 pytestmark = pytest.mark.long
 

@@ -24,7 +24,7 @@ from playwright.sync_api import (
 
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.factories import make_block
-from tests.serving import Service, until
+from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
 

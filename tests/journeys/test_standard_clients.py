@@ -16,7 +16,7 @@ from shapely.geometry import box, mapping, shape
 from app.usecases.features.stac import RESULTS
 from app.usecases.registration.deliverables import OUTPUTS
 from tests.app.flat_world import CENTRE, SIGMA_M, FlatWorld, make_flat_world
-from tests.serving import Service, until
+from tests.service_process import Service, until
 
 a_hundredth_of_a_degree = 0.01
 SCENES = 3
