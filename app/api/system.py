@@ -21,6 +21,7 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Cell, Page, document_page
+from app.db.engine import check_postgis
 
 router = APIRouter(tags=["system"])
 
@@ -141,5 +142,5 @@ def alive() -> Health:
 def ready(*, database: DatabaseDep) -> Health:
     """Report that the process and the database answer."""
     with database.reading() as connection:
-        connection.execute("select postgis_version()")
+        check_postgis(connection)
     return Health(status="ready")

@@ -208,6 +208,15 @@ def set_origin(connection: Connection) -> None:
     )
 
 
+def check_postgis(connection: Connection) -> None:
+    """Let the database answer, and PostGIS in it.
+
+    Raises:
+        psycopg.Error: one of them does not.
+    """
+    connection.execute(select(func.postgis_version()))
+
+
 def limit_lock_wait(connection: Connection, seconds: float) -> None:
     """Let statements fail that wait longer for a lock, until the end of the transaction."""
     connection.execute(select(func.set_config("lock_timeout", f"{seconds:g}s", True)))

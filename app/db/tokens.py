@@ -1,16 +1,16 @@
 """The table `token`: who may call, and how much. Secrets are never stored, only their SHA-256."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import Text, cast, func, or_, select, update
+from sqlalchemy import Text, bindparam, cast, func, or_, select, update
 from sqlalchemy.dialects.postgresql import insert
 
-from app.db.engine import Connection
+from app.db.engine import Connection, driver
 from app.db.rows import columns_of, every, first, only
 from app.db.schema import job, now, token
-from app.db.statements import named
+from app.db.statements import hot, named
 
 UPLOADED_BYTES = named("tokens.sql", "uploaded_bytes")
 
@@ -38,6 +38,14 @@ class Token:
 
 
 COLUMNS = columns_of(Token, token)
+# Each request with a token begins with this one.
+VALID_TOKEN = hot(
+    select(*COLUMNS).where(
+        token.c.secret_hash == bindparam("secret_hash"),
+        token.c.revoked_at.is_(None),
+        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+    )
+)
 
 
 def insert_token(
@@ -68,12 +76,15 @@ def insert_token(
 
 def find_valid_token(connection: Connection, secret_hash: bytes) -> Token | None:
     """The token of a secret if it is neither expired nor revoked."""
-    statement = select(*COLUMNS).where(
-        token.c.secret_hash == secret_hash,
-        token.c.revoked_at.is_(None),
-        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+    row = (
+        driver(connection)
+        .execute(VALID_TOKEN.sql, VALID_TOKEN.parameters({"secret_hash": secret_hash}))
+        .fetchone()
     )
-    return first(Token, connection.execute(statement))
+    if row is None:
+        return None
+    found = Token(*row)
+    return replace(found, scopes=tuple(found.scopes))
 
 
 def find_subject(connection: Connection, subject: str) -> Token | None:
