@@ -47,11 +47,9 @@ class RefinementOptions:
 
 def refine_on_chips(
     scenes: Sequence[Scene],
-    models: Sequence[SensorModel],
     lon_lat_h: Array,
     gsd_m: float,
     options: RefinementOptions = RefinementOptions(),
-    *,
     progress: Progress = no_progress,
 ) -> Observations:
     """Positions of points in every image that shows their whole chip, measured by chip matching.
@@ -60,8 +58,7 @@ def refine_on_chips(
     the geometry of the chip.
 
     Args:
-        scenes: the images.
-        models: one per image, consistent with each other to a few chip pixels.
+        scenes: the images, with models that are consistent with each other to a few chip pixels.
         lon_lat_h: (n, 3) the points.
         gsd_m: ground sampling of the chips, metres.
         options: thresholds.
@@ -70,25 +67,19 @@ def refine_on_chips(
     Returns:
         Image positions of the points that two images or more measure; `point` is the row of `lon_lat_h`.
     """
-    whole = np.stack(
-        [
-            chip_inside(model, scene.image.shape, lon_lat_h, gsd_m)
-            for scene, model in zip(scenes, models, strict=True)
-        ]
-    )
+    whole = np.stack([chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for scene in scenes])
     by_incidence = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
     point, image, line_sample, sigma = [], [], [], []
     for row, ground in enumerate(lon_lat_h):
         if row % 64 == 0:
             progress(row / len(lon_lat_h), f"measuring {len(lon_lat_h)} points on chips")
-        views = [(scenes[i], models[i]) for i in by_incidence if whole[i, row]]
-        numbers = [int(i) for i in by_incidence if whole[i, row]]
-        measures = _measure_point(views, ground, gsd_m, options)
+        seen_by = [int(i) for i in by_incidence if whole[i, row]]
+        measures = _measure_point(scenes, seen_by, ground, gsd_m, options)
         if len(measures) < 2:
             continue
-        for view, position, sigma_px in measures:
+        for i, position, sigma_px in measures:
             point.append(row)
-            image.append(numbers[view])
+            image.append(i)
             line_sample.append(position)
             sigma.append(sigma_px)
     return Observations(
@@ -100,35 +91,38 @@ def refine_on_chips(
 
 
 def _measure_point(
-    views: Sequence[tuple[Scene, SensorModel]],
+    scenes: Sequence[Scene],
+    seen_by: list[int],
     ground: Array,
     gsd_m: float,
     options: RefinementOptions,
 ) -> list[tuple[int, Array, float]]:
-    """View, position (2,) in pixels and sigma in pixels of one point (3,) where its chip is found.
+    """Image, position (2,) and sigma, in pixels, of one point (3,) in the images that show its chip.
 
-    The first view gives the chip; its measure, the last one returned, is the projection of the point.
+    The first image of `seen_by` gives the chip. Its own position, the last one returned, is the
+    projection of the point.
     """
-    if len(views) < 2:
+    if len(seen_by) < 2:
         return []
-    first_scene, first_model = views[0]
-    chip = render_chip(first_scene.image, first_model, ground, gsd_m)
+    first = scenes[seen_by[0]]
+    chip = render_chip(first.image, first.model, ground, gsd_m)
     measures = []
     best_sigma_px = np.inf
-    for view, (scene, model) in enumerate(views[1:], start=1):
-        patch = render_chip(scene.image, model, ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
+    for i in seen_by[1:]:
+        scene = scenes[i]
+        patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
         peak = find_chip(patch, chip, options.correlation)
         if peak.reason != FOUND:
             continue
         displacement_m = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
-        position = model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]
+        position = scene.model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]
         sigma_px = max(peak.sigma_px, options.min_sigma_px)
         best_sigma_px = min(best_sigma_px, sigma_px)
-        measures.append((view, position, sigma_px * gsd_m / image_gsd_m(model, ground)))
+        measures.append((i, position, sigma_px * gsd_m / image_gsd_m(scene.model, ground)))
     if measures:
         # The first view defines the detail: its position is as precise as the best of the others.
-        scale = gsd_m / image_gsd_m(first_model, ground)
-        measures.append((0, first_model.project(ground[None, :])[0], best_sigma_px * scale))
+        scale = gsd_m / image_gsd_m(first.model, ground)
+        measures.append((seen_by[0], first.model.project(ground[None, :])[0], best_sigma_px * scale))
     return measures
 
 

@@ -1,19 +1,19 @@
-"""Where the pixels of a map lie in an image, through its model and the terrain.
+"""Positions in an image of the pixels of a map, through the model of the image and the terrain.
 
-The model is asked at nodes of the map and at three heights. Between the nodes positions are bilinear,
-between the heights quadratic; the height itself is that of the terrain at each pixel. So relief is
-followed exactly, and the model, which is smooth, is approximated within a tolerance. That is checked
-where the approximation is worst: in the middle of the cells and between the heights.
+The model projects nodes of the map at three heights. Positions are bilinear between the nodes and
+quadratic between the heights; the height is that of the terrain at each pixel. So the relief is
+followed exactly, and the model, which is smooth, is approximated within a tolerance. The error is
+checked where it is largest: at the centres of the cells and between the heights.
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from services.errors import ComputationError
-from services.geodesy import metres_per_degree
 from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
@@ -21,22 +21,23 @@ from services.terrain import Terrain
 from services.types import Array, BoolArray, FloatImage
 
 NODE_PX = 64
-"""Map pixels between the nodes, to begin with."""
-_BETWEEN = math.sqrt(1.0 / 3.0)
-"""Where between three heights, -1, 0, 1, a quadratic misses a cubic most."""
-_HIDDEN_BY_M = 0.1
-"""Ground that stands higher than this into a line of sight hides what is behind it."""
-_MOST_STEPS = 4096
+"""Map pixels between the nodes at the start."""
+_WORST_HEIGHT = math.sqrt(1.0 / 3.0)
+"""Where the difference between a cubic and the quadratic through -1, 0 and 1 is largest."""
+_OCCLUSION_M = 0.1
+"""Ground that rises above a line of sight by more than this occludes the ground behind it."""
+_MAX_STEPS = 4096
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """Where the pixels of a window of a map lie in an image.
+    """Positions in an image of the pixels of a window of a map.
 
     Attributes:
-        line_sample: (lines, samples, 2) pixels of the image; NaN where there is no ground or no model.
-        height_m: (lines, samples) above the ellipsoid, of the ground.
-        error_px: largest difference from the model itself among the places it was checked at.
+        line_sample: (lines, samples, 2) pixels of the image; NaN where the terrain or the model is
+            undefined.
+        height_m: (lines, samples) of the ground, metres above the ellipsoid.
+        error_px: largest difference from the projection of the model at the positions checked.
     """
 
     line_sample: Array
@@ -46,58 +47,88 @@ class Mapping:
 
 @dataclass(frozen=True)
 class _Ground:
-    """Terrain around a window of a map.
+    """The terrain around a window of a map.
 
     Attributes:
-        heights: (lines, samples) as the terrain counts them, NaN in voids.
-        first: (2,) line and sample of its first node in the terrain's grid.
+        heights: (lines, samples) in the vertical datum of the terrain; NaN in voids.
+        first: (2,) line and sample of its first node in the grid of the terrain.
     """
 
     heights: FloatImage
     first: Array
 
 
+class _HeightRange(NamedTuple):
+    """Heights above the ellipsoid between which positions are interpolated; a tuple for the kernels."""
+
+    low_m: float
+    high_m: float
+
+
+class _LineOfSight(NamedTuple):
+    """The way towards the sensor through the terrain; a tuple for the kernels.
+
+    Attributes:
+        line_per_m, sample_per_m: nodes of the terrain per metre of height.
+        undulation_m: of the geoid that the heights of the terrain refer to.
+        highest_m: highest ground, in the vertical datum of the terrain.
+    """
+
+    line_per_m: float
+    sample_per_m: float
+    undulation_m: float
+    highest_m: float
+
+
+@dataclass(frozen=True)
+class _Table:
+    """What is interpolated between the nodes of a window.
+
+    Attributes:
+        nodes: (r, c, 2) map pixels of the nodes.
+        values: (r, c, 9) at the nodes: image position (2), its first and second order by the height (4),
+            position in `ground` (2), undulation of the geoid in metres.
+        ground: the terrain around the window.
+        heights: range of the heights.
+    """
+
+    nodes: Array
+    values: Array
+    ground: _Ground
+    heights: _HeightRange
+
+
 def map_into_image(
     model: SensorModel, terrain: Terrain, grid: MapGrid, window: Window, tolerance_px: float
 ) -> Mapping | None:
-    """Where a window of a map lies in an image; None where it has no known ground.
+    """Positions in an image of a window of a map; None where the terrain is void in the whole window.
 
     Args:
         model: of the image.
         terrain: the ground.
         grid: the map.
         window: of the map, inside its grid.
-        tolerance_px: how far positions may be from the model's, image pixels.
+        tolerance_px: largest error of the positions, image pixels.
 
     Raises:
-        ComputationError: when not even nodes at every second pixel are near enough.
+        ComputationError: nodes at every second pixel exceed the tolerance.
     """
     step = NODE_PX
     while True:
-        nodes = _nodes(window, step)
-        lon_lat = grid.lon_lat(nodes.reshape(-1, 2))
-        position = terrain.grid.line_sample(lon_lat)
-        ground = _ground_around(terrain, position)
-        if ground is None:
+        table = _table(model, terrain, grid, _nodes(window, step))
+        if table is None:
             return None
-        undulation = np.zeros(len(lon_lat))
-        if terrain.geoid is not None:
-            undulation = terrain.geoid(lon_lat)
-        low = float(np.nanmin(ground.heights)) + float(np.nanmin(undulation))
-        high = float(np.nanmax(ground.heights)) + float(np.nanmax(undulation)) + 1.0
-        table = _table(model, lon_lat, position - ground.first, undulation, low, high)
-        table = np.ascontiguousarray(table.reshape(*nodes.shape[:2], 9))
-        error_px = _error_px(model, terrain, grid, nodes, table, ground, low, high)
+        error_px = _error_px(model, terrain, grid, table)
         if not error_px > tolerance_px:
             break
         step //= 2
         if step < 2:
             raise ComputationError(
-                f"the model of the image is too rough to be rectified within {tolerance_px:g} px: "
-                f"nodes at every second pixel miss it by {error_px:.3g} px"
+                f"the model of the image cannot be interpolated within {tolerance_px:g} px: nodes at "
+                f"every second pixel leave an error of {error_px:.3g} px. Give a larger tolerance_px"
             )
     line_sample, height_m = _positions(
-        table, ground.heights, step, window.lines, window.samples, (low + high) / 2.0, (high - low) / 2.0
+        table.values, table.ground.heights, step, (window.lines, window.samples), table.heights
     )
     return Mapping(line_sample, height_m, 0.0 if math.isnan(error_px) else error_px)
 
@@ -107,15 +138,15 @@ def occluded_ground(
 ) -> BoolArray:
     """Which ground (lines, samples) of a window other ground hides from the sensor.
 
-    From each place a step after the other is made towards the sensor, each over half a node of the
-    terrain, until nothing of the terrain is as high any more.
+    From each pixel the line of sight is followed towards the sensor, by half a node of the terrain a
+    step, until it is higher than all the terrain around.
 
     Args:
-        model: of the image; its direction of view is taken as one within the window.
+        model: of the image; its direction of view is taken as constant within the window.
         terrain: the ground.
         grid: the map.
         window: of the map.
-        height_m: (lines, samples) of the ground, as of `map_into_image`.
+        height_m: (lines, samples) of the ground, metres, see `map_into_image`.
     """
     hidden = np.zeros(height_m.shape, dtype=bool)
     corner = np.array([[window.line, window.sample]], dtype=np.float64)
@@ -141,26 +172,27 @@ def occluded_ground(
     if terrain.geoid is not None:
         undulation = float(np.nanmean(terrain.geoid(lon_lat)))
     offset = np.ascontiguousarray((position - ground.first).reshape(*nodes.shape[:2], 2))
-    highest = float(np.nanmax(ground.heights))
-    _hide(hidden, height_m, offset, ground.heights, per_metre, undulation, highest)
+    highest_m = float(np.nanmax(ground.heights))
+    sight = _LineOfSight(float(per_metre[0]), float(per_metre[1]), undulation, highest_m)
+    _mark_occluded(hidden, height_m, offset, ground.heights, sight)
     return hidden
 
 
 def _nodes(window: Window, step: int) -> Array:
-    """Map pixels (r, c, 2) of nodes all over a window and just beyond its end."""
+    """Map pixels (r, c, 2) of nodes that cover a window, the last ones at or beyond its end."""
     lines = window.line + step * np.arange(-(-max(window.lines - 1, 1) // step) + 1)
     samples = window.sample + step * np.arange(-(-max(window.samples - 1, 1) // step) + 1)
     return np.stack(np.meshgrid(lines, samples, indexing="ij"), axis=-1).astype(np.float64)
 
 
 def _ground_around(terrain: Terrain, position: Array) -> _Ground | None:
-    """The terrain under some of its positions (n, 2); None where it has no height."""
-    known = position[np.isfinite(position).all(axis=1)]
-    if not len(known):
+    """The terrain under positions (n, 2) in its grid; None where all of it is void."""
+    defined = position[np.isfinite(position).all(axis=1)]
+    if not len(defined):
         return None
     last = np.array(terrain.grid.shape) - 1
-    low = np.clip(np.floor(known.min(axis=0)).astype(np.int64) - 1, 0, last)
-    high = np.clip(np.ceil(known.max(axis=0)).astype(np.int64) + 1, 0, last)
+    low = np.clip(np.floor(defined.min(axis=0)).astype(np.int64) - 1, 0, last)
+    high = np.clip(np.ceil(defined.max(axis=0)).astype(np.int64) + 1, 0, last)
     lines, samples = (int(size) for size in high - low + 1)
     heights = terrain.heights.read(Window(int(low[0]), int(low[1]), lines, samples))
     if not np.isfinite(heights).any():
@@ -168,52 +200,53 @@ def _ground_around(terrain: Terrain, position: Array) -> _Ground | None:
     return _Ground(heights, low.astype(np.float64))
 
 
-def _table(
-    model: SensorModel, lon_lat: Array, position: Array, undulation: Array, low: float, high: float
-) -> Array:
-    """What is interpolated (n, 9): line and sample with their first and second orders by the height,
-    position in the terrain, geoid."""
+def _table(model: SensorModel, terrain: Terrain, grid: MapGrid, nodes: Array) -> _Table | None:
+    """The values at nodes (r, c, 2) of a map; None where the terrain around them is void."""
+    lon_lat = grid.lon_lat(nodes.reshape(-1, 2))
+    position = terrain.grid.line_sample(lon_lat)
+    ground = _ground_around(terrain, position)
+    if ground is None:
+        return None
+    undulation = np.zeros(len(lon_lat))
+    if terrain.geoid is not None:
+        undulation = terrain.geoid(lon_lat)
+    low_m = float(np.nanmin(ground.heights)) + float(np.nanmin(undulation))
+    high_m = float(np.nanmax(ground.heights)) + float(np.nanmax(undulation)) + 1.0
     at = [
-        model.project(np.column_stack([lon_lat, np.full(len(lon_lat), h)]))
-        for h in (low, (low + high) / 2.0, high)
+        model.project(np.column_stack([lon_lat, np.full(len(lon_lat), height_m)]))
+        for height_m in (low_m, (low_m + high_m) / 2.0, high_m)
     ]
     first, second = (at[2] - at[0]) / 2.0, (at[2] + at[0]) / 2.0 - at[1]
-    return np.column_stack([at[1], first, second, position, undulation])
+    values = np.column_stack([at[1], first, second, position - ground.first, undulation])
+    values = np.ascontiguousarray(values.reshape(*nodes.shape[:2], 9))
+    return _Table(nodes, values, ground, _HeightRange(low_m, high_m))
 
 
-def _error_px(
-    model: SensorModel,
-    terrain: Terrain,
-    grid: MapGrid,
-    nodes: Array,
-    table: Array,
-    ground: _Ground,
-    low: float,
-    high: float,
-) -> float:
-    """How far interpolated positions are from the model's in the middle of the cells; NaN: no cell."""
-    middle = (nodes[:-1, :-1] + nodes[1:, 1:]).reshape(-1, 2) / 2.0
-    mean = (table[:-1, :-1] + table[1:, 1:] + table[:-1, 1:] + table[1:, :-1]).reshape(-1, 9) / 4.0
-    lon_lat = grid.lon_lat(middle)
-    worst = [math.nan]
-    for u in (-_BETWEEN, 0.0, _BETWEEN):
-        height = np.full(len(lon_lat), (low + high) / 2.0 + u * (high - low) / 2.0)
+def _error_px(model: SensorModel, terrain: Terrain, grid: MapGrid, table: _Table) -> float:
+    """Largest error in pixels of positions at the centres of the cells; NaN where no cell is defined."""
+    nodes, values, (low_m, high_m) = table.nodes, table.values, table.heights
+    centre = (nodes[:-1, :-1] + nodes[1:, 1:]).reshape(-1, 2) / 2.0
+    mean = (values[:-1, :-1] + values[1:, 1:] + values[:-1, 1:] + values[1:, :-1]).reshape(-1, 9) / 4.0
+    lon_lat = grid.lon_lat(centre)
+    errors = [math.nan]
+    for u in (-_WORST_HEIGHT, 0.0, _WORST_HEIGHT):
+        height = np.full(len(lon_lat), (low_m + high_m) / 2.0 + u * (high_m - low_m) / 2.0)
         exact = model.project(np.column_stack([lon_lat, height]))
-        off = np.hypot(*(mean[:, :2] + u * mean[:, 2:4] + u * u * mean[:, 4:6] - exact).T)
-        worst += off[np.isfinite(off)].tolist()
-    # A place in the terrain that is off counts as that part of a map pixel.
-    exact = terrain.grid.line_sample(lon_lat) - ground.first
+        error = np.hypot(*(mean[:, :2] + u * mean[:, 2:4] + u * u * mean[:, 4:6] - exact).T)
+        errors += error[np.isfinite(error)].tolist()
+    # An error of the position in the terrain counts as that fraction of a map pixel.
+    exact = terrain.grid.line_sample(lon_lat) - table.ground.first
     per_pixel = (
-        np.abs(table[1:, 1:, 6:8] - table[:-1, :-1, 6:8]).max() / (nodes[1, 1] - nodes[0, 0]).max()
+        np.abs(values[1:, 1:, 6:8] - values[:-1, :-1, 6:8]).max() / (nodes[1, 1] - nodes[0, 0]).max()
     )
-    off = np.abs(mean[:, 6:8] - exact).max(axis=1) / max(float(per_pixel), 1e-12)
-    worst += off[np.isfinite(off)].tolist()
-    return float(np.nanmax(worst)) if len(worst) > 1 else math.nan
+    error = np.abs(mean[:, 6:8] - exact).max(axis=1) / max(float(per_pixel), 1e-12)
+    errors += error[np.isfinite(error)].tolist()
+    return float(np.nanmax(errors)) if len(errors) > 1 else math.nan
 
 
 @njit(inline="always", error_model="numpy")
 def _height(heights: FloatImage, line: float, sample: float) -> float:
-    """Bilinear height; the outermost hold half a step beyond, NaN further out and beside voids."""
+    """Bilinear height; constant for half a node beyond the grid, NaN farther out and beside voids."""
     lines, samples = heights.shape
     if not (-0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5):
         return np.nan
@@ -230,9 +263,20 @@ def _height(heights: FloatImage, line: float, sample: float) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _positions(
-    table: Array, heights: FloatImage, step: int, lines: int, samples: int, middle: float, half: float
+    table: Array, heights: FloatImage, step: int, shape: tuple[int, int], height_range: _HeightRange
 ) -> tuple[Array, FloatImage]:
-    """Image positions (lines, samples, 2) and ground heights (lines, samples) of a window."""
+    """Image positions (lines, samples, 2) and ground heights (lines, samples) of a window.
+
+    Args:
+        table: `_Table.values`.
+        heights: of the terrain around.
+        step: map pixels between nodes.
+        shape: lines and samples of the window.
+        height_range: `_Table.heights`.
+    """
+    lines, samples = shape
+    middle = (height_range.low_m + height_range.high_m) / 2.0
+    half = (height_range.high_m - height_range.low_m) / 2.0
     out = np.empty((lines, samples, 2))
     ground = np.empty((lines, samples), dtype=np.float32)
     cells = table.shape[1] - 1
@@ -257,17 +301,11 @@ def _positions(
 
 
 @njit(cache=True, error_model="numpy")
-def _hide(
-    hidden: BoolArray,
-    height_m: FloatImage,
-    offset: Array,
-    heights: FloatImage,
-    per_metre: Array,
-    undulation: float,
-    highest: float,
+def _mark_occluded(
+    hidden: BoolArray, height_m: FloatImage, offset: Array, heights: FloatImage, sight: _LineOfSight
 ) -> None:
-    """Mark what is hidden; `offset` are the positions of nodes of the map in `heights`."""
-    rise = 0.5 / max(abs(per_metre[0]), abs(per_metre[1]))
+    """Set `hidden` where ground is occluded; `offset` (r, c, 2) are the map nodes in `heights`."""
+    rise = 0.5 / max(abs(sight.line_per_m), abs(sight.sample_per_m))
     lines, samples = hidden.shape
     for r in range(lines):
         i = min(r // NODE_PX, offset.shape[0] - 2)
@@ -278,18 +316,13 @@ def _hide(
             top = offset[i, j] + fj * (offset[i, j + 1] - offset[i, j])
             bottom = offset[i + 1, j] + fj * (offset[i + 1, j + 1] - offset[i + 1, j])
             line, sample = top + fi * (bottom - top)
-            ray = height_m[r, s] - undulation
-            for _ in range(_MOST_STEPS):
+            ray = height_m[r, s] - sight.undulation_m
+            for _ in range(_MAX_STEPS):
                 ray += rise
-                if not ray < highest:
+                if not ray < sight.highest_m:
                     break
-                line += rise * per_metre[0]
-                sample += rise * per_metre[1]
-                if _height(heights, line, sample) > ray + _HIDDEN_BY_M:
+                line += rise * sight.line_per_m
+                sample += rise * sight.sample_per_m
+                if _height(heights, line, sample) > ray + _OCCLUSION_M:
                     hidden[r, s] = True
                     break
-
-
-def metres_a_unit(crs_is_geographic: bool, lat: float) -> tuple[float, float]:
-    """Metres a unit of a map along x and y: of a degree, or one."""
-    return metres_per_degree(lat, 0.0) if crs_is_geographic else (1.0, 1.0)

@@ -1,4 +1,4 @@
-"""A scene laid on a map through its model and the terrain, window by window."""
+"""A scene orthorectified on a map through its model and the terrain, window by window."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -9,32 +9,33 @@ import numpy as np
 from numba import njit
 
 from services.errors import CoverageError, InputError
+from services.geodesy import metres_per_degree
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window, block_means, low_pass
 from services.map_grid import MapGrid, utm_of, xy_of_lon_lat
-from services.orthorectification.mapping import map_into_image, metres_a_unit, occluded_ground
+from services.orthorectification.mapping import map_into_image, occluded_ground
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
 from services.types import Array, FloatImage, IntArray, Progress, no_progress
 
 MAX_READ_PIXELS = 24_000_000
-"""Pixels of the image read at once, 96 MB; a window of the map that needs more is divided."""
+"""Largest number of image pixels read at once, 96 MB; a window of the map that needs more is divided."""
 _SMALLEST_WINDOW = 16
 _MAX_MAP_PIXELS = 40_000_000_000
-_REACH_PX = 3
+_KERNEL_REACH_PX = 3
 _RATIO_STEP = 8
-"""Map pixels between those whose size in the image is looked at."""
+"""Map pixels between those whose size in the image is computed."""
 
 
 @dataclass(frozen=True)
 class OrthoOptions:
-    """How a scene is rectified.
+    """How a scene is orthorectified.
 
     Attributes:
         kernel: "cubic" (convolution, a = -0.5) or "bilinear".
-        tolerance_px: how far positions may be from those of the model, pixels of the scene.
-        hide: leave out ground that other ground hides from the sensor.
-        window_px: side of the windows of the map.
+        tolerance_px: largest error of the interpolated positions, pixels of the scene.
+        hide: write nodata for ground that other ground hides from the sensor.
+        window_px: side of the windows of the map, pixels.
     """
 
     kernel: Literal["cubic", "bilinear"] = "cubic"
@@ -43,22 +44,22 @@ class OrthoOptions:
     window_px: int = 512
 
     def __post_init__(self) -> None:
-        """Refuse what nothing can be rectified with."""
+        """Reject a tolerance and a window that are too small."""
         if not self.tolerance_px > 0.0 or self.window_px < _SMALLEST_WINDOW:
             raise InputError(
-                f"tolerance_px above 0 and window_px of at least {_SMALLEST_WINDOW} expected, found "
-                f"{self.tolerance_px:g} and {self.window_px}"
+                f"tolerance_px {self.tolerance_px:g} and window_px {self.window_px} given, tolerance_px "
+                f"above 0 and window_px of at least {_SMALLEST_WINDOW} expected"
             )
 
 
 @dataclass(frozen=True)
 class OrthoWindow:
-    """A finished window of the map.
+    """A window of an ortho-image.
 
     Attributes:
-        window: where.
-        pixels: (bands, lines, samples) float32; NaN where the scene shows nothing.
-        error_px: largest difference from the model found where the mapping was checked.
+        window: of the map.
+        pixels: (bands, lines, samples) float32; NaN where the scene has no data.
+        error_px: largest error of the positions where they were checked, pixels of the scene.
     """
 
     window: Window
@@ -69,25 +70,29 @@ class OrthoWindow:
 def choose_grid(
     scene: Scene, terrain: Terrain, crs: str | None = None, gsd_m: float | None = None
 ) -> MapGrid:
-    """The north-up map that holds all the ground a scene shows.
+    """The north-up map that covers all the ground a scene shows.
 
     Args:
         scene: with the model to be used.
         terrain: the ground.
         crs: reference system of the map; by default the UTM zone of the centre.
-        gsd_m: ground sampling; by default that of the scene. Pixel corners lie on multiples of it.
+        gsd_m: ground sampling, metres; by default that of the scene. Pixel corners lie on multiples of
+            it. On a geographic map a pixel has this side both east and north, at the mean latitude.
 
     Raises:
-        CoverageError: when the terrain does not reach the scene.
-        InputError: when the map would be larger than any image.
+        CoverageError: the terrain does not reach the scene.
+        InputError: the scene is outside the map, or the map would be too large.
     """
-    border = _border(scene.image.shape)
+    positions = _grid_over(scene.image.shape)
     low, high = scene.model.height_range_m
-    around = terrain.around(_located(scene.model, border, (low, high)))
-    lon_lat = _located(scene.model, border, around.range_m())
+    around = terrain.around(_located(scene.model, positions, (low, high)))
+    lon_lat = _located(scene.model, positions, around.range_m())
     lon_lat = lon_lat[np.isfinite(lon_lat).all(axis=1)]
     if not len(lon_lat):
-        raise CoverageError("the model of the scene leads to no place at the heights of the terrain")
+        raise CoverageError(
+            "the model of the scene locates none of its pixels at the heights of the terrain: check "
+            "that the image, the model and the terrain belong together"
+        )
     lon_lat[:, 0] = lon_lat[0, 0] + (lon_lat[:, 0] - lon_lat[0, 0] + 180.0) % 360.0 - 180.0
     lon, lat = lon_lat.mean(axis=0)
     crs = crs or utm_of((lon + 180.0) % 360.0 - 180.0, lat)
@@ -95,15 +100,40 @@ def choose_grid(
     xy = lon_lat if empty.is_geographic else xy_of_lon_lat(crs, lon_lat)
     xy = xy[np.isfinite(xy).all(axis=1)]
     if not len(xy):
-        raise InputError(f"{crs}: the scene at {lon:.3f}, {lat:.3f} has no place on this map")
-    unit = np.array(metres_a_unit(empty.is_geographic, lat))
-    step = (gsd_m or scene_gsd_m(scene)) / unit
+        raise InputError(
+            f"{crs}: the scene at longitude {lon:.3f}, latitude {lat:.3f} is outside this reference "
+            "system. Choose another one"
+        )
+    unit_m = np.array(metres_per_degree(lat, 0.0) if empty.is_geographic else (1.0, 1.0))
+    step = (gsd_m or scene_gsd_m(scene)) / unit_m
     first, last = np.floor(xy.min(axis=0) / step), np.ceil(xy.max(axis=0) / step)
     samples, lines = (int(count) for count in last - first)
     if lines * samples > _MAX_MAP_PIXELS:
-        raise InputError(f"a map of {lines} x {samples} pixels of {gsd_m} m: too large")
+        raise InputError(
+            f"the map would have {lines} x {samples} pixels, at most {_MAX_MAP_PIXELS:,} in all are "
+            "possible: give a larger gsd_m"
+        )
     origin = np.array([first[0] + 0.5, last[1] - 0.5]) * step
     return MapGrid(crs, origin, np.array([[0.0, step[0]], [-step[1], 0.0]]), (lines, samples))
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What all the windows of an ortho-image are made from.
+
+    Attributes:
+        images: bands of one image.
+        model: of the image.
+        terrain: the ground.
+        grid: the map.
+        options: of the rectification.
+    """
+
+    images: Sequence[ImageSource]
+    model: SensorModel
+    terrain: Terrain
+    grid: MapGrid
+    options: OrthoOptions
 
 
 def orthorectify(
@@ -115,84 +145,72 @@ def orthorectify(
     *,
     progress: Progress = no_progress,
 ) -> Iterator[OrthoWindow]:
-    """The windows of an ortho-image, row after row; memory does not grow with image, terrain or map.
+    """The windows of an ortho-image, row by row; memory does not grow with image, terrain or map.
 
-    Where a map pixel is larger than one of the image, the image is low-passed to its size first.
+    Where a map pixel is larger than an image pixel, the image is first low-passed to the size of the map
+    pixel.
 
     Args:
         images: bands of one image.
         model: of the image.
         terrain: the ground.
         grid: the map.
-        options: how.
-        progress: told where the work stands.
+        options: kernel, tolerance, occlusion and size of the windows.
+        progress: receives the fraction of the rows done.
 
     Raises:
-        ComputationError: when the model cannot be followed within the tolerance.
+        ComputationError: positions exceed the tolerance.
     """
+    task = _Task(images, model, terrain, grid, options)
     lines, samples = grid.shape
     side = options.window_px
     for line in range(0, lines, side):
         for sample in range(0, samples, side):
             window = Window(line, sample, min(side, lines - line), min(side, samples - sample))
-            yield _rectified(images, model, terrain, grid, window, options)
+            yield _rectified(task, window)
         progress(min(line + side, lines) / lines, "rectifying")
 
 
-def _rectified(
-    images: Sequence[ImageSource],
-    model: SensorModel,
-    terrain: Terrain,
-    grid: MapGrid,
-    window: Window,
-    options: OrthoOptions,
-) -> OrthoWindow:
+def _rectified(task: _Task, window: Window) -> OrthoWindow:
     shape = (window.lines, window.samples)
-    nothing = OrthoWindow(window, np.full((len(images), *shape), np.nan, dtype=np.float32), 0.0)
-    mapping = map_into_image(model, terrain, grid, window, options.tolerance_px)
+    empty = OrthoWindow(window, np.full((len(task.images), *shape), np.nan, dtype=np.float32), 0.0)
+    mapping = map_into_image(task.model, task.terrain, task.grid, window, task.options.tolerance_px)
     if mapping is None:
-        return nothing
+        return empty
     line_sample = mapping.line_sample
-    low, high = _hold_inside(line_sample, *images[0].shape)
+    low, high = _drop_outside(line_sample, *task.images[0].shape)
     if not (high >= low).all():
-        return nothing
+        return empty
     first = np.floor(low).astype(np.int64)
     size = np.ceil(high).astype(np.int64) - first + 1
     if math.prod(size.tolist()) > MAX_READ_PIXELS and min(shape) > _SMALLEST_WINDOW:
-        return _divided(images, model, terrain, grid, window, options)
-    if options.hide:
-        line_sample[occluded_ground(model, terrain, grid, window, mapping.height_m)] = np.nan
-    ratio = _ratio(line_sample)
+        return _divided(task, window)
+    if task.options.hide:
+        hidden = occluded_ground(task.model, task.terrain, task.grid, window, mapping.height_m)
+        line_sample[hidden] = np.nan
     pixels = np.stack(
-        [_sampled(image, line_sample, first, size, ratio, options.kernel) for image in images]
+        [_sampled(image, line_sample, first, size, task.options.kernel) for image in task.images]
     )
     return OrthoWindow(window, pixels, mapping.error_px)
 
 
-def _divided(
-    images: Sequence[ImageSource],
-    model: SensorModel,
-    terrain: Terrain,
-    grid: MapGrid,
-    window: Window,
-    options: OrthoOptions,
-) -> OrthoWindow:
-    """A window in quarters, each of which needs less of the image."""
-    pixels = np.empty((len(images), window.lines, window.samples), dtype=np.float32)
+def _divided(task: _Task, window: Window) -> OrthoWindow:
+    """A window made from its quarters, each of which reads less of the image."""
+    pixels = np.empty((len(task.images), window.lines, window.samples), dtype=np.float32)
     error_px = 0.0
     halves = [(0, window.lines // 2), (window.lines // 2, window.lines)]
     sides = [(0, window.samples // 2), (window.samples // 2, window.samples)]
     for top, bottom in halves:
         for left, right in sides:
             part = Window(window.line + top, window.sample + left, bottom - top, right - left)
-            done = _rectified(images, model, terrain, grid, part, options)
-            pixels[:, top:bottom, left:right] = done.pixels
-            error_px = max(error_px, done.error_px)
+            quarter = _rectified(task, part)
+            pixels[:, top:bottom, left:right] = quarter.pixels
+            error_px = max(error_px, quarter.error_px)
     return OrthoWindow(window, pixels, error_px)
 
 
 def _ratio(line_sample: Array) -> float:
-    """Image pixels a map pixel, in each direction, on the average of a window."""
+    """Image pixels per map pixel along a side, the median over a window."""
     every = slice(None, -1, _RATIO_STEP), slice(1, None, _RATIO_STEP)
     corner = line_sample[every[0], every[0]]
     along, down = line_sample[every[0], every[1]] - corner, line_sample[every[1], every[0]] - corner
@@ -202,16 +220,24 @@ def _ratio(line_sample: Array) -> float:
 
 
 def _sampled(
-    image: ImageSource, line_sample: Array, first: IntArray, size: IntArray, ratio: float, kernel: str
+    image: ImageSource, line_sample: Array, first: IntArray, size: IntArray, kernel: str
 ) -> FloatImage:
-    """Pixels of an image at positions (lines, samples, 2)."""
-    # Nearly equal pixels are not worth a blur.
+    """Values (lines, samples) of an image at positions (lines, samples, 2).
+
+    Args:
+        image: one band.
+        line_sample: positions; NaN where there is no value.
+        first, size: (2,) of the window of the image that contains the positions, pixels.
+        kernel: see `OrthoOptions`.
+    """
+    # Pixels of nearly the same size need no low-pass.
+    ratio = _ratio(line_sample)
     ratio = ratio if ratio > 1.1 else 1.0
     factor = max(1, int(ratio / 2.0))
-    margin = _REACH_PX * factor + int(2.0 * ratio)
+    margin = _KERNEL_REACH_PX * factor + int(2.0 * ratio)
     begin = first - margin
     lines, samples = (int(count) for count in size + 2 * margin)
-    # Pixels beyond the border are like the border's, as far as a kernel reaches.
+    # The kernels extend the image by the pixels of its border.
     low = np.clip(begin, 0, np.array(image.shape) - 1)
     high = np.clip(begin + [lines, samples], 1, np.array(image.shape))
     whole = (high - low) // factor * factor
@@ -219,12 +245,13 @@ def _sampled(
     pixels = image.read(Window(int(low[0]), int(low[1]), int(whole[0]), int(whole[1])))
     factor = factor if min(pixels.shape) >= factor else 1
     pixels = np.ascontiguousarray(low_pass(block_means(pixels, factor), ratio / factor))
-    return _resampled(pixels, line_sample, float(low[0]), float(low[1]), factor, kernel == "cubic")
+    origin = (float(low[0]), float(low[1]))
+    return _resampled(pixels, line_sample, origin, factor, kernel == "cubic")
 
 
 @njit(cache=True)
-def _hold_inside(line_sample: Array, lines: int, samples: int) -> tuple[Array, Array]:
-    """Make positions beyond the image NaN; the lowest and highest (2,) of the others, inf of none."""
+def _drop_outside(line_sample: Array, lines: int, samples: int) -> tuple[Array, Array]:
+    """Set positions outside the image to NaN; return the lowest and highest (2,) of the others."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for r in range(line_sample.shape[0]):
         for s in range(line_sample.shape[1]):
@@ -249,13 +276,15 @@ def _cubic_weights(t: float) -> tuple[float, float, float, float]:
 
 
 @njit(inline="always", error_model="numpy")
-def _weighted(pixels: FloatImage, i: int, j: int, v0: float, v1: float, v2: float, v3: float) -> float:
+def _weighted(pixels: FloatImage, i: int, j: int, weights: tuple[float, float, float, float]) -> float:
+    """Weighted sum of the four pixels of row `i` around column `j`."""
+    v0, v1, v2, v3 = weights
     return v0 * pixels[i, j - 1] + v1 * pixels[i, j] + v2 * pixels[i, j + 1] + v3 * pixels[i, j + 2]
 
 
 @njit(inline="always", error_model="numpy")
 def _bilinear(pixels: FloatImage, line: float, sample: float) -> float:
-    """Between the pixels; a pixel without weight does not count."""
+    """Bilinear value; a missing pixel with zero weight does not count."""
     lines, samples = pixels.shape
     i, j = int(line), int(sample)
     fi, fj = line - i, sample - j
@@ -270,20 +299,27 @@ def _bilinear(pixels: FloatImage, line: float, sample: float) -> float:
 def _resampled(
     pixels: FloatImage,
     line_sample: Array,
-    first_line: float,
-    first_sample: float,
+    origin: tuple[float, float],
     factor: int,
     cubic: bool,
 ) -> FloatImage:
-    """Values (lines, samples) at positions of the image; bilinear beside what is missing."""
+    """Values (lines, samples) at positions of the image; bilinear beside missing pixels.
+
+    Args:
+        pixels: means over squares of `factor` pixels of the image.
+        line_sample: (lines, samples, 2) positions in the image.
+        origin: line and sample in the image of the first pixel averaged.
+        factor: image pixels per pixel.
+        cubic: whether the kernel is cubic.
+    """
     lines, samples = pixels.shape
     rows, columns, _ = line_sample.shape
     out = np.empty((rows, columns), dtype=np.float32)
     centre = (factor - 1) / 2.0
     for r in range(rows):
         for s in range(columns):
-            line = (line_sample[r, s, 0] - first_line - centre) / factor
-            sample = (line_sample[r, s, 1] - first_sample - centre) / factor
+            line = (line_sample[r, s, 0] - origin[0] - centre) / factor
+            sample = (line_sample[r, s, 1] - origin[1] - centre) / factor
             if not (line == line and sample == sample):
                 out[r, s] = np.nan
                 continue
@@ -292,11 +328,11 @@ def _resampled(
             i, j = int(line), int(sample)
             if cubic and 1 <= i < lines - 2 and 1 <= j < samples - 2:
                 u0, u1, u2, u3 = _cubic_weights(line - i)
-                v0, v1, v2, v3 = _cubic_weights(sample - j)
-                a = _weighted(pixels, i - 1, j, v0, v1, v2, v3)
-                b = _weighted(pixels, i, j, v0, v1, v2, v3)
-                c = _weighted(pixels, i + 1, j, v0, v1, v2, v3)
-                d = _weighted(pixels, i + 2, j, v0, v1, v2, v3)
+                weights = _cubic_weights(sample - j)
+                a = _weighted(pixels, i - 1, j, weights)
+                b = _weighted(pixels, i, j, weights)
+                c = _weighted(pixels, i + 1, j, weights)
+                d = _weighted(pixels, i + 2, j, weights)
                 value = u0 * a + u1 * b + u2 * c + u3 * d
                 if value == value:
                     out[r, s] = value
@@ -305,14 +341,14 @@ def _resampled(
     return out
 
 
-def _border(shape: tuple[int, int], per_side: int = 16) -> Array:
-    """Positions (n, 2) round the border of an image and over its middle."""
+def _grid_over(shape: tuple[int, int], per_side: int = 16) -> Array:
+    """Positions (n, 2) on a regular grid over an image, its border included."""
     axes = [np.linspace(-0.5, size - 0.5, per_side + 1) for size in shape]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _located(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
-    """Places (2n, 2) of image positions at two heights."""
+    """Longitudes and latitudes (2n, 2) of image positions at two heights."""
     return np.concatenate(
         [model.locate(line_sample, np.full(len(line_sample), h))[:, :2] for h in heights_m]
     )

@@ -1,7 +1,7 @@
-"""BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, refine on chips, choose, cut."""
+"""BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, measure on chips, select, cut."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,9 +21,9 @@ from services.matching.multi_image import (
 )
 from services.matching.predict import rank_in_group
 from services.matching.tie_points import FeatureOptions, find_tie_points
-from services.sensors.base import SensorModel
 from services.types import (
     Array,
+    BoolArray,
     ChipArray,
     ControlPoints,
     IntArray,
@@ -40,15 +40,15 @@ class ProductionOptions:
     """How points are produced.
 
     Attributes:
-        fine_gsd_m, coarse_gsd_m: ground samplings of the chips.
-        spacing_m: side of the squares of ground that get a point each; None cuts the ground into about
-            `points` of them.
-        points: how many points are aimed at when there is no spacing.
-        candidates: how many tie points of every square are tried.
-        min_views: images that must see a point.
-        min_saliency: of a point's chip.
+        fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres.
+        spacing_m: side of the squares of ground that get one point each; None divides the ground into
+            about `points` squares.
+        points: number of points aimed at when there is no spacing.
+        candidates: number of tie points of every square that are tried.
+        min_views: smallest number of images that show a point.
+        min_saliency: smallest saliency of a point's chip.
         max_sigma_m: largest horizontal standard deviation of a point within the block.
-        max_sigma_up_m: largest vertical one.
+        max_sigma_up_m: largest vertical standard deviation of a point within the block.
         features, block, refinement: of the stages.
     """
 
@@ -65,18 +65,23 @@ class ProductionOptions:
     block: BlockOptions = field(default_factory=BlockOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
 
+    @property
+    def gsds_m(self) -> tuple[float, float]:
+        """Ground samplings of the chips, finest first, metres."""
+        return self.fine_gsd_m, self.coarse_gsd_m
+
 
 @dataclass(frozen=True)
 class RelativeAccuracy:
     """How well the images of a block agree.
 
     Attributes:
-        tie_points: points seen in two images or more.
+        tie_points: number of points seen in two images or more.
         before_px: median distance between rays and tie points, with the models as delivered, pixels.
         after_px: the same with the adjusted models.
-        refined_px: the same for the block's points, measured on chips.
-        frame_sigma_m: how well the frame of the block is known, from what the images' models promise,
-            one standard deviation a coordinate on the ground.
+        refined_px: the same for the points of the block, measured on chips.
+        frame_sigma_m: accuracy of the frame of the block, from the stated accuracy of the models, one
+            standard deviation a coordinate on the ground.
     """
 
     tie_points: int
@@ -91,12 +96,12 @@ class Production:
     """The points of a block.
 
     Attributes:
-        points: in no particular order; `chip_file` and `chip_row` are as if the chips of all points
-            followed each other in one file.
+        points: in no particular order; `chip_file` and `chip_row` assume one file with the chips of all
+            points, in their order.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
-        adjustment: of the images; its models are those the points refer to.
+        adjustment: of the images; the points refer to its models.
         relative_accuracy: how well the images agree.
-        outline: (m, 2) lon, lat of a rectangle that holds the points, counter-clockwise, not closed.
+        outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
     """
 
     points: ControlPoints
@@ -111,86 +116,108 @@ def produce_points(
     options: ProductionOptions = ProductionOptions(),
     progress: Progress = no_progress,
 ) -> Production:
-    """Make control points with chips out of overlapping images and nothing else.
+    """Control points with chips, produced from overlapping images alone.
 
-    Tie points and one adjustment bring the images together. Salient, well spread ones are then
-    measured again where it matters, chip against chip, the images adjusted on these measures, and the
-    points intersected. The frame of the block is what the images' own models say on average.
+    Tie points and one adjustment bring the images into agreement. Salient, well-distributed tie points
+    are then measured again chip by chip, the images adjusted on these measures, and the points
+    intersected. The frame of the block is the mean of what the models of the images state.
 
     Args:
         scenes: two or more, with models as delivered.
         options: of the block.
-        progress: told where the work stands.
+        progress: receives the fraction done.
 
     Raises:
         InputError: fewer than two scenes, or two of the same name.
         NotEnoughPoints: the images have too little in common.
     """
-    _check(scenes)
+    _check_scenes(scenes)
     ties = find_tie_points(scenes, options.features, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"
         )
     progress(0.5, "adjusting the block")
-    first = _adjusted(scenes, [s.model for s in scenes], ties, options)
-    before = intersect([s.model for s in scenes], ties, int(ties.point[-1]) + 1)
+    tied = _adjust(scenes, ties, options)
+    before = intersect([scene.model for scene in scenes], ties, int(ties.point[-1]) + 1)
 
-    candidates = _candidates(scenes, first, ties, options)
-    measured = refine_on_chips(
-        scenes,
-        first.models,
+    candidates = _candidates(_with_models(scenes, tied), tied, ties, options)
+    measures = refine_on_chips(
+        _with_models(scenes, tied),
         candidates,
         options.fine_gsd_m,
         options.refinement,
-        progress=part_of(progress, 0.5, 0.4),
+        part_of(progress, 0.5, 0.4),
     )
     progress(0.9, "adjusting the block on its chips")
-    final = _adjusted(scenes, [s.model for s in scenes], measured, options)
-    kept = measured.take(final.active)
-    points = intersect(final.models, _with_sigma(kept, final.sigma_px), len(candidates))
-    chosen = _chosen(scenes, final, points, kept, options)
-    relative = RelativeAccuracy(
-        tie_points=int(np.isfinite(first.lon_lat_h[:, 0]).sum()),
-        before_px=_median_px(before.residual_px),
-        after_px=_median_px(first.residual_px),
-        refined_px=_median_px(final.residual_px[final.active]),
-        frame_sigma_m=float(np.sum([s.sigma_m**-2.0 for s in scenes]) ** -0.5),
+    adjustment = _adjust(scenes, measures, options)
+    active = measures.take(adjustment.active)
+    intersection = intersect(
+        adjustment.models, _with_scaled_sigma(active, adjustment.sigma_px), len(candidates)
     )
-    progress(1.0, f"{len(chosen)} points")
-    return _finished(scenes, final, points, kept, chosen, relative, options)
+    adjusted = _with_models(scenes, adjustment)
+    rows, saliency = _select_points(adjusted, intersection, active, options)
+    points = _control_points(
+        intersection, rows, saliency, _views(adjusted, intersection, rows, active, options)
+    )
+    relative_accuracy = RelativeAccuracy(
+        tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
+        before_px=_median_px(before.residual_px),
+        after_px=_median_px(tied.residual_px),
+        refined_px=_median_px(adjustment.residual_px[adjustment.active]),
+        frame_sigma_m=float(np.sum([scene.sigma_m**-2.0 for scene in scenes]) ** -0.5),
+    )
+    progress(1.0, f"{len(points)} points")
+
+    def cut_chips(row: int) -> ChipArray:
+        views = slice(points.views.start[row], points.views.start[row + 1])
+        return np.stack(
+            [
+                stored_chip(
+                    render_chip(
+                        adjusted[i].image, adjusted[i].model, points.lon_lat_h[row], float(gsd_m)
+                    )
+                )
+                for i, gsd_m in zip(points.views.image[views], points.views.gsd_m[views], strict=True)
+            ]
+        )
+
+    return Production(points, cut_chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
 
 
-def _check(scenes: Sequence[Scene]) -> None:
+def _check_scenes(scenes: Sequence[Scene]) -> None:
     names = [scene.acquisition.image_id for scene in scenes]
     if len(names) < 2:
         raise InputError(f"{len(names)} image given, at least 2 needed to make points")
     if len(set(names)) < len(names):
-        raise InputError(f"images of a block must have different names, not {', '.join(sorted(names))}")
+        raise InputError(
+            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
+            "one of them"
+        )
 
 
-def _adjusted(
-    scenes: Sequence[Scene],
-    models: Sequence[SensorModel],
-    observations: Observations,
-    options: ProductionOptions,
+def _adjust(
+    scenes: Sequence[Scene], observations: Observations, options: ProductionOptions
 ) -> BlockAdjustment:
+    """The block adjustment of scenes with their models as delivered."""
+    models = [scene.model for scene in scenes]
     sigma_px = np.array([scene.sigma_m / scene_gsd_m(scene) for scene in scenes])
     shapes = [scene.image.shape for scene in scenes]
     return adjust_block(models, shapes, observations, sigma_px, options.block)
 
 
-def _with_sigma(observations: Observations, scale: float) -> Observations:
-    """Observations with the sigmas the adjustment found.
+def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:
+    """The scenes with their adjusted models."""
+    return [replace(scene, model=model) for scene, model in zip(scenes, adjustment.models, strict=True)]
 
-    It sees what two rays do across each other, not along: half the stated sigma is kept in any case.
+
+def _with_scaled_sigma(observations: Observations, scale: float) -> Observations:
+    """Observations with their sigmas scaled by the sigma of the adjustment, at least by one half.
+
+    The residuals of two rays only show the errors across the epipolar line, so that the scale may be too
+    small.
     """
-    return Observations(
-        observations.point,
-        observations.image,
-        observations.line_sample,
-        observations.sigma_px * max(scale, 0.5),
-    )
+    return replace(observations, sigma_px=observations.sigma_px * max(scale, 0.5))
 
 
 def _median_px(residual: Array) -> float:
@@ -200,35 +227,39 @@ def _median_px(residual: Array) -> float:
 def _candidates(
     scenes: Sequence[Scene], block: BlockAdjustment, ties: Observations, options: ProductionOptions
 ) -> Array:
-    """Ground positions (n, 3) of the tie points to try: the best few of every square of ground."""
+    """Ground positions (n, 3) of the tie points to try: the best of every square of ground."""
     active = ties.take(block.active)
     rays = np.bincount(active.point, minlength=len(block.lon_lat_h))
     residual = np.linalg.norm(block.residual_px[block.active], axis=1)
-    worst = np.zeros(len(block.lon_lat_h))
-    np.maximum.at(worst, active.point, residual)
+    largest_residual = np.zeros(len(block.lon_lat_h))
+    np.maximum.at(largest_residual, active.point, residual)
     sigma_m = np.sqrt(np.diagonal(block.point_covariance_m2, 0, 1, 2))
-    usable = np.isfinite(block.lon_lat_h[:, 0]) & (rays >= 2)
-    usable &= (sigma_m[:, :2].max(axis=1) <= options.max_sigma_m) & (
-        sigma_m[:, 2] <= options.max_sigma_up_m
-    )
+    usable = np.isfinite(block.lon_lat_h[:, 0]) & (rays >= 2) & _precise(sigma_m, options)
     rows = np.flatnonzero(usable)
-    inside = np.zeros(len(rows), dtype=np.int64)
-    for scene, model in zip(scenes, block.models, strict=True):
-        inside += chip_inside(model, scene.image.shape, block.lon_lat_h[rows], options.fine_gsd_m)
-    rows, inside = rows[inside >= options.min_views], inside[inside >= options.min_views]
+    n_whole = np.zeros(len(rows), dtype=np.int64)
+    for scene in scenes:
+        n_whole += chip_inside(scene.model, scene.image.shape, block.lon_lat_h[rows], options.fine_gsd_m)
+    rows, n_whole = rows[n_whole >= options.min_views], n_whole[n_whole >= options.min_views]
     if len(rows) < options.block.min_points:
         raise NotEnoughPoints(
             len(rows),
             options.block.min_points,
-            f"tie points whose chip of {CHIP_SIZE * options.fine_gsd_m:g} m is seen whole by "
+            f"tie points whose chip of {CHIP_SIZE * options.fine_gsd_m:g} m lies completely inside "
             f"{options.min_views} images",
         )
     square = _squares(block.lon_lat_h[rows], options)
-    return block.lon_lat_h[rows[rank_in_group(square, inside - worst[rows]) < options.candidates]]
+    preference = n_whole - largest_residual[rows]
+    return block.lon_lat_h[rows[rank_in_group(square, preference) < options.candidates]]
+
+
+def _precise(sigma_m: Array, options: ProductionOptions) -> BoolArray:
+    """Which points, by their sigmas (n, 3) east, north, up, are precise enough."""
+    horizontal = sigma_m[:, :2].max(axis=1) <= options.max_sigma_m
+    return np.asarray(horizontal & (sigma_m[:, 2] <= options.max_sigma_up_m))
 
 
 def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
-    """Number of the square of ground every point (n, 3) lies in."""
+    """Number (n,) of the square of ground that every point (n, 3) lies in."""
     enu = east_north_up(lon_lat_h, np.median(continuous(lon_lat_h), axis=0))[:, :2]
     if options.spacing_m is not None:
         side = options.spacing_m
@@ -239,25 +270,20 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
     return np.unique(cell, axis=0, return_inverse=True)[1].astype(np.int64)
 
 
-def _chosen(
+def _select_points(
     scenes: Sequence[Scene],
-    block: BlockAdjustment,
     points: Intersection,
-    kept: Observations,
+    observations: Observations,
     options: ProductionOptions,
-) -> list[tuple[int, float]]:
-    """The best point of every square of ground, with its saliency."""
+) -> tuple[IntArray, Array]:
+    """Row (n,) and saliency (n,) of the best point of every square of ground."""
     sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
-    good = np.isfinite(points.lon_lat_h[:, 0]) & (points.rays >= options.min_views)
-    good &= sigma_m[:, :2].max(axis=1) <= options.max_sigma_m
-    good &= sigma_m[:, 2] <= options.max_sigma_up_m
-    rows = np.flatnonzero(good)
+    usable = np.isfinite(points.lon_lat_h[:, 0]) & (points.rays >= options.min_views)
+    rows = np.flatnonzero(usable & _precise(sigma_m, options))
     saliency = np.zeros(len(rows))
     for number, row in enumerate(rows):
-        image = kept.image[kept.point == row][0]
-        chip = render_chip(
-            scenes[image].image, block.models[image], points.lon_lat_h[row], options.fine_gsd_m
-        )
+        scene = scenes[observations.image[observations.point == row][0]]
+        chip = render_chip(scene.image, scene.model, points.lon_lat_h[row], options.fine_gsd_m)
         saliency[number] = chip_saliency(chip)
     salient = saliency >= options.min_saliency
     rows, saliency = rows[salient], saliency[salient]
@@ -266,86 +292,67 @@ def _chosen(
             len(rows), options.block.min_points, f"salient points out of {len(points.rays)} candidates"
         )
     square = _squares(points.lon_lat_h[rows], options)
-    preference = points.rays[rows] + saliency
-    best = np.flatnonzero(rank_in_group(square, preference) == 0)
-    return [(int(rows[b]), float(saliency[b])) for b in best]
+    best = np.flatnonzero(rank_in_group(square, points.rays[rows] + saliency) == 0)
+    return rows[best], saliency[best]
 
 
-def _finished(
-    scenes: Sequence[Scene],
-    block: BlockAdjustment,
-    intersection: Intersection,
-    kept: Observations,
-    chosen: list[tuple[int, float]],
-    relative: RelativeAccuracy,
-    options: ProductionOptions,
-) -> Production:
-    """Points, views and the way to their chips."""
-    rows = np.array([row for row, _ in chosen])
-    lon_lat_h = intersection.lon_lat_h[rows]
-    image, gsd_m, start = _views(scenes, block, lon_lat_h, rows, kept, options)
-    incidence, azimuth = _directions(block, lon_lat_h, image, start)
-    taken = tuple(scene.acquisition for scene in scenes)
-    views = Views(start, gsd_m, image, incidence, azimuth, np.ones(len(image)), taken)
-    points = ControlPoints(
-        id=np.arange(len(rows), dtype=np.int64),
-        lon_lat_h=lon_lat_h,
+def _control_points(
+    intersection: Intersection, rows: IntArray, saliency: Array, views: Views
+) -> ControlPoints:
+    """The selected rows of an intersection as control points of one chip file."""
+    n = len(rows)
+    return ControlPoints(
+        id=np.arange(n, dtype=np.int64),
+        lon_lat_h=intersection.lon_lat_h[rows],
         covariance_m2=intersection.covariance_m2[rows],
-        saliency=np.array([saliency for _, saliency in chosen]),
-        health=np.ones(len(rows)),
+        saliency=saliency,
+        health=np.ones(n),
         views=views,
-        chip_file=np.zeros(len(rows), dtype=np.int64),
-        chip_row=start[:-1].copy(),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=views.start[:-1].copy(),
         chip_files=("chips",),
     )
-
-    def cut(row: int) -> ChipArray:
-        return np.stack(
-            [
-                stored_chip(render_chip(scenes[i].image, block.models[i], lon_lat_h[row], float(g)))
-                for i, g in zip(
-                    image[start[row] : start[row + 1]], gsd_m[start[row] : start[row + 1]], strict=True
-                )
-            ]
-        )
-
-    return Production(points, cut, block, relative, box_around(lon_lat_h))
 
 
 def _views(
     scenes: Sequence[Scene],
-    block: BlockAdjustment,
-    lon_lat_h: Array,
+    intersection: Intersection,
     rows: IntArray,
-    kept: Observations,
+    observations: Observations,
     options: ProductionOptions,
-) -> tuple[IntArray, Array, IntArray]:
-    """Image and ground sampling of every view, points after points, and where each point's begin."""
-    whole = np.zeros((len(scenes), 2, len(rows)), dtype=bool)
-    for i, (scene, model) in enumerate(zip(scenes, block.models, strict=True)):
-        for g, gsd_m in enumerate((options.fine_gsd_m, options.coarse_gsd_m)):
-            whole[i, g] = chip_inside(model, scene.image.shape, lon_lat_h, gsd_m)
-    image, gsd, start = [], [], [0]
+) -> Views:
+    """The views of the selected points: every image that measured the point and shows its whole chip."""
+    lon_lat_h = intersection.lon_lat_h[rows]
+    whole = np.stack(
+        [
+            [chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for gsd_m in options.gsds_m]
+            for scene in scenes
+        ]
+    )
+    images: list[int] = []
+    gsds_m: list[float] = []
+    start = [0]
     for number, row in enumerate(rows):
-        seen_by = kept.image[kept.point == row]
-        for g, gsd_m in enumerate((options.fine_gsd_m, options.coarse_gsd_m)):
-            valid = [int(i) for i in seen_by if whole[i, g, number]]
-            image += valid
-            gsd += [gsd_m] * len(valid)
-        start.append(len(image))
-    return np.array(image, dtype=np.int64), np.array(gsd), np.array(start, dtype=np.int64)
-
-
-def _directions(
-    block: BlockAdjustment, lon_lat_h: Array, image: IntArray, start: IntArray
-) -> tuple[Array, Array]:
-    """Incidence and azimuth of every view."""
+        measured_in = observations.image[observations.point == row]
+        for level, gsd_m in enumerate(options.gsds_m):
+            of_level = [int(i) for i in measured_in if whole[i, level, number]]
+            images += of_level
+            gsds_m += [gsd_m] * len(of_level)
+        start.append(len(images))
+    image = np.array(images, dtype=np.int64)
     ground = np.repeat(lon_lat_h, np.diff(start), axis=0)
-    incidence = np.empty(len(image))
-    azimuth = np.empty(len(image))
-    for i, model in enumerate(block.models):
-        views = np.flatnonzero(image == i)
-        incidence[views], azimuth[views] = view_direction(
-            model, model.project(ground[views]), ground[views]
+    incidence, azimuth = np.empty(len(image)), np.empty(len(image))
+    for i, scene in enumerate(scenes):
+        of_image = np.flatnonzero(image == i)
+        incidence[of_image], azimuth[of_image] = view_direction(
+            scene.model, scene.model.project(ground[of_image]), ground[of_image]
         )
-    return incidence, azimuth
+    return Views(
+        start=np.array(start, dtype=np.int64),
+        gsd_m=np.array(gsds_m),
+        image=image,
+        incidence_deg=incidence,
+        azimuth_deg=azimuth,
+        health=np.ones(len(image)),
+        images=tuple(scene.acquisition for scene in scenes),
+    )

@@ -1,4 +1,4 @@
-"""ORTHO-IMAGE AND HEIGHTS IN -> NEW POINTS OUT: the salient places of one image that lies on a map."""
+"""ORTHO-IMAGE AND HEIGHTS IN -> NEW POINTS OUT: the salient corners of one image that lies on a map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,24 +23,25 @@ from services.types import (
     no_progress,
 )
 
-_FEWEST = 6
-"""Points that make a block."""
-_APART_PX = 10
-"""Distance of the corners that are tried in a square, pixels of the fine chips."""
+_MIN_POINTS = 6
+"""Fewest points of a block."""
+_CORNER_DISTANCE_PX = 10
+"""Smallest distance between the corners tried in a square, pixels of the fine chips."""
 
 
 @dataclass(frozen=True)
 class OrthoPointOptions:
-    """How points are taken out of an ortho-image.
+    """How points are produced from an ortho-image.
 
     Attributes:
-        fine_gsd_m, coarse_gsd_m: ground samplings of the chips; by default the image's own in two
-            digits, and four times that.
-        spacing_m: side of the squares that get a point each; None cuts the image into about `points`.
-        points: how many points are aimed at when there is no spacing.
-        candidates: how many corners of every square are tried.
-        min_saliency: of a point's chip.
-        local_sigma_px: how far a detail of the image lies off the rest of it, its own pixels, one
+        fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres; by default that of the image in
+            two digits, and four times that.
+        spacing_m: side of the squares that get one point each; None divides the image into about
+            `points` squares.
+        points: number of points aimed at when there is no spacing.
+        candidates: number of corners of every square that are tried.
+        min_saliency: smallest saliency of a point's chip.
+        local_sigma_px: position of a detail relative to the rest of the image, pixels of the image, one
             standard deviation a coordinate.
     """
 
@@ -55,12 +56,12 @@ class OrthoPointOptions:
 
 @dataclass(frozen=True)
 class GroundHeights:
-    """How high the ground lies.
+    """Heights of the ground.
 
     Attributes:
-        terrain: where it is known.
-        flat_m: metres above the ellipsoid, the same everywhere, where there is no terrain.
-        sigma_m: of these heights, one standard deviation.
+        terrain: a terrain model; None for flat ground.
+        flat_m: height of flat ground, metres above the ellipsoid; not used with a terrain.
+        sigma_m: of the heights, one standard deviation.
     """
 
     terrain: Terrain | None
@@ -68,7 +69,7 @@ class GroundHeights:
     sigma_m: float
 
     def at(self, lon_lat: Array) -> Array:
-        """Heights (n,) at longitudes and latitudes (n, 2); NaN where they are not known."""
+        """Heights (n,) at longitudes and latitudes (n, 2), metres; NaN where unknown."""
         if self.terrain is not None:
             return self.terrain.height_m(lon_lat)
         return np.full(len(lon_lat), self.flat_m)
@@ -79,10 +80,10 @@ class OrthoPoints:
     """The points of an ortho-image.
 
     Attributes:
-        points: as of `Production`; each has one view.
+        points: as in `Production`; each has one view at every ground sampling that shows it whole.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
-        gsds_m: ground samplings of the chips, fine and coarse.
-        outline: (m, 2) lon, lat of a rectangle that holds the points, counter-clockwise, not closed.
+        gsds_m: ground samplings of the chips, fine and coarse, metres.
+        outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
     """
 
     points: ControlPoints
@@ -97,48 +98,58 @@ def produce_ortho_points(
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
 ) -> OrthoPoints:
-    """Make control points with chips out of one ortho-image and the heights of its ground.
+    """Control points with chips, produced from one ortho-image and the heights of its ground.
 
-    The image is cut into squares; the corners of each (Shi and Tomasi, 1994) whose chips can be located
-    by their own content are points. Their place is the image's, their height that of the ground there:
-    what the image's producer got wrong is in them, and their frame is the image's.
+    The image is divided into squares. The most salient corner of each square becomes a point. Its
+    horizontal position is that of the image and its height that of the ground: the points inherit the
+    errors and the frame of the image.
+
+    Source of the corners: Shi and Tomasi (1994), Good features to track.
 
     Args:
         scene: an ortho-image, with its map grid as model.
         heights: of the ground.
         options: thresholds.
-        progress: told where the work stands.
+        progress: receives the fraction done.
 
     Raises:
-        InputError: heights move what the scene shows, so that it is no ortho-image.
-        NotEnoughPoints: too little of the image is salient and known in height.
+        InputError: the scene has a parallax, so that it is no ortho-image.
+        NotEnoughPoints: too few corners are salient and have a known height.
     """
     gsd_m = scene_gsd_m(scene)
     middle = scene_centre(scene)[None, :]
     if scene.model.project_derivative(middle)[0, :, 2].any():
-        raise InputError("an ortho-image is needed: heights move what this scene shows")
+        raise InputError(
+            "an ortho-image is needed: positions in this scene depend on the height of the ground. "
+            "Orthorectify it first"
+        )
     fine_m = options.fine_gsd_m or float(f"{gsd_m:.2g}")
     coarse_m = options.coarse_gsd_m or 4.0 * fine_m
     if not 0.0 < fine_m < coarse_m:
-        raise InputError(f"ground samplings {fine_m:g} and {coarse_m:g} m: the finer is expected first")
+        raise InputError(
+            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: fine_gsd_m must be above 0 and "
+            "below coarse_gsd_m"
+        )
     squares = _squares(scene, gsd_m, options)
-    found: list[tuple[Array, float]] = []
+    points: list[tuple[Array, float]] = []
     for number, square in enumerate(squares):
         if number % 16 == 0:
-            progress(0.9 * number / len(squares), f"looking at {len(squares)} squares")
-        best = _best_of(scene, heights, square, fine_m, options)
+            progress(0.9 * number / len(squares), f"searching {len(squares)} squares")
+        best = _best_corner(scene, heights, square, fine_m, options)
         if best is not None:
-            found.append(best)
-    if len(found) < _FEWEST:
+            points.append(best)
+    if len(points) < _MIN_POINTS:
         raise NotEnoughPoints(
-            len(found), _FEWEST, f"salient places of known height in {len(squares)} squares of the image"
+            len(points),
+            _MIN_POINTS,
+            f"salient corners of known height in {len(squares)} squares of the image",
         )
-    progress(1.0, f"{len(found)} points")
-    return _finished(scene, heights, found, (fine_m, coarse_m), gsd_m * options.local_sigma_px)
+    progress(1.0, f"{len(points)} points")
+    return _assembled(scene, heights, points, (fine_m, coarse_m), gsd_m * options.local_sigma_px)
 
 
 def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Window]:
-    """The image cut into squares, or nearly so."""
+    """The windows of an image divided into squares, as nearly as its size permits."""
     lines, samples = scene.image.shape
     if options.spacing_m is not None:
         side = options.spacing_m / gsd_m
@@ -154,10 +165,10 @@ def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Win
     ]
 
 
-def _best_of(
+def _best_corner(
     scene: Scene, heights: GroundHeights, square: Window, fine_m: float, options: OrthoPointOptions
 ) -> tuple[Array, float] | None:
-    """The most salient corner (lon, lat, height) of a square with its saliency."""
+    """The most salient corner (lon, lat, height) of a square and its saliency; None without any."""
     factor = max(1, int(fine_m / scene_gsd_m(scene)))
     corners = _corners(block_means(scene.image.read(square), factor), options.candidates)
     line_sample = corners * factor + (factor - 1) / 2.0 + [square.line, square.sample]
@@ -175,47 +186,47 @@ def _best_of(
 
 
 def _corners(pixels: FloatImage, count: int) -> Array:
-    """The strongest corners (n, 2) of some pixels, away from what is missing."""
+    """The strongest corners (n, 2), row and column, away from missing pixels."""
     missing = ~np.isfinite(pixels)
     if missing.all() or min(pixels.shape) < 8:
         return np.empty((0, 2))
     filled = np.where(missing, np.float32(pixels[~missing].mean()), pixels)
     mask = cv2.erode((~missing).astype(np.uint8), np.ones((9, 9), np.uint8))
-    found = cv2.goodFeaturesToTrack(filled, count, 0.01, _APART_PX, mask=mask, blockSize=7)
-    return np.empty((0, 2)) if found is None else found.reshape(-1, 2)[:, ::-1].astype(np.float64)
+    col_row = cv2.goodFeaturesToTrack(filled, count, 0.01, _CORNER_DISTANCE_PX, mask=mask, blockSize=7)
+    return np.empty((0, 2)) if col_row is None else col_row.reshape(-1, 2)[:, ::-1].astype(np.float64)
 
 
-def _finished(
+def _assembled(
     scene: Scene,
     heights: GroundHeights,
-    found: list[tuple[Array, float]],
+    corners: list[tuple[Array, float]],
     gsds_m: tuple[float, float],
     sigma_m: float,
 ) -> OrthoPoints:
-    """Points, views and the way to their chips."""
-    lon_lat_h = np.array([ground for ground, _ in found])
+    """Corners as control points with their views and chips."""
+    lon_lat_h = np.array([ground for ground, _ in corners])
     n = len(lon_lat_h)
-    shown = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsds_m[1])
-    for row in np.flatnonzero(shown):
+    has_coarse = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsds_m[1])
+    for row in np.flatnonzero(has_coarse):
         chip = render_chip(scene.image, scene.model, lon_lat_h[row], gsds_m[1])
-        shown[row] = np.isfinite(chip).all()
-    start = np.concatenate([[0], np.cumsum(1 + shown)]).astype(np.int64)
+        has_coarse[row] = np.isfinite(chip).all()
+    start = np.concatenate([[0], np.cumsum(1 + has_coarse)]).astype(np.int64)
     gsd_m = np.full(start[-1], gsds_m[0])
-    gsd_m[start[1:][shown] - 1] = gsds_m[1]
-    straight_down = np.zeros(start[-1])
+    gsd_m[start[1:][has_coarse] - 1] = gsds_m[1]
+    vertical = np.zeros(start[-1])
     variance_m2 = np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2
     points = ControlPoints(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=lon_lat_h,
         covariance_m2=np.tile(np.diag(variance_m2), (n, 1, 1)),
-        saliency=np.array([saliency for _, saliency in found]),
+        saliency=np.array([saliency for _, saliency in corners]),
         health=np.ones(n),
         views=Views(
             start=start,
             gsd_m=gsd_m,
             image=np.zeros(start[-1], dtype=np.int64),
-            incidence_deg=straight_down,
-            azimuth_deg=straight_down,
+            incidence_deg=vertical,
+            azimuth_deg=vertical,
             health=np.ones(start[-1]),
             images=(scene.acquisition,),
         ),
@@ -224,7 +235,7 @@ def _finished(
         chip_files=("chips",),
     )
 
-    def cut(row: int) -> ChipArray:
+    def cut_chips(row: int) -> ChipArray:
         return np.stack(
             [
                 stored_chip(render_chip(scene.image, scene.model, lon_lat_h[row], float(g)))
@@ -232,4 +243,4 @@ def _finished(
             ]
         )
 
-    return OrthoPoints(points, cut, gsds_m, box_around(lon_lat_h))
+    return OrthoPoints(points, cut_chips, gsds_m, box_around(lon_lat_h))

@@ -126,16 +126,16 @@ def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
 
 
 def test_an_image_without_detail_makes_no_points() -> None:
-    with pytest.raises(NotEnoughPoints, match="salient places of known height in"):
+    with pytest.raises(NotEnoughPoints, match="salient corners of known height in"):
         produce_ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
 
 
 def test_an_image_that_is_not_rectified_is_refused() -> None:
-    with pytest.raises(InputError, match="an ortho-image is needed: heights move"):
+    with pytest.raises(InputError, match="an ortho-image is needed: positions in this scene depend"):
         produce_ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
 
 
 def test_ground_samplings_the_wrong_way_round_are_refused() -> None:
     options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
-    with pytest.raises(InputError, match="20 and 10 m: the finer is expected first"):
+    with pytest.raises(InputError, match="20 and 10 m given: fine_gsd_m must be above 0 and below"):
         produce_ortho_points(ortho(land()), FLAT, options)
