@@ -41,7 +41,7 @@ OLD_WORDS = (
     r"\bsteady_weights\b",
     r"\bmin_edge_score\b",
     r"\bvotes?\b",
-    r"\brival",
+    r"\brival|another story",
     r"\bclass Equipment|\bcount_equipment\b|\.equipment\b|\"equipment\"",
     r"\bas_they_scatter\b|\bless_sure\b",
     r"\buntested_px\b",
@@ -50,6 +50,9 @@ OLD_WORDS = (
     r"\bjob_course\b|\bservice_time\b|\bn_superseded\b",
     r"\bapi[./](watch|documents|replies|origin)\b",
     r"\b(besieged|block_doors)\b",
+    r"[\"'`]uncertain[\"'`]",
+    r"(condition|collection)\.(beside|everything)\b",
+    r"record of changes",
 )
 """Words that the glossary has replaced; see `docs/glossary.md` for those in use."""
 EXAMPLES_OF_NAMES = {"match_count", "reported_sigma_m"}
