@@ -1,4 +1,4 @@
-"""Formats of features and tiles, opened by programs that are not ours."""
+"""Formats of features and tiles, opened by other programs."""
 
 import io
 import json
@@ -103,7 +103,7 @@ def test_a_format_is_chosen_by_the_header_accept(client, bearer, made):
         assert reply.headers["content-type"].startswith(kind), accept
 
 
-def test_a_large_page_is_streamed_and_says_the_same(get, monkeypatch):
+def test_a_large_page_is_streamed_with_the_same_content(get, monkeypatch):
     whole = get(ITEMS, limit=50).json()
     monkeypatch.setattr(items, "LARGEST_TEXT", 10)
     monkeypatch.setattr("app.db.features.pages.ROWS_AT_ONCE", 7)
@@ -116,7 +116,7 @@ def test_a_large_page_is_streamed_and_says_the_same(get, monkeypatch):
     assert get(ITEMS, limit=50, bbox="0,0,1,1").json()["features"] == []
 
 
-def test_density_is_what_is_published_and_goes_when_it_is_withdrawn(get, connection):
+def test_density_is_that_of_published_blocks_only(get, connection):
     cells = get("/collections/density/items").json()["features"]
     assert sum(cell["properties"]["n_points"] for cell in cells) == 60
     cell = cells[0]["properties"]
@@ -161,7 +161,7 @@ def tile_of(lon, lat, z):
 
 
 @pytest.mark.parametrize(("name", "z"), [("points", 8), ("points", 3), ("density", 0), ("blocks", 6)])
-def test_a_tile_holds_what_lies_there_in_a_layer_of_the_collection(get, made, tmp_path, name, z):
+def test_a_tile_has_the_features_of_its_place_in_a_layer_of_the_collection(get, made, tmp_path, name, z):
     y, x = tile_of(5.25, 43.25, z)
     reply = get(TILES.format(name, z, y, x))
     assert reply.headers["content-type"] == "application/vnd.mapbox-vector-tile"
@@ -192,7 +192,7 @@ def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, con
     assert (after.status_code, after.content) == (200, b"")
 
 
-def test_tilesets_are_described_and_tiles_that_are_not_there_are_not_found(get):
+def test_tilesets_are_described_and_tiles_outside_the_grid_are_not_found(get):
     listed = get("/collections/points/tiles").json()["tilesets"]
     assert [one["dataType"] for one in listed] == ["vector"]
     one = get("/collections/points/tiles/WebMercatorQuad").json()
@@ -207,7 +207,7 @@ def test_tilesets_are_described_and_tiles_that_are_not_there_are_not_found(get):
         assert get(path).status_code == 404, path
 
 
-def test_pages_for_people_show_no_more_than_text(get, connection):
+def test_html_pages_escape_text(get, connection):
     run_sql(connection, "update block set title = '<script>alert(1)</script>'")
     connection.commit()
     page = get("/collections/blocks/items", f="html").text

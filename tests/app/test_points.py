@@ -1,4 +1,4 @@
-"""Asking for control points over HTTP and by command."""
+"""Control points over HTTP and by command."""
 
 import csv
 import io
@@ -49,7 +49,7 @@ def made(connection, storage, tmp_path):
 
 @pytest.fixture
 def get(client, bearer):
-    """GET as a reader; returns the reply."""
+    """GET with scope `read`; returns the reply."""
     headers = bearer("read")
     return lambda path: client.get(path, headers=headers)
 
@@ -87,19 +87,19 @@ def test_pages_follow_each_other_without_gap_or_repetition(made, get):
     assert seen == (2**26 + np.arange(60)).tolist()
 
 
-def test_a_page_that_holds_exactly_all_has_no_next(made, get):
+def test_a_page_with_exactly_all_points_has_no_next(made, get):
     for query in ("limit=60", "limit=60&bbox=5,43,6,44"):
         page = get(f"{ITEMS}?{query}").json()
         assert page["numberReturned"] == 60
         assert "next" not in [link["rel"] for link in page["links"]]
 
 
-def test_a_limit_beyond_the_most_is_taken_as_the_most(made, get):
+def test_a_limit_above_the_largest_gives_the_largest(made, get):
     assert get(f"{ITEMS}?limit=1000000").json()["numberReturned"] == 60
 
 
 @pytest.mark.parametrize("limit", ["0", "-1", "many"])
-def test_a_limit_that_is_none_is_refused(made, get, limit):
+def test_a_limit_that_is_no_positive_number_is_refused(made, get, limit):
     reply = get(f"{ITEMS}?limit={limit}")
     assert reply.status_code == 400
     assert "limit" in reply.json()["detail"]
@@ -128,7 +128,7 @@ def test_a_wrong_box_is_refused_naming_the_value(made, get, bbox, named):
     assert named in reply.json()["detail"]
 
 
-def test_a_box_across_the_antimeridian_holds_both_sides_and_nothing_between(
+def test_a_box_across_the_antimeridian_has_both_sides_and_nothing_between(
     connection, storage, tmp_path, get
 ):
     made = make_block(tmp_path / "far", count=50, box=(179.9, -17.0, -179.9, -16.9))
@@ -147,13 +147,13 @@ def test_a_box_across_the_antimeridian_holds_both_sides_and_nothing_between(
 @pytest.mark.parametrize(
     "page_token", ["", "x", "AAAA", "a" * 32, "é" * 8, "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"]
 )
-def test_a_token_that_was_not_given_is_refused(made, get, page_token):
+def test_a_page_token_that_the_service_did_not_issue_is_refused(made, get, page_token):
     reply = get(f"{ITEMS}?token={page_token}")
     assert reply.status_code == 400
     assert "token" in reply.json()["detail"]
 
 
-def test_a_token_of_another_query_is_refused(made, get):
+def test_a_page_token_of_another_query_is_refused(made, get):
     page = get(f"{ITEMS}?bbox=5,43,6,44&limit=10").json()
     link = next(link["href"] for link in page["links"] if link["rel"] == "next")
     assert get(link).status_code == 200
@@ -190,10 +190,10 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
 
     assert count(f"4,42,{middle},44") == Count(10_000, exact=True)
     assert count(None) == Count(12_500, exact=True)
-    # Cells that the box does not cut are counted, so these are wrong by nothing.
+    # Points of cells inside the box are counted exactly.
     assert count("4,42,6,44") == Count(12_500, exact=False)
     assert count("170,42,5.4,44") == Count(12_500, exact=False)
-    # Of cells that it cuts at 5.36, the part inside is taken for the part of their points.
+    # Of a cell that the box cuts at 5.36, points are estimated by the share of its area inside.
     estimate, true = count("4,42,5.36,44"), (lon <= 5.36).sum()
     assert not estimate.exact
     assert 10_000 < true != estimate.number
@@ -205,7 +205,7 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     true = (many.points.saliency > 0.1).sum()
     assert not estimate.exact
     assert true > 10_000
-    # The planner keeps what all points hold, served or not, in a hundred steps.
+    # The statistics of the planner are of all points, served or not, in a hundred steps.
     assert estimate.number == pytest.approx(true, rel=a_step_of_the_planner)
 
 
@@ -230,7 +230,7 @@ def test_a_point_that_is_not_there_or_not_published_is_not_found(made, get, poin
         assert get(f"{ITEMS}/{point_id}{path}").status_code == 404
 
 
-def test_chips_as_npz_are_the_raw_values_with_what_they_show(made, get):
+def test_chips_as_npz_are_the_raw_values_with_their_metadata(made, get):
     with np.load(io.BytesIO(get(f"{ITEMS}/{2**26 + 7}/chips").content), allow_pickle=False) as archive:
         assert (archive["chips"] == made.chips(7)).all()
         assert archive["gsd_m"].tolist() == [0.5] * 3 + [2.0] * 3
@@ -273,7 +273,7 @@ def test_a_chip_as_geotiff_lies_where_the_conventions_put_its_pixels(made, get):
             assert_allclose(enu[:2], [(column - 50) * 2.0, (50 - row) * 2.0], atol=a_millimetre)
 
 
-def test_a_view_that_is_not_there_and_a_format_nobody_knows_are_refused(made, get):
+def test_an_unknown_view_and_an_unknown_format_are_refused(made, get):
     reply = get(f"{ITEMS}/{2**26 + 7}/chips/6")
     assert reply.status_code == 404
     assert "0 to 5" in reply.json()["detail"]
@@ -318,7 +318,7 @@ def test_collections_of_an_empty_store_state_the_whole_world_since_stac_asks_for
 
 @pytest.fixture
 def run(settings, monkeypatch, made):
-    """Runs `amers points query` on the test's database; returns what it printed."""
+    """Runs `amers points query` on the test's database; returns its output."""
     monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
     monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
 
@@ -348,7 +348,7 @@ def test_the_command_writes_geojson_or_csv_to_a_file_or_standard_output(
     assert {row["block_number"] for row in rows} == {"1"}
 
 
-def test_the_command_tells_how_many_points_there_are_as_json(run):
+def test_the_command_reports_the_number_of_points_as_json(run):
     assert json.loads(run("--bbox", "5,43,6,44", "--json")) == {
         "points": 60,
         "exact": True,
@@ -361,7 +361,7 @@ def test_the_command_on_an_empty_box_writes_an_empty_collection(run):
     assert run("--bbox", "0,0,1,1", "--format", "csv").startswith("id,lon_deg")
 
 
-def test_the_command_refuses_a_wrong_box_naming_it(run):
+def test_the_command_refuses_a_wrong_box_and_names_it(run):
     result = CliRunner().invoke(commands, ["points", "query", "--bbox", "1,2,3"])
     assert isinstance(result.exception, InputError)
     assert "'1,2,3'" in str(result.exception)

@@ -1,4 +1,4 @@
-"""Scenes as STAC items: what becomes of times, angles, footprints and files."""
+"""Scenes as STAC items: times, angles, footprints and files."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -38,7 +38,7 @@ def scene(client: TestClient, me: dict[str, str]) -> str:
 
 @pytest.fixture
 def described(dsn: str, scene: str) -> Callable[..., None]:
-    """Notes what the files of the scene say, with an outline (n, 2) of lon, lat."""
+    """Records what the files of the scene state, and an outline (n, 2) of lon, lat."""
 
     def describe(outline: list[list[float]], azimuth_deg: float = 90.0) -> None:
         taken = Acquisition(
@@ -67,21 +67,25 @@ def item(client: TestClient, me: dict[str, str], scene: str) -> Callable[[], dic
     return item
 
 
-def test_an_item_tells_what_the_files_of_a_scene_say(item, described):
-    told = item()["properties"]
-    assert told["datetime"] == told["created"], "when it was taken is not known yet"
-    assert "amers:acquired" not in told
-    assert "platform" not in told, "what is not known is left out, as STAC has it"
+def test_an_item_has_what_the_files_of_a_scene_state(item, described):
+    properties = item()["properties"]
+    assert properties["datetime"] == properties["created"], "when it was taken is not known yet"
+    assert "amers:acquired" not in properties
+    assert "platform" not in properties, "what is not known is left out, as STAC has it"
     described([[5.0, 43.0], [5.2, 43.0], [5.2, 43.1], [5.0, 43.1]])
     now = item()
-    told = now["properties"]
+    properties = now["properties"]
     assert (
-        datetime.fromisoformat(told["datetime"])
+        datetime.fromisoformat(properties["datetime"])
         == TAKEN
-        == datetime.fromisoformat(told["amers:acquired"])
+        == datetime.fromisoformat(properties["amers:acquired"])
     )
-    assert (told["platform"], told["gsd"], told["proj:shape"]) == ("PHR1A", GSD_M, [3000, 2000])
-    assert (told["view:incidence_angle"], told["view:sun_elevation"]) == (12.0, 60.0)
+    assert (properties["platform"], properties["gsd"], properties["proj:shape"]) == (
+        "PHR1A",
+        GSD_M,
+        [3000, 2000],
+    )
+    assert (properties["view:incidence_angle"], properties["view:sun_elevation"]) == (12.0, 60.0)
     assert now["bbox"] == pytest.approx([5.0, 43.0, 5.2, 43.1], abs=seven_decimals_deg)
 
 
@@ -98,7 +102,7 @@ def test_a_scene_across_the_antimeridian_has_its_west_greater_than_its_east(item
     assert item()["bbox"] == pytest.approx([179.9, -17.0, -179.9, -16.9], abs=seven_decimals_deg)
 
 
-def test_scenes_are_filtered_by_the_names_that_items_have(
+def test_scenes_are_filtered_by_the_property_names_of_items(
     client: TestClient, me: dict[str, str], scene: str, described
 ):
     described([[5.0, 43.0], [5.2, 43.0], [5.2, 43.1]])
@@ -128,7 +132,7 @@ def test_other_formats_have_the_same_scenes(
     assert "stac_version" not in feature, "items are in longitude and latitude"
 
 
-def test_the_files_of_a_scene_are_its_owners_and_go_with_it(
+def test_only_the_owner_gets_the_files_of_a_scene_until_it_is_removed(
     client: TestClient, me: dict[str, str], bearer: Bearer, scene: str, item
 ):
     assets = item()["assets"]

@@ -1,4 +1,4 @@
-"""The map page in a real browser: what people do there, and that nothing leaves the machine."""
+"""The map page in a real browser: tasks of users, and requests only to the service."""
 
 import io
 import json
@@ -37,7 +37,7 @@ PHONE = {"width": 390, "height": 844}
 patience_ms = 90_000
 chip_px = 101
 piece_bytes = 8 * 1024 * 1024
-"""Of an upload, as web/source/upload.ts sends them."""
+"""Size of a piece of an upload in web/source/upload.ts."""
 points_of_the_block = 40
 vector_colour = np.array([0xB3, 0x26, 0x1E])
 enough_px = 50
@@ -47,7 +47,7 @@ poll_ms = 100
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Debian's Chromium, which finds no machine but this one."""
+    """Debian's Chromium without a network beyond this machine."""
     chromium = shutil.which("chromium")
     if chromium is None:
         pytest.skip("there is no chromium: the page cannot be looked at (make test installs it)")
@@ -70,7 +70,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def world(amers, tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
-    """A scene, and the block it can be registered on, published."""
+    """A scene and a published block to register it on."""
     world = make_flat_world(tmp_path_factory.mktemp("world"))
     amers("block", "ingest", world.block, "--publish")
     return world
@@ -86,18 +86,18 @@ Visit = Callable[..., Page]
 
 @pytest.fixture
 def visit(browser: Browser, service: Service, world: FlatWorld) -> Iterator[Visit]:
-    """Opens the page; in the end, all requests must have gone to the service, without a complaint."""
-    asked: list[str] = []
-    complaints: list[str] = []
+    """Opens the page; then checks that requests went to the service and no error was logged."""
+    requested_urls: list[str] = []
+    errors: list[str] = []
     contexts = []
 
     def open_page(where: str = "", secret: str | None = None, size=DESKTOP, scheme="light") -> Page:
         context = browser.new_context(viewport=size, color_scheme=scheme, reduced_motion="reduce")
         context.set_default_timeout(patience_ms)
         contexts.append(context)
-        context.on("request", lambda request: asked.append(request.url))
-        context.on("weberror", lambda error: complaints.append(str(error.error)))
-        context.on("console", lambda said: complaints.append(said.text) if is_complaint(said) else None)
+        context.on("request", lambda request: requested_urls.append(request.url))
+        context.on("weberror", lambda error: errors.append(str(error.error)))
+        context.on("console", lambda message: errors.append(message.text) if is_error(message) else None)
         if secret is not None:
             keep = f"sessionStorage.setItem('amers-token', {json.dumps(secret)})"
             context.add_init_script(f"if (location.protocol === 'http:') {keep}")
@@ -109,18 +109,18 @@ def visit(browser: Browser, service: Service, world: FlatWorld) -> Iterator[Visi
     for context in contexts:
         context.close()
     inside = (f"{service.url}/", f"blob:{service.url}/", "data:")
-    assert asked
-    assert [url for url in asked if not url.startswith(inside)] == []
-    assert complaints == []
+    assert requested_urls
+    assert [url for url in requested_urls if not url.startswith(inside)] == []
+    assert errors == []
 
 
-def is_complaint(said: ConsoleMessage) -> bool:
-    """Errors, the refusals of the policy among them; that a stranger is refused is as it should be."""
-    return said.type == "error" and "status of 401" not in said.text
+def is_error(message: ConsoleMessage) -> bool:
+    """Whether a message is an error, a violation of the policy included; a reply 401 is none."""
+    return message.type == "error" and "status of 401" not in message.text
 
 
 def tab_to(page: Page, name: str) -> None:
-    """Go on with the Tab key to the control of that name."""
+    """Press the Tab key until the control with a name has the focus."""
     for _ in range(most_stops):
         page.keyboard.press("Tab")
         focused = page.evaluate(
@@ -132,7 +132,7 @@ def tab_to(page: Page, name: str) -> None:
 
 
 def until_drawn(page: Page) -> None:
-    """Wait for the map to have drawn all it has been given."""
+    """Wait until the map has drawn all of its data."""
     expect(page.locator("#map")).to_have_attribute("aria-busy", "false")
 
 
@@ -183,10 +183,10 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     opened.value.screenshot(path=ARTEFACTS / "report-page.png")
 
 
-def test_an_upload_goes_on_where_it_stopped_when_the_page_is_opened_again(
+def test_an_upload_resumes_where_it_stopped_when_the_page_is_opened_again(
     visit, world, secret, tmp_path
 ):
-    """The connection hangs after the first piece, the reader loads the page anew and asks once more."""
+    """The connection stalls after the first piece; the user reloads the page and sends it again."""
     image = tmp_path / "large.tif"
     image.write_bytes(world.tagged.read_bytes().ljust(piece_bytes + piece_bytes // 2, b"\0"))
     page = visit("#/scenes", secret)
@@ -220,13 +220,13 @@ def test_an_upload_goes_on_where_it_stopped_when_the_page_is_opened_again(
 
 
 def upload(page: Page, label: str, file: Path) -> None:
-    """Choose a file in the form and send it off."""
+    """Choose a file in the form and submit it."""
     page.get_by_label(label).first.set_input_files(file)
     page.locator("form button[type=submit]").click()
 
 
-def test_a_job_that_waits_tells_its_place_in_the_queue(visit, world, secret, service):
-    """The worker is held still, as one is that is busy with something else."""
+def test_a_waiting_job_shows_its_place_in_the_queue(visit, world, secret, service):
+    """The worker is stopped, so that the job has to wait."""
     headers = {"Authorization": f"Bearer {secret}"}
     with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
         sent = client.post("/scenes?name=waits.tif", content=world.tagged.read_bytes())
@@ -245,7 +245,7 @@ def test_a_job_that_waits_tells_its_place_in_the_queue(visit, world, secret, ser
         expect(page.get_by_role("link", name="Open the report")).to_be_visible()
 
 
-def test_an_administrator_uploads_a_block_which_is_checked_and_staged(
+def test_an_administrator_uploads_a_block_which_is_ingested_and_staged(
     visit, administrator, secret, tmp_path
 ):
     made = make_block(tmp_path / "block", name="uploaded")
@@ -297,7 +297,7 @@ def test_an_administrator_withdraws_a_block_and_publishes_it_again(
     assert served() == points_of_the_block
 
 
-def test_only_an_administrator_is_offered_to_publish(visit, secret):
+def test_only_administrators_see_the_button_to_publish(visit, secret):
     page = visit("#/block/1", secret)
     expect(page.locator(".badge")).to_have_text("published")
     assert page.get_by_role("button", name="Withdraw").count() == 0
@@ -319,7 +319,7 @@ def test_a_point_shows_all_its_chips(visit, secret):
     page.screenshot(path=ARTEFACTS / "point.png")
 
 
-def test_a_wrong_token_is_refused_in_the_words_of_the_service(visit):
+def test_an_invalid_token_is_refused_with_the_message_of_the_service(visit):
     page = visit("#/access")
     page.get_by_label("Token").fill("wrong")
     page.get_by_role("button", name="Sign in").click()
@@ -336,8 +336,8 @@ VIEWS = {
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_view_fits_a_phone_and_can_be_used_by_everybody(visit, administrator, scheme):
-    """No sideways scrolling, and no finding of axe-core: contrast, names, roles, order."""
+def test_every_view_fits_a_phone_and_is_accessible(visit, administrator, scheme):
+    """No horizontal scrolling, and no violation that axe-core finds: contrast, names, roles, order."""
     page = visit("#/points", administrator, PHONE, scheme)
     for view, heading in VIEWS.items():
         page.evaluate(f"location.hash = '#/{view}'")

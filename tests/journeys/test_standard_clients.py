@@ -1,4 +1,4 @@
-"""Clients that know nothing of Amers: pystac-client looks scenes up, OWSLib has them registered."""
+"""Standard clients: pystac-client searches scenes, OWSLib registers them."""
 
 import json
 from typing import Any
@@ -20,7 +20,7 @@ from tests.service_process import Service, until
 
 a_hundredth_of_a_degree = 0.01
 SCENES = 3
-"""The first of them is registered."""
+"""The first one is registered."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def http(service: Service, amers, me: dict[str, str], world: FlatWorld):
 
 @pytest.fixture(scope="module")
 def scenes(http: httpx.Client, world: FlatWorld) -> list[str]:
-    """The ids of some scenes, each an image with a file that holds its model."""
+    """The ids of scenes, each an image with the file of its model."""
     ids = []
     for number in range(SCENES):
         query = f"/scenes?name=scene{number}.tif&sigma_m={SIGMA_M}"
@@ -60,7 +60,7 @@ def processes(service: Service, me: dict[str, str]) -> Processes:
 
 @pytest.fixture(scope="module")
 def job(http: httpx.Client, processes: Processes, scenes: list[str]) -> dict[str, Any]:
-    """The registration of the first scene, asked for by OWSLib, once it has ended."""
+    """The registration of the first scene, started by OWSLib, after its end."""
     told = processes.execute("register-scene", {"scene": scenes[0]}, async_=True)
     assert processes.response_headers["location"].endswith(f"/jobs/{told['jobID']}")
     assert processes.response_headers["preference-applied"] == "respond-async"
@@ -84,7 +84,7 @@ def catalog(service: Service, me: dict[str, str], job: dict[str, Any]) -> Client
 # OWSLib
 
 
-def test_owslib_reads_what_can_be_asked_for(processes: Processes):
+def test_owslib_reads_the_descriptions_of_the_processes(processes: Processes):
     names = {process["id"] for process in processes.processes()}
     assert names >= {"register-scene", "orthorectify", "ingest-block", "export-block"}
     described = processes.process("register-scene")
@@ -94,12 +94,12 @@ def test_owslib_reads_what_can_be_asked_for(processes: Processes):
     assert "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/core" in classes
 
 
-def test_owslib_has_a_scene_registered(http: httpx.Client, job: dict[str, Any]):
+def test_owslib_registers_a_scene(http: httpx.Client, job: dict[str, Any]):
     assert (job["status"], job["progress"], job["processID"]) == ("successful", 100, "register-scene")
     said = [entry["message"] for entry in http.get(f"/jobs/{job['jobID']}/messages").json()["messages"]]
     assert said[:2] == ["waiting for a worker", "started"]
     assert said[-1] == job["message"]
-    # Steps are told every half second: a quick registration tells of one.
+    # Progress is reported every half second: a quick registration reports one step.
     assert len(said) > 3, "steps of the work between"
     results = http.get(f"/jobs/{job['jobID']}/results").json()
     assert results["verdict"] in ("good", "usable")
@@ -107,7 +107,7 @@ def test_owslib_has_a_scene_registered(http: httpx.Client, job: dict[str, Any]):
     assert files == {*OUTPUTS, "scene0_RPC.TXT"}
 
 
-def test_owslib_asks_for_a_report_by_value_and_a_model_by_reference(
+def test_owslib_gets_a_report_by_value_and_a_model_by_reference(
     http: httpx.Client, processes: Processes, scenes: list[str], job: dict[str, Any]
 ):
     wanted: dict[str, Any] = {
@@ -131,7 +131,7 @@ def test_owslib_asks_for_a_report_by_value_and_a_model_by_reference(
 # pystac-client
 
 
-def test_pystac_client_reads_catalog_and_collections_that_keep_the_schema(catalog: Client):
+def test_pystac_client_reads_a_catalog_and_collections_that_follow_the_schema(catalog: Client):
     assert (catalog.id, catalog.title) == ("amers", "Amers")
     for name in ("CORE", "COLLECTIONS", "FEATURES", "ITEM_SEARCH", "FILTER", "SORT"):
         catalog.add_conforms_to(name)
@@ -151,13 +151,13 @@ def test_pystac_client_reads_catalog_and_collections_that_keep_the_schema(catalo
     assert scenes.extent.temporal.intervals[0][0] is not None
 
 
-def test_pystac_client_reads_items_that_keep_the_schema(
+def test_pystac_client_reads_items_that_follow_the_schema(
     catalog: Client, scenes: list[str], http: httpx.Client, world: FlatWorld
 ):
     items = {item.id: item for item in catalog.get_collection("scenes").get_items()}
     assert set(items) == set(scenes)
     for item in items.values():
-        # The schemas of extensions lie on the network; what extensions read of an item is looked at.
+        # The schemas of extensions need the network; what the extensions read of an item is checked.
         validate_dict(item.to_dict(transform_hrefs=False), extensions=[])
     assert items[scenes[1]].geometry is None, "its files are opened by the job that uses them"
     item = catalog.get_collection("scenes").get_item(scenes[0])
@@ -215,7 +215,7 @@ def test_pystac_client_follows_pages_to_the_last(catalog: Client, scenes: list[s
     assert search.matched() == SCENES
 
 
-def test_scenes_are_their_owners(service: Service, amers, catalog: Client):
+def test_only_their_owners_see_scenes(service: Service, amers, catalog: Client):
     stranger = amers("token", "create", "stranger", "--scope", "register")["secret"]
     headers = {"Authorization": f"Bearer {stranger}"}
     assert list(Client.open(service.url, headers=headers).search().items()) == []
@@ -241,7 +241,7 @@ def test_scenes_are_their_owners(service: Service, amers, catalog: Client):
         ({"colour": "red"}, "colour"),
     ],
 )
-def test_searches_that_mean_nothing_are_refused_by_name(
+def test_searches_that_cannot_be_used_are_refused_by_name(
     http: httpx.Client, body: dict[str, Any], named: str
 ):
     reply = http.post("/search", json=body)

@@ -1,4 +1,4 @@
-"""A store for the abstract tests: a published block, and a staged one beside."""
+"""The store of the abstract tests: a published and a staged block."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from tests.statements import run_sql
 
 @pytest.fixture
 def made(connection, storage, tmp_path):
-    """A published block of 60 points, 3 of them tried; one of 10, staged, lies in the same place."""
+    """A published block of 60 points, 3 of them with history; a staged one of 10 in the same place."""
     made = make_block(tmp_path / "block", count=60)
     lifecycle.ingest_block(connection, storage, made.folder)
     lifecycle.publish_block(connection, "calanques")
@@ -25,20 +25,20 @@ def made(connection, storage, tmp_path):
 
 @pytest.fixture
 def get(made, client, bearer) -> Callable[..., Any]:
-    """GET as a reader of the service; parameters by name."""
+    """GET with scope `read`; parameters by name."""
     headers = bearer("read")
 
     def get(path: str, accept: str | None = None, **parameters: Any) -> Any:
-        said = headers if accept is None else {**headers, "Accept": accept}
+        all_headers = headers if accept is None else {**headers, "Accept": accept}
         query = {name.replace("_", "-"): value for name, value in parameters.items()}
-        return client.get(path, params=query or None, headers=said)
+        return client.get(path, params=query or None, headers=all_headers)
 
     return get
 
 
 @pytest.fixture
 def ids(get) -> Callable[..., list[int]]:
-    """The ids of the points that a question leaves."""
+    """The ids of the points that a query returns."""
 
     def ids(**parameters: Any) -> list[int]:
         reply = get("/collections/points/items", limit=1000, **parameters)

@@ -82,7 +82,7 @@ def test_relations_that_a_collection_of_geometries_does_not_have_are_refused(get
         assert "GeometryCollection" in reply.json()["detail"]
 
 
-def test_json_says_the_same_as_text(get):
+def test_json_means_the_same_as_text(get):
     for text in (
         f"s_within(geometry, {LITERALS['polygon around']}) and not s_touches(geometry, POINT(6 44))",
         "t_after(created_at, TIMESTAMP('2020-01-01T00:00:00Z')) and n_points between 10 and 100",
@@ -95,7 +95,7 @@ def test_json_says_the_same_as_text(get):
             assert reply.json()["numberReturned"] == 1, (text, reply.text)
 
 
-# Points were seen from 2023-03-01 to 2023-06-09; each of these stands to that in one way alone.
+# Views are of 2023-03-01 to 2023-06-09; each of these has one relation to that interval.
 INTERVALS = {
     "after": ("2023-01-01", "2023-02-01"),
     "metby": ("2023-01-01", "2023-03-01"),
@@ -164,7 +164,7 @@ PROPERTY_PROPERTY = (
 )
 
 
-def test_property_property_compares_what_stands_on_either_side(ids, made):
+def test_property_property_compares_expressions_on_both_sides(ids, made):
     east, north = (made.points.covariance_m2[:, i, i].astype(np.float32) for i in (0, 1))
     assert len(ids(filter="sigma_east_m < sigma_north_m")) == (east < north).sum() > 0
     for text, count in PROPERTY_PROPERTY:

@@ -1,4 +1,4 @@
-"""No conformance class is declared that no test holds the service to."""
+"""Every declared conformance class has tests."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from app.api.system import CONFORMS_TO
 
 OGC = "http://www.opengis.net/spec/"
-HELD_TO = {
+TESTS_OF_CLASS = {
     "ogcapi-common-1/1.0/conf/core": "test_req_core_query_param",
     "ogcapi-common-1/1.0/conf/landing-page": "test_common_landing_page",
     "ogcapi-common-1/1.0/conf/json": "test_common_json_and_html",
@@ -19,8 +19,8 @@ HELD_TO = {
     "ogcapi-features-3/1.0/conf/queryables-query-parameters": "test_req_queryables_query_parameters",
     "ogcapi-features-3/1.0/conf/filter": "test_req_filter_filter_",
     "ogcapi-features-3/1.0/conf/features-filter": "test_req_filter_mixing",
-    "cql2/1.0/conf/cql2-text": "test_json_says_the_same_as_text",
-    "cql2/1.0/conf/cql2-json": "test_json_says_the_same_as_text",
+    "cql2/1.0/conf/cql2-text": "test_json_means_the_same_as_text",
+    "cql2/1.0/conf/cql2-json": "test_json_means_the_same_as_text",
     "cql2/1.0/conf/basic-cql2": "test_req_cql2_numbers",
     "cql2/1.0/conf/advanced-comparison-operators": "test_req_cql2_texts",
     "cql2/1.0/conf/case-insensitive-comparison": "test_req_cql2_texts",
@@ -41,14 +41,14 @@ HELD_TO = {
     "ogcapi-processes-1/1.0/conf/job-list": "test_req_job_list_",
     "ogcapi-processes-1/1.0/conf/dismiss": "test_req_dismiss_",
 }
-"""What the names of the tests of each class begin with; those of STAC are tests/app/test_stac*.py."""
+"""How the names of the tests of each class begin; those of STAC are tests/app/test_stac*.py."""
 
 
 def test_each_declared_class_is_tested_and_each_tested_class_is_declared():
     declared = {name.removeprefix(OGC) for name in CONFORMS_TO if name.startswith(OGC)}
-    assert declared == set(HELD_TO)
+    assert declared == set(TESTS_OF_CLASS)
     folder = Path(__file__).parent
     text = "\n".join(path.read_text() for path in folder.glob("test_*.py"))
     tests = re.findall(r"^def (test_\w+)", text, re.MULTILINE)
-    for name, beginning in HELD_TO.items():
+    for name, beginning in TESTS_OF_CLASS.items():
         assert any(test.startswith(beginning) for test in tests), name

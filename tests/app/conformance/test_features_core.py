@@ -138,7 +138,7 @@ def test_req_core_fc_bbox_response(get, ids, made):
 
 
 def test_req_core_fc_time_response(get, ids):
-    # Views are of 2023-03-01 to 2023-06-09 (the last image does not say when it was taken).
+    # Views are of 2023-03-01 to 2023-06-09; the last image has no time.
     everything = ids()
     for inside in (
         "2023-03-01",

@@ -50,7 +50,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ({"outputs": {"report.json": {"transmissionMode": "pigeon"}}}, "transmissionMode"),
     ({"subscriber": {"successUri": "http://127.0.0.1/"}}, "subscriber"),
 )
-"""Bodies that cannot be used, and what the reply names."""
+"""Bodies that are refused, and text that the refusal contains."""
 REPORT, MODEL, PAGE = b'{"verdict": "good"}', b"LINE_OFF: 1\n", b"<html></html>"
 LAYERS = bytes(range(256))
 
@@ -62,7 +62,7 @@ def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
 
 @pytest.fixture
 def get(client: TestClient, me: dict[str, str]) -> Callable[..., Any]:
-    """GET as a caller who may register."""
+    """GET with scope `register`."""
     return lambda path, **query: client.get(path, params=query or None, headers=me)
 
 
@@ -74,7 +74,7 @@ def scene(client: TestClient, me: dict[str, str]) -> str:
 
 @pytest.fixture
 def ask(client: TestClient, me: dict[str, str], scene: str) -> Callable[..., Any]:
-    """Asks for a registration; members of the body by name."""
+    """Executes a registration; members of the body by name."""
 
     def ask(prefer: str | None = None, **more: Any) -> Any:
         headers = me if prefer is None else {**me, "Prefer": prefer}
@@ -85,7 +85,7 @@ def ask(client: TestClient, me: dict[str, str], scene: str) -> Callable[..., Any
 
 @pytest.fixture
 def done(ask: Callable[..., Any], dsn: str, storage: Storage) -> Callable[..., str]:
-    """The URL of a job that was asked for so and has made a report, a model, a page and layers."""
+    """The URL of a job with these members that has made a report, a model, a page and layers."""
 
     def done(**more: Any) -> str:
         reply = ask(**more)
@@ -109,7 +109,7 @@ def done(ask: Callable[..., Any], dsn: str, storage: Storage) -> Callable[..., s
 
 
 def begun(dsn: str, job_id: str) -> Job:
-    """The job, taken by a worker."""
+    """The job after a worker has claimed it."""
     with engine.connect(dsn) as connection:
         job = attempts.claim(connection, UUID(job_id), "a worker", 30.0)
     assert job is not None
@@ -220,7 +220,7 @@ def test_req_core_process_execute_success_async(get, ask):
 
 
 def test_req_core_process_execute_default_execution_mode(ask):
-    # No process can be executed while its caller waits.
+    # No process has synchronous execution.
     for prefer in (None, "respond-sync", "wait=10"):
         reply = ask(prefer)
         assert reply.status_code == 201

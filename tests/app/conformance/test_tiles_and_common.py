@@ -40,7 +40,7 @@ def test_tiles_core_a_tile_is_at_its_template_and_there_is_none_beyond_the_grid(
 
 
 @pytest.mark.parametrize("name", TILED)
-def test_tiles_tileset_says_what_it_holds_and_its_grid(get, name):
+def test_tiles_tileset_describes_its_layer_and_its_grid(get, name):
     tileset = get(f"/collections/{name}/tiles/WebMercatorQuad").json()
     assert tileset["dataType"] == "vector"
     assert tileset["crs"].endswith("EPSG/0/3857")
@@ -68,7 +68,7 @@ def test_tiles_tilesets_list_and_geodata_tilesets_lead_from_the_collection_to_it
 
 
 @pytest.mark.parametrize("name", TILED)
-def test_tiles_mvt_holds_a_layer_of_the_collection(get, made, tmp_path, name):
+def test_tiles_mvt_has_a_layer_of_the_collection(get, made, tmp_path, name):
     row, column = tile_of(5.25, 43.25, 9)
     reply = get(f"/collections/{name}/tiles/WebMercatorQuad/9/{row}/{column}")
     assert reply.headers["content-type"] == MVT
@@ -77,7 +77,7 @@ def test_tiles_mvt_holds_a_layer_of_the_collection(get, made, tmp_path, name):
     assert len(read_features(path, layer=name)[2]) > 0
 
 
-def test_common_landing_page_leads_to_the_api_what_it_conforms_to_and_its_data(get):
+def test_common_landing_page_links_to_the_api_the_conformance_classes_and_the_data(get):
     page = get("/").json()
     assert {"title", "description", "links"} <= set(page)
     for rel in ("service-desc", "service-doc", f"{REL}/conformance", f"{REL}/data"):
@@ -92,7 +92,7 @@ DOCUMENTS = ("/", "/conformance", "/collections", "/collections/points")
 
 
 @pytest.mark.parametrize("path", DOCUMENTS)
-def test_common_json_and_html_are_had_by_accept_and_lead_to_each_other(get, path):
+def test_common_json_and_html_are_chosen_by_accept_and_link_to_each_other(get, path):
     document = get(path, accept="application/json")
     assert document.headers["content-type"] == "application/json"
     page = get(path, accept="text/html")
