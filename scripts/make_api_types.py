@@ -1,7 +1,8 @@
 """Write the TypeScript types of the API's replies and of the report into the sources of the map page.
 
-They come from the OpenAPI description and from the JSON Schema of `report.json`. With `--check` nothing
-is written: the exit code is 1 if a file is not up to date.
+They come from the OpenAPI description and from the JSON Schema of `report.json`, which have the
+descriptions of all members. With `--check` nothing is written: the exit code is 1 if a file is not up to
+date.
 """
 
 import json
@@ -99,15 +100,9 @@ def _referred(schema: Schema) -> str:
 
 
 def _declaration(name: str, schema: Schema) -> str:
-    comment = _comment(schema)
     if schema.get("type") == "object" and "properties" in schema:
-        return f"{comment}export interface {name} {_members(schema)}\n"
-    return f"{comment}export type {name} = {_type(schema)};\n"
-
-
-def _comment(schema: Schema, indent: str = "") -> str:
-    text = " ".join(schema.get("description", "").split("\n\n")[0].split())
-    return f"{indent}/** {text} */\n" if text else ""
+        return f"export interface {name} {_members(schema)}\n"
+    return f"export type {name} = {_type(schema)};\n"
 
 
 def _members(schema: Schema) -> str:
@@ -117,7 +112,7 @@ def _members(schema: Schema) -> str:
     for name, member in schema["properties"].items():
         key = name if name.isidentifier() else json.dumps(name)
         mark = "" if name in required else "?"
-        lines.append(f"{_comment(member, '  ')}  {key}{mark}: {_type(member)};\n")
+        lines.append(f"  {key}{mark}: {_type(member)};\n")
     if schema.get("additionalProperties") is True:
         lines.append("  [member: string]: unknown;\n")
     return "{\n" + "".join(lines) + "}"

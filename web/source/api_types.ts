@@ -2,7 +2,6 @@
 
 import type { Geometry, MultiPolygon, Point, Polygon } from "geojson";
 
-/** A figure on the accuracy of a block, with the reference it was measured against. */
 export interface AccuracyRecord {
   kind: "relative" | "absolute";
   name: string;
@@ -11,7 +10,6 @@ export interface AccuracyRecord {
   against: string;
 }
 
-/** A file of a STAC item. */
 export interface Asset {
   href: string;
   type: string;
@@ -19,7 +17,6 @@ export interface Asset {
   roles: string[];
 }
 
-/** A feature of the collection blocks in GeoJSON. */
 export interface BlockFeature {
   type: "Feature";
   id: number;
@@ -28,7 +25,6 @@ export interface BlockFeature {
   links?: Link[];
 }
 
-/** Properties of a feature of the collection blocks. */
 export interface BlockFeatureProperties {
   number?: number;
   id?: string;
@@ -43,7 +39,6 @@ export interface BlockFeatureProperties {
   state_changed_at?: string;
 }
 
-/** A page of features of the collection blocks in GeoJSON. */
 export interface BlockPage {
   type: "FeatureCollection";
   features: BlockFeature[];
@@ -53,7 +48,6 @@ export interface BlockPage {
   "amers:numberMatchedIsExact"?: boolean;
 }
 
-/** The quality of a block, from its points and views. */
 export interface BlockQuality {
   points: number;
   area_km2: number;
@@ -68,7 +62,6 @@ export interface BlockQuality {
   accuracy: AccuracyRecord[];
 }
 
-/** One version of a block. */
 export interface BlockRecord {
   number: number;
   id: string;
@@ -84,7 +77,6 @@ export interface BlockRecord {
   state_changed_at: string;
 }
 
-/** A change in the audit trail; `before` or `after` is null where the row did not exist. */
 export interface ChangeRecord {
   id: number;
   at: string;
@@ -99,18 +91,15 @@ export interface ChangeRecord {
   after: Record<string, unknown> | null;
 }
 
-/** A page of the audit trail, newest first. */
 export interface ChangeRecords {
   changes: ChangeRecord[];
   links: Link[];
 }
 
-/** A block after a change. */
 export interface ChangedBlock {
   block: BlockRecord;
 }
 
-/** A collection of OGC API - Features and of STAC. */
 export interface CollectionDescription {
   id: string;
   title: string;
@@ -125,18 +114,15 @@ export interface CollectionDescription {
   links: Link[];
 }
 
-/** The collections that the caller may read. */
 export interface Collections {
   links: Link[];
   collections: CollectionDescription[];
 }
 
-/** The conformance classes of the service. */
 export interface Conformance {
   conformsTo: string[];
 }
 
-/** A feature of the collection density in GeoJSON. */
 export interface DensityFeature {
   type: "Feature";
   id: number;
@@ -145,7 +131,6 @@ export interface DensityFeature {
   links?: Link[];
 }
 
-/** Properties of a feature of the collection density. */
 export interface DensityFeatureProperties {
   id?: number;
   n_points?: number;
@@ -154,7 +139,6 @@ export interface DensityFeatureProperties {
   points_per_km2?: number;
 }
 
-/** A page of features of the collection density in GeoJSON. */
 export interface DensityPage {
   type: "FeatureCollection";
   features: DensityFeature[];
@@ -164,7 +148,6 @@ export interface DensityPage {
   "amers:numberMatchedIsExact"?: boolean;
 }
 
-/** Five figures of the values of one kind. */
 export interface Distribution {
   minimum: number;
   median: number;
@@ -173,18 +156,15 @@ export interface Distribution {
   maximum: number;
 }
 
-/** Where and when the features of a collection are. */
 export interface Extent {
   spatial: SpatialExtent;
   temporal: TemporalExtent;
 }
 
-/** The state of the service. */
 export interface Health {
   status: string;
 }
 
-/** An input of a process. */
 export interface InputDescription {
   title: string;
   description?: string;
@@ -192,7 +172,6 @@ export interface InputDescription {
   schema: Record<string, unknown>;
 }
 
-/** Why a job failed, as problem details; `error` names the kind of error. */
 export interface JobError {
   type?: string;
   title: string;
@@ -201,13 +180,11 @@ export interface JobError {
   [member: string]: unknown;
 }
 
-/** A page of jobs. */
 export interface Jobs {
   jobs: StatusInfo[];
   links: Link[];
 }
 
-/** A JSON Schema of the properties of a collection. */
 export interface JsonSchema {
   "$schema": string;
   "$id": string;
@@ -217,7 +194,6 @@ export interface JsonSchema {
   additionalProperties: boolean;
 }
 
-/** The landing page, which is also a STAC catalog. */
 export interface Landing {
   conformsTo: string[];
   type: "Catalog";
@@ -228,7 +204,6 @@ export interface Landing {
   links: Link[];
 }
 
-/** A link, RFC 8288. */
 export interface Link {
   rel: string;
   href: string;
@@ -239,7 +214,6 @@ export interface Link {
   body?: Record<string, unknown>;
 }
 
-/** A message of a job; `attempt` is 0 before the first attempt. */
 export interface Message {
   at: string;
   attempt: number;
@@ -247,13 +221,11 @@ export interface Message {
   message: string;
 }
 
-/** The last messages of a job. */
 export interface Messages {
   messages: Message[];
   links: Link[];
 }
 
-/** A new token; this reply alone has its secret. */
 export interface NewTokenRecord {
   id: string;
   name: string;
@@ -267,14 +239,12 @@ export interface NewTokenRecord {
   secret: string;
 }
 
-/** An output of a process. */
 export interface OutputDescription {
   title: string;
   description?: string;
   schema: Record<string, unknown>;
 }
 
-/** A feature of the collection points in GeoJSON. */
 export interface PointFeature {
   type: "Feature";
   id: number;
@@ -283,7 +253,6 @@ export interface PointFeature {
   links?: Link[];
 }
 
-/** Properties of a feature of the collection points. */
 export interface PointFeatureProperties {
   id?: number;
   sigma_east_m?: number;
@@ -300,7 +269,6 @@ export interface PointFeatureProperties {
   block_number?: number;
 }
 
-/** A feature of the collection point-history in GeoJSON. */
 export interface PointHistoryFeature {
   type: "Feature";
   id: number;
@@ -309,7 +277,6 @@ export interface PointHistoryFeature {
   links?: Link[];
 }
 
-/** Properties of a feature of the collection point-history. */
 export interface PointHistoryFeatureProperties {
   id?: number;
   state?: "served" | "proposed" | "suspended";
@@ -327,7 +294,6 @@ export interface PointHistoryFeatureProperties {
   block_number?: number;
 }
 
-/** A page of features of the collection point-history in GeoJSON. */
 export interface PointHistoryPage {
   type: "FeatureCollection";
   features: PointHistoryFeature[];
@@ -337,7 +303,6 @@ export interface PointHistoryPage {
   "amers:numberMatchedIsExact"?: boolean;
 }
 
-/** How one point fared in the scenes that tried to match it. */
 export interface PointHistoryRecord {
   state: "served" | "proposed" | "suspended";
   attempts: number;
@@ -354,7 +319,6 @@ export interface PointHistoryRecord {
   id: number;
 }
 
-/** A page of features of the collection points in GeoJSON. */
 export interface PointPage {
   type: "FeatureCollection";
   features: PointFeature[];
@@ -364,7 +328,6 @@ export interface PointPage {
   "amers:numberMatchedIsExact"?: boolean;
 }
 
-/** A control point: its accuracy, its views, its history. */
 export interface PointProperties {
   state: "served" | "proposed" | "suspended";
   attempts: number;
@@ -394,7 +357,6 @@ export interface PointProperties {
   views: PointViewProperties[];
 }
 
-/** A view of a point: its chip, and the image that the chip was cut from; null where unknown. */
 export interface PointViewProperties {
   view: number;
   gsd_m: number;
@@ -407,7 +369,6 @@ export interface PointViewProperties {
   sun_azimuth_deg: number | null;
 }
 
-/** A control point with its views, a GeoJSON feature. */
 export interface PointWithViews {
   type: "Feature";
   id: number;
@@ -416,7 +377,6 @@ export interface PointWithViews {
   links: Link[];
 }
 
-/** Problem details, RFC 9457. */
 export interface Problem {
   type: string;
   title: string;
@@ -427,7 +387,6 @@ export interface Problem {
   [member: string]: unknown;
 }
 
-/** A process with its inputs and outputs, each described by a JSON Schema. */
 export interface ProcessDescription {
   id: string;
   title: string;
@@ -440,7 +399,6 @@ export interface ProcessDescription {
   outputs: Record<string, OutputDescription>;
 }
 
-/** A process in a list. */
 export interface ProcessSummary {
   id: string;
   title: string;
@@ -451,19 +409,16 @@ export interface ProcessSummary {
   links: Link[];
 }
 
-/** A page of the processes. */
 export interface Processes {
   processes: ProcessSummary[];
   links: Link[];
 }
 
-/** A block after its publication, and the version that it superseded; null if there was none. */
 export interface PublishedBlock {
   block: BlockRecord;
   superseded: BlockRecord | null;
 }
 
-/** A reference image; paths are below AMERS_REFERENCE_FOLDER. */
 export interface Reference {
   id: number;
   name: string;
@@ -477,19 +432,16 @@ export interface Reference {
   footprint: Geometry;
 }
 
-/** Reference images, by name. */
 export interface References {
   references: Reference[];
 }
 
-/** A file of the results of a job, by reference. */
 export interface ResultFile {
   href: string;
   type: string;
   title: string;
 }
 
-/** A scene; what its files state about it is null until it is registered. */
 export interface Scene {
   id: string;
   name: string;
@@ -507,7 +459,6 @@ export interface Scene {
   removed: string | null;
 }
 
-/** A feature of the collection scenes in GeoJSON. */
 export interface SceneFeature {
   type: "Feature";
   id: string;
@@ -516,7 +467,6 @@ export interface SceneFeature {
   links?: Link[];
 }
 
-/** Properties of a feature of the collection scenes. */
 export interface SceneFeatureProperties {
   id?: string;
   datetime?: string;
@@ -536,7 +486,6 @@ export interface SceneFeatureProperties {
   "amers:verdict"?: "good" | "usable" | "failed" | null;
 }
 
-/** A page of features of the collection scenes in GeoJSON. */
 export interface ScenePage {
   type: "FeatureCollection";
   features: SceneFeature[];
@@ -546,21 +495,17 @@ export interface ScenePage {
   "amers:numberMatchedIsExact"?: boolean;
 }
 
-/** Scenes, newest first. */
 export interface Scenes {
   scenes: Scene[];
 }
 
-/** What a token allows; `register` includes `read`, `admin` includes everything. */
 export type Scope = "read" | "register" | "monitor" | "admin";
 
-/** The box of a collection. */
 export interface SpatialExtent {
   bbox: number[][];
   crs: string;
 }
 
-/** A scene as a STAC item. */
 export interface StacItem {
   type: "Feature";
   stac_version: string;
@@ -574,7 +519,6 @@ export interface StacItem {
   links: Link[];
 }
 
-/** A page of scenes as STAC items. */
 export interface StacItems {
   type: "FeatureCollection";
   features: StacItem[];
@@ -583,7 +527,6 @@ export interface StacItems {
   links: Link[];
 }
 
-/** The state of a job. */
 export interface StatusInfo {
   jobID: string;
   processID: string;
@@ -602,26 +545,22 @@ export interface StatusInfo {
   "amers:estimatedEnd"?: string;
 }
 
-/** A file in the storage. */
 export interface StoredFile {
   name: string;
   size_bytes: number;
   sha256: string;
 }
 
-/** The period of a collection; null is an open end. */
 export interface TemporalExtent {
   interval: ((string | null)[])[];
 }
 
-/** A layer of vector tiles. */
 export interface TileLayer {
   id: string;
   dataType: "vector";
   geometryDimension: number;
 }
 
-/** The grid of tiles of one zoom. */
 export interface TileMatrix {
   id: string;
   scaleDenominator: number;
@@ -634,7 +573,6 @@ export interface TileMatrix {
   matrixHeight: number;
 }
 
-/** Grids of tiles, one for each zoom. */
 export interface TileMatrixSet {
   id: string;
   uri: string;
@@ -643,19 +581,16 @@ export interface TileMatrixSet {
   tileMatrices: TileMatrix[];
 }
 
-/** A tile matrix set in a list. */
 export interface TileMatrixSetItem {
   id: string;
   uri: string;
   links: Link[];
 }
 
-/** The tile matrix sets of the service. */
 export interface TileMatrixSets {
   tileMatrixSets: TileMatrixSetItem[];
 }
 
-/** The vector tiles of a collection. */
 export interface TileSet {
   title: string;
   dataType: "vector";
@@ -665,13 +600,11 @@ export interface TileSet {
   layers?: TileLayer[];
 }
 
-/** The tile sets of a collection. */
 export interface TileSets {
   links: Link[];
   tilesets: TileSet[];
 }
 
-/** A token without its secret; null quotas are those of the settings. */
 export interface TokenRecord {
   id: string;
   name: string;
@@ -684,12 +617,10 @@ export interface TokenRecord {
   job_quota: number | null;
 }
 
-/** Tokens, newest first. */
 export interface TokenRecords {
   tokens: TokenRecord[];
 }
 
-/** A resumable upload; `offset` is the number of bytes that have arrived. */
 export interface Upload {
   id: string;
   state: "arriving" | "finished";
@@ -702,7 +633,6 @@ export interface Upload {
   expires: string | null;
 }
 
-/** An uploaded archive of a block; `POST /blocks` names it by this id. */
 export interface UploadedBlock {
   upload: string;
 }
