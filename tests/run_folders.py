@@ -1,4 +1,4 @@
-"""A folder for each run of the tests, and the end of what runs that were killed have left."""
+"""A folder for each run of the tests, and the clean-up after killed runs."""
 
 import fcntl
 import os
@@ -12,25 +12,25 @@ from pathlib import Path
 
 PREFIX = "amers-test-"
 MARK = "run"
-"""A file that is locked as long as the process lives that runs the tests."""
+"""A file that the process of the tests locks as long as it lives."""
 PATIENCE_S = 10.0
 
 
 @contextmanager
 def run_folder(where: Path = Path("/tmp")) -> Iterator[Path]:
-    """A short temporary folder that the server's user can pass, unlike pytest's own."""
+    """A temporary folder with a short path that the server's user can enter, unlike pytest's."""
     folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=where))
     folder.chmod(0o755)
     with (folder / f"{MARK}.new").open("w") as mark:
         fcntl.flock(mark, fcntl.LOCK_EX)
-        # Under its own name only once it is locked, so that nobody takes a beginner for dead.
+        # It gets its name once it is locked, so that no other run takes this one for dead.
         (folder / f"{MARK}.new").rename(folder / MARK)
         yield folder
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def end_dead_runs(where: Path = Path("/tmp")) -> list[Path]:
-    """Kill what runs that were killed have left running, and remove their folders; returns these."""
+    """Kill the remaining processes of killed runs and delete their folders; returns the folders."""
     ended = []
     for mark in where.glob(f"{PREFIX}*/{MARK}"):
         with suppress(OSError), mark.open() as file:
@@ -42,7 +42,7 @@ def end_dead_runs(where: Path = Path("/tmp")) -> list[Path]:
 
 
 def processes_in(folder: Path) -> dict[int, bool]:
-    """The processes that work in a folder (true), or have a file of it open."""
+    """The processes with their working folder (True) or an open file (False) in a folder."""
     found: dict[int, bool] = {}
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -61,7 +61,7 @@ def _leads_into(link: Path, folder: Path) -> bool:
 
 
 def _end_processes_in(folder: Path) -> None:
-    """PostgreSQL, which works in its data, is told to end at once; it puts its shared memory away."""
+    """Stop PostgreSQL, which works in its data, so that it frees its memory; kill the others."""
     deadline = time.monotonic() + PATIENCE_S
     while (left := processes_in(folder)) and time.monotonic() < deadline:
         for number, works_there in left.items():

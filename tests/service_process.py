@@ -1,4 +1,4 @@
-"""A running `amers serve` for tests that look at it from outside."""
+"""A running `amers serve` process, for tests from outside."""
 
 import os
 import socket
@@ -15,12 +15,12 @@ from app.db.cluster.embedded import Cluster
 
 patience_s = 90.0
 PORTS = range(20_000, 32_000)
-"""Below those that Linux gives to outgoing connections."""
+"""Ports below those that Linux gives to outgoing connections."""
 _ports = islice(cycle(PORTS), 37 * os.getpid() % len(PORTS), None)
 
 
 def free_port() -> int:
-    """A port that nobody has, and that no outgoing connection is given before its service listens."""
+    """A free port that no outgoing connection gets before the service listens on it."""
     for port in _ports:
         with socket.socket() as free, suppress(OSError):
             free.bind(("127.0.0.1", port))
@@ -53,7 +53,7 @@ class Service:
             )
 
     def end(self) -> None:
-        """Ask it to end, and see that it does."""
+        """Stop the service by SIGTERM and wait until it has ended."""
         self.process.terminate()
         self.process.wait(timeout=patience_s)
 
@@ -68,7 +68,7 @@ class Service:
             return False
 
     def workers(self) -> list[int]:
-        """The processes that hold the cluster's lease and are not the API."""
+        """The processes, other than the API, that have a lease of the cluster."""
         lease = self.cluster.folder / "lease"
         return [number for number in users_of(lease) if number != self.process.pid]
 

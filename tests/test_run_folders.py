@@ -1,4 +1,4 @@
-"""Runs of the tests that are killed: the next one ends what they left, and nothing else."""
+"""Killed runs of the tests: the next run ends what they left, and nothing else."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ with run_folder(Path(sys.argv[1])) as folder, Cluster(folder / "postgres", durab
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A folder in which other runs than those of this test have nothing."""
+    """A folder that only runs of this test use."""
     with run_folder() as folder:
         place = folder / "place"
         place.mkdir(mode=0o755)
@@ -34,7 +34,7 @@ def place() -> Iterator[Path]:
 
 @contextmanager
 def running(place: Path) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
-    """A run with a database, as a process of its own; and its folder."""
+    """A run with a database as a separate process, and its folder."""
     pipe = subprocess.PIPE
     command = [sys.executable, "-c", RUN, str(place)]
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as run:

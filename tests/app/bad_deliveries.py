@@ -1,4 +1,4 @@
-"""Deliveries and keys that must be refused: of scenes, uploads, blocks, tokens."""
+"""Bad requests about scenes, uploads, blocks and tokens; all must be refused."""
 
 from base64 import b64encode
 

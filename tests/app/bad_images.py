@@ -1,4 +1,4 @@
-"""Images, models and archives that must be refused: damaged, absurd, reaching for what is not theirs."""
+"""Images, models and archives that must be refused: damaged, absurd, or reading other files."""
 
 import gzip
 import io
@@ -65,7 +65,7 @@ class BadScene:
 
 
 def tiff(following: int = 0, first: int = 520, **changed: tuple[int, int]) -> bytes:
-    """A small TIFF, pixels before its only directory, with some of its numbers changed."""
+    """A small TIFF with its pixels before its only directory, and with some of its numbers changed."""
     tags = {**PLAIN, **{int(key[1:]): value for key, value in changed.items()}}
     entries = b""
     for tag, (kind, value) in sorted(tags.items()):
@@ -86,7 +86,7 @@ def big_tiff(width: int, length: int) -> bytes:
 
 
 def written(dtype: str, **more: object) -> Callable[[FlatWorld], bytes]:
-    """An image of zeros as GDAL writes it."""
+    """An image of zeros, written by GDAL."""
 
     def make(world: FlatWorld) -> bytes:
         profile = {"driver": "GTiff", "width": 64, "height": 64, "count": 1, "dtype": dtype, **more}
@@ -108,7 +108,7 @@ def good(world: FlatWorld) -> bytes:
 
 
 def jpeg2000(width: int, height: int) -> bytes:
-    """The head of a code stream."""
+    """The header of a code stream."""
     size = struct.pack(">HHIIIIIIIIH", 41, 0, width, height, 0, 0, width, height, 0, 0, 1)
     return b"\xff\x4f\xff\x51" + size + b"\x0f\x01\x01" + b"\xff\xd9"
 
@@ -229,7 +229,7 @@ MODELS = [
 
 
 def zipped(*files: tuple[str, bytes], link: str | None = None) -> bytes:
-    """A zip, with a link in it if one is named."""
+    """A zip; with a link in it if `link` is given."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files:
@@ -242,7 +242,7 @@ def zipped(*files: tuple[str, bytes], link: str | None = None) -> bytes:
 
 
 def tarred(*files: tuple[str, bytes], kind: bytes = tarfile.REGTYPE, target: str = "") -> bytes:
-    """A tar whose last member is of a kind."""
+    """A tar whose last member has this type."""
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w") as archive:
         for name, data in files:
@@ -255,7 +255,7 @@ def tarred(*files: tuple[str, bytes], kind: bytes = tarfile.REGTYPE, target: str
 
 
 def lying(data: bytes) -> bytes:
-    """A zip that declares its first member ten bytes long, in both of its places."""
+    """A zip that declares a length of ten bytes for its first member, in both headers."""
     content = bytearray(zipped(("a.tif", data)))
     struct.pack_into("<L", content, 22, 10)
     struct.pack_into("<L", content, content.rfind(b"PK\1\2") + 24, 10)
@@ -303,7 +303,7 @@ ARCHIVES: list[tuple[str, str, bytes]] = [
 
 
 def folder_archive(folder: Path, spoil: Callable[[dict[str, bytes]], None]) -> bytes:
-    """A zip of a block folder, some of its files changed."""
+    """A zip of a block folder with some of its files changed."""
     files = {
         f"block/{path.relative_to(folder)}": path.read_bytes()
         for path in sorted(folder.rglob("*"))

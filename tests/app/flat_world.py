@@ -1,4 +1,4 @@
-"""A textured plane, a block of points on it, and a scene of it whose model is wrong by a known shift."""
+"""A textured plane, a block of points on it, and a scene of it whose model has a known error."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ GROUND_H = 200.0
 GSD_M = 0.5
 GSDS_M = (0.5, 2.0)
 SHIFT_PX = np.array([14.0, -9.0])
-"""What the delivered model has to be moved by, line and sample."""
+"""The shift that corrects the delivered model, line and sample."""
 SIGMA_M = 6.0
 VIEWS = 2
 
@@ -68,7 +68,7 @@ def make_flat_world(folder: Path, size: int = 1200, points: int = 40, seed: int 
 
 
 def _model(size: int) -> RpcModel:
-    """A vertical view, north up, with a slight lean with height."""
+    """A vertical, north-up view whose positions depend slightly on the height."""
     one = np.eye(20)[0]
     line_num, sample_num = np.zeros(20), np.zeros(20)
     line_num[[2, 3]] = -1.0, 0.02
@@ -90,7 +90,7 @@ def _model(size: int) -> RpcModel:
 
 
 def _texture(size: int, rng: np.random.Generator) -> FloatImage:
-    """Noise at all scales, as land has."""
+    """Noise at all scales, like natural ground."""
     out = np.full((size, size), 1500.0, dtype=np.float32)
     for sigma in (1.0, 3.0, 9.0, 27.0):
         layer = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
@@ -99,7 +99,7 @@ def _texture(size: int, rng: np.random.Generator) -> FloatImage:
 
 
 def _seen(ground: FloatImage, rng: np.random.Generator) -> FloatImage:
-    """The ground in another light, with the noise of another sensor."""
+    """The ground with another illumination and the noise of another sensor."""
     gain, noise = rng.uniform(0.8, 1.2), rng.normal(0.0, 20.0, ground.shape)
     return np.clip(gain * ground + noise, 1.0, 4095.0).astype(np.float32)
 
@@ -149,6 +149,6 @@ def _control_points(lon_lat_h: Array, count: int) -> ControlPoints:
 
 
 def publish_world(dsn: str, storage: Storage, world: FlatWorld) -> None:
-    """Put the points of a world into the store, visible."""
+    """Ingest and publish the block of a world."""
     with engine.connect(dsn) as connection:
         publish_block(connection, str(ingest_block(connection, storage, world.block).block.number))

@@ -1,4 +1,4 @@
-"""An installation with something to lose, and what shows that nothing of it was touched or told."""
+"""An installation with points, scenes and secrets, to check that requests change and disclose nothing."""
 
 import hashlib
 import json
@@ -38,7 +38,7 @@ LEFT_BY_JOBS = (
     "procrastinate_events",
 )
 LEFT_BY_JOBS += ("scenes", "blocks", "uploads")
-"""Tables and folders in which a file that a job refuses leaves what it was: file, job, reason."""
+"""Tables and folders that a refused file may change: with the file, the job and the reason."""
 
 
 @dataclass(frozen=True)
@@ -88,19 +88,19 @@ class Installation:
         return found
 
     def known_digest(self) -> dict[str, str]:
-        """That of the last look, whatever a test that has failed did since."""
+        """The digest of the last check; computed anew after a failed test."""
         if not self.looked:
             self.digest()
         return self.looked[-1]
 
     def filled(self, text: str) -> str:
-        """A text of a case with the ids of this installation in it."""
+        """The text of a case with its names replaced by ids of this installation."""
         for name, value in self.names.items():
             text = text.replace(f"<{name}>", value)
         return text
 
     def outcome(self, reply: httpx.Response) -> dict[str, Any]:
-        """The job that a reply names, after one attempt at it by the code of a worker's process."""
+        """The job that a reply names, after one attempt at it by the code of the worker process."""
         job_id = UUID(reply.json()["jobID"])
         with self.database.transaction() as connection:
             job = attempts.claim(connection, job_id, "a worker", 60.0)
@@ -190,5 +190,5 @@ def _names(client: TestClient, headers: dict[str, dict[str, str]], world: FlatWo
 
 
 def told(reply: httpx.Response) -> str:
-    """All that a caller is told: headers and body."""
+    """The headers and the body of a reply as one text."""
     return json.dumps(dict(reply.headers)) + reply.content.decode(errors="replace")

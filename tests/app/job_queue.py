@@ -1,4 +1,4 @@
-"""Jobs in the queue of a test, as a worker would have them."""
+"""Jobs in the queue of a test, in the states that workers bring them into."""
 
 from uuid import UUID, uuid4
 
@@ -19,7 +19,7 @@ def new_job(database: Database) -> Job:
 
 
 def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S) -> Job:
-    """The job, taken by a worker."""
+    """The job, claimed by a worker."""
     with database.transaction() as connection:
         job = attempts.claim(connection, job_id, worker, lease_s)
     assert job is not None
@@ -27,7 +27,7 @@ def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float 
 
 
 def state_of(database: Database, job_id: UUID) -> Job:
-    """The job as it is now."""
+    """The present row of the job."""
     with database.transaction() as connection:
         job = jobs.find(connection, job_id)
     assert job is not None
@@ -35,7 +35,7 @@ def state_of(database: Database, job_id: UUID) -> Job:
 
 
 def let_lease_lapse(database: Database, job_id: UUID) -> None:
-    """As if the worker had been silent for too long."""
+    """Let the lease of the job expire."""
     with database.transaction() as connection:
         run_sql(
             connection,
@@ -45,7 +45,7 @@ def let_lease_lapse(database: Database, job_id: UUID) -> None:
 
 
 def queue_entries(connection: Connection, job_id: UUID) -> int:
-    """How many entries of the queue wait to be fetched for a job."""
+    """The number of waiting queue entries of a job."""
     row = run_sql(
         connection,
         "select count(*) as n from procrastinate_jobs where status = 'todo' and args ->> 'job_id' = %s",

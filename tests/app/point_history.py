@@ -1,4 +1,4 @@
-"""Time that passes for a store: what was written down lies further back."""
+"""Simulated time for a store: recorded times are moved into the past."""
 
 from app.db.engine import Connection
 from tests.statements import run_sql
@@ -11,13 +11,13 @@ MOVED = (
 
 
 def jump(connection: Connection, hours: int) -> None:
-    """The clock of the database is so far ahead of what it was, all of a sudden; or behind."""
+    """Simulate a jump of the database's clock, ahead or back."""
     for statement in MOVED:
         run_sql(connection, statement, [hours])
 
 
 def let_pass(connection: Connection, hours: int) -> None:
-    """So many hours go by in which the service runs."""
+    """Simulate hours during which the service runs."""
     jump(connection, hours)
     run_sql(
         connection,

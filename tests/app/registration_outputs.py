@@ -1,4 +1,4 @@
-"""What a registration of the flat world must have given, and files that can be sent with its scene."""
+"""Checks of the outputs of a registration of the flat world, and files to send with its scene."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ def largest_error_px(found: RpcModel, truth: SensorModel) -> float:
 
 
 def assert_registered(folder: Path, world: FlatWorld) -> None:
-    """The folder holds a report that keeps its schema and a model that is right."""
+    """Check that the report follows its schema and that the refined model is right."""
     report = json.loads((folder / "report.json").read_text())
     validate(report, report_schema())
     assert report["run"]["blocks"] == [{"id": "flat", "version": "1"}]
@@ -47,7 +47,7 @@ def assert_registered(folder: Path, world: FlatWorld) -> None:
 
 
 def assert_exchanged(folder: Path, active: int) -> None:
-    """Every format holds the active points where the document of the registration has them."""
+    """Check that every exchange format has the active points at the positions of the GeoJSON file."""
     document = read_control_points(folder / "control_points.geojson")
     used = document.take(document.active)
     assert len(used) == active
@@ -62,7 +62,7 @@ def assert_exchanged(folder: Path, active: int) -> None:
 
 
 def write_mask(path: Path) -> None:
-    """A mask four times coarser than the scene that hides its first lines."""
+    """Write a mask, four times coarser than the scene, that hides its first lines."""
     hidden = np.zeros((300, 300), np.uint8)
     hidden[: MASKED_LINES // 4 + 30] = 1
     with rasterio.open(path, "w", driver="GTiff", width=300, height=300, count=1, dtype="uint8") as file:
@@ -70,7 +70,7 @@ def write_mask(path: Path) -> None:
 
 
 def write_check_points(path: Path, world: FlatWorld, moved_px: float = 0.0) -> None:
-    """Ground that the truth places in the scene, as GeoJSON; marks are moved along the lines."""
+    """Write true ground points of the scene as GeoJSON, with marks shifted along the lines."""
     step = np.linspace(-0.002, 0.002, 6)
     lon, lat = (axis.ravel() for axis in np.meshgrid(step + CENTRE[0], step + CENTRE[1]))
     ground = np.column_stack([lon, lat, np.full(CHECK_POINTS, GROUND_H)])
@@ -86,7 +86,7 @@ def write_check_points(path: Path, world: FlatWorld, moved_px: float = 0.0) -> N
 
 
 def assert_masked(folder: Path) -> None:
-    """No point under the mask was looked for."""
+    """Check that no point under the mask was searched."""
     points = json.loads((folder / "control_points.geojson").read_text())["features"]
     under_the_mask = [
         one["properties"]["reason"]

@@ -1,4 +1,4 @@
-"""A service as a process of its own, on a database of the tests."""
+"""A service as a separate process, on a database of the tests."""
 
 import os
 import subprocess
@@ -41,7 +41,7 @@ class Served:
 
 @contextmanager
 def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator[Served]:
-    """A service without a worker, for a caller with a scope; stopped at the end."""
+    """A service without a worker and a token with one scope; the service is stopped at the end."""
     with fresh_database(cluster, TEMPLATE) as dsn:
         made = make_block(folder / "block", count=60)
         settings = Settings(database_url=dsn, data_folder=folder / "data")

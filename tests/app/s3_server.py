@@ -1,4 +1,4 @@
-"""An S3-compatible server in this process, and a bucket of its own for each test."""
+"""An S3-compatible server in this process, with a new bucket for each test."""
 
 import logging
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ KEYS = {
 
 @contextmanager
 def running_bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The address of an empty bucket, as AMERS_STORAGE_URL has it; the environment says where it is."""
+    """The AMERS_STORAGE_URL of a new bucket; environment variables lead to its server."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

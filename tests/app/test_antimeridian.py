@@ -1,4 +1,4 @@
-"""Longitude 180 through the middle: images, their block, the store, and a scene registered on it."""
+"""Data across the antimeridian: images, their block, the store, and a scene registered on it."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -274,7 +274,7 @@ def test_a_scene_is_registered_on_points_of_the_store(
     truth = later_view().geometry.true_model
     ground = check_block(made.block).points.lon_lat_h
     left_px = done.registration.model.project(ground) - truth.project(ground)
-    # What all points share is the error of the block's own frame.
+    # The common part of the errors is the error of the block's frame.
     assert np.hypot(*(left_px - np.median(left_px, axis=0)).T).max() < a_pixel
     assert np.hypot(*np.median(left_px, axis=0)) < 4.0 * BLOCK_SIGMA_M
     assert (tmp_path / "out" / "control_points.geojson").stat().st_size > 0

@@ -1,4 +1,4 @@
-"""Backup and restore as docs/operations.md tells them: what was destroyed answers as before."""
+"""Backup and restore as in docs/operations.md: a destroyed installation gives the same replies again."""
 
 import json
 import shutil
@@ -46,7 +46,7 @@ TILED = (("points", 6), ("points", 14), ("density", 8), ("blocks", 10))
 
 
 def tile_paths(lon: float, lat: float) -> tuple[str, ...]:
-    """The tiles in which a place lies."""
+    """The tiles that contain a place."""
     east = (lon + 180.0) / 360.0
     south = 0.5 - np.arctanh(np.sin(np.radians(lat))) / (2.0 * np.pi)
     return tuple(
@@ -56,7 +56,7 @@ def tile_paths(lon: float, lat: float) -> tuple[str, ...]:
 
 
 def features(tile: bytes, folder: Path) -> list[tuple[object, ...]]:
-    """What a vector tile shows, place by place; a tile has no order."""
+    """The features of a vector tile, sorted, because a tile has no order."""
     path = folder / "tile.mvt"
     path.write_bytes(tile)
     meta, _, geometry, values = read(path)
@@ -88,7 +88,7 @@ def started(folder: Path) -> Service:
 
 
 def answers(service: Service, secret: str, paths: tuple[str, ...]) -> dict[str, tuple[int, bytes]]:
-    """What an administrator is told at each path, wherever the service listens."""
+    """The replies to an administrator for each path, without the address of the service."""
     headers = SAME_HOST | {"Authorization": f"Bearer {secret}"}
     with httpx.Client(base_url=service.url, headers=headers, timeout=60.0) as client:
         replies = {path: client.get(path) for path in paths}

@@ -1,4 +1,4 @@
-"""Files that are damaged, absurd or hostile: refused by the API or by the job, with the reason."""
+"""Damaged, absurd and hostile files: the API or the job refuses them with the reason."""
 
 import hashlib
 import io
@@ -38,21 +38,21 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 @pytest.fixture(scope="module")
 def store(cluster, world, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installation]:
-    """One installation for all cases: what they leave are files of scenes and jobs that failed."""
+    """One installation for all cases; they leave only files of scenes and failed jobs."""
     folder = tmp_path_factory.mktemp("hostile_installation")
     with fresh_database(cluster, TEMPLATE) as dsn, hostile_installation(dsn, folder, world) as store:
         yield store
 
 
 def refused(store: Installation, reply: httpx.Response, says: str) -> None:
-    """A clear 4xx that tells nothing of this machine."""
+    """Check that a reply is a clear 4xx that discloses nothing of this machine."""
     assert 400 <= reply.status_code < 500, f"{reply.status_code} {reply.text[:300]}"
     assert says in reply.json()["detail"], reply.json()
     keeps_secrets(store, told(reply))
 
 
 def failed(store: Installation, job: dict[str, Any], says: str) -> None:
-    """A job that failed for good with its reason."""
+    """Check that a job failed for good with its reason."""
     assert job["status"] == "failed", job
     assert says in json.dumps(job["error"]), job["error"]
     assert job["error"]["error"] not in ("Internal error", ""), job
@@ -67,7 +67,7 @@ def keeps_secrets(store: Installation, text: str) -> None:
 
 
 def sent(store: Installation, content: bytes, who: str, **metadata: str) -> httpx.Response:
-    """The reply to the only piece of an upload by tus."""
+    """The reply to the only piece of a tus upload."""
     said = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in metadata.items())
     headers = store.headers[who] | TUS
     begun = store.client.post(
@@ -113,7 +113,7 @@ def test_a_bad_archive_is_refused_and_forgotten(
 
 
 def signed(files: Files) -> None:
-    """Make the checksums true again, so that only what was changed on purpose is wrong."""
+    """Update the checksums, so that only the intended change is wrong."""
     document = json.loads(files["block/block.json"])
     for name in document["amers:checksums"]:
         if f"block/{name}" in files:
@@ -122,7 +122,7 @@ def signed(files: Files) -> None:
 
 
 def said(change: Callable[[dict[str, Any]], Any]) -> Callable[[Files], None]:
-    """A change of what block.json says."""
+    """A change of block.json."""
 
     def spoil(files: Files) -> None:
         document = json.loads(files["block/block.json"])
@@ -133,7 +133,7 @@ def said(change: Callable[[dict[str, Any]], Any]) -> Callable[[Files], None]:
 
 
 def chips(make: Callable[[np.ndarray], bytes]) -> Callable[[Files], None]:
-    """Other bytes for the file of chips, rightly signed."""
+    """Other bytes for the chip file, with the right checksum."""
 
     def spoil(files: Files) -> None:
         files["block/chips/0000.npy"] = make(np.load(io.BytesIO(files["block/chips/0000.npy"])))
@@ -143,7 +143,7 @@ def chips(make: Callable[[np.ndarray], bytes]) -> Callable[[Files], None]:
 
 
 def column(file: str, name: str, change: Callable[[list[Any]], list[Any]]) -> Callable[[Files], None]:
-    """Other values in a column of a table, rightly signed."""
+    """Other values in a column of a table, with the right checksum."""
 
     def spoil(files: Files) -> None:
         table = pq.read_table(io.BytesIO(files[f"block/{file}"]))
@@ -175,7 +175,7 @@ def saved(array: np.ndarray) -> bytes:
 
 
 class Harm:
-    """What a pickle would do if anybody opened it."""
+    """The action of a pickle, if code unpickled it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (open, ("/tmp/amers-pickle-was-opened", "w"))

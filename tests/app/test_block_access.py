@@ -1,4 +1,4 @@
-"""Blocks as an administrator handles them: by HTTP, and by `amers block`."""
+"""Administration of blocks over HTTP and with `amers block`."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ from tests.factories import BOX, make_block
 
 
 def ingested_by_job(client, settings, admin, body: dict) -> dict:
-    """What became of an ingestion asked for over HTTP, done by the code of a worker's process."""
+    """The outcome of an ingestion requested over HTTP and done by the code of the worker process."""
     asked = client.post("/blocks", json=body, headers=admin)
     assert asked.status_code == 201, asked.text
     job_id = UUID(asked.json()["jobID"])
@@ -173,7 +173,7 @@ def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client
 
 @pytest.fixture
 def run(settings, monkeypatch):
-    """Runs a command on the test's database; returns what it printed, as JSON."""
+    """Runs a command on the test's database; returns its JSON output."""
     monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
     monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
 

@@ -1,4 +1,4 @@
-"""The life of a block in the store, ingested to withdrawn, and what the store then gives."""
+"""The life of a block in the store, from ingestion to withdrawal, and the points that it serves."""
 
 import numpy as np
 import pytest

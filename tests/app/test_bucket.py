@@ -1,4 +1,4 @@
-"""The storage in a bucket: the same as in a folder, over S3."""
+"""The storage in a bucket behaves like the storage in a folder."""
 
 import hashlib
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from services.errors import FormatError
 from tests.app.s3_server import running_bucket
 
 SEVERAL_PARTS = 12_000_000
-"""Bytes that are sent in parts."""
+"""Size of a file that is sent in several parts."""
 
 
 @pytest.fixture(scope="module")

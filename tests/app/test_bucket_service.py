@@ -1,4 +1,4 @@
-"""A service with its files in a bucket: a registration from end to end, and what an outage is like."""
+"""A service with its files in a bucket: a registration from end to end, and an outage of the bucket."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 @pytest.fixture
 def url(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     with running_bucket(monkeypatch) as url:
-        # For the worker, which is a process of its own.
+        # For the worker, which is a separate process.
         monkeypatch.setenv("AMERS_STORAGE_URL", url)
         yield url
 

@@ -1,4 +1,4 @@
-"""The chips of many points at once."""
+"""Replies with the chips of many points."""
 
 import io
 

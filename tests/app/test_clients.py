@@ -1,6 +1,6 @@
-"""Clients that know nothing of Amers, unmodified, on a service that is a process of its own.
+"""Unmodified standard clients on a service that is a separate process.
 
-They come with a token as they are given one in practice: by a setting of GDAL, by an argument of OWSLib.
+They receive a token as in practice: GDAL by a setting, OWSLib by an argument.
 """
 
 import os
@@ -52,7 +52,7 @@ def header_file(served) -> str:
 
 @pytest.fixture
 def source(served, header_file) -> Iterator[str]:
-    """The service as GDAL names it, with the token as GDAL takes one; what it fetches is printed."""
+    """The GDAL name of the service, with the token in GDAL's setting; GDAL prints the requests."""
     options = {"GDAL_HTTP_HEADER_FILE": header_file, "CPL_DEBUG": "ON"}
     pyogrio.set_gdal_config_options(options)
     yield f"OAPIF:{served.url}"
@@ -60,7 +60,7 @@ def source(served, header_file) -> Iterator[str]:
 
 
 def fetched(capture) -> list[str]:
-    """The addresses of items that GDAL has asked for since this was last called."""
+    """The item requests of GDAL since the last call."""
     said = "".join(capture.readouterr())
     return [line for line in said.splitlines() if "Fetch(" in line and "/items?" in line]
 

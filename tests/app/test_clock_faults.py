@@ -1,4 +1,4 @@
-"""Clocks that jump: leases and tokens go by the database's, limits by one that never jumps."""
+"""Clock jumps: leases and tokens follow the clock of the database, time limits a monotonic clock."""
 
 import os
 import shutil
@@ -71,7 +71,7 @@ Bearer = Callable[[str], dict[str, str]]
 
 @dataclass(frozen=True)
 class WrongClock:
-    """The wall clock of processes, moved by so many seconds as a file says; other clocks go on.
+    """The wall clock of processes, moved by a number of seconds in a file; other clocks are unchanged.
 
     Attributes:
         file: eight bytes, a whole number of seconds.
@@ -82,14 +82,14 @@ class WrongClock:
     environment: dict[str, str]
 
     def jump(self, days: float) -> None:
-        """Put the clock so far from the right time."""
+        """Move the clock this far from the right time."""
         with self.file.open("r+b") as file:
             file.write(struct.pack("q", round(86_400 * days)))
 
 
 @pytest.fixture
 def clock(tmp_path: Path) -> WrongClock:
-    """A clock that is right to begin with."""
+    """A clock that shows the right time at first."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         pytest.skip("no C compiler is installed: no clock can be made to jump")

@@ -1,4 +1,4 @@
-"""Settings come from the environment, and a wrong one is named."""
+"""Settings come from the environment, and the error of a wrong value names its variable."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Many more requests at once than there are threads and connections: all are answered."""
+"""Many more concurrent requests than threads and connections: all are answered."""
 
 from collections.abc import AsyncIterator, MutableMapping
 from contextlib import suppress
@@ -45,7 +45,7 @@ def app(dsn: str, tmp_path: Path) -> FastAPI:
 
 
 def client_of(app: FastAPI, headers: dict[str, str] | None = None) -> httpx.AsyncClient:
-    """A client within the process of a started application."""
+    """A client in the process of a started application."""
     return httpx.AsyncClient(
         transport=httpx.ASGITransport(app), base_url="http://service", headers=headers
     )
@@ -68,7 +68,7 @@ async def answered(app: FastAPI, requests: list[httpx.Request]) -> list[httpx.Re
 def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
     app: FastAPI, bearer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Pages of more pieces than are read ahead: they hold their connection while others wait for it.
+    # Pages of more pieces than are read ahead keep their connection while others wait for it.
     monkeypatch.setattr(features, "ROWS_AT_ONCE", POINTS // 6)
     kinds = [
         ("GET", f"http://service{ITEMS}/{FIRST_ID}", 200),

@@ -1,4 +1,4 @@
-"""The private cluster: shared, started and stopped by need, surviving the kill of anybody."""
+"""The private cluster: shared, started and stopped on demand, and robust against killed processes."""
 
 import os
 import shutil
@@ -34,7 +34,7 @@ LISTENING = "0A"
 
 
 class User:
-    """Another process that uses the cluster until it is told to leave or killed."""
+    """Another process that uses the cluster until it is stopped or killed."""
 
     def __init__(self, folder: Path) -> None:
         command = [sys.executable, "-c", USER, str(folder)]
@@ -59,7 +59,7 @@ class User:
 
 @pytest.fixture(scope="module")
 def pattern(open_folder):
-    """A cluster that was made and stopped; copying it is quicker than making one."""
+    """A stopped cluster to copy, which is quicker than creating one."""
     cluster = Cluster(open_folder / "pattern", durable=False)
     with cluster.lease():
         pass
@@ -68,14 +68,14 @@ def pattern(open_folder):
 
 @pytest.fixture
 def own(bare, pattern):
-    """A cluster of this test alone, made and stopped."""
+    """A created and stopped cluster of this test alone."""
     subprocess.run(["cp", "--archive", pattern.folder, bare.folder], check=True)
     return bare
 
 
 @pytest.fixture
 def bare(open_folder):
-    """A cluster of this test alone, not made yet."""
+    """A cluster of this test alone, not created yet."""
     cluster = Cluster(open_folder / uuid4().hex[:8], durable=False)
     yield cluster
     if (cluster.data / "postmaster.pid").exists():

@@ -1,4 +1,4 @@
-"""Disks that fill up in the middle of an upload or an ingestion: a clear refusal, nothing half."""
+"""Disks that fill up during an upload or an ingestion: a clear error and no partial data."""
 
 import os
 import shutil
@@ -30,13 +30,13 @@ TOO_MUCH = b"II*\0" + np.random.default_rng(1).bytes(4 * MEBIBYTE)
 TUS = {"Tus-Resumable": "1.0.0"}
 LEASE_S = 0.5
 DATABASE_ROOM = 300 * MEBIBYTE
-"""For a database, its log and a block, and not much more."""
+"""Enough for a database, its log and a block, and little more."""
 
 Bearer = Callable[[str], dict[str, str]]
 
 
 class Disk:
-    """A file system in memory of a size; tests are skipped where none can be made."""
+    """A file system in memory of a given size; tests are skipped where none can be mounted."""
 
     def __init__(self, folder: Path, size_bytes: int) -> None:
         if os.geteuid() != 0:
@@ -60,7 +60,7 @@ class Disk:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Disk]:
-    """A disk with little room, for the data folder of a test."""
+    """A small disk for the data folder of a test."""
     disk = Disk(tmp_path / "disk", ROOM)
     yield disk
     disk.remove()
@@ -68,7 +68,7 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
 
 @pytest.fixture
 def settings(dsn: str, disk: Disk, tmp_path: Path) -> Settings:
-    """An installation whose files lie on the small disk; its database does not."""
+    """An installation with its files on the small disk and its database elsewhere."""
     return Settings(
         database_url=dsn,
         data_folder=disk.folder / "data",
@@ -78,7 +78,7 @@ def settings(dsn: str, disk: Disk, tmp_path: Path) -> Settings:
 
 
 def files(storage: Storage) -> list[str]:
-    """All that lies in the storage, finished or not."""
+    """All files in the storage, finished or not."""
     return [
         str(path.relative_to(storage.folder)) for path in storage.folder.rglob("*") if path.is_file()
     ]
@@ -163,7 +163,7 @@ def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is
         with cluster.lease() as dsn:
             engine.upgrade(dsn)
             with engine.connect(dsn) as connection:
-                # A fresh segment of the log, begun: what has no room is the table.
+                # With a new segment of the log, it is the table that has no room.
                 run_sql(connection, "select pg_switch_wal()")
                 run_sql(connection, "checkpoint")
             ballast = disk.folder / "ballast"
@@ -176,7 +176,7 @@ def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is
                 lifecycle.ingest_block(connection, storage, made.folder)
             assert is_no_room(refused.value), refused.value
             ballast.unlink()
-            # It stops where even its log has no room, and is started again as `amers serve` does.
+            # The server stops when its log has no room; restart it as `amers serve` does.
             cluster.revive()
             with engine.connect(dsn) as connection:
                 assert lifecycle.list_blocks(connection) == []

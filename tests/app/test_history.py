@@ -1,4 +1,4 @@
-"""What registrations leave behind of points and views, and what becomes of it."""
+"""Histories of points and views: recorded by registrations, and used for health and suspensions."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -35,13 +35,13 @@ from services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
 
 VANISHED = 5
-"""Of the 40 points: what they show is gone in the scene."""
+"""Number of points, of 40, whose ground is different in the scene."""
 OPTIONS = RegistrationOptions(max_points=0)
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
-    """A block and a scene in which something else is where five of the points should be."""
+    """A block and a scene whose ground differs at five of the points."""
     made = make_flat_world(tmp_path_factory.mktemp("world"))
     points = check_block(made.block).points
     rng = np.random.default_rng(8)
@@ -56,7 +56,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 @pytest.fixture(scope="module")
 def registered(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> RegisteredScene:
-    """The scene registered on all points of the block; ids are those of the block."""
+    """The scene registered on all points of the block, with the ids of the block."""
     files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
     return run_registration(
         files,
@@ -75,7 +75,7 @@ def database(dsn: str, settings: Settings) -> Iterator[Database]:
 
 @pytest.fixture
 def first_id(world: FlatWorld, connection: Connection, storage: Storage) -> int:
-    """Id in the store of the first point of the block, which is published."""
+    """The id in the store of the first point of the published block."""
     block = ingest_block(connection, storage, world.block).block
     publish_block(connection, str(block.number))
     connection.commit()
@@ -84,14 +84,14 @@ def first_id(world: FlatWorld, connection: Connection, storage: Storage) -> int:
 
 @pytest.fixture
 def stored(registered: RegisteredScene, first_id: int) -> Registration:
-    """The registration as it would have come from the points of the store."""
+    """The registration with the ids of the points in the store."""
     measures = registered.registration.measures
     measures = replace(measures, point_id=measures.point_id + first_id)
     return replace(registered.registration, measures=measures)
 
 
 def remembered(connection: Connection, registration: Registration, scene: str) -> None:
-    """Remember a registration of a scene of that name."""
+    """Record a registration of a scene of this name."""
     registration_id = registrations.insert_registration(
         connection,
         job_id=None,
@@ -106,7 +106,7 @@ def remembered(connection: Connection, registration: Registration, scene: str) -
 
 
 def failing(registration: Registration, verdict: str = "failed") -> Registration:
-    """The same registration with another verdict."""
+    """The same registration with the verdict "failed"."""
     return replace(registration, qualification=replace(registration.qualification, verdict=verdict))
 
 

@@ -1,4 +1,4 @@
-"""Ingestions that break: whatever happens, nothing of the block is left to be seen."""
+"""Failed ingestions: whatever the fault, nothing of the block is visible afterwards."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ PATIENCE_S = 30.0
 
 
 def rows(connection) -> dict[str, int]:
-    """How many rows of blocks there are."""
+    """The number of rows in the tables of blocks."""
     return {
         table: run_sql(connection, f"select count(*) as n from {table}").fetchone()["n"]
         for table in TABLES
@@ -153,12 +153,12 @@ def test_a_block_that_changes_while_it_is_ingested_is_refused(connection, storag
 
 @pytest.fixture
 def own(open_folder):
-    """A cluster of this test alone; what a killed process wrote survives without a sync."""
+    """A cluster of this test alone, without fsync: writes of a killed process survive all the same."""
     return Cluster(open_folder / uuid4().hex[:8], durable=False)
 
 
 def kill(cluster: Cluster) -> None:
-    """SIGKILL the server and all its processes at once, and see them gone."""
+    """Send SIGKILL to the server and its processes, and wait until they are gone."""
     server = int((cluster.data / "postmaster.pid").read_text().splitlines()[0])
     processes = [server, *children(server)]
     assert len(processes) > 2
@@ -191,7 +191,7 @@ def alive(process: int) -> bool:
 
 
 def wait_until_rows_arrive(dsn: str, table: str) -> None:
-    """Return when the server is seen in the middle of a COPY into the table."""
+    """Wait until the server is in the middle of a COPY into the table."""
     deadline = time.monotonic() + PATIENCE_S
     with psycopg.connect(dsn, autocommit=True) as watcher:
         while True:

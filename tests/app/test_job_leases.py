@@ -1,4 +1,4 @@
-"""Jobs as workers have them: claimed under a lease, fenced against the dead, swept after them."""
+"""Jobs and workers: claims under a lease, fencing of dead workers, and the sweep after them."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""The course of a job as it is told: messages, the expected end, results that go after a while."""
+"""Progress of jobs: messages, the expected end, and the removal of old results."""
 
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -17,7 +17,7 @@ from tests.statements import run_sql
 LEASE_S = 30.0
 LONGEST_JOB_S = 3600.0
 a_slow_machine = timedelta(seconds=15)
-"""What a test may take between its steps; jobs that run grow old meanwhile."""
+"""Time that a test may take between its steps, during which running jobs grow older."""
 
 
 def asked(connection: Connection, kind: str = "register-scene") -> Job:
@@ -34,7 +34,7 @@ def begun(connection: Connection, kind: str = "register-scene") -> Job:
 
 
 def done_in(connection: Connection, seconds: float, kind: str = "register-scene") -> UUID:
-    """A job that succeeded so long after a worker had taken it."""
+    """A job that succeeded this long after its claim."""
     job = begun(connection, kind)
     attempts.succeed(connection, job.id, job.attempt, {})
     run_sql(
@@ -46,7 +46,7 @@ def done_in(connection: Connection, seconds: float, kind: str = "register-scene"
 
 
 def wait_of(connection: Connection, job: Job) -> timedelta:
-    """From now to the expected end of a job."""
+    """Time from now to the expected end of a job."""
     end = progress.expected_end(connection, job)
     now = run_sql(connection, "select clock_timestamp() as now").fetchone()
     assert end is not None

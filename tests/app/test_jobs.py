@@ -1,4 +1,4 @@
-"""Jobs as callers have them: asked for once, seen by their owner, dismissed, counted."""
+"""Jobs and their callers: requests, visibility, dismissal and quotas."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""A few clients at once for a few seconds. The large run is `python -m benchmarks.load`."""
+"""A few concurrent clients for a few seconds; the large run is `python -m benchmarks.load`."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Workers on machines of their own, one of them cut off: another takes over, once and for all."""
+"""Workers on two machines, one of which loses its network: the other takes over the job."""
 
 import os
 import shutil
@@ -53,11 +53,11 @@ class Machine:
 
     @property
     def enter(self) -> tuple[str, ...]:
-        """The command that runs another one in it."""
+        """The prefix that runs a command in the namespace."""
         return ("ip", "netns", "exec", self.name)
 
     def line(self, state: str) -> None:
-        """Cut the line (`down`), or mend it (`up`)."""
+        """Cut (`down`) or restore (`up`) the network line."""
         _ip("link", "set", self.name, state)
 
 
@@ -83,7 +83,7 @@ def _machine(number: int, cleanup: ExitStack) -> Machine:
 
 @pytest.fixture
 def machines() -> Iterator[tuple[Machine, Machine]]:
-    """Two machines that reach this one and not each other."""
+    """Two machines that reach this one but not each other."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("network namespaces need root and iproute2")
     with ExitStack() as cleanup:
@@ -96,7 +96,7 @@ def machines() -> Iterator[tuple[Machine, Machine]]:
 
 @pytest.fixture
 def reached(machines: tuple[Machine, Machine], dsn: str) -> Iterator[tuple[str, str]]:
-    """How each machine reaches the database of the test: by TCP, over its own line only."""
+    """The connection string of each machine: by TCP over its own line."""
     with ExitStack() as cleanup:
         yield tuple(_listen(machine.address, dsn, cleanup) for machine in machines)
 

@@ -1,4 +1,4 @@
-"""Bearers of an OpenID Connect issuer, which runs on this machine."""
+"""Tokens of an OpenID Connect issuer that runs on this machine."""
 
 import json
 import threading
@@ -16,7 +16,7 @@ from app.usecases.tokens import revoke_token
 
 
 class LocalIssuer:
-    """An issuer with one key, and what was asked of it."""
+    """An issuer with one key, and the requests it received."""
 
     def __init__(self) -> None:
         self.key = ec.generate_private_key(ec.SECP256R1())
@@ -44,7 +44,7 @@ class LocalIssuer:
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
     def token(self, key=None, algorithm="ES256", kid="one", **claims) -> dict[str, str]:
-        """Headers with a token; claims replace the usual ones, None leaves one out."""
+        """Headers with a token; `claims` replace the default ones, and None leaves one out."""
         usual = {
             "iss": self.url,
             "aud": "amers",

@@ -1,4 +1,4 @@
-"""What is recorded, watched and logged, what a token may have, and who may ask for it."""
+"""Operations: the audit record, metrics, the log, quotas of tokens, and access to them."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Rectifying scenes from the command line and by a service."""
+"""Orthorectification of scenes on the command line and by a service."""
 
 import json
 from collections.abc import Callable
@@ -36,13 +36,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreference
 
 
 def in_the_image(lines_off: int = 0) -> RpcModel:
-    """The model of an image of 300 x 400 pixels, perhaps some lines off."""
+    """The model of an image of 300 x 400 pixels, shifted by a number of lines."""
     line, sample = (int(number) for number in MODEL.image_offset)
     return replace(MODEL, image_offset=MODEL.image_offset - [line - 150 + lines_off, sample - 200])
 
 
 def write_inputs(folder: Path) -> tuple[Path, Path]:
-    """An image that shows its own lines, and level ground under it."""
+    """Write an image whose values are its line numbers, and flat ground under it."""
     lon, lat, height_m = (float(number) for number in MODEL.ground_offset)
     pixels = np.repeat(np.arange(1, 301, dtype=np.uint16)[:, None], 400, axis=1)
     write_raster(folder / "scene.tif", pixels, in_the_image())
@@ -191,7 +191,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
 def test_two_views_of_one_place_lie_on_each_other_once_rectified(
     real_data: Path, tmp_path: Path
 ) -> None:
-    """Their models disagree by up to a pixel; relief of 190 m, 12.8 degrees apart, is some 85 px."""
+    """The models disagree by up to 1 px; 190 m of relief seen 12.8 degrees apart are 85 px."""
     folder = real_data / "phr_calanques_triplet"
     dem = folder / "expected_output" / "dsm.tif"
     words = ["--dem", dem, "--vertical", "ellipsoid", "--fill-px", 10, "--crs", "EPSG:32631"]

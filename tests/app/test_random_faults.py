@@ -1,4 +1,4 @@
-"""Processes killed at random moments, a small run of the benchmark `python -m benchmarks.faults`."""
+"""Processes killed at random moments: a small run of the benchmark `python -m benchmarks.faults`."""
 
 from pathlib import Path
 

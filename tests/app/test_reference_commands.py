@@ -1,4 +1,4 @@
-"""`amers reference`: an administrator's reference images, from the command line."""
+"""`amers reference`: reference images on the command line."""
 
 import json
 import sys
@@ -16,7 +16,7 @@ from tests.app.test_references import GSD_M, SIZE, write
 
 @dataclass(frozen=True)
 class Said:
-    """How a command ended and what it said."""
+    """The exit code and the output of a command."""
 
     returncode: int
     stdout: str
@@ -28,7 +28,7 @@ Amers = Callable[..., Said]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The folder that references may lie in, and one beside it."""
+    """The folder of references, and one beside it."""
     flat = np.full((SIZE, SIZE), 300.0, np.float32)
     for path in ("allowed/land.tif", "allowed/heights.tif", "beside/land.tif"):
         write(tmp_path / path, flat)
@@ -82,7 +82,7 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
     done = amers("remove", "Ventoux")
     assert (done.returncode, done.stdout.strip()) == (0, "removed Ventoux")
     assert [one["name"] for one in listed(amers)] == ["Alps"]
-    assert (folder / "land.tif").exists(), "its files stay where they are"
+    assert (folder / "land.tif").exists(), "its files stay in their folder"
     gone = amers("remove", "Ventoux")
     assert (gone.returncode, "no reference Ventoux" in gone.stderr) == (2, True)
 

@@ -1,4 +1,4 @@
-"""Reference images of a service: registered, used where there are no points, their places kept."""
+"""Reference images of a service: added, used where there are no points, and their recorded places."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -53,7 +53,7 @@ OPTIONS = RegistrationOptions()
 def write(
     path: Path, pixels: FloatImage, crs: str = "EPSG:32632", corner: tuple[float, float] = (5e5, 5e6)
 ) -> Path:
-    """An image on a map, in Germany if not said otherwise."""
+    """Write an image on a map, by default in Germany."""
     grid = Affine(GSD_M, 0, corner[0], 0, -GSD_M, corner[1])
     lines, samples = pixels.shape
     profile = {"driver": "GTiff", "width": samples, "height": lines, "count": 1, "dtype": "uint16"}
@@ -65,7 +65,7 @@ def write(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a reference, and two scenes of its ground whose maps are a few pixels off."""
+    """A folder with a reference and two scenes of its ground, whose maps are a few pixels wrong."""
     folder = tmp_path_factory.mktemp("images")
     rng = np.random.default_rng(4)
     ground = cv2.GaussianBlur(rng.normal(size=(512, 512)), (0, 0), 1.5)
@@ -80,7 +80,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def settings(settings: Settings, folder: Path) -> Settings:
-    """Settings that let references be used."""
+    """Settings with a folder of references."""
     return settings.model_copy(update={"reference_folder": folder / "allowed"})
 
 
@@ -99,7 +99,7 @@ def added(connection: Connection, settings: Settings) -> None:
 
 
 def registered(database: Database, settings: Settings, image: Path, output: Path) -> RegisteredScene:
-    """A scene registered as the service would, its places kept."""
+    """A scene registered like by the service, with its places recorded."""
     find = references_of_store(database, settings)
     files = SceneFiles(image, sigma_m=SIGMA_M)
     made = run_registration(files, ControlSources(None, find), output, options=OPTIONS)
@@ -110,7 +110,7 @@ def registered(database: Database, settings: Settings, image: Path, output: Path
 
 
 def places(connection: Connection) -> list[tuple[int, int]]:
-    """How often each place was looked for and found."""
+    """The number of attempts and of matches of each place."""
     rows = run_sql(connection, "select attempts, successes from reference_point order by id").fetchall()
     return [(row["attempts"], row["successes"]) for row in rows]
 
@@ -303,7 +303,7 @@ EAST_OF_180, WEST_OF_180 = "EPSG:32701", "EPSG:32760"
 
 
 def centred_on_180(crs: str) -> MapGrid:
-    """A map of a UTM zone beside 180 degrees, its middle on it."""
+    """A map of a UTM zone next to 180 degrees, centred on that meridian."""
     step = np.array([[0.0, GSD_M], [-GSD_M, 0.0]])
     middle = xy_of_lon_lat(crs, np.array([[180.0, -17.0]]))[0]
     return MapGrid(crs, middle - step @ np.full(2, (SIZE - 1) / 2.0), step, (SIZE, SIZE))
@@ -337,5 +337,5 @@ def test_scenes_on_either_side_of_180_degrees_are_registered_on_a_reference_acro
         made = registered(database, allowed, tmp_path / f"{name}.tif", tmp_path / name)
         shift_px = made.registration.adjustment.correction.parameters[:, 0]
         assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
-    # What the scene east of 180 degrees was found by is looked for in the one across it.
+    # Places of the scene east of 180 degrees are searched in the scene across it.
     assert sum(tried == 2 for tried, _ in places(connection)) > 10

@@ -1,4 +1,4 @@
-"""`amers scene register`: on a block folder, on the store, and by a service elsewhere."""
+"""`amers scene register`: on a block folder, on the store, and by a remote service."""
 
 import json
 import os
@@ -180,7 +180,7 @@ def test_the_command_says_by_its_exit_code_what_went_wrong(
     code, told = register(bare)
     assert code == 2
     assert "no sensor model" in told
-    # The points are 8 m from where a model that claims a tenth of a metre expects them.
+    # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
     code, told = register(world.tagged, "--sigma-m", 0.1)
     assert code == 3
     assert "found" in told

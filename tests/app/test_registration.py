@@ -1,4 +1,4 @@
-"""From an image and a block to a refined model: by HTTP with a worker, and by the code itself."""
+"""From an image and a block to a refined model: over HTTP with a worker, and by the use case."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Scenes registered from the command line on a reference image, where there is no control point."""
+"""Registration on a reference image on the command line, without control points."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ SIZE = 420
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A reference on a map, and the same ground as a scene whose map is a few pixels off."""
+    """A reference on a map, and a scene of the same ground whose map is a few pixels wrong."""
     folder = tmp_path_factory.mktemp("reference")
     ground = cv2.GaussianBlur(np.random.default_rng(4).normal(size=(512, 512)), (0, 0), 1.5)
     ground = (500.0 + 80.0 * ground / ground.std()).astype(np.float32)

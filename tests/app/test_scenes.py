@@ -1,4 +1,4 @@
-"""Uploading scenes: bounded, checked, private; and removing them."""
+"""Uploads of scenes: limits, checks, privacy; and removal of scenes."""
 
 import hashlib
 import os
@@ -31,12 +31,12 @@ Bearer = Callable[[str], dict[str, str]]
 
 @pytest.fixture
 def settings(dsn: str, tmp_path: Path) -> Settings:
-    """An installation that takes small uploads only."""
+    """An installation with a small limit of uploads."""
     return Settings(database_url=dsn, data_folder=tmp_path / "data", upload_limit_bytes=LIMIT_BYTES)
 
 
 def stored_files(storage: Storage) -> list[Path]:
-    """Every file of the storage, finished or not."""
+    """All files in the storage, finished or not."""
     return [path for path in storage.folder.rglob("*") if path.is_file()]
 
 

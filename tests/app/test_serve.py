@@ -1,4 +1,4 @@
-"""`amers serve`: the API and a worker on the private database, and what is left after any end of it."""
+"""`amers serve`: the API and a worker on the private database, and all the ways it can end."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from tests.service_process import Service, until, users_of
 pytestmark = pytest.mark.long
 
 POINTS = 2100
-"""More than are made into one text: they are streamed."""
+"""More features than are built as one text, so that they are streamed."""
 IMAGE = b"II*\0" + bytes(400_000)
 SMALL_WINDOW = 4096
 
@@ -75,7 +75,7 @@ def test_requests_under_way_are_answered_when_the_service_is_told_to_end(service
         secret = create_token(connection, "slow", ["register"]).secret
     said = f"Host: amers\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
     with slow_line(service.port) as reading, slow_line(service.port) as sending:
-        # A streamed reply whose reader is slow, and an upload of which the second half is missing.
+        # A streamed reply with a slow reader, and an upload whose second half is missing.
         reading.sendall(f"GET /collections/points/items?limit={POINTS} HTTP/1.1\r\n{said}\r\n".encode())
         streamed = reading.recv(SMALL_WINDOW)
         sending.sendall(
@@ -101,7 +101,7 @@ def test_requests_under_way_are_answered_when_the_service_is_told_to_end(service
 
 @contextmanager
 def slow_line(port: int) -> Iterator[socket.socket]:
-    """A connection that takes in little at once."""
+    """A connection with a small receive buffer."""
     with socket.socket() as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SMALL_WINDOW)
         line.settimeout(60.0)
@@ -123,7 +123,7 @@ def refuses(port: int) -> bool:
 
 
 def joined(chunks: bytes) -> bytes:
-    """A body sent in chunks; an error if it was cut off."""
+    """The body of a chunked reply; an error if it is incomplete."""
     text = b""
     while True:
         size, _, chunks = chunks.partition(b"\r\n")

@@ -1,4 +1,4 @@
-"""Files by key: whole or not at all, bounded, and never outside the folder."""
+"""Files by key: complete or absent, limited in size, and never outside the folder."""
 
 import hashlib
 import io

@@ -1,4 +1,4 @@
-"""Several blocks over one place: which point is served, whatever the order of events."""
+"""Several blocks at one place: which point is served, independent of the order of events."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What nobody goes on with is given up after a day of the service's own time, however clocks jump."""
+"""Abandoned uploads are deleted after a day of running time, even if clocks jump."""
 
 import os
 import subprocess
@@ -45,7 +45,7 @@ def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
 
 
 def begun(client: TestClient, me: dict[str, str]) -> str:
-    """The address of an upload of which the first ten bytes have arrived."""
+    """The address of an upload with ten bytes received."""
     said = {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="}
     url: str = client.post("/uploads", headers=me | said).headers["location"]
     assert client.patch(url, content=TIFF[:10], headers=me | {"Upload-Offset": "0"}).status_code == 204
@@ -53,7 +53,7 @@ def begun(client: TestClient, me: dict[str, str]) -> str:
 
 
 def clocks_jump(database: Database, storage: Storage, hours: int) -> None:
-    """All that is noted and all files of the storage are so much older than they were a moment ago."""
+    """Make all recorded times and all files of the storage this much older."""
     with database.transaction() as connection:
         jump(connection, hours)
     for path in storage.folder.rglob("*"):
@@ -83,7 +83,7 @@ def test_an_upload_nobody_goes_on_with_is_given_up_after_a_day_that_the_service_
     while client.head(idle, headers=me).status_code == 200:
         clocks_jump(database, storage, 1)
         sweep_files(database, storage, JOB_S)
-        # A piece without a byte is a sign of life as well.
+        # An empty piece prolongs an upload too.
         sign = client.patch(busy, content=b"", headers=me | {"Upload-Offset": "10"})
         assert sign.status_code == 204
         sweeps += 1
@@ -116,7 +116,7 @@ def test_the_time_of_the_service_goes_on_by_a_little_at_a_jump_and_never_back(
 
 @contextmanager
 def writing(storage: Storage) -> Iterator["subprocess.Popen[bytes]"]:
-    """A process in the middle of a file and of a folder."""
+    """A process that is writing a file and a folder of files."""
     with subprocess.Popen(
         [sys.executable, "-c", WRITER, storage.folder], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:

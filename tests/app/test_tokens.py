@@ -1,4 +1,4 @@
-"""Who may call: making, showing once, checking, revoking tokens."""
+"""Tokens: creation, secrets, scopes, revocation."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Uploads that are resumed: tus 1.0 as its own client speaks it, over lines that break."""
+"""Resumable uploads with the tus client over connections that break."""
 
 import hashlib
 import io
@@ -67,7 +67,7 @@ def listening(settings: Settings) -> Iterator[str]:
 
 
 def said(**values: str) -> dict[str, str]:
-    """The header with what is said about a file."""
+    """The `Upload-Metadata` header of a file."""
     pairs = (f"{name} {b64encode(value.encode()).decode()}" for name, value in values.items())
     return {"Upload-Metadata": ",".join(pairs)}
 
@@ -91,7 +91,7 @@ def whole(client: TestClient, me: dict[str, str], data: bytes, **values: str) ->
 
 @contextmanager
 def breaking_line(url: str, me: dict[str, str], start: int, part: bytes) -> Iterator[None]:
-    """A line over which the rest of the file is announced and a part of it sent; then it breaks."""
+    """A connection that announces the rest of the file, sends a part of it, and breaks."""
     host, port = url.split("/")[2].split(":")
     path = "/" + url.split("/", 3)[3]
     headers = {**me, **PIECE, "Upload-Offset": start, "Content-Length": len(TIFF) - start, "Host": host}
@@ -118,7 +118,7 @@ def test_an_upload_interrupted_and_resumed_ten_times_arrives_intact(
                 while int(http.head(url).headers["Upload-Offset"]) == arrived:
                     assert time.monotonic() < deadline, f"break {number}: nothing of {sent} bytes came"
                     time.sleep(0.01)
-            # Until the service notices that the line is gone.
+            # Until the service notices that the connection is gone.
             while probe(http, url) == 423:
                 assert time.monotonic() < deadline
                 time.sleep(0.02)
@@ -135,7 +135,7 @@ def test_an_upload_interrupted_and_resumed_ten_times_arrives_intact(
 
 
 def probe(http: httpx.Client, url: str) -> int:
-    """The status of an empty piece where the file ends: 423 while the former sender holds it."""
+    """The status of an empty piece at the end of the file: 423 while the former sender locks it."""
     start = http.head(url).headers["Upload-Offset"]
     return http.patch(url, content=b"", headers=PIECE | {"Upload-Offset": start}).status_code
 
@@ -205,7 +205,7 @@ def test_a_piece_that_is_not_as_announced_is_thrown_away(client: TestClient, me:
 
 
 def tar_with_a_broken_later_header() -> bytes:
-    """An image, which is whole, and a model whose header is not what its checksum says."""
+    """A complete image, and a model whose tar header has a wrong checksum."""
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w") as archive:
         for name, data in (("a.tif", TIFF[:1000]), ("a_RPC.TXT", b"LINE_OFF: 1")):

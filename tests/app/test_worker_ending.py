@@ -1,4 +1,4 @@
-"""A worker that is told to end does end, whatever its queue still runs."""
+"""A worker that receives a signal ends, whatever its queue still runs."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ async def run_beside(self, **options):
 procrastinate.App.run_worker_async = run_beside
 run_worker(read_settings())
 """
-"""A worker whose queue has left a task behind that does not hear its cancellation."""
+"""A worker whose queue has a leftover task that ignores its cancellation."""
 
 
 def test_a_worker_ends_although_a_task_of_its_queue_ignores_its_cancellation(

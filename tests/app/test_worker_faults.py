@@ -1,4 +1,4 @@
-"""Workers that die, hang, are stopped or run out of memory in the middle of a real registration."""
+"""Workers that die, hang, are stopped or run out of memory during a real registration."""
 
 import os
 import signal
@@ -45,7 +45,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 @pytest.fixture
 def settings(dsn: str, tmp_path: Path) -> Settings:
-    """An installation that notices a dead worker soon."""
+    """An installation with short leases, which notices a dead worker soon."""
     return Settings(database_url=dsn, data_folder=tmp_path / "data", lease_seconds=LEASE_S)
 
 
@@ -59,14 +59,14 @@ def me(bearer: Bearer) -> dict[str, str]:
 def ask(
     client: TestClient, me: dict[str, str], world: FlatWorld, storage: Storage, dsn: str
 ) -> Callable[..., str]:
-    """Asks for the registration of the scene, whose points are published; returns the URL of the job."""
+    """Requests the registration of the scene, whose points are published; returns the URL of the job."""
     execute = scene_to_register(client, me, storage, dsn, world)
     return lambda passes=PASSES: execute(passes)
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[Path]:
-    """Where the workers of a test write; shown when the test fails."""
+    """The log of the workers of a test, printed when the test fails."""
     path = tmp_path / "worker.log"
     path.touch()
     yield path
@@ -74,7 +74,7 @@ def log(tmp_path: Path) -> Iterator[Path]:
 
 
 def attempt_of(dsn: str, job_url: str) -> int:
-    """How often the job was claimed."""
+    """The number of claims of the job."""
     with engine.connect(dsn) as connection:
         job = jobs.find(connection, UUID(job_url.rsplit("/", 1)[1]))
     assert job is not None
@@ -82,7 +82,7 @@ def attempt_of(dsn: str, job_url: str) -> int:
 
 
 def results_of(dsn: str, job_url: str) -> int:
-    """How many results the job has."""
+    """The number of registrations of the job."""
     with engine.connect(dsn) as connection:
         row = run_sql(
             connection,

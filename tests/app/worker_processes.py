@@ -1,4 +1,4 @@
-"""Real workers on the database of a test, and what a caller of the API sees of their jobs."""
+"""Real worker processes on the database of a test, and the jobs as callers of the API see them."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ ENDED = ("successful", "failed", "dismissed")
 def running_worker(
     settings: Settings, log: Path, *prefix: str, **more: str
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """`amers worker` as a process of its own; killed at the end with all it started.
+    """`amers worker` as a separate process; at the end it is killed with all it started.
 
     Args:
         prefix: the command that runs it, as `ip netns exec NAME`.
@@ -57,7 +57,7 @@ def running_worker(
 
 
 def children(pid: int) -> list[int]:
-    """The processes a process has started and that still live."""
+    """The living child processes of a process."""
     found = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -70,7 +70,7 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process still runs."""
+    """Whether a process is running."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -104,7 +104,7 @@ def ended(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str
 
 
 def under_way(client: TestClient, job_url: str, headers: dict[str, str]) -> dict[str, Any]:
-    """The job, once its work is really under way; an error if it ends before."""
+    """The job, once its work has started; an error if it ends before."""
 
     def told() -> dict[str, Any] | None:
         job: dict[str, Any] = client.get(job_url, headers=headers).json()
@@ -139,5 +139,5 @@ def scene_to_register(
 
 
 def kill(pid: int) -> None:
-    """End a process at once."""
+    """Kill a process."""
     os.kill(pid, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""What journeys share: a service of their own, and the command line beside it."""
+"""Fixtures of the journeys: a running service, and the command line beside it."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ def service(open_folder: Path) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def amers(service: Service) -> Amers:
-    """Runs a command on the service's installation; what it prints as JSON."""
+    """Runs a command on the service's installation; returns its JSON output."""
 
     def run(*words: str | Path) -> Any:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""What a running service says to scenes and blocks it cannot use: the reason, and nothing changes."""
+"""Unusable scenes and blocks on a running service: it states the reason and changes nothing."""
 
 import json
 import shutil
@@ -39,7 +39,7 @@ def client(service: Service, amers, secret: str, world: FlatWorld):
 
 @pytest.fixture
 def store(service: Service, amers):
-    """What the store holds: published and staged blocks, and the files of the chips."""
+    """The content of the store: published and staged blocks, and the chip files."""
 
     def state() -> tuple[str, list[str]]:
         chips = sorted(path.name for path in (service.folder / "storage" / "chips").rglob("*.npy"))
@@ -49,7 +49,7 @@ def store(service: Service, amers):
 
 
 def registered(client: httpx.Client, image: bytes, model: str | None) -> dict:
-    """The job, once it has ended, that was asked to register an image."""
+    """The ended job that registered an image."""
     scene = (
         client.post("/scenes?name=scene.tif&sigma_m=6", content=image).raise_for_status().json()["id"]
     )
@@ -125,7 +125,7 @@ def lose_chips(block: Path) -> None:
 
 
 def lose_coordinates(block: Path) -> None:
-    """A point at NaN, NaN, NaN, in a file whose checksum is right."""
+    """Set a point to NaN, NaN, NaN, in a file with the right checksum."""
     path = block / "points.parquet"
     table = pq.read_table(path)
     geometry = table.column("geometry").to_pylist()
@@ -140,7 +140,7 @@ def lose_coordinates(block: Path) -> None:
 
 
 def rename(block: Path) -> None:
-    """Another block than the one that is in the store already."""
+    """Rename the block, so that it is not the one in the store."""
     document = json.loads((block / "block.json").read_text())
     document["id"] = "nowhere"
     (block / "block.json").write_text(json.dumps(document))

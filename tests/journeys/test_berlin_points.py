@@ -1,4 +1,4 @@
-"""Points out of one Sentinel-2 image, and the same land of another day registered on them."""
+"""Points made from one Sentinel-2 image, and a scene of another day registered on them."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 pytestmark = pytest.mark.real_data
 
 SHIFT_M = np.array([6.4, 18.3])
-"""East and north, of the May scene against the June one: SIFT features over all of both."""
+"""East and north shift of the May scene against the June scene, from SIFT features over both."""
 SHIFT_ALLOWED_M = 1.0
 GSD_M = 10.0
 
@@ -33,4 +33,4 @@ def test_the_may_scene_of_berlin_is_registered_on_points_of_the_june_one(
     print(f"{found_m} m east and north, {done['active']} of {done['visible']} points, {done['verdict']}")
     assert np.abs(found_m - SHIFT_M).max() < SHIFT_ALLOWED_M
     assert done["verdict"] == "good"
-    assert done["matched"] < 0.8 * done["visible"]  # the others are under the clouds of May
+    assert done["matched"] < 0.8 * done["visible"]  # The other points lie under the clouds of May.

@@ -1,4 +1,4 @@
-"""A colour crop four times coarser, registered on points made from two panchromatic views."""
+"""A colour crop, four times coarser, registered on points made from two panchromatic views."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ RATIO = 4
 SPOILED_PX = np.array([6.0, -9.0])
 SIGMA_M = 15.0
 WINDOW_PX = 40
-"""Half a side: 20 pixels of the colour crop are compared."""
+"""Half the side of compared windows: 20 pixels of the colour crop."""
 three_tenths_of_a_pixel = 0.3
 same_moment_px = 0.02
 
@@ -66,7 +66,7 @@ def colour(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture(scope="module")
 def ties(folder: Path, colour: Scene) -> tuple[Array, Array]:
-    """Places of the left view found in the colour crop, window against window, without a model."""
+    """Places of the left view matched in the colour crop, window against window, without a model."""
     left = read_scene(folder / "left_image.tif")
     fine = cv2.GaussianBlur(left.image.read(Window(0, 0, *left.image.shape)), (0, 0), RATIO / 2.0)
     coarse = colour.image.read(Window(0, 0, *colour.image.shape))
@@ -95,7 +95,7 @@ def _top(scores: FloatImage) -> float:
 def differences_px(
     colour: SensorModel, left: SensorModel, ties: tuple[Array, Array], height_m: float
 ) -> Array:
-    """Where the colour crop shows details of the left view, against where the models say: (n, 2)."""
+    """Matched minus predicted positions (n, 2) of the left view's details in the colour crop."""
     ground = left.locate(ties[1], np.full(len(ties[1]), height_m))
     return ties[0] - colour.project(ground)
 
@@ -110,7 +110,7 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
     wrong = replace(delivered, image_offset=delivered.image_offset + SPOILED_PX)  # type: ignore[type-var]
     found = register_scene(replace(colour, model=wrong), points, FolderChips(block))
 
-    # Beyond the points, which lie where the two views overlap, the model is an extrapolation.
+    # The points lie where the two views overlap; beyond them the model is an extrapolation.
     seen = left.project(points.lon_lat_h)
     among = ((ties[1] >= seen.min(axis=0)) & (ties[1] <= seen.max(axis=0))).all(axis=1)
     delivered_px, registered_px = (
@@ -129,9 +129,9 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
     assert np.quantile(registered_px[among], 0.9) < three_tenths_of_a_pixel
     assert np.median(registered_px[~among]) < 3.0 * np.median(std_px[~among])
     assert found.qualification.verdict in ("good", "usable")
-    assert found.search_stages[-1].chip_gsd_m == 0.5  # chips of 1 m are there for few points
+    assert found.search_stages[-1].chip_gsd_m == 0.5  # Few points have chips of 1 m.
 
-    # Taken at the same moment: how high the ground lies hardly matters.
+    # Both images were taken at the same moment, so the height of the ground hardly matters.
     higher = differences_px(found.model, left, ties, height_m + 1.0)
     assert (
         np.hypot(*(higher - differences_px(found.model, left, ties, height_m)).T).max() < same_moment_px

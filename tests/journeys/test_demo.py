@@ -1,4 +1,4 @@
-"""The main job on the simulated world, as a newcomer runs it."""
+"""The demonstration on the simulated world, as a new user runs it."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Real pairs: blocks made from them, ingested, and the rays of their images agreeing."""
+"""Real pairs: blocks made from them are ingested, and the rays of their images intersect."""
 
 from pathlib import Path
 

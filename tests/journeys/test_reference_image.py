@@ -1,4 +1,4 @@
-"""Sentinel-2 scenes of another day on a reference ortho-image: the dense method on real pixels."""
+"""Sentinel-2 scenes of another day on a reference ortho-image: dense matching on real pixels."""
 
 from pathlib import Path
 
@@ -18,12 +18,12 @@ from services.types import Acquisition, Array, FloatImage
 pytestmark = pytest.mark.real_data
 
 SHIFT_EAST_M, SHIFT_NORTH_M = 6.4, 18.3
-"""Of the May scene against the June one, measured with SIFT features over all of both."""
+"""Shift of the May scene against the June scene, from SIFT features over both."""
 SHIFT_ALLOWED_M = 1.0
 LARGEST_LOCAL_SHIFT_PX = 0.7
 MEDIAN_ALLOWED_PX = 0.05
 TYPICAL_ALLOWED_PX = 0.3
-"""Of two measures, with windows of 31 and 41 pixels, in a field of shifts that changes between them."""
+"""Difference of two measurements with windows of 31 and 41 pixels, in a field of varying shifts."""
 
 
 def ortho(path: Path) -> tuple[ImageSource, OrthoModel]:
@@ -59,7 +59,7 @@ def test_the_may_scene_of_berlin_is_found_eighteen_metres_north_and_its_clouds_a
 
 
 def plain_displacement(left: FloatImage, right: FloatImage, line_sample: Array) -> Array:
-    """Where pieces of one image lie in the other, pixel against pixel: (n, 2), NaN where at the edge."""
+    """Displacements (n, 2) of windows between two images, by plain correlation; NaN at edges."""
     found = np.full((len(line_sample), 2), np.nan)
     for i, (line, sample) in enumerate(np.round(line_sample).astype(int)):
         piece = left[line - 15 : line + 16, sample - 15 : sample + 16]
@@ -95,6 +95,6 @@ def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_
     assert len(difference) > 500
     assert np.abs(np.median(difference, axis=0)).max() < MEDIAN_ALLOWED_PX
     assert np.median(np.abs(difference), axis=0).max() < TYPICAL_ALLOWED_PX
-    # One shift for all cannot follow fields that moved by themselves, and the residuals say so.
+    # One shift cannot follow fields that moved separately, and the residuals show it.
     assert np.abs(found.adjustment.correction.parameters[:, 0]).max() < LARGEST_LOCAL_SHIFT_PX
     assert found.adjustment.sigma0 > 2.0

@@ -1,4 +1,4 @@
-"""Three real views: points from two of them, the third registered on these by the service."""
+"""Three real views: points made from two of them, and the third registered on these by the service."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +19,12 @@ pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
 names = ("img_01", "img_02", "img_03")
 injected_shift_px = np.array([400.0, -900.0])
-"""492 m on the ground, of a scene 512 m wide."""
+"""492 m on the ground; the scene is 512 m wide."""
 injected_drift_px = 2.0
 injected_sigma_m = "200"
 delivered_residual_px = (0.4, 0.7)
 delivered_shift_px = 2.0
-"""How far the views may lie from each other as they were delivered."""
+"""Largest expected difference between the views as delivered."""
 three_tenths_of_a_pixel = 0.3
 
 
@@ -54,7 +54,7 @@ def median_residual_px(models: list[RpcModel], tracks) -> float:
 
 
 def spoiled(model: RpcModel, shape: tuple[int, int]) -> RpcModel:
-    """The model wrong by the injected shift, and by the injected drift from one edge to the other."""
+    """The model with the injected shift and the injected drift from one edge to the other."""
     frame = no_correction(shape)
     drift = np.diag([injected_drift_px / 2.0, injected_drift_px / 2.0])
     parameters = np.column_stack([injected_shift_px, drift])
@@ -100,7 +100,9 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     for name in sources:
         models[name] = parse_rpc_text((block / "models" / f"{name}_RPC.TXT").read_text())
     models[third] = wrong
-    assert not median_residual_px(list(models.values()), tracks) < 1.0  # so far off, no rays meet
+    assert (
+        not median_residual_px(list(models.values()), tracks) < 1.0
+    )  # With such an error no rays intersect.
     models[third] = parse_rpc_text((out / "refined_RPC.TXT").read_text())
     left_px = median_residual_px(list(models.values()), tracks)
     print(f"{third} from {injected_shift_px} px: {left_px:.3f} px, {done['verdict']}")

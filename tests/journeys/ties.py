@@ -1,4 +1,4 @@
-"""Tie points that neither production nor registration ever sees: features larger than theirs."""
+"""Tie points independent of production and registration: features of larger scale than theirs."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,7 +13,7 @@ LARGEST_PX = 12.0
 
 
 def independent_tracks(images: Sequence[FloatImage]) -> Observations:
-    """Details that every image shows, matched without any model.
+    """Tracks of details that every image shows, matched without any model.
 
     SIFT features of another size than those production uses, mutual best and clearly so, on the epipolar
     geometry that MAGSAC finds, and consistent from the first image to the last.
