@@ -1,4 +1,4 @@
-"""An installation with points, scenes and secrets, to check that requests change and disclose nothing."""
+"""An installation with points, scenes and secrets, to check what requests change and disclose."""
 
 import hashlib
 import json
