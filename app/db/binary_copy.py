@@ -103,13 +103,13 @@ def copy_pieces(columns: Sequence[Column]) -> Iterator[tuple[bytes, int]]:
 def _rows(columns: Sequence[Column]) -> bytes:
     n = len(columns[0].length)
     pieces = [np.tile(np.array([len(columns)], dtype=">i2").view(np.uint8), (n, 1))]
-    kept = [np.ones((n, 2), dtype=np.bool_)]
+    in_row = [np.ones((n, 2), dtype=np.bool_)]
     for column in columns:
         pieces.append(column.length.astype(">i4").view(np.uint8).reshape(n, 4))
         pieces.append(column.data)
-        kept.append(np.ones((n, 4), dtype=np.bool_))
-        kept.append(np.arange(column.data.shape[1]) < column.length[:, None])
-    rows, mask = np.concatenate(pieces, axis=1), np.concatenate(kept, axis=1)
+        in_row.append(np.ones((n, 4), dtype=np.bool_))
+        in_row.append(np.arange(column.data.shape[1]) < column.length[:, None])
+    rows, mask = np.concatenate(pieces, axis=1), np.concatenate(in_row, axis=1)
     return rows.tobytes() if mask.all() else rows[mask].tobytes()
 
 

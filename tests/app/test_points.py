@@ -209,6 +209,16 @@ def test_the_number_of_points_is_exact_to_ten_thousand_and_estimated_beyond(
     assert estimate.number == pytest.approx(true, rel=a_step_of_the_planner)
 
 
+@pytest.mark.parametrize("link", [" + ", " % "])
+def test_a_filter_of_operators_too_deep_in_each_other_is_refused(made, get, link):
+    within = f"{ITEMS}?filter=saliency > {link.join(['saliency'] * 31)}"
+    assert get(within.replace("+", "%2B").replace(" % ", " %25 ")).status_code == 200
+    beyond = f"{ITEMS}?filter=saliency > {link.join(['saliency'] * 40)}"
+    reply = get(beyond.replace("+", "%2B").replace(" % ", " %25 "))
+    assert reply.status_code == 400
+    assert "32 deep" in reply.json()["detail"]
+
+
 def test_one_point_comes_with_its_views_and_their_images(made, get):
     reply = get(f"{ITEMS}/{2**26 + 7}")
     feature = reply.json()

@@ -38,7 +38,7 @@ from app.db.schema.base import Double, Timestamp
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
-DEEPEST_EXPRESSION = 64
+DEEPEST_EXPRESSION = 32
 """Operators in each other. SQLAlchemy compiles them recursively, with a dozen calls for each."""
 
 Expression = ColumnElement[Any]

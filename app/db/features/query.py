@@ -29,7 +29,7 @@ from app.db.engine import Connection, driver
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.crs import Crs
 from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
-from app.db.kept import kept
+from app.db.opaque import opaque
 from app.db.schema.base import Double
 from app.db.statements import HotStatement, hot
 
@@ -180,14 +180,14 @@ def select_visible(
 def _kept_predicate(collection: Collection, box: BoxShape | None) -> ColumnElement[bool]:
     """The predicate that the caller may see a row and that it meets a box."""
     if box is None:
-        return kept(collection.visible)
-    return kept(and_(collection.visible, box_predicate(collection, box)))
+        return opaque(collection.visible)
+    return opaque(and_(collection.visible, box_predicate(collection, box)))
 
 
 @lru_cache(KEPT_STATEMENTS)
 def kept_columns(layout: Layout, columns: Columns) -> tuple[Label[Any], ...]:
     """The columns of a page, built once."""
-    return tuple(kept(column).label(name) for name, column in columns(layout).items())
+    return tuple(opaque(column).label(name) for name, column in columns(layout).items())
 
 
 @lru_cache(KEPT_STATEMENTS)
