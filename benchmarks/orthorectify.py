@@ -189,7 +189,7 @@ def make_inputs(folder: Path, size: int) -> tuple[Scene, MapGrid]:
     """A scene whose two bands are ramps, terrain with 1,200 m of relief, and the map of both."""
     heights = (size, size)
     place = np.array([*PLACE, np.mean(HEIGHTS_M)])
-    true = pushbroom_over(place, heights, GSD_M, 25.0, 100.0, HEIGHTS_M)
+    true = pushbroom_over(place, heights, GSD_M, (25.0, 100.0), HEIGHTS_M)
     model = fit_rpc(true, heights, HEIGHTS_M).model
     profile = {"driver": "GTiff", "tiled": True, "BIGTIFF": "IF_SAFER"}
     scene_path = folder / "scene.tif"

@@ -16,7 +16,10 @@ GSD_M = 1.0
 def write_block_images(folder: Path) -> list[Path]:
     """Write three overlapping images, each with a model that is 3 m wrong, and return their paths."""
     rng = np.random.default_rng(2)
-    return [_write(view, folder) for view in simulate_block(_world(), rng, 3, SHAPE, GSD_M, 3.0, 20.0)]
+    views = simulate_block(
+        _world(), rng, n_views=3, shape=SHAPE, gsd_m=GSD_M, error_m=3.0, largest_incidence_deg=20.0
+    )
+    return [_write(view, folder) for view in views]
 
 
 def write_scene(folder: Path) -> Path:

@@ -163,7 +163,12 @@ def _simulate(options: DemoOptions, progress: Progress) -> _Truth:
     world = make_world(rng, options.size_m, options.posting_m, options.relief_m)
     progress(0.05, f"simulating {options.views} images for the block")
     sources = simulate_block(
-        world, rng, options.views, options.shape, options.gsd_m, options.block_error_m
+        world,
+        rng,
+        n_views=options.views,
+        shape=options.shape,
+        gsd_m=options.gsd_m,
+        error_m=options.block_error_m,
     )
     progress(0.25, "simulating the scene")
     return _Truth(world, sources, _scene(world, options, rng))

@@ -1,4 +1,4 @@
-"""What stands between a world and a good image of it: haze, clouds, season, other bands, noise."""
+"""Conditions that degrade an image: haze, clouds, season, inverted contrast, noise."""
 
 from dataclasses import dataclass, replace
 
@@ -11,17 +11,17 @@ from services.simulation.world import natural_noise
 from services.types import Array, FloatImage
 
 HAZE_LIGHT = 0.35
-"""Light of haze that hides everything, in that of a white ground in the sun."""
+"""Light of haze that hides all contrast, relative to white ground in the sun."""
 
 INVERSION_LIGHT = 0.6
-"""Light that is dark where contrast is inverted; what is brighter is as dark."""
+"""Light that becomes black by an inversion of contrast; brighter light does too."""
 
 CLOUD_LIGHT = 0.65
 CLOUD_RELIEF = 0.08
-"""Light of a thick cloud and how much it varies over it."""
+"""Light of a thick cloud, and amplitude of its variation."""
 
 SHADOW_LIGHT = 0.45
-"""What a thick cloud leaves of the light below it."""
+"""Share of the light that reaches the ground below a thick cloud."""
 
 _CLOUD_NODES = 256
 _CLOUD_EDGE = 0.25
@@ -30,14 +30,14 @@ _SHADOW_SHIFT = (0.05, 0.03)
 
 @dataclass(frozen=True)
 class Conditions:
-    """How an image was taken, besides its geometry.
+    """The conditions of an acquisition.
 
     Attributes:
-        haze: 0 to 1, share of the ground's contrast that is lost.
-        cloud_cover: 0 to 1, share of the image under clouds; their shadows come on top.
-        inverted: what is bright is dark, as between some pairs of bands.
-        season: 0 to 1, how far the ground is from another day's; see `light.day_of`.
-        noise: standard deviation where it is dark, of 12 bits; the sensor's when that is larger.
+        haze: 0 to 1, share of the contrast of the ground that is lost.
+        cloud_cover: 0 to 1, share of the image under clouds, without their shadows.
+        inverted: whether the contrast is inverted, as between some pairs of bands.
+        season: 0 to 1, distance from another season; see `light.day_of`.
+        noise: standard deviation in the dark, in 12 bits; that of the sensor when it is larger.
     """
 
     haze: float = 0.0
@@ -47,7 +47,7 @@ class Conditions:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse shares that are none."""
+        """Refuse shares outside 0 to 1."""
         for name in ("haze", "cloud_cover", "season"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"{name}: {getattr(self, name)} given, 0 to 1 expected")
@@ -58,12 +58,12 @@ CLEAR = Conditions()
 
 @dataclass(frozen=True)
 class Clouds:
-    """Where an image is cloudy; the same for a pixel whatever is read with it.
+    """The clouds of an image; those of a pixel do not depend on the window that is read.
 
     Attributes:
-        thickness: (n, n) noise of unit spread, stretched over the image.
-        threshold: thickness from which on there is cloud.
-        per_px: (2,) nodes a line and a sample.
+        thickness: (n, n) noise of unit standard deviation, stretched over the image.
+        threshold: smallest thickness of a cloud.
+        per_px: (2,) nodes per line and per sample.
     """
 
     thickness: FloatImage
@@ -71,11 +71,11 @@ class Clouds:
     per_px: Array
 
     def opacity(self, line: Array, sample: Array, shift: tuple[float, float] = (0.0, 0.0)) -> FloatImage:
-        """How much of the ground is hidden, 0 to 1: (lines, samples).
+        """Share (lines, samples) of the ground that is hidden, 0 to 1.
 
         Args:
             line, sample: (lines,) and (samples,) pixels.
-            shift: lines and samples in sizes of the image, of what hides it.
+            shift: shift of the clouds along lines and samples, relative to the size of the image.
         """
         size = len(self.thickness)
         y = (line[:, None] + 0.5) * self.per_px[0] + shift[0] * size
@@ -87,12 +87,12 @@ class Clouds:
 
 
 def clouds_over(shape: tuple[int, int], cover: float, rng: np.random.Generator) -> Clouds | None:
-    """Clouds over a share of an image; none when it is zero.
+    """Random clouds over a share of an image; None when the share is zero.
 
     Args:
         shape: lines and samples.
-        cover: 0 to 1.
-        rng: where they are.
+        cover: share of the image under clouds, 0 to 1.
+        rng: source of randomness.
     """
     if cover == 0.0:
         return None
@@ -102,7 +102,7 @@ def clouds_over(shape: tuple[int, int], cover: float, rng: np.random.Generator) 
 
 
 def under_clouds(light: FloatImage, clouds: Clouds, line: Array, sample: Array) -> FloatImage:
-    """Light (lines, samples) of the ground with clouds and their shadows over it."""
+    """Light (lines, samples) of the ground with clouds and their shadows added."""
     shadow = clouds.opacity(line, sample, _SHADOW_SHIFT)
     cloud = clouds.opacity(line, sample)
     top = CLOUD_LIGHT + CLOUD_RELIEF * (2.0 * shadow - 1.0)
@@ -111,12 +111,12 @@ def under_clouds(light: FloatImage, clouds: Clouds, line: Array, sample: Array) 
 
 
 def inverted(light: FloatImage) -> FloatImage:
-    """Light whose contrast is the opposite."""
+    """Light with inverted contrast."""
     return np.maximum(np.float32(INVERSION_LIGHT) - light, np.float32(0.0))
 
 
 def seen_through(conditions: Conditions, radiometry: Radiometry) -> Radiometry:
-    """From light to numbers through haze, with the noise of the conditions."""
+    """The radiometry through haze, with the noise of the conditions."""
     return replace(
         radiometry,
         gain=radiometry.gain * (1.0 - conditions.haze),

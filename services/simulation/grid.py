@@ -1,4 +1,4 @@
-"""Reading a grid that repeats without end."""
+"""Bilinear interpolation in a grid that repeats in both directions."""
 
 import numpy as np
 from numba import njit
@@ -8,7 +8,7 @@ from services.types import Array, FloatImage
 
 @njit(cache=True)
 def bilinear(grid: FloatImage, x: float, y: float) -> float:
-    """Value between the nodes; x columns, y rows."""
+    """Bilinear value at column x and row y."""
     rows, columns = grid.shape
     x0 = int(np.floor(x))
     y0 = int(np.floor(y))
@@ -27,7 +27,7 @@ def bilinear(grid: FloatImage, x: float, y: float) -> float:
 
 @njit(cache=True)
 def bilinear_values(grid: FloatImage, column_row: Array) -> Array:
-    """Values (n,) at positions (n, 2), columns first."""
+    """Bilinear values (n,) at positions (n, 2), column first."""
     out = np.empty(len(column_row))
     for i in range(len(column_row)):
         out[i] = bilinear(grid, column_row[i, 0], column_row[i, 1])

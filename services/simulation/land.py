@@ -1,11 +1,12 @@
-"""What covers a simulated world: roads, fields, woods, villages and trees, cell by cell.
+"""Land cover of a simulated world: roads, fields, woods, villages and trees, cell by cell.
 
-The land is divided by a warped lattice of roads into blocks, a block into rectangles by repeated
-splitting, and everything about a block or a rectangle follows from a hash of where it is. A cell can
-therefore be computed without knowing any other, and the land repeats as the lattice does.
+A warped lattice of roads divides the land into blocks, and repeated splitting divides a block into
+rectangles. A hash of the position determines everything about a block or a rectangle. Each cell can
+therefore be computed separately, and the land repeats with the lattice.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,64 +16,74 @@ from services.simulation.grid import bilinear
 from services.types import Array, FloatImage
 
 NO_ROOF = np.float32(-np.inf)
-"""Height of the roof where there is none."""
+"""Roof height of open ground."""
 
 BLOCK_M = 260.0
 ROAD_HALF_WIDTH_M = 3.2
 TREE_LATTICE_M = 6.5
 
 ORCHARD_ROW_M = 7.0
-"""Distance of the trees of an orchard, which stand on a square lattice."""
+"""Distance of the trees of an orchard, on a square lattice."""
 
 ESTATE_LOT_M = 24.0
-"""Side of the lots of a housing estate, each with the same house."""
+"""Side of the lots of a housing estate, which all have the same house."""
 
 FIELDS, WOOD, VILLAGE, WORKS, ORCHARD, ESTATE = 0, 1, 2, 3, 4, 5
+"""Kinds of blocks."""
 _LOT_M = np.array([95.0, 400.0, 27.0, 75.0, 400.0, ESTATE_LOT_M])
 _TREES = np.array([0.012, 0.85, 0.22, 0.03, 0.0, 0.0])
 _TEXTURE = np.array([0.09, 0.22, 0.16, 0.10, 0.05, 0.05])
 
 
+class LandNoise(NamedTuple):
+    """The noise that makes a land irregular.
+
+    Attributes:
+        warp: (2, w, w) displacement of the lattice of roads, columns and rows, cells.
+        texture: (t, t) noise of unit standard deviation, repeated; the side of the world is a multiple
+            of t.
+        blotches: (b, b) coarse noise of unit standard deviation, stretched over the world.
+    """
+
+    warp: FloatImage
+    texture: FloatImage
+    blotches: FloatImage
+
+
+class LandCover(NamedTuple):
+    """The cover of a land, cell by cell.
+
+    Attributes:
+        albedo: (n, n) reflectance.
+        roof_m: (n, n) heights of roofs, `NO_ROOF` on open ground.
+        parcel: (n, n) number of the field, 0 where there is none.
+    """
+
+    albedo: FloatImage
+    roof_m: FloatImage
+    parcel: npt.NDArray[np.uint16]
+
+
 def cover_land(
-    terrain_m: FloatImage,
-    warp: FloatImage,
-    texture: FloatImage,
-    blotches: FloatImage,
-    posting_m: float,
-    seed: int,
-    patterned_share: float = 0.0,
-) -> tuple[FloatImage, FloatImage, npt.NDArray[np.uint16]]:
-    """Albedo, roofs and fields of a world.
+    terrain_m: FloatImage, noise: LandNoise, posting_m: float, seed: int, patterned_share: float
+) -> LandCover:
+    """The land cover of a world.
 
     Args:
         terrain_m: (n, n) heights.
-        warp: (2, w, w) displacement of the lattice of roads, columns and rows, cells.
-        texture: (t, t) noise of unit spread, repeated; n is a multiple of t.
-        blotches: (b, b) coarse noise of unit spread, stretched over the world.
+        noise: irregularities of the land.
         posting_m: size of a cell.
-        seed: what the hashes start from.
-        patterned_share: of the blocks that are orchards or housing estates, the same over and over.
-
-    Returns:
-        Albedo (n, n), roof heights (n, n) with `NO_ROOF` on open ground, number of the field (n, n).
+        seed: start of the hashes.
+        patterned_share: share of the blocks that are orchards or housing estates, whose details repeat.
     """
     shape = terrain_m.shape
-    albedo = np.empty(shape, dtype=np.float32)
-    roof = np.full(shape, NO_ROOF, dtype=np.float32)
-    parcel = np.zeros(shape, dtype=np.uint16)
-    _cover(
-        terrain_m,
-        warp,
-        texture,
-        blotches,
-        posting_m,
-        np.uint64(seed),
-        patterned_share,
-        albedo,
-        roof,
-        parcel,
+    cover = LandCover(
+        albedo=np.empty(shape, dtype=np.float32),
+        roof_m=np.full(shape, NO_ROOF, dtype=np.float32),
+        parcel=np.zeros(shape, dtype=np.uint16),
     )
-    return albedo, roof, parcel
+    _cover(terrain_m, noise, posting_m, (np.uint64(seed), patterned_share), cover)
+    return cover
 
 
 @njit(inline="always")
@@ -86,13 +97,13 @@ def _mix(seed: np.uint64, value: int) -> np.uint64:
 
 @njit(inline="always")
 def _part(h: np.uint64, k: int) -> float:
-    """The k-th (0 to 3) number between 0 and 1 of a hash."""
+    """The k-th (0 to 3) number between 0 and 1 in a hash."""
     return float((h >> np.uint64(16 * k)) & np.uint64(0xFFFF)) / 65535.0
 
 
 @njit(cache=True)
 def _lattice(warp: FloatImage, x: float, y: float, n: int) -> tuple[float, float]:
-    """Position on the lattice of roads of a position on the grid, both in cells."""
+    """Position on the lattice of roads of a grid position, both in cells."""
     scale = warp.shape[1] / n
     return (
         x + bilinear(warp[0], x * scale, y * scale),
@@ -102,7 +113,7 @@ def _lattice(warp: FloatImage, x: float, y: float, n: int) -> tuple[float, float
 
 @njit(cache=True)
 def _ground_below(terrain: FloatImage, warp: FloatImage, u: float, v: float) -> float:
-    """Height of the terrain at a position on the lattice of roads."""
+    """Height of the terrain at a position on the lattice of roads, metres."""
     n = len(terrain)
     x, y = u, v
     for _ in range(6):
@@ -114,7 +125,7 @@ def _ground_below(terrain: FloatImage, warp: FloatImage, u: float, v: float) -> 
 
 @njit(cache=True)
 def _highest_below(terrain: FloatImage, warp: FloatImage, u: float, v: float, walls: Array) -> float:
-    """Highest terrain below a building; walls in cells from the corner (u, v) of its block."""
+    """Highest terrain below a building, with walls in cells from the corner (u, v) of its block."""
     top = -np.inf
     for i in range(3):
         for j in range(3):
@@ -125,10 +136,11 @@ def _highest_below(terrain: FloatImage, warp: FloatImage, u: float, v: float, wa
 
 
 @njit(cache=True)
-def _lot(h: np.uint64, kind: int, p: float, q: float, side: float, box: Array) -> np.uint64:
-    """The lot of a block that holds (p, q), into `box`, and its hash; those of an estate are alike."""
+def _lot(h: np.uint64, kind: int, position: tuple[float, float], side: float, box: Array) -> np.uint64:
+    """Write into `box` the lot of a block at a position; returns its hash, one for a whole estate."""
+    p, q = position
     if kind != ESTATE:
-        return _split(h, p, q, side, _LOT_M[kind], box)
+        return _split(h, position, side, _LOT_M[kind], box)
     box[0] = math.floor(p / ESTATE_LOT_M) * ESTATE_LOT_M
     box[2] = math.floor(q / ESTATE_LOT_M) * ESTATE_LOT_M
     box[1], box[3] = box[0] + ESTATE_LOT_M, box[2] + ESTATE_LOT_M
@@ -138,8 +150,11 @@ def _lot(h: np.uint64, kind: int, p: float, q: float, side: float, box: Array) -
 
 
 @njit(cache=True)
-def _split(h: np.uint64, p: float, q: float, side: float, limit: float, box: Array) -> np.uint64:
-    """The rectangle of a block that holds (p, q), into `box` (p0, p1, q0, q1), and its hash; metres."""
+def _split(
+    h: np.uint64, position: tuple[float, float], side: float, limit: float, box: Array
+) -> np.uint64:
+    """Write into `box` (p0, p1, q0, q1) the rectangle of a block at a position; returns its hash."""
+    p, q = position
     box[0], box[1], box[2], box[3] = 0.0, side, 0.0, side
     for _ in range(12):
         width, height = box[1] - box[0], box[3] - box[2]
@@ -159,7 +174,7 @@ def _split(h: np.uint64, p: float, q: float, side: float, limit: float, box: Arr
 
 @njit(cache=True)
 def _kind(h: np.uint64, patterned_share: float) -> int:
-    """What a block is."""
+    """The kind of a block."""
     draw = _part(_mix(h, 11), 0)
     if draw < patterned_share:
         return ORCHARD if draw < 0.5 * patterned_share else ESTATE
@@ -173,7 +188,7 @@ def _kind(h: np.uint64, patterned_share: float) -> int:
 
 @njit(cache=True)
 def _tree(h: np.uint64, p: float, q: float, chance: float, side: float) -> float:
-    """How a tree changes the albedo: its factor, or 1 where there is none; a crown and its shadow."""
+    """Factor of the albedo by the crown or the shadow of a tree; 1 without a tree."""
     i = int(np.floor(p / TREE_LATTICE_M))
     j = int(np.floor(q / TREE_LATTICE_M))
     factor = 1.0
@@ -198,7 +213,7 @@ def _tree(h: np.uint64, p: float, q: float, chance: float, side: float) -> float
 
 @njit(cache=True)
 def _orchard_tree(p: float, q: float) -> float:
-    """How the trees of an orchard change the albedo: crowns and their shadows, one like the other."""
+    """Factor of the albedo by the crowns and shadows of the trees of an orchard, which are all alike."""
     dp = p / ORCHARD_ROW_M - math.floor(p / ORCHARD_ROW_M) - 0.5
     dq = q / ORCHARD_ROW_M - math.floor(q / ORCHARD_ROW_M) - 0.5
     if dp * dp + dq * dq < 0.08:
@@ -209,7 +224,7 @@ def _orchard_tree(p: float, q: float) -> float:
 
 @njit(cache=True)
 def _ground_albedo(h: np.uint64, kind: int, box: Array, p: float, q: float) -> float:
-    """Crops with rows along one side and a track or a hedge around; soil of woods; gardens and yards."""
+    """Albedo of open ground: crops in rows with a track or a hedge around, soil, gardens, yards."""
     edge = min(min(p - box[0], box[1] - p), min(q - box[2], box[3] - q))
     if kind == WOOD:
         return 0.13
@@ -228,7 +243,7 @@ def _ground_albedo(h: np.uint64, kind: int, box: Array, p: float, q: float) -> f
 
 @njit(cache=True)
 def _building(h: np.uint64, kind: int, box: Array, walls: Array) -> float:
-    """Walls of the building of a lot (p0, p1, q0, q1), and its height above the ground; 0 for none."""
+    """Write into `walls` the building of a lot (p0, p1, q0, q1); returns its height, 0 for none."""
     if kind in (WOOD, FIELDS, ORCHARD) or box[1] <= box[0]:
         return 0.0
     if kind != ESTATE and _part(h, 2) < 0.16:
@@ -249,7 +264,7 @@ def _building(h: np.uint64, kind: int, box: Array, walls: Array) -> float:
 
 @njit(cache=True)
 def _roof_albedo(h: np.uint64, kind: int, walls: Array, p: float, q: float) -> float:
-    """Tiles in two tones on either side of a ridge, or a flat roof with bands and a rim."""
+    """Albedo of a roof: tiles in two tones on both sides of a ridge, or flat with bands and a rim."""
     width, depth = walls[1] - walls[0], walls[3] - walls[2]
     edge = min(min(p - walls[0], walls[1] - p), min(q - walls[2], walls[3] - q))
     tone = 0.17 + 0.22 * _part(h, 1)
@@ -271,16 +286,15 @@ def _roof_albedo(h: np.uint64, kind: int, walls: Array, p: float, q: float) -> f
 @njit(cache=True)
 def _cover(
     terrain: FloatImage,
-    warp: FloatImage,
-    texture: FloatImage,
-    blotches: FloatImage,
+    noise: LandNoise,
     posting: float,
-    seed: np.uint64,
-    patterned_share: float,
-    albedo: FloatImage,
-    roof: FloatImage,
-    parcel: npt.NDArray[np.uint16],
+    seed_and_patterned_share: tuple[np.uint64, float],
+    cover: LandCover,
 ) -> None:
+    """Fill the land cover of all cells."""
+    warp, texture, blotches = noise
+    seed, patterned_share = seed_and_patterned_share
+    albedo, roof, parcel = cover
     n = len(terrain)
     blocks = max(2, int(np.round(n * posting / BLOCK_M)))
     cells = n / blocks
@@ -308,7 +322,7 @@ def _cover(
             if edge < ROAD_HALF_WIDTH_M + 1.5:
                 albedo[r, c] = 0.15 * blotch * (1.0 + 0.15 * grain)
                 continue
-            h = _lot(block, kind, p, q, side, box)
+            h = _lot(block, kind, (p, q), side, box)
             height = _building(h, kind, box, walls)
             if height > 0.0 and walls[0] <= p <= walls[1] and walls[2] <= q <= walls[3]:
                 house = _mix(_mix(h, int(walls[0])), int(walls[2]))

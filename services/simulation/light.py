@@ -1,8 +1,8 @@
-"""What the ground sends up on a given day: crops that change, slopes that face the sun, shadows."""
+"""Light reflected by the ground on a given day: changing crops, slopes towards the sun, shadows."""
 
 import math
-from dataclasses import dataclass
 from datetime import date
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,28 +15,29 @@ from services.simulation.world import World, natural_noise
 from services.types import BoolArray, FloatImage
 
 SKY_LIGHT = 0.30
-"""Share of the light on level ground that comes from the whole sky and reaches shadows."""
+"""Share of the light on level ground that comes from the whole sky, also into shadows."""
 
 CHANGING_SHARE = 0.35
-"""Share of the fields that are at another stage of the year on another day."""
+"""Share of the fields that look different on another day."""
 
 SEASONAL_GRAIN = 0.35
-"""Spread of the logarithm of what grows over the ground from one season to another."""
+"""Standard deviation of the logarithm of the albedo change from one season to another."""
 
+BLOCK = 16
+"""Cells along the side of the squares in which buildings are searched."""
 _STRIP_ROWS = 1024
 _GRAIN_CELLS = 512
 
 
-@dataclass(frozen=True)
-class Day:
+class Day(NamedTuple):
     """The state of a world on a day.
 
     Attributes:
-        stage: (65536,) factor of the albedo of every field.
-        grain: (t, t) factor of the albedo of all open ground, repeated; what has grown since.
+        stage: (65536,) factor of the albedo of each field.
+        grain: (t, t) factor of the albedo of all open ground, repeated: growth since another season.
         sun: (3,) unit vector to the sun, east, north, up.
-        reach: cells that the shadow of the highest roof is long.
-        shaded: squares of 16 cells that a shadow may reach.
+        reach: length of the shadow of the highest roof, cells.
+        shaded: whether a shadow may reach each square of 16 x 16 cells.
     """
 
     stage: FloatImage
@@ -49,16 +50,16 @@ class Day:
 def day_of(
     world: World, day: date, sun_elevation_deg: float, sun_azimuth_deg: float, season: float = 0.0
 ) -> Day:
-    """How a world looks on a day.
+    """The state of a world on a day.
 
-    Fields differ from day to day: most a little, `CHANGING_SHARE` of them a lot.
+    Fields differ from day to day: most of them slightly, `CHANGING_SHARE` of them strongly.
 
     Args:
         world: the ground.
-        day: two images of the same day see the same fields.
-        sun_elevation_deg, sun_azimuth_deg: where the sun stands.
-        season: 0 to 1; more of the fields are at another stage, at 1 all of them, and another texture
-            covers what grows.
+        day: date; the fields are the same in all images of a date.
+        sun_elevation_deg, sun_azimuth_deg: direction of the sun.
+        season: 0 to 1, distance from another season: at 1 all fields differ strongly, and another
+            texture covers the vegetation.
     """
     rng = np.random.default_rng([world.seed, day.toordinal()])
     stage = rng.uniform(0.93, 1.07, 65536)
@@ -83,58 +84,52 @@ def day_of(
 def radiance_of_day(
     world: World, day: date, sun_elevation_deg: float, sun_azimuth_deg: float
 ) -> FloatImage:
-    """Light sent up by every cell of a world, 1 for a white level ground in the sun.
+    """Light reflected by each cell of a world; 1 for white level ground in the sun.
 
-    Slopes, flat roofs and the shadows of buildings follow the sun; the shadows of trees belong to the
-    albedo and do not. See `day_of`.
+    Slopes, flat roofs and the shadows of buildings depend on the sun; the shadows of trees are part of
+    the albedo and do not. See `day_of`.
     """
-    rows, columns = world.albedo.shape
-    return radiance(world, day_of(world, day, sun_elevation_deg, sun_azimuth_deg), 0, 0, rows, columns)
+    shape = world.albedo.shape
+    return radiance(world, day_of(world, day, sun_elevation_deg, sun_azimuth_deg), (0, 0), shape)
 
 
-def radiance(world: World, day: Day, row: int, column: int, rows: int, columns: int) -> FloatImage:
-    """Light (rows, columns) sent up on a day by the cells from (row, column) on; the grid repeats."""
-    out = np.empty((rows, columns), dtype=np.float32)
-    _light(
-        world.terrain_m,
-        world.roof_m,
-        world.albedo,
-        world.parcel,
-        day.stage,
-        day.grain,
-        day.shaded,
-        day.sun,
-        world.posting_m,
-        day.reach,
-        row,
-        column,
-        out,
-    )
+def radiance(world: World, day: Day, first: tuple[int, int], shape: tuple[int, ...]) -> FloatImage:
+    """Light reflected on a day by the cells of a window, which may cross the border of the grid.
+
+    Args:
+        world: the ground.
+        day: its state.
+        first: row and column of the first cell.
+        shape: rows and columns.
+    """
+    out = np.empty(shape, dtype=np.float32)
+    ground = _Ground(world.terrain_m, world.roof_m, world.albedo, world.parcel)
+    _reflect(ground, world.posting_m, day, first, out)
     return out
 
 
-def near_buildings(roof_m: FloatImage, reach: int, block: int = 16) -> BoolArray:
-    """Which squares of `block` cells have a building within `reach` cells; the grid repeats.
+def near_buildings(roof_m: FloatImage, reach: int) -> BoolArray:
+    """Whether each square of `BLOCK` x `BLOCK` cells has a building within `reach` cells.
 
     Returns:
-        (ceil(rows / block), ceil(columns / block)).
+        (ceil(rows / BLOCK), ceil(columns / BLOCK)).
     """
     rows, columns = roof_m.shape
-    height, width = -(-rows // block), -(-columns // block)
+    height, width = -(-rows // BLOCK), -(-columns // BLOCK)
     built = np.zeros((height, width), dtype=np.uint8)
     for r in range(height):
-        line = (roof_m[r * block : (r + 1) * block] > NO_ROOF).any(axis=0)
-        built[r] = np.maximum.reduceat(line, np.arange(0, columns, block))
-    steps = min(-(-reach // block) + 1, height, width)
+        line = (roof_m[r * BLOCK : (r + 1) * BLOCK] > NO_ROOF).any(axis=0)
+        built[r] = np.maximum.reduceat(line, np.arange(0, columns, BLOCK))
+    steps = min(-(-reach // BLOCK) + 1, height, width)
     padded = np.pad(built, steps, mode="wrap")
     grown = cv2.dilate(padded, np.ones((2 * steps + 1, 2 * steps + 1), np.uint8))
     return np.asarray(grown[steps:-steps, steps:-steps] > 0)
 
 
 def smooth_radiance(radiance: FloatImage, roof_m: FloatImage, ratio: float) -> FloatImage:
-    """Light averaged over pixels `ratio` times larger than a cell, roofs and ground each by themselves.
+    """Light averaged over pixels `ratio` times larger than a cell, separately for roofs and ground.
 
-    Roofs and ground are kept apart because a view from the side moves one against the other.
+    The separation is necessary because roofs move relative to the ground in an oblique view.
     """
     if ratio <= 1.0:
         return radiance
@@ -151,14 +146,14 @@ def smooth_radiance(radiance: FloatImage, roof_m: FloatImage, ratio: float) -> F
 
 
 def smoothing_margin(ratio: float) -> int:
-    """How many cells around decide on the light averaged over pixels `ratio` times larger."""
+    """Number of cells on each side that contribute to light averaged over larger pixels."""
     if ratio <= 1.0:
         return 0
     return math.ceil(4.0 * BLUR_PER_RATIO * math.sqrt(ratio * ratio - 1.0)) + 1
 
 
 def averaged(light: FloatImage, built: BoolArray, ratio: float) -> FloatImage:
-    """Light averaged over pixels `ratio` times larger than its own, built cells and others apart."""
+    """Light averaged over pixels `ratio` times larger, separately for built cells and others."""
     if ratio <= 1.0:
         return light
     sigma = BLUR_PER_RATIO * math.sqrt(ratio * ratio - 1.0)
@@ -171,22 +166,21 @@ def averaged(light: FloatImage, built: BoolArray, ratio: float) -> FloatImage:
     return out
 
 
+class _Ground(NamedTuple):
+    """The arrays of a world for the kernel."""
+
+    terrain: FloatImage
+    roof: FloatImage
+    albedo: FloatImage
+    parcel: npt.NDArray[np.uint16]
+
+
 @njit(cache=True)
-def _light(
-    terrain: FloatImage,
-    roof: FloatImage,
-    albedo: FloatImage,
-    parcel: npt.NDArray[np.uint16],
-    stage: FloatImage,
-    grain: FloatImage,
-    shaded: BoolArray,
-    sun: npt.NDArray[np.float64],
-    posting: float,
-    reach: int,
-    first_row: int,
-    first_column: int,
-    out: FloatImage,
-) -> None:
+def _reflect(ground: _Ground, posting: float, day: Day, first: tuple[int, int], out: FloatImage) -> None:
+    """Fill `out` with the light that the cells from `first` reflect."""
+    terrain, roof, albedo, parcel = ground
+    stage, grain, sun, reach, shaded = day
+    first_row, first_column = first
     rows, columns = terrain.shape
     tile = len(grain)
     horizontal = math.hypot(sun[0], sun[1])
@@ -212,7 +206,7 @@ def _light(
                     1.0 + east * east + north * north
                 )
             direct = max(facing, 0.0) / sun[2]
-            if shaded[r // 16, c // 16]:
+            if shaded[r // BLOCK, c // BLOCK]:
                 for k in range(1, reach):
                     x = math.floor(c + k * step_x + 0.5) % columns
                     y = math.floor(r + k * step_y + 0.5) % rows

@@ -1,4 +1,4 @@
-"""A true pushbroom: a satellite on its orbit that turns to see a place from where it was asked to."""
+"""Simulated orbits: a pushbroom satellite that views a target from a given direction."""
 
 import math
 from datetime import datetime
@@ -20,7 +20,7 @@ from services.types import Array
 EARTH_GM_M3_S2 = 3.986004418e14
 EARTH_ROTATION_RAD_S = 7.292115e-5
 INCLINATION_DEG = 98.2
-"""Of a sun-synchronous orbit at 700 km."""
+"""Inclination of a sun-synchronous orbit at 700 km."""
 
 JITTER_HZ = 1.5
 _STEP_S = 0.05
@@ -31,31 +31,32 @@ def pushbroom_over(
     target_lon_lat_h: Array,
     shape: tuple[int, int],
     gsd_m: float,
-    incidence_deg: float,
-    azimuth_deg: float,
+    direction_deg: tuple[float, float],
     height_range_m: tuple[float, float],
+    *,
     orbit_height_m: float = 700e3,
     jitter_px: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> PushbroomModel:
-    """A pushbroom on a circular, descending orbit whose central pixel sees a target as asked.
+    """A pushbroom model on a circular, descending orbit whose central pixel views a target.
 
     The line of sight follows the ground at the speed of the satellite's track, and the row of detectors
-    stays across it, so that pixels are square at the target.
+    stays perpendicular to it, so that pixels are square at the target.
 
     Args:
-        target_lon_lat_h: (3,) seen by the centre of the image.
+        target_lon_lat_h: (3,) ground point at the centre of the image.
         shape: lines and samples.
-        gsd_m: ground sampling at the target, along and across.
-        incidence_deg, azimuth_deg: direction from the target to the satellite.
-        height_range_m: of the model.
-        orbit_height_m: above the equatorial radius.
-        jitter_px: amplitude of an oscillation of the line of sight on each axis, in pixels at 1.5 Hz.
-        rng: phases of that oscillation; without it they are zero.
+        gsd_m: ground sampling distance at the target, along and across the track.
+        direction_deg: incidence and azimuth, the direction from the target to the satellite.
+        height_range_m: height range of the model.
+        orbit_height_m: height of the orbit above the equatorial radius.
+        jitter_px: amplitude of an oscillation of the line of sight about each axis, at 1.5 Hz.
+        rng: source of the phases of that oscillation; without it they are zero.
 
     Raises:
-        InputError: when the target cannot be seen from that orbit under that incidence.
+        InputError: the target is not visible from that orbit with that incidence.
     """
+    incidence_deg, azimuth_deg = direction_deg
     ground_axes = ecef_from_east_north_up(target_lon_lat_h)
     target = ecef_from_lon_lat_h(target_lon_lat_h[None, :])[0]
     satellite = _satellite(target, ground_axes, incidence_deg, azimuth_deg, orbit_height_m)
@@ -71,9 +72,9 @@ def pushbroom_over(
     steps = math.ceil(half_s / step_s) + _MARGIN_STEPS
     times = step_s * np.arange(-steps, steps + 1, dtype=np.float64)
     position = track.position(times)
-    seen = target + times[:, None] * ground_speed * heading
-    seen = _at_height(seen, float(target_lon_lat_h[2]))
-    attitude = _steering(position, seen, heading)
+    viewed = target + times[:, None] * ground_speed * heading
+    viewed = _at_height(viewed, float(target_lon_lat_h[2]))
+    attitude = _steering(position, viewed, heading)
     distance = float(np.linalg.norm(target - satellite))
     if jitter_px:
         phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
@@ -100,13 +101,13 @@ def pushbroom_over(
 
 
 def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
-    """Elevation and azimuth of the sun, degrees, to about half a degree.
+    """Elevation and azimuth of the sun in degrees, accurate to about half a degree.
 
     Source: the low-precision formulas of the Astronomical Almanac.
 
     Args:
         lon_lat: (2,) degrees.
-        when: UTC.
+        when: time, UTC.
     """
     days = (when.replace(tzinfo=None) - datetime(2000, 1, 1, 12)).total_seconds() / 86400.0
     anomaly = np.radians(357.528 + 0.9856003 * days)
@@ -127,7 +128,7 @@ def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
 def _satellite(
     target: Array, axes: Array, incidence_deg: float, azimuth_deg: float, orbit_height_m: float
 ) -> Array:
-    """Where the line of sight from a target meets the orbit's sphere, ECEF."""
+    """Intersection (3,) of the line of sight from a target with the sphere of the orbit, ECEF."""
     incidence, azimuth = np.radians([incidence_deg, azimuth_deg])
     direction = axes @ np.array(
         [
@@ -141,13 +142,14 @@ def _satellite(
     square = along * along + radius * radius - float(target @ target)
     if not 0.0 <= incidence_deg < 60.0 or square <= 0.0:
         raise InputError(
-            f"no view under {incidence_deg:g} degrees from an orbit at {orbit_height_m / 1e3:g} km"
+            f"incidence: {incidence_deg:g} degrees given, 0 to less than 60 degrees and visible from an "
+            f"orbit at {orbit_height_m / 1e3:g} km expected"
         )
     return np.asarray(target + (math.sqrt(square) - along) * direction)
 
 
 class _Track:
-    """A circular orbit through a position (3,) ECEF at time zero, flown southwards."""
+    """A circular orbit that passes southwards through a position (3,) ECEF at time zero."""
 
     def __init__(self, satellite: Array) -> None:
         radius = float(np.linalg.norm(satellite))
@@ -162,13 +164,13 @@ class _Track:
         self._ahead = radius * ahead / np.linalg.norm(ahead)
 
     def position(self, times: Array) -> Array:
-        """(n, 3) ECEF metres: the orbit stands still among the stars, the Earth turns below it."""
+        """Positions (n, 3) in ECEF metres, of an inertial orbit above the rotating Earth."""
         angle = self._rate * times[:, None]
         inertial = np.cos(angle) * self._out + np.sin(angle) * self._ahead
         return Rotation.from_rotvec(np.outer(times, [0.0, 0.0, -EARTH_ROTATION_RAD_S])).apply(inertial)
 
     def velocity(self, times: Array) -> Array:
-        """(n, 3) ECEF metres a second."""
+        """Velocities (n, 3) in ECEF, metres per second."""
         half_s = 0.01
         return np.asarray(
             (self.position(times + half_s) - self.position(times - half_s)) / (2.0 * half_s)
@@ -176,17 +178,17 @@ class _Track:
 
 
 def _at_height(ecef: Array, height_m: float) -> Array:
-    """Points (n, 3) moved vertically to one height."""
+    """ECEF points (n, 3) moved vertically to one height."""
     lon_lat_h = lon_lat_h_from_ecef(ecef)
     lon_lat_h[:, 2] = height_m
     return ecef_from_lon_lat_h(lon_lat_h)
 
 
-def _steering(position: Array, seen: Array, heading: Array) -> Rotation:
-    """Attitudes (n) that look at ground points (n, 3), the row of detectors across a heading (3,)."""
-    down = seen - position
+def _steering(position: Array, viewed: Array, heading: Array) -> Rotation:
+    """Attitudes (n) that view ground points (n, 3), with the row of detectors across a heading (3,)."""
+    down = viewed - position
     down /= np.linalg.norm(down, axis=1, keepdims=True)
-    up = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    up = viewed / np.linalg.norm(viewed, axis=1, keepdims=True)
     right = np.cross(heading[None, :], up)
     right -= (right * down).sum(axis=1, keepdims=True) * down
     right /= np.linalg.norm(right, axis=1, keepdims=True)

@@ -1,6 +1,7 @@
-"""Lines of sight that come down on a simulated world, and the light they meet there."""
+"""Lines of sight in a simulated world: their first intersection with the surface, and its light."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,23 +12,62 @@ from services.simulation.land import NO_ROOF
 from services.types import Array, BoolArray, FloatImage
 
 GROUND, ROOF, WALL_EAST_WEST, WALL_NORTH_SOUTH = 0, 1, 2, 3
-"""What a line of sight meets; a wall is named after the directions it may face."""
+"""Kinds of surface; a wall has the name of the directions that it may face."""
 
 WALL_ALBEDO = 0.22
 _GROUND_TOLERANCE_M = 1e-5
 _GROUND_STEPS = 60
 
 
-@njit(cache=True)
-def meet_ground(
-    terrain: FloatImage, x0: float, y0: float, by_h_x: float, by_h_y: float, h: float
-) -> float:
-    """Height where a line of sight meets the terrain.
+class Ray(NamedTuple):
+    """A line of sight, at height h in column `x0 + h by_h_x` and row `y0 + h by_h_y` of the grid."""
 
-    The line is at `(x0 + h by_h_x, y0 + h by_h_y)` at height h. Fixed-point steps; they settle while
-    the slope of the ground times the tangent of the incidence is below one, and then there is only one
-    such place.
+    x0: float
+    y0: float
+    by_h_x: float
+    by_h_y: float
+
+
+class RayNodes(NamedTuple):
+    """Lines of sight of some image lines at every `spacing`-th sample, at two heights.
+
+    Attributes:
+        low, high: (3, lines, nodes, 2) columns and rows at both heights; the first axis is a quarter
+            line before, at and after the line.
+        low_m, high_m: the heights.
     """
+
+    low: Array
+    high: Array
+    low_m: float
+    high_m: float
+
+
+class LitSurface(NamedTuple):
+    """The arrays of a world and its light, for the kernel.
+
+    Attributes:
+        terrain, roof: heights of the world.
+        light: light of its cells, averaged over pixels.
+        near: whether buildings may be met, for each square of 16 x 16 cells.
+        walls: (4,) light of walls that face west, east, north, south.
+    """
+
+    terrain: FloatImage
+    roof: FloatImage
+    light: FloatImage
+    near: BoolArray
+    walls: Array
+
+
+@njit(cache=True)
+def intersect_ground(terrain: FloatImage, ray: Ray, h: float) -> float:
+    """Height of the intersection of a line of sight with the terrain, searched from height h.
+
+    The fixed-point iteration converges while the slope of the ground times the tangent of the incidence
+    is below one; the intersection is then unique.
+    """
+    x0, y0, by_h_x, by_h_y = ray
     for _ in range(_GROUND_STEPS):
         height = bilinear(terrain, x0 + h * by_h_x, y0 + h * by_h_y)
         change = height - h
@@ -38,22 +78,15 @@ def meet_ground(
 
 
 @njit(cache=True)
-def meet_building(
-    roof: FloatImage,
-    x0: float,
-    y0: float,
-    by_h_x: float,
-    by_h_y: float,
-    ground: float,
-    top: float,
-) -> tuple[int, float]:
-    """What a line of sight meets first on its way from one height down to the ground.
+def intersect_building(roof: FloatImage, ray: Ray, ground: float, top: float) -> tuple[int, float]:
+    """First intersection of a line of sight between the height `top` and the ground.
 
-    Source: Amanatides and Woo (1987), the cells of a grid along a line, in order.
+    Source: Amanatides and Woo (1987), traversal of the cells of a grid along a line.
 
     Returns:
-        What is met and at which height.
+        Kind of the surface, and height of the intersection.
     """
+    x0, y0, by_h_x, by_h_y = ray
     if not top > ground:
         return GROUND, ground
     rows, columns = roof.shape
@@ -99,8 +132,8 @@ def _cubic_weights(f: float) -> tuple[float, float, float, float]:
 
 
 @njit(cache=True)
-def _open_light(light: FloatImage, x: float, y: float) -> float:
-    """Light of open ground far from buildings, bicubic."""
+def _open_ground_light(light: FloatImage, x: float, y: float) -> float:
+    """Bicubic light of open ground far from buildings."""
     rows, columns = light.shape
     x0, y0 = math.floor(x), math.floor(y)
     wx = _cubic_weights(x - x0)
@@ -124,8 +157,10 @@ def _open_light(light: FloatImage, x: float, y: float) -> float:
 
 
 @njit(cache=True)
-def _kept_light(light: FloatImage, roof: FloatImage, x: float, y: float, on_roof: bool) -> float:
-    """Light of a roof, or of the ground beside one, bilinear over the cells of that kind."""
+def _light_beside_buildings(
+    light: FloatImage, roof: FloatImage, x: float, y: float, on_roof: bool
+) -> float:
+    """Light of a roof, or of the ground beside one, bilinear over the cells of the same kind."""
     rows, columns = light.shape
     x0, y0 = math.floor(x), math.floor(y)
     fx, fy = x - x0, y - y0
@@ -142,57 +177,43 @@ def _kept_light(light: FloatImage, roof: FloatImage, x: float, y: float, on_roof
 
 
 @njit(cache=True)
-def meet_surface(
-    terrain: FloatImage, roof: FloatImage, low: Array, high: Array, h_low: float, h_high: float
+def intersect_surface(
+    terrain: FloatImage, roof: FloatImage, low: Array, high: Array, heights_m: tuple[float, float]
 ) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Heights (n,) at which lines of sight meet the surface first, and what they meet.
-
-    The height of a line that is not a number is none.
+    """Heights (n,) of the first intersections of lines of sight with the surface, and its kinds (n,).
 
     Args:
-        terrain, roof: of the world.
-        low, high: (n, 2) column and row of each line at two heights.
-        h_low, h_high: those heights; nothing of the world is above the second.
+        terrain, roof: heights of the world.
+        low, high: (n, 2) column and row of each line at two heights; NaN gives a height of NaN.
+        heights_m: the two heights; nothing of the world is above the second.
     """
+    h_low, h_high = heights_m
     height = np.empty(len(low))
-    met = np.empty(len(low), dtype=np.int64)
+    kind = np.empty(len(low), dtype=np.int64)
     for i in range(len(low)):
         gx = (high[i, 0] - low[i, 0]) / (h_high - h_low)
         gy = (high[i, 1] - low[i, 1]) / (h_high - h_low)
-        x0, y0 = low[i, 0] - h_low * gx, low[i, 1] - h_low * gy
-        ground = meet_ground(terrain, x0, y0, gx, gy, h_low)
-        met[i], height[i] = meet_building(roof, x0, y0, gx, gy, ground, h_high)
-    return height, met
+        ray = Ray(low[i, 0] - h_low * gx, low[i, 1] - h_low * gy, gx, gy)
+        ground = intersect_ground(terrain, ray, h_low)
+        kind[i], height[i] = intersect_building(roof, ray, ground, h_high)
+    return height, kind
 
 
 @njit(cache=True)
 def render_lines(
-    terrain: FloatImage,
-    roof: FloatImage,
-    light: FloatImage,
-    near: BoolArray,
-    nodes_low: Array,
-    nodes_high: Array,
-    h_low: float,
-    h_high: float,
-    spacing: int,
-    clearance: float,
-    walls: Array,
-    out: FloatImage,
+    surface: LitSurface, nodes: RayNodes, spacing: int, clearance: float, out: FloatImage
 ) -> None:
-    """Light met by the pixels of some lines, one line of sight each, four beside buildings.
+    """Fill the pixels of some lines with the light on their lines of sight: one, or four near buildings.
 
     Args:
-        terrain, roof, light: of the world; the light averaged over pixels already.
-        near: squares of 16 cells where buildings may be met.
-        nodes_low, nodes_high: (3, lines, nodes, 2) column and row at two heights of every `spacing`-th
-            sample, from sample `-0.5` on; the first axis is a quarter line before, at and after.
-        h_low, h_high: those heights.
+        surface: the world and its light.
+        nodes: lines of sight at every `spacing`-th sample, from sample -0.5 on.
         spacing: samples between nodes.
-        clearance: highest roof above the terrain, metres, and what the terrain may rise below a line.
-        walls: (4,) light of walls that face west, east, north, south.
-        out: (lines, samples) filled.
+        clearance: greatest height above the terrain at which a building may be met, metres.
+        out: (lines, samples) pixels.
     """
+    terrain, roof, light, near, walls = surface
+    nodes_low, nodes_high, h_low, h_high = nodes
     lines, samples = out.shape
     rows, columns = terrain.shape
     per_h = 1.0 / (h_high - h_low)
@@ -215,12 +236,13 @@ def render_lines(
                 gx = (high[0] + f * (high1[0] - high[0]) - xl) * per_h
                 gy = (high[1] + f * (high1[1] - high[1]) - yl) * per_h
                 x0, y0 = xl - h_low * gx, yl - h_low * gy
-                h = meet_ground(terrain, x0, y0, gx, gy, h)
+                ray = Ray(x0, y0, gx, gy)
+                h = intersect_ground(terrain, ray, h)
                 x, y = x0 + h * gx, y0 + h * gy
                 block_x = (math.floor(x) % columns) // 16
                 block_y = (math.floor(y) % rows) // 16
                 if not near[block_y, block_x]:
-                    total += _open_light(light, x, y)
+                    total += _open_ground_light(light, x, y)
                     k += 1
                     if rays == 4:
                         continue
@@ -229,10 +251,11 @@ def render_lines(
                     rays = 4
                     total = 0.0
                     continue
-                met, height = meet_building(roof, x0, y0, gx, gy, h, h + clearance)
-                if met <= ROOF:
-                    total += _kept_light(light, roof, x0 + height * gx, y0 + height * gy, met == ROOF)
-                elif met == WALL_EAST_WEST:
+                kind, height = intersect_building(roof, ray, h, h + clearance)
+                if kind <= ROOF:
+                    column, row = x0 + height * gx, y0 + height * gy
+                    total += _light_beside_buildings(light, roof, column, row, kind == ROOF)
+                elif kind == WALL_EAST_WEST:
                     total += walls[1] if gx > 0.0 else walls[0]
                 else:
                     total += walls[3] if gy > 0.0 else walls[2]

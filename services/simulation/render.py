@@ -1,4 +1,4 @@
-"""Images of a simulated world, line by line as a scanner takes them."""
+"""Rendering of images of a simulated world, line by line."""
 
 import math
 from collections.abc import Iterator
@@ -9,32 +9,38 @@ import numpy.typing as npt
 
 from services.errors import InputError
 from services.sensors.base import SensorModel
-from services.simulation.light import SKY_LIGHT, near_buildings, smooth_radiance
-from services.simulation.rays import WALL_ALBEDO, meet_surface, render_lines
+from services.simulation.light import SKY_LIGHT, near_buildings
+from services.simulation.rays import (
+    WALL_ALBEDO,
+    LitSurface,
+    RayNodes,
+    intersect_surface,
+    render_lines,
+)
 from services.simulation.world import World
 from services.types import Array, BoolArray, FloatImage
 
 DARKEST, BRIGHTEST = 1, 4095
-"""Range of the pixels: 12 bits, zero kept for nodata."""
+"""Range of the pixels: 12 bits, with zero reserved for nodata."""
 
 NODE_SPACING = 64
-"""Samples between the lines of sight that go through the model; those between are interpolated."""
+"""Samples between lines of sight computed by the sensor model; the others are interpolated."""
 
 _HEIGHT_MARGIN_M = 2.0
 STEEPEST = 0.9
-"""Largest product of slope and tangent of the incidence: beyond one, terrain hides itself."""
+"""Largest product of slope and tangent of the incidence; above 1, terrain would occlude itself."""
 
 _LINES_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class Radiometry:
-    """From light to numbers: `haze + gain light`, and noise that grows with the signal.
+    """The pixel value of light, `haze + gain light`, with noise that grows with the signal.
 
     Attributes:
-        gain: of a white ground in the sun.
-        haze: of a black one.
-        noise_floor: standard deviation where it is dark.
+        gain: additional value of white ground in the sun.
+        haze: value of black ground.
+        noise_floor: standard deviation in the dark.
         noise_per_signal: variance added by each unit of signal.
     """
 
@@ -45,13 +51,14 @@ class Radiometry:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What the kernels need to know about a world as one image sees it.
+class RaySetup:
+    """The properties of a world that the lines of sight of one image need.
 
     Attributes:
-        near: squares of 16 cells where buildings may be met.
-        clearance_m: highest roof above the terrain, and what the terrain may rise below a line.
-        low_m, high_m: heights between which lines of sight run.
+        near: whether buildings may be met, for each square of 16 x 16 cells.
+        clearance_m: greatest height above the terrain at which a building may be met: the highest roof,
+            plus the rise of the terrain below a line of sight.
+        low_m, high_m: heights of both ends of the lines of sight.
         walls: (4,) light of walls that face west, east, north, south.
     """
 
@@ -66,96 +73,76 @@ def render(
     world: World,
     model: SensorModel,
     shape: tuple[int, int],
-    radiance: FloatImage,
-    gsd_m: float,
-    incidence_deg: float,
-    sun_elevation_deg: float,
-    sun_azimuth_deg: float,
+    light: FloatImage,
+    setup: RaySetup,
+    *,
     radiometry: Radiometry,
     rng: np.random.Generator,
 ) -> Iterator[tuple[int, npt.NDArray[np.uint16]]]:
-    """The image a sensor takes of a world, from the first line to the last.
+    """Yield the image of a world strip by strip, from the first line to the last.
 
-    Each pixel follows its line of sight to what it meets first; memory holds a few hundred lines.
+    Each pixel has the light of the first intersection of its line of sight. Only one strip is in memory.
 
     Args:
         world: the ground.
         model: true geometry of the image.
         shape: lines and samples.
-        radiance: light of the day, `radiance_of_day`.
-        gsd_m: ground sampling, to which the light is averaged.
-        incidence_deg: of the image's centre.
-        sun_elevation_deg, sun_azimuth_deg: for walls.
-        radiometry: from light to numbers.
-        rng: of the noise.
+        light: light of the cells of the world, averaged over pixels by `smooth_radiance`.
+        setup: properties of the lines of sight.
+        radiometry: pixel values of light.
+        rng: source of the noise.
 
     Yields:
-        First line and pixels (lines, samples) uint16 of one strip after the other.
-
-    Raises:
-        InputError: when slopes are so steep that the terrain would hide itself.
+        First line and pixels (lines, samples) uint16 of each strip.
     """
-    light = smooth_radiance(radiance, world.roof_m, gsd_m / world.posting_m)
-    sight = sight_of(world, incidence_deg, sun_elevation_deg, sun_azimuth_deg)
+    nodes = range(shape[1] // NODE_SPACING + 2)
     for first in range(0, shape[0], _LINES_AT_ONCE):
-        count = min(_LINES_AT_ONCE, shape[0] - first)
-        low, high = nodes(world, model, sight, first, count, 0, shape[1] // NODE_SPACING + 2)
-        strip = light_met(world, light, sight, low, high, (count, shape[1]))
+        lines = range(first, min(first + _LINES_AT_ONCE, shape[0]))
+        rays = ray_nodes(world, model, setup, lines, nodes)
+        strip = light_along_rays(world, light, setup, rays, (len(lines), shape[1]))
         yield first, digitise(strip, radiometry, rng)
 
 
-def light_met(
-    world: World, light: FloatImage, sight: Sight, low: Array, high: Array, shape: tuple[int, int]
+def light_along_rays(
+    world: World, light: FloatImage, setup: RaySetup, rays: RayNodes, shape: tuple[int, int]
 ) -> FloatImage:
-    """Light (lines, samples) met by lines of sight, interpolated between `nodes`."""
+    """Light (lines, samples) at the first intersections of lines of sight between given nodes."""
     out = np.empty(shape, dtype=np.float32)
-    render_lines(
-        world.terrain_m,
-        world.roof_m,
-        light,
-        sight.near,
-        low,
-        high,
-        sight.low_m,
-        sight.high_m,
-        NODE_SPACING,
-        sight.clearance_m,
-        sight.walls,
-        out,
-    )
+    surface = LitSurface(world.terrain_m, world.roof_m, light, setup.near, setup.walls)
+    render_lines(surface, rays, NODE_SPACING, setup.clearance_m, out)
     return out
 
 
 def surface_seen(world: World, model: SensorModel, line_sample: Array) -> Array:
-    """Ground points (n, 3) that image positions (n, 2) show: what their lines of sight meet first."""
+    """Ground points (n, 3) visible at image positions (n, 2): the first on their lines of sight."""
     low_m, high_m = world.height_range_m
     low_m, high_m = low_m - _HEIGHT_MARGIN_M, high_m + _HEIGHT_MARGIN_M
     low, high = (
         world.column_row(model.locate(line_sample, np.full(len(line_sample), h))[:, :2])
         for h in (low_m, high_m)
     )
-    height, _ = meet_surface(world.terrain_m, world.roof_m, low, high, low_m, high_m)
+    height, _ = intersect_surface(world.terrain_m, world.roof_m, low, high, (low_m, high_m))
     return model.locate(line_sample, height)
 
 
-def sight_of(
+def ray_setup(
     world: World, incidence_deg: float, sun_elevation_deg: float, sun_azimuth_deg: float
-) -> Sight:
-    """How far buildings may hide the ground, between which heights rays run, how walls are lit.
+) -> RaySetup:
+    """The setup of the lines of sight of an image with a given incidence and sun.
 
     Raises:
-        InputError: when slopes are so steep that the terrain would hide itself.
+        InputError: slopes are so steep that the terrain would occlude itself.
     """
     tangent = math.tan(math.radians(incidence_deg + 2.0))
     steepness = tangent * world.steepest_slope
     if steepness > STEEPEST:
         raise InputError(
-            f"a view under {incidence_deg:g} degrees of slopes up to {world.steepest_slope:.2f} m/m "
-            "would need terrain that hides itself, which is not simulated"
+            f"incidence of {incidence_deg:g} degrees with slopes up to {world.steepest_slope:.2f} m/m: "
+            "the terrain would occlude itself, which is not simulated; reduce incidence or relief"
         )
     clearance_m = world.roof_clearance_m / (1.0 - steepness) + 0.1
     low, high = world.height_range_m
-    return Sight(
+    return RaySetup(
         near=near_buildings(world.roof_m, math.ceil(clearance_m * tangent / world.posting_m) + 2),
         clearance_m=clearance_m,
         low_m=low - _HEIGHT_MARGIN_M,
@@ -164,23 +151,18 @@ def sight_of(
     )
 
 
-def nodes(
-    world: World, model: SensorModel, sight: Sight, first: int, count: int, node: int, n_nodes: int
-) -> tuple[Array, Array]:
-    """Grid positions of some lines, and of a quarter pixel around, at both heights of a sight.
+def ray_nodes(world: World, model: SensorModel, setup: RaySetup, lines: range, nodes: range) -> RayNodes:
+    """Lines of sight of some lines, and of a quarter line before and after them, at some nodes.
 
     Args:
-        world: its grid.
+        world: the grid.
         model: true geometry of the image.
-        sight: its heights.
-        first, count: lines.
-        node, n_nodes: every `NODE_SPACING`-th sample, counted from sample -0.5.
-
-    Returns:
-        Low and high, (3, count, n_nodes, 2) columns and rows each.
+        setup: both heights.
+        lines: consecutive lines.
+        nodes: consecutive nodes, one for every `NODE_SPACING`-th sample from sample -0.5 on.
     """
-    line = first + np.arange(-1.0, count + 1.0)
-    sample = -0.5 + NODE_SPACING * np.arange(node, node + n_nodes)
+    line = lines.start + np.arange(-1.0, len(lines) + 1.0)
+    sample = -0.5 + NODE_SPACING * np.arange(nodes.start, nodes.stop)
     image = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def at(height_m: float) -> Array:
@@ -189,7 +171,7 @@ def nodes(
         before, here, after = grid[:-2], grid[1:-1], grid[2:]
         return np.stack([here + 0.25 * (before - here), here, here + 0.25 * (after - here)])
 
-    return at(sight.low_m), at(sight.high_m)
+    return RayNodes(at(setup.low_m), at(setup.high_m), setup.low_m, setup.high_m)
 
 
 def _wall_light(sun_elevation_deg: float, sun_azimuth_deg: float) -> Array:
@@ -204,7 +186,7 @@ def _wall_light(sun_elevation_deg: float, sun_azimuth_deg: float) -> Array:
 def digitise(
     light: FloatImage, radiometry: Radiometry, rng: np.random.Generator
 ) -> npt.NDArray[np.uint16]:
-    """Pixels of light, with noise."""
+    """Pixel values of light, with noise."""
     signal = radiometry.haze + radiometry.gain * np.maximum(light, 0.0)
     spread = np.sqrt(radiometry.noise_floor**2 + radiometry.noise_per_signal * signal)
     signal += spread * rng.standard_normal(light.shape, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Images of a world rendered where they are read: scenes larger than anyone would render whole."""
+"""Images of a world that are rendered where they are read, for scenes too large to render whole."""
 
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -18,11 +18,17 @@ from services.simulation.conditions import (
 )
 from services.simulation.land import NO_ROOF
 from services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
-from services.simulation.rays import meet_surface
-from services.simulation.render import NODE_SPACING, digitise, light_met, nodes, sight_of
+from services.simulation.rays import RayNodes, intersect_surface
+from services.simulation.render import (
+    NODE_SPACING,
+    digitise,
+    light_along_rays,
+    ray_nodes,
+    ray_setup,
+)
 from services.simulation.view import ViewGeometry
 from services.simulation.world import World
-from services.types import Array, FloatImage
+from services.types import FloatImage
 
 TILE_PX = NODE_SPACING
 _CELLS = 128
@@ -32,10 +38,10 @@ Pixels = npt.NDArray[np.uint16]
 
 
 class LightOnDemand:
-    """Light of a day averaged over pixels, computed for the cells that are asked for.
+    """Light of a day averaged over pixels, computed for the requested cells only.
 
     Attributes:
-        values: (rows, columns), NaN where not computed yet.
+        values: (rows, columns) light, NaN where it is not computed yet.
     """
 
     def __init__(self, world: World, day: Day, ratio: float) -> None:
@@ -44,13 +50,13 @@ class LightOnDemand:
         Args:
             world: the ground.
             day: its state.
-            ratio: pixel size in cells, to which the light is averaged.
+            ratio: size of the pixels in cells.
         """
         self.values: FloatImage = np.full(world.albedo.shape, np.nan, dtype=np.float32)
         self._world, self._day, self._ratio = world, day, ratio
 
     def compute(self, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]) -> None:
-        """Compute what is missing from row and column (2,) `first` to `last`; the grid repeats."""
+        """Compute the missing light from row and column (2,) `first` to `last`; the grid repeats."""
         rows, columns = self.values.shape
         for row in _starts(int(first[0]), int(last[0]), rows):
             for column in _starts(int(first[1]), int(last[1]), columns):
@@ -61,7 +67,7 @@ class LightOnDemand:
         out = self.values[row : row + _CELLS, column : column + _CELLS]
         margin = smoothing_margin(self._ratio)
         height, width = out.shape[0] + 2 * margin, out.shape[1] + 2 * margin
-        light = radiance(self._world, self._day, row - margin, column - margin, height, width)
+        light = radiance(self._world, self._day, (row - margin, column - margin), (height, width))
         take = np.arange(row - margin, row - margin + height) % len(self.values)
         wrap = np.arange(column - margin, column - margin + width) % self.values.shape[1]
         built = self._world.roof_m[take[:, None], wrap] > NO_ROOF
@@ -70,7 +76,7 @@ class LightOnDemand:
 
 
 def _starts(first: int, last: int, size: int) -> Iterator[int]:
-    """First cells of the tiles that hold cells `first` to `last` of an axis that repeats."""
+    """Yield the first cells of the tiles with cells `first` to `last` of an axis that repeats."""
     if last - first >= size:
         first, last = 0, size - 1
     at = first
@@ -81,10 +87,10 @@ def _starts(first: int, last: int, size: int) -> Iterator[int]:
 
 
 class TiledView:
-    """An image of a world as an `ImageSource`: tiles are rendered when a window first touches them.
+    """An image of a world as an `ImageSource` whose tiles are rendered when they are first read.
 
-    The pixels are those of the image, not of the window: noise is drawn tile by tile from a seed of its
-    own, and no tile knows what was rendered before it.
+    The pixels do not depend on the windows read: each tile draws its noise from its own seed and is
+    rendered separately.
     """
 
     def __init__(
@@ -94,12 +100,12 @@ class TiledView:
 
         Args:
             world: the ground.
-            geometry: how it is taken.
-            seed: of clouds and noise.
-            conditions: what it is taken through.
+            geometry: geometry of the image.
+            seed: seed of clouds and noise.
+            conditions: conditions of the acquisition.
 
         Raises:
-            InputError: when slopes are so steep that the terrain would hide itself.
+            InputError: slopes are so steep that the terrain would occlude itself.
         """
         plan, acquisition = geometry.plan, geometry.acquisition
         sun = acquisition.sun_elevation_deg, acquisition.sun_azimuth_deg
@@ -108,7 +114,7 @@ class TiledView:
         self._geometry = geometry
         self._conditions = conditions
         self._seed = seed
-        self._sight = sight_of(world, plan.incidence_deg, *sun)
+        self._setup = ray_setup(world, plan.incidence_deg, *sun)
         self._light = LightOnDemand(world, day, plan.gsd_m / world.posting_m)
         self._clouds: Clouds | None = clouds_over(
             plan.shape, conditions.cloud_cover, np.random.default_rng([seed, 0])
@@ -122,7 +128,7 @@ class TiledView:
         return self._geometry.plan.shape
 
     def read(self, window: Window) -> FloatImage:
-        """Pixels of a window, float32; NaN beyond the image."""
+        """Pixels of a window, float32; NaN outside the image."""
         out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
         start = np.array([window.line, window.sample])
         first = np.maximum(start, 0)
@@ -140,34 +146,34 @@ class TiledView:
         return out
 
     def _row_of_tiles(self, row: int, first: int, last: int) -> Iterator[tuple[int, Pixels]]:
-        """Columns and pixels of neighbouring tiles, rendered where they are missing."""
+        """Yield columns and pixels of neighbouring tiles, rendering those that are missing."""
         missing = [c for c in range(first, last + 1) if (row, c) not in self._tiles]
         if missing:
-            low, high = self._nodes(row, missing[0], missing[-1] + 1)
+            rays = self._rays(row, range(missing[0], missing[-1] + 2))
         for column in range(first, last + 1):
             pixels = self._tiles.pop((row, column), None)
             if pixels is None:
                 at = column - missing[0]
-                pixels = self._render(row, column, low[:, :, at : at + 2], high[:, :, at : at + 2])
+                of_tile = np.s_[:, :, at : at + 2]
+                tile_rays = rays._replace(low=rays.low[of_tile], high=rays.high[of_tile])
+                pixels = self._render(row, column, tile_rays)
             self._tiles[row, column] = pixels
             yield column, pixels
         while len(self._tiles) > _CACHED_TILES:
             self._tiles.popitem(last=False)
 
-    def _nodes(self, row: int, first: int, last: int) -> tuple[Array, Array]:
-        """Lines of sight of a row of tiles, from one node to another."""
-        line = row * TILE_PX
-        count = min(TILE_PX, self.shape[0] - line)
-        model = self._geometry.true_model
-        return nodes(self._world, model, self._sight, line, count, first, last - first + 1)
+    def _rays(self, row: int, nodes: range) -> RayNodes:
+        """Lines of sight of a row of tiles at some nodes."""
+        lines = range(row * TILE_PX, min((row + 1) * TILE_PX, self.shape[0]))
+        return ray_nodes(self._world, self._geometry.true_model, self._setup, lines, nodes)
 
-    def _render(self, row: int, column: int, low: Array, high: Array) -> Pixels:
-        """One tile."""
+    def _render(self, row: int, column: int, rays: RayNodes) -> Pixels:
+        """Pixels of one tile."""
         line = np.arange(row * TILE_PX, min((row + 1) * TILE_PX, self.shape[0]), dtype=np.float64)
         sample = np.arange(
             column * TILE_PX, min((column + 1) * TILE_PX, self.shape[1]), dtype=np.float64
         )
-        light = self._light_met(low, high, (len(line), len(sample)))
+        light = self._light_along(rays, (len(line), len(sample)))
         if self._conditions.inverted:
             light = inverted(light)
         if self._clouds is not None:
@@ -175,21 +181,20 @@ class TiledView:
         rng = np.random.default_rng([self._seed, 1, row, column])
         return digitise(light, self._radiometry, rng)
 
-    def _light_met(self, low: Array, high: Array, shape: tuple[int, int]) -> FloatImage:
-        """Light of the pixels of a tile, after that of the cells around what they show."""
-        sight = self._sight
-        ends = [low[1, [0, -1]].reshape(-1, 2), high[1, [0, -1]].reshape(-1, 2)]
-        height, _ = meet_surface(
-            self._world.terrain_m, self._world.roof_m, ends[0], ends[1], sight.low_m, sight.high_m
+    def _light_along(self, rays: RayNodes, shape: tuple[int, int]) -> FloatImage:
+        """Light of the pixels of a tile, after computing the light of the cells that they show."""
+        ends = [rays.low[1, [0, -1]].reshape(-1, 2), rays.high[1, [0, -1]].reshape(-1, 2)]
+        height, _ = intersect_surface(
+            self._world.terrain_m, self._world.roof_m, ends[0], ends[1], (rays.low_m, rays.high_m)
         )
-        share = (height - sight.low_m) / (sight.high_m - sight.low_m)
+        share = (height - rays.low_m) / (rays.high_m - rays.low_m)
         column_row = ends[0] + share[:, None] * (ends[1] - ends[0])
         first = np.floor(column_row.min(axis=0)).astype(np.int64)[::-1]
         last = np.ceil(column_row.max(axis=0)).astype(np.int64)[::-1]
         margin = 8
         while True:
             self._light.compute(first - margin, last + margin)
-            light = light_met(self._world, self._light.values, sight, low, high, shape)
+            light = light_along_rays(self._world, self._light.values, self._setup, rays, shape)
             if np.isfinite(light).all() or margin > max(self._light.values.shape):
                 return light
             margin *= 4

@@ -1,4 +1,4 @@
-"""Simulated images whose geometry is known, and the spoiled models that would be delivered with them."""
+"""Simulated images with known geometry, and the erroneous models that a provider would deliver."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,34 +19,34 @@ from services.sensors.correction import (
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_rpc
-from services.simulation.light import radiance_of_day
+from services.simulation.light import radiance_of_day, smooth_radiance
 from services.simulation.orbit import pushbroom_over, sun_direction
-from services.simulation.render import Radiometry, render, surface_seen
+from services.simulation.render import Radiometry, ray_setup, render, surface_seen
 from services.simulation.world import World
 from services.types import Acquisition, Array
 
 PLAIN_RADIOMETRY = Radiometry()
 
 RPC_ERROR_PX = 0.01
-"""What an RPC may lose of the model it was fitted to."""
+"""Largest difference of an RPC from the model to which it is fitted."""
 
 _HEIGHT_MARGIN_M = 50.0
 
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """What is asked of a simulated satellite.
+    """The specification of a simulated image.
 
     Attributes:
         image_id: name of the image.
-        lon_lat: (2,) place at the centre of the image, degrees.
+        lon_lat: (2,) position of the image centre, degrees.
         shape: lines and samples.
-        gsd_m: ground sampling at the centre.
+        gsd_m: ground sampling distance at the centre.
         incidence_deg, azimuth_deg: direction from the ground to the satellite.
-        acquired_at: UTC; settles the sun and the state of the fields.
-        orbit_height_m: above the equator.
-        jitter_px: oscillation of the line of sight.
-        radiometry: from light to numbers.
+        acquired_at: UTC; determines the sun and the state of the fields.
+        orbit_height_m: height of the orbit above the equatorial radius.
+        jitter_px: amplitude of the oscillation of the line of sight.
+        radiometry: pixel values of light.
     """
 
     image_id: str
@@ -63,15 +63,15 @@ class ViewPlan:
 
 @dataclass(frozen=True)
 class ViewGeometry:
-    """How an image is taken, before it has pixels.
+    """The geometry of a simulated image, without its pixels.
 
     Attributes:
-        plan: what was asked.
-        true_model: the sensor as it really flew.
-        rpc: fitted to the true model, within `RPC_ERROR_PX`.
-        delivered: the RPC with the error on top, as a provider would deliver it.
+        plan: the specification.
+        true_model: the true sensor model.
+        rpc: RPC fitted to the true model within `RPC_ERROR_PX`.
+        delivered: RPC with an error, as a provider would deliver it.
         error: from positions of `rpc` to positions of `delivered`.
-        acquisition: how it was taken.
+        acquisition: time, viewing direction and sun.
     """
 
     plan: ViewPlan
@@ -84,11 +84,11 @@ class ViewGeometry:
 
 @dataclass(frozen=True)
 class SimulatedView:
-    """An image of a world and everything that is true about it.
+    """A simulated image with its true and its delivered geometry.
 
     Attributes:
         pixels: (lines, samples) uint16, 12 bits; 0 is nodata and does not occur.
-        geometry: true and delivered.
+        geometry: true and delivered models.
     """
 
     pixels: npt.NDArray[np.uint16]
@@ -96,11 +96,11 @@ class SimulatedView:
 
     @property
     def image(self) -> ArrayImage:
-        """The pixels as an image."""
+        """The pixels as an `ImageSource`."""
         return ArrayImage(self.pixels.astype(np.float32))
 
     def as_scene(self, sigma_m: float) -> Scene:
-        """The image with the model that would be delivered, said to be good to `sigma_m`."""
+        """The image with its delivered model, of the stated accuracy `sigma_m`."""
         return Scene(self.image, self.geometry.delivered, self.geometry.acquisition, sigma_m)
 
 
@@ -111,18 +111,18 @@ def plan_geometry(
     ground_error_m: tuple[float, float] = (0.0, 0.0),
     error_px: Array | None = None,
 ) -> ViewGeometry:
-    """Fly a view and spoil its model.
+    """The geometry of a planned image, with an error in its delivered model.
 
     Args:
         world: the ground.
-        plan: what is asked.
+        plan: the specification.
         rng: phases of the jitter.
-        ground_error_m: east and north; a place is found in the image by the delivered model where the
-            true model has what lies that far from it, at the centre of the image.
-        error_px: (2, 3) more error, `ImageCorrection.parameters`: shift, drift, affine.
+        ground_error_m: error east and north at the image centre: the delivered model projects a point
+            to the position that the true model has for the point this far from it.
+        error_px: (2, 3) additional error as `ImageCorrection.parameters`: shift, drift, affine.
 
     Raises:
-        ComputationError: when an RPC cannot follow the true model or the error.
+        ComputationError: no RPC fits the true model or the error.
     """
     lon_lat = np.array(plan.lon_lat)
     ground = np.append(lon_lat, world.height_m(lon_lat[None, :]))
@@ -132,12 +132,11 @@ def plan_geometry(
         ground,
         plan.shape,
         plan.gsd_m,
-        plan.incidence_deg,
-        plan.azimuth_deg,
+        (plan.incidence_deg, plan.azimuth_deg),
         heights_m,
-        plan.orbit_height_m,
-        plan.jitter_px,
-        rng,
+        orbit_height_m=plan.orbit_height_m,
+        jitter_px=plan.jitter_px,
+        rng=rng,
     )
     rpc = _fitted(true_model, plan.shape, heights_m)
     parameters = np.zeros((2, 3)) if error_px is None else np.array(error_px, dtype=np.float64)
@@ -162,24 +161,21 @@ def plan_geometry(
 def render_view(
     world: World, geometry: ViewGeometry, rng: np.random.Generator
 ) -> Iterator[tuple[int, npt.NDArray[np.uint16]]]:
-    """The image of a view, strip by strip, for images that do not fit in memory.
+    """Yield a simulated image strip by strip, for images that do not fit in memory.
 
     Yields:
         First line and pixels (lines, samples) of each strip.
+
+    Raises:
+        InputError: slopes are so steep that the terrain would occlude itself.
     """
     plan, acquisition = geometry.plan, geometry.acquisition
     sun = acquisition.sun_elevation_deg, acquisition.sun_azimuth_deg
     radiance = radiance_of_day(world, plan.acquired_at.date(), *sun)
+    light = smooth_radiance(radiance, world.roof_m, plan.gsd_m / world.posting_m)
+    setup = ray_setup(world, plan.incidence_deg, *sun)
     yield from render(
-        world,
-        geometry.true_model,
-        plan.shape,
-        radiance,
-        plan.gsd_m,
-        plan.incidence_deg,
-        *sun,
-        plan.radiometry,
-        rng,
+        world, geometry.true_model, plan.shape, light, setup, radiometry=plan.radiometry, rng=rng
     )
 
 
@@ -190,7 +186,7 @@ def simulate_view(
     ground_error_m: tuple[float, float] = (0.0, 0.0),
     error_px: Array | None = None,
 ) -> SimulatedView:
-    """Fly a view, spoil its model and take the image; see `plan_geometry`."""
+    """The simulated image of a plan, with an error in its delivered model; see `plan_geometry`."""
     geometry = plan_geometry(world, plan, rng, ground_error_m, error_px)
     pixels = np.empty(plan.shape, dtype=np.uint16)
     for line, strip in render_view(world, geometry, rng):
@@ -201,22 +197,23 @@ def simulate_view(
 def simulate_block(
     world: World,
     rng: np.random.Generator,
+    *,
     n_views: int = 3,
     shape: tuple[int, int] = (1000, 1000),
     gsd_m: float = 0.5,
     error_m: float = 3.0,
     largest_incidence_deg: float = 25.0,
 ) -> list[SimulatedView]:
-    """Several views of the middle of a world, from all sides and on different days.
+    """Simulated images of the middle of a world, from all directions and on different days.
 
     Args:
         world: the ground.
-        rng: directions, days, errors and noise.
-        n_views: how many.
-        shape: lines and samples of each.
-        gsd_m: ground sampling.
+        rng: source of directions, days, errors and noise.
+        n_views: number of images.
+        shape: lines and samples of each image.
+        gsd_m: ground sampling distance.
         error_m: length of the error of each delivered model on the ground, in a random direction.
-        largest_incidence_deg: the views lie between a quarter of it and all of it.
+        largest_incidence_deg: largest incidence; the smallest is a quarter of it.
     """
     lon, lat = (float(v) for v in world.centre_lon_lat)
     turn = rng.uniform(0.0, 360.0)
@@ -239,21 +236,21 @@ def simulate_block(
 
 
 def true_ground(view: SimulatedView, world: World, line_sample: Array) -> Array:
-    """Ground points (n, 3) that image positions (n, 2) really show."""
+    """Ground points (n, 3) truly visible at image positions (n, 2)."""
     return surface_seen(world, view.geometry.true_model, line_sample)
 
 
 def true_line_sample(view: SimulatedView, lon_lat_h: Array) -> Array:
-    """Image positions (n, 2) where ground points (n, 3) really are, hidden or not."""
+    """True image positions (n, 2) of ground points (n, 3), visible or not."""
     return view.geometry.true_model.project(lon_lat_h)
 
 
 def _fitted(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[float, float]) -> RpcModel:
-    """An RPC that follows a model within `RPC_ERROR_PX`."""
+    """The RPC that fits a model within `RPC_ERROR_PX`."""
     fit = fit_rpc(model, shape, height_range_m)
     if not fit.max_error_px < RPC_ERROR_PX:
         raise ComputationError(
-            f"no RPC follows the simulated sensor: error up to {fit.max_error_px:.3g} px, "
-            f"{RPC_ERROR_PX:g} px allowed"
+            f"no RPC fits the simulated sensor: error up to {fit.max_error_px:.3g} px, less than "
+            f"{RPC_ERROR_PX:g} px expected"
         )
     return fit.model

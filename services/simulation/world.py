@@ -1,4 +1,4 @@
-"""A piece of ground that is known exactly: heights, buildings and what covers them."""
+"""A simulated piece of ground, exactly known: heights, buildings and land cover."""
 
 import math
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from services.geodesy import metres_per_degree
+from services.geodesy import metres_per_degree, wrapped_degrees
 from services.simulation.grid import bilinear_values
-from services.simulation.land import NO_ROOF, cover_land
+from services.simulation.land import NO_ROOF, LandNoise, cover_land
 from services.types import Array, FloatImage
 
 Parcels = npt.NDArray[np.uint16]
@@ -24,21 +24,21 @@ _STRIP_ROWS = 1024
 
 @dataclass(frozen=True)
 class World:
-    """Ground on a grid of longitudes and latitudes, repeated without end in both directions.
+    """Ground on a grid of longitudes and latitudes, which repeats in both directions.
 
-    Row 0 is the northern one. The terrain is bilinear between the nodes of the grid, by definition. A
-    cell reaches half a step around its node and is either open ground or part of a building, with
+    Row 0 is the northernmost. The terrain is bilinear between the nodes of the grid, by definition. A
+    cell extends half a step around its node and is either open ground or part of a building with
     vertical walls and a flat roof.
 
     Attributes:
-        seed: what all that changes with the date is drawn from, together with the date.
+        seed: seed, together with the date, of everything that changes with the date.
         origin_lon_lat: (2,) first node, in the north-west, degrees.
-        step_deg: (2,) from node to node, eastwards and southwards, degrees.
-        posting_m: the same in metres.
+        step_deg: (2,) distance of the nodes, eastwards and southwards, degrees.
+        posting_m: distance of the nodes, metres.
         terrain_m: (rows, columns) metres above the ellipsoid.
         roof_m: (rows, columns) metres above the ellipsoid, minus infinity on open ground.
-        albedo: (rows, columns) reflectance of what is seen from above, 0 to 1.
-        parcel: (rows, columns) number of the field a cell belongs to, 0 where nothing changes.
+        albedo: (rows, columns) reflectance seen from above, 0 to 1.
+        parcel: (rows, columns) number of the field of a cell, 0 where nothing changes with the date.
     """
 
     seed: int
@@ -52,7 +52,7 @@ class World:
 
     @property
     def centre_lon_lat(self) -> Array:
-        """(2,) middle of the grid, degrees."""
+        """Longitude and latitude (2,) of the middle of the grid, degrees."""
         rows, columns = self.terrain_m.shape
         return self.lon_lat(np.array([[(columns - 1) / 2.0, (rows - 1) / 2.0]]))[0]
 
@@ -64,13 +64,13 @@ class World:
 
     @cached_property
     def roof_clearance_m(self) -> float:
-        """How far a roof stands above the terrain at most; zero without buildings."""
+        """Largest height of a roof above the terrain, metres; zero without buildings."""
         strips = (slice(r, r + _STRIP_ROWS) for r in range(0, len(self.roof_m), _STRIP_ROWS))
         return max(0.0, *(float((self.roof_m[s] - self.terrain_m[s]).max()) for s in strips))
 
     @cached_property
     def steepest_slope(self) -> float:
-        """Largest slope of the terrain, metres a metre."""
+        """Largest slope of the terrain, metres per metre."""
         steepest = 0.0
         for r in range(0, len(self.terrain_m), _STRIP_ROWS):
             strip = self.terrain_m[r : r + _STRIP_ROWS + 1]
@@ -84,9 +84,9 @@ class World:
         return np.asarray(self.origin_lon_lat + column_row * self.step_deg * [1.0, -1.0])
 
     def column_row(self, lon_lat: Array) -> Array:
-        """Grid positions (n, 2), not wrapped, of longitudes and latitudes (n, 2)."""
+        """Grid positions (n, 2) of longitudes and latitudes (n, 2); outside the grid it repeats."""
         offset = lon_lat - self.origin_lon_lat
-        offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
+        offset[:, 0] = wrapped_degrees(offset[:, 0])
         return np.asarray(offset / self.step_deg * [1.0, -1.0])
 
     def height_m(self, lon_lat: Array) -> Array:
@@ -106,22 +106,23 @@ def make_world(
     size_m: float = 1000.0,
     posting_m: float = 0.5,
     relief_m: float = 60.0,
+    *,
     centre_lon_lat: tuple[float, float] = (5.4, 43.6),
     lowest_m: float = 150.0,
     smallest_hill_m: float = 350.0,
     patterned_share: float = 0.0,
 ) -> World:
-    """Draw a world: hills, fields between roads, woods, villages with buildings, trees.
+    """A random world: hills, fields between roads, woods, villages with buildings, trees.
 
     Args:
-        rng: what it is drawn from.
-        size_m: side of the square, about; it repeats beyond.
+        rng: source of randomness.
+        size_m: approximate side of the square, beyond which it repeats.
         posting_m: distance of the nodes.
-        relief_m: from the lowest to the highest ground.
-        centre_lon_lat: degrees.
+        relief_m: difference between the lowest and the highest ground.
+        centre_lon_lat: centre of the square, degrees.
         lowest_m: height of the lowest ground above the ellipsoid.
-        smallest_hill_m: wavelength below which the terrain is smooth; so that slopes are gentler.
-        patterned_share: of the land that is orchards and housing estates, where details have doubles.
+        smallest_hill_m: wavelength below which the terrain is smooth; larger values make slopes gentler.
+        patterned_share: share of the blocks that are orchards and housing estates, whose details repeat.
     """
     tiles = max(1, round(size_m / posting_m / _TEXTURE_TILE))
     tile = fft.next_fast_len(round(size_m / posting_m / tiles))
@@ -137,21 +138,30 @@ def make_world(
     )
     texture = natural_noise(rng, tile, 1.0, 0.0)
     blotches = natural_noise(rng, _WARP_NODES, 1.5, 0.0)
-    albedo, roof, parcel = cover_land(terrain, warp, texture, blotches, posting_m, seed, patterned_share)
+    cover = cover_land(terrain, LandNoise(warp, texture, blotches), posting_m, seed, patterned_share)
     east_m, north_m = metres_per_degree(centre_lon_lat[1], lowest_m + relief_m / 2.0)
     step = np.array([posting_m / east_m, posting_m / north_m])
     origin = np.array(centre_lon_lat) + (n - 1) / 2.0 * step * [-1.0, 1.0]
-    return World(seed, origin, step, posting_m, terrain, roof, albedo, parcel)
+    return World(
+        seed=seed,
+        origin_lon_lat=origin,
+        step_deg=step,
+        posting_m=posting_m,
+        terrain_m=terrain,
+        roof_m=cover.roof_m,
+        albedo=cover.albedo,
+        parcel=cover.parcel,
+    )
 
 
 def natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: float) -> FloatImage:
-    """Periodic noise (n, n) of unit spread whose amplitudes fall with the frequency.
+    """Periodic noise (n, n) of unit standard deviation with amplitudes that fall with the frequency.
 
     Args:
-        rng: phases and amplitudes.
+        rng: source of randomness.
         n: side.
-        exponent: of the fall; 1 is that of natural images.
-        shortest: wavelength below which it fades out, as a fraction of the side.
+        exponent: exponent of the fall; 1 for natural images.
+        shortest: wavelength below which the noise fades out, as a fraction of the side.
     """
     white = rng.standard_normal((n, n), dtype=np.float32)
     spectrum = fft.rfft2(white)
@@ -164,7 +174,7 @@ def natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: f
 
 
 def _stretch(noise: FloatImage, n: int) -> FloatImage:
-    """Periodic noise resampled to (n, n), smooth between its nodes."""
+    """Periodic noise resampled to (n, n) by cubic interpolation."""
     nodes = len(noise)
     if n == nodes:
         return noise

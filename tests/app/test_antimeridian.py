@@ -69,7 +69,15 @@ class Made:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("antimeridian")
     rng = np.random.default_rng(8)
-    views = simulate_block(world(), rng, 2, SHAPE, 1.0, BLOCK_SIGMA_M, 20.0)
+    views = simulate_block(
+        world(),
+        rng,
+        n_views=2,
+        shape=SHAPE,
+        gsd_m=1.0,
+        error_m=BLOCK_SIGMA_M,
+        largest_incidence_deg=20.0,
+    )
     images = [as_file(view, folder) for view in views]
     options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60)
     run_production(

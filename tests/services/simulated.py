@@ -34,7 +34,17 @@ def world(seed: int = 1) -> World:
 def block_views() -> tuple[SimulatedView, ...]:
     """Three views of the middle of the world, each with an error of about 3 m."""
     rng = np.random.default_rng(2)
-    return tuple(simulate_block(world(), rng, 3, SHAPE, GSD_M, BLOCK_SIGMA_M, 20.0))
+    return tuple(
+        simulate_block(
+            world(),
+            rng,
+            n_views=3,
+            shape=SHAPE,
+            gsd_m=GSD_M,
+            error_m=BLOCK_SIGMA_M,
+            largest_incidence_deg=20.0,
+        )
+    )
 
 
 @cache

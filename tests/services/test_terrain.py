@@ -42,7 +42,7 @@ def places(n: int = 500, margin: float = 3.0) -> Array:
 def view(incidence_deg: float, azimuth_deg: float = 110.0) -> PushbroomModel:
     lon, lat = GRID.lon_lat(np.array([[150.0, 140.0]]))[0]
     return pushbroom_over(
-        np.array([lon, lat, 500.0]), (400, 400), 2.0, incidence_deg, azimuth_deg, (200.0, 800.0)
+        np.array([lon, lat, 500.0]), (400, 400), 2.0, (incidence_deg, azimuth_deg), (200.0, 800.0)
     )
 
 

@@ -41,7 +41,7 @@ def terrain(relief_m: float = 120.0) -> Terrain:
 def scene(incidence_deg: float = 25.0, azimuth_deg: float = 100.0) -> Scene:
     lon, lat = DEM.lon_lat(np.array([[160.0, 170.0]]))[0]
     true = pushbroom_over(
-        np.array([lon, lat, 700.0]), SHAPE, GSD_M, incidence_deg, azimuth_deg, (100.0, 1300.0)
+        np.array([lon, lat, 700.0]), SHAPE, GSD_M, (incidence_deg, azimuth_deg), (100.0, 1300.0)
     )
     model = fit_rpc(true, SHAPE, (100.0, 1300.0)).model
     ramp = np.indices(SHAPE)[0].astype(np.float32)

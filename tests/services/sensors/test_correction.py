@@ -61,7 +61,7 @@ def test_a_shift_and_a_drift_fold_into_the_rpc_exactly(a: float, b: float, c: fl
 
 @pytest.mark.parametrize("rows", [[[1, 0, 0.1], [1, 0, 0]], [[1, 0, 0], [1, -0.1, 0]]])
 def test_a_correction_that_mixes_lines_and_samples_does_not_fold(rows: list[list[float]]) -> None:
-    with pytest.raises(ValueError, match="each coordinate by itself"):
+    with pytest.raises(ValueError, match="mixes lines and samples does not fold"):
         fold_into_rpc(MODEL, correction(rows))
 
 

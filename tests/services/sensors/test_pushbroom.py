@@ -27,8 +27,7 @@ def a_model(incidence_deg: float, azimuth_deg: float, lon: float = 5.4) -> Pushb
         target,
         SHAPE,
         0.5,
-        incidence_deg,
-        azimuth_deg,
+        (incidence_deg, azimuth_deg),
         (100.0, 900.0),
         jitter_px=0.5,
         rng=np.random.default_rng(4),
@@ -90,7 +89,7 @@ def test_the_derivative_is_that_of_project() -> None:
 def test_the_target_is_seen_in_the_middle_from_where_it_was_asked(
     incidence: float, azimuth: float
 ) -> None:
-    model = pushbroom_over(TARGET, SHAPE, 0.7, incidence, azimuth, (100.0, 900.0))
+    model = pushbroom_over(TARGET, SHAPE, 0.7, (incidence, azimuth), (100.0, 900.0))
     centre = (np.array([SHAPE]) - 1.0) / 2.0
     np.testing.assert_allclose(model.project(TARGET[None, :]), centre, atol=0.001)
     seen_incidence, seen_azimuth = view_direction(model, centre, TARGET[None, :])

@@ -18,7 +18,7 @@ a_thousandth_of_a_pixel = 0.001
 def a_pushbroom(shape: tuple[int, int], jitter_px: float = 0.0, lon: float = 5.4) -> PushbroomModel:
     """A pushbroom that looks 25 degrees to the side."""
     target = np.array([lon, 43.6, 300.0])
-    return pushbroom_over(target, shape, 0.5, 25.0, 110.0, HEIGHTS_M, jitter_px=jitter_px)
+    return pushbroom_over(target, shape, 0.5, (25.0, 110.0), HEIGHTS_M, jitter_px=jitter_px)
 
 
 def error_px(model, fitted, shape: tuple[int, int]) -> np.ndarray:
@@ -83,7 +83,7 @@ def test_a_drift_is_refitted_to_what_folding_gives_exactly() -> None:
 
 
 def test_a_model_that_does_not_reach_the_heights_is_refused_with_numbers() -> None:
-    with pytest.raises(CoverageError, match=r"only \d+ of 2048 points"):
+    with pytest.raises(CoverageError, match=r"only \d+ of 2048 positions"):
         fit_rpc(a_pushbroom((300, 400)), (300, 400), (-6.4e6, 100.0))
 
 

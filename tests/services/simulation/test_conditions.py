@@ -88,7 +88,7 @@ def test_a_season_changes_what_grows_and_leaves_the_roofs(world: World) -> None:
     sun = 50.0, 150.0
     rows, columns = world.albedo.shape
     now, later = (
-        radiance(world, day_of(world, SUMMER.date(), *sun, season), 0, 0, rows, columns)
+        radiance(world, day_of(world, SUMMER.date(), *sun, season), (0, 0), (rows, columns))
         for season in (0.0, 1.0)
     )
     built = np.isfinite(world.roof_m)

@@ -10,8 +10,8 @@ from services.errors import InputError
 from services.imagery.source import render_chip
 from services.sensors.correction import CorrectedModel
 from services.simulation.land import NO_ROOF
-from services.simulation.light import radiance_of_day
-from services.simulation.render import Radiometry, render
+from services.simulation.light import radiance_of_day, smooth_radiance
+from services.simulation.render import Radiometry, ray_setup, render
 from services.simulation.view import (
     SimulatedView,
     ViewPlan,
@@ -78,7 +78,9 @@ def test_marks_on_the_ground_are_seen_where_the_true_model_says(
     )
     model = plan_geometry(bare, views, rng).true_model
     light = albedo.astype(np.float32)
-    strips = render(bare, model, (300, 300), light, gsd, incidence, 60.0, 150.0, SILENT, rng)
+    smooth = smooth_radiance(light, bare.roof_m, gsd / bare.posting_m)
+    setup = ray_setup(bare, incidence, 60.0, 150.0)
+    strips = render(bare, model, (300, 300), smooth, setup, radiometry=SILENT, rng=rng)
     pixels = np.concatenate([strip for _, strip in strips]).astype(np.float64)
     lon_lat = bare.lon_lat(marks)
     expected = model.project(np.column_stack([lon_lat, bare.height_m(lon_lat)]))

@@ -75,7 +75,7 @@ def test_an_rpc_that_no_longer_follows_the_model_is_refused_with_its_error() -> 
     target = np.array([5.4, 43.6, 300.0])
     smooth, shaking = (
         CorrectedModel(
-            pushbroom_over(target, shape, 0.5, 25.0, 110.0, heights_m, jitter_px=jitter_px),
+            pushbroom_over(target, shape, 0.5, (25.0, 110.0), heights_m, jitter_px=jitter_px),
             replace(no_correction(shape), parameters=CORRECTION.parameters),
         )
         for jitter_px in (0.0, 3.0)
