@@ -58,7 +58,7 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
         Conflict: another reference has this name.
     """
     if not 1 <= len(new.name.strip()) <= LONGEST_NAME:
-        raise InputError(f"name: {len(new.name)} characters found, 1 to {LONGEST_NAME} expected")
+        raise InputError(f"name: 1 to {LONGEST_NAME} characters expected, {len(new.name.strip())} found")
     if new.sigma_m is not None and not 0.0 < new.sigma_m < np.inf:
         raise InputError(f"sigma_m: {new.sigma_m:g} found, more than 0 expected")
     reference = read_reference(_reference_files(settings, new))

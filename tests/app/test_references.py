@@ -161,8 +161,8 @@ def test_places_found_are_kept_and_searched_first_in_the_next_scene(
 ) -> None:
     first = registered(database, settings, folder / "first.tif", tmp_path / "first")
     assert first.report.verdict == "good"
-    assert first.report.method == "reference image"
-    assert [block.id for block in first.report.blocks] == ["land"]
+    assert first.report.run.method == "reference image"
+    assert [block.id for block in first.report.run.blocks] == ["land"]
     found = first.registration.adjustment.correction.parameters[:, 0]
     assert np.abs(found - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
     once = places(connection)

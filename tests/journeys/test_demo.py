@@ -86,4 +86,4 @@ def test_a_block_that_is_there_is_not_written_over(tmp_path):
         "production", "run", "--images", "a.tif", "--images", "b.tif", "-o", tmp_path / "block"
     )
     assert refused.returncode == 2
-    assert "exists already" in refused.stderr
+    assert "already exists" in refused.stderr

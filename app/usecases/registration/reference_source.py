@@ -100,7 +100,7 @@ def read_reference(files: ReferenceFiles) -> Reference:
     if grid is None:
         image.close()
         raise InputError(
-            f"{files.image}: no coordinate reference system found, an ortho-image on a map expected"
+            f"{files.image}: expected an ortho-image on a map, found no coordinate reference system"
         )
     model = OrthoModel(grid)
     gsd_m = grid.gsd_m
