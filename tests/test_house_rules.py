@@ -1,5 +1,6 @@
 """What holds the house together: imports, the tour, and documents that name everything there is."""
 
+import ast
 import json
 import re
 import subprocess
@@ -13,6 +14,7 @@ from typer.main import get_command
 
 from app.cli.main import app
 from app.config import Settings
+from tests.composed_sql import Source, read_sources
 
 ROOT = Path(__file__).parent.parent
 HEAVY = {"numba", "scipy", "cv2", "rasterio", "matplotlib", "pyarrow", "fastapi"}
@@ -217,3 +219,48 @@ def test_a_real_image_is_asked_for_by_its_marker():
         text = path.read_text()
         if re.search(r"\breal_data\b[,)]", text.replace("mark.real_data", "")):
             assert "mark.real_data" in text, path
+
+
+def test_no_sql_is_put_together_out_of_strings():
+    composed = {
+        f"{path.relative_to(ROOT)}:{line}"
+        for path, source in read_sources(ROOT, "app", "migrations").items()
+        for line in source.violations()
+    }
+    assert composed == set()
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        'connection.execute(f"select * from {table}")',
+        'connection.execute("select * from %s" % table)',
+        'connection.execute("select * from " + table)',
+        'connection.execute(START + table)\nSTART = "select * from "',
+        'connection.execute("select * from {}".format(table))',
+        'connection.execute(" ".join(words))',
+        'connection.exec_driver_sql(f"lock {table}".encode())',
+        'text(f"select {column}")',
+        'sql.SQL("select {}").format(column)\ncursor.copy(sql.SQL("copy {} to stdout").format(query))',
+        'def read(table):\n    query = f"select * from {table}"\n    return cursor.execute(query)',
+        'def read():\n    query = "select 1"\n    query += " from b"\n    return one.scalar(query)',
+        'connection.execute(query("b"))\ndef query(table):\n    return f"select * from {table}"',
+        'connection.execute(A if wide else B)\nA = "select 1"\nB = f"select {c}"',
+    ],
+)
+def test_the_rule_finds_sql_that_is_put_together(module):
+    assert Source(ast.parse(module)).violations() != []
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        'connection.execute("select * from block where number = %s", [number])',
+        "connection.execute(select(block.c.number + 1).where(block.c.id == name))",
+        'connection.execute(QUERY)\nQUERY = text("select 1" " from block")',
+        "numbers = values.copy()\nshutil.copy(folder / name, other)",
+        'log.info(f"{count} rows")',
+    ],
+)
+def test_the_rule_lets_sql_pass_that_is_not_put_together(module):
+    assert Source(ast.parse(module)).violations() == []
