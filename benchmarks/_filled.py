@@ -19,6 +19,7 @@ from app.db.schema import point
 from services.formats.block.hilbert import hilbert_order
 from services.geodesy import metres_per_degree
 from services.types import Array
+from tests.statements import run_sql
 
 WEST_DEG = -177.0
 CENTRE_LAT_DEG = 44.0
@@ -62,17 +63,17 @@ def fill(dsn: str, count: int, console: Console | None = None) -> Ground:
     blocks = -(-count // largest)
     with engine.connect(dsn) as connection:
         # Rows made here need no check against the tables they point to, four fifths of the time.
-        connection.execute("set session_replication_role = replica")
-        connection.execute("drop index point_geom")
+        run_sql(connection, "set session_replication_role = replica")
+        run_sql(connection, "drop index point_geom")
         for k in range(blocks):
             low = np.array([WEST_DEG + k * side_deg[0], south_deg])
             _fill_block(connection, k + 1, low, side_deg, min(largest, count - k * largest))
             if console is not None:
                 console.print(f"block {k + 1} of {blocks} filled")
-        connection.execute("set session_replication_role = origin")
-        connection.execute("select setval(pg_get_serial_sequence('block', 'number'), %s)", [blocks])
-        connection.execute("select setval(pg_get_serial_sequence('chip_file', 'id'), %s)", [blocks])
-        connection.execute("create index point_geom on point using gist (geom)")
+        run_sql(connection, "set session_replication_role = origin")
+        run_sql(connection, "select setval(pg_get_serial_sequence('block', 'number'), %s)", [blocks])
+        run_sql(connection, "select setval(pg_get_serial_sequence('chip_file', 'id'), %s)", [blocks])
+        run_sql(connection, "create index point_geom on point using gist (geom)")
     with psycopg.connect(dsn, autocommit=True) as alone:
         alone.execute("vacuum analyze point")
         alone.execute("vacuum analyze block")
@@ -83,13 +84,15 @@ def _fill_block(connection: Connection, number: int, low: Array, side_deg: Array
     rng = np.random.default_rng(number)
     lon_lat = low + rng.uniform(0.0, 1.0, (count, 2)) * side_deg
     lon_lat_h = np.column_stack([lon_lat[hilbert_order(lon_lat)], rng.uniform(0.0, 2000.0, count)])
-    connection.execute(
+    run_sql(
+        connection,
         """insert into block (number, id, version, state, extent, n_points, n_views, metadata, checksum)
            overriding system value
            values (%s, %s, '1', 'published', st_makeenvelope(%s, %s, %s, %s, 4326), %s, 0, '{}', '')""",
         [number, f"bench-{number}", *low, *(low + side_deg), count],
     )
-    connection.execute(
+    run_sql(
+        connection,
         """insert into chip_file (id, block_number, name, storage_key, dtype, n_chips)
            overriding system value values (%s, %s, 'chips/0000.npy', 'chips/0', 'uint8', 0)""",
         [number, number],

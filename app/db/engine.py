@@ -20,6 +20,7 @@ from select import POLLIN, poll
 from typing import Any
 
 import psycopg
+import sqlalchemy
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from sqlalchemy import (
     Engine,
@@ -37,10 +38,10 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 from app import request_context
 from app.config import Settings
 from app.db.cluster import embedded
-from app.db.transition import Connection as Connection
-from app.db.transition import DriverConnection as DriverConnection
-from app.db.transition import driver as driver
 from app.errors import InputError
+
+Connection = sqlalchemy.Connection
+DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
 READER = "amers_reader"
 """Role of the connections that answer reading requests: it can do nothing but select."""
@@ -185,13 +186,22 @@ def pooled(dsn: str, settings: Settings) -> Iterator[Database]:
 def connect(dsn: str) -> Iterator[Connection]:
     """A connection without a pool: one transaction, committed at the end of the context."""
     try:
-        connection: Any = _unpooled(dsn).connect()  # transition
+        connection = _unpooled(dsn).connect()
     except psycopg.OperationalError as error:
         raise _unreachable(error) from error
     with connection:
         set_origin(connection)
         yield connection
         connection.commit()
+
+
+def driver(connection: Connection) -> DriverConnection:
+    """The driver's own connection, for COPY, streams and hot statements, in the same transaction."""
+    if not connection.in_transaction():
+        connection.begin()
+    own: DriverConnection | None = connection.connection.driver_connection
+    assert own is not None
+    return own
 
 
 def set_origin(connection: Connection) -> None:
@@ -306,7 +316,6 @@ def _engine(dsn: str, **options: Any) -> Engine:
         use_native_hstore=False,
         **options,
     )
-    engine._connection_cls = Connection  # transition
     event.listen(engine, "connect", _warm)
     event.listen(engine, "checkout", _check)
     event.listen(engine, "handle_error", _raise_as_driver)
@@ -321,7 +330,6 @@ def _unpooled(dsn: str) -> Engine:
         use_native_hstore=False,
         poolclass=NullPool,
     )
-    engine._connection_cls = Connection  # transition
     event.listen(engine, "handle_error", _raise_as_driver)
     return engine
 
@@ -329,7 +337,7 @@ def _unpooled(dsn: str) -> Engine:
 @contextmanager
 def _connection(engine: Engine) -> Iterator[Connection]:
     try:
-        connection: Any = engine.connect()  # transition
+        connection = engine.connect()
     except exc.TimeoutError as error:
         raise PoolTimeout(f"no connection was free within {POOL_TIMEOUT_S:g} s") from error
     with connection:

@@ -33,6 +33,7 @@ from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+from tests.statements import run_sql
 
 VANISHED = 5
 """Number of points, of 40, whose ground is different in the scene."""
@@ -112,7 +113,7 @@ def failing(registration: Registration, verdict: str = "failed") -> Registration
 
 def counters(connection: Connection) -> dict[int, tuple[int, int]]:
     """Attempts and successes of every point that has a history."""
-    rows = connection.execute("select point_id, attempts, successes from point_history").fetchall()
+    rows = run_sql(connection, "select point_id, attempts, successes from point_history").fetchall()
     return {row["point_id"]: (row["attempts"], row["successes"]) for row in rows}
 
 
@@ -129,7 +130,7 @@ def test_every_point_and_view_that_was_tried_leaves_a_row(
 ) -> None:
     remembered(connection, stored, "a")
     measures, views = stored.measures, stored.views
-    rows = connection.execute("select * from measure order by point_id").fetchall()
+    rows = run_sql(connection, "select * from measure order by point_id").fetchall()
     assert [row["point_id"] for row in rows] == measures.point_id.tolist()
     assert [row["active"] for row in rows] == measures.active.tolist()
     assert [row["reason"] for row in rows] == measures.reason.tolist()
@@ -137,7 +138,7 @@ def test_every_point_and_view_that_was_tried_leaves_a_row(
     np.testing.assert_array_equal(lines, measures.line_sample[:, 0])
     east = np.array([row["residual_east_m"] for row in rows], dtype=float)
     np.testing.assert_allclose(east, measures.residual_m[:, 0], rtol=1e-6)
-    rows = connection.execute("select * from view_measure order by point_id, view").fetchall()
+    rows = run_sql(connection, "select * from view_measure order by point_id, view").fetchall()
     assert [row["point_id"] for row in rows] == measures.point_id[views.point].tolist()
     assert [row["view"] for row in rows] == views.view.tolist()
     assert [row["agreed"] for row in rows] == views.agreed.tolist()
@@ -149,11 +150,12 @@ def test_what_is_kept_of_a_point_is_what_its_rows_add_up_to(
 ) -> None:
     for scene in ("a", "b", "c"):
         remembered(connection, stored, scene)
-    kept = connection.execute("select * from point_history order by point_id").fetchall()
-    summed = connection.execute(
+    kept = run_sql(connection, "select * from point_history order by point_id").fetchall()
+    summed = run_sql(
+        connection,
         """select point_id, count(*) as attempts, count(*) filter (where active) as successes,
                avg(residual_east_m) filter (where matched) as east
-           from measure group by point_id order by point_id"""
+           from measure group by point_id order by point_id""",
     ).fetchall()
     for ours, theirs in zip(kept, summed, strict=True):
         assert (ours["point_id"], ours["attempts"], ours["successes"]) == (
@@ -183,7 +185,7 @@ def test_a_failed_registration_is_kept_and_says_nothing_of_its_points(
 ) -> None:
     remembered(connection, failing(stored), "a")
     assert counters(connection) == {}
-    kept = connection.execute("select count(*) as n from measure").fetchone()
+    kept = run_sql(connection, "select count(*) as n from measure").fetchone()
     assert kept == {"n": 40}
     remembered(connection, stored, "a")
     assert len(counters(connection)) == 40
@@ -229,7 +231,7 @@ def test_a_view_counts_only_where_it_is_known_what_it_should_have_shown(
 ) -> None:
     remembered(connection, stored, "a")
     active = set(stored.measures.point_id[stored.measures.active].tolist())
-    rows = connection.execute("select * from view_history").fetchall()
+    rows = run_sql(connection, "select * from view_history").fetchall()
     assert {row["point_id"] for row in rows} == active
     agreed = {
         (int(stored.measures.point_id[point]), int(view)): bool(agreed)
@@ -250,8 +252,10 @@ def test_the_health_of_points_and_views_is_read_with_them(
     assert (fresh.views.health == 1.0).all()
     for scene in ("a", "b"):
         remembered(connection, stored, scene)
-    connection.execute(
-        "update view_history set successes = 0 where point_id = %s and view = 1", [first_id + 30]
+    run_sql(
+        connection,
+        "update view_history set successes = 0 where point_id = %s and view = 1",
+        [first_id + 30],
     )
     connection.commit()
     read = points_of_store(database, storage)(outline).points
