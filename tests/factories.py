@@ -1,4 +1,4 @@
-"""Small valid blocks: points anywhere, chips of noise that can be told apart."""
+"""Small valid blocks: random points with chips of noise that differ from each other."""
 
 import zlib
 from collections.abc import Callable
@@ -26,13 +26,13 @@ BOX = (5.2, 43.2, 5.3, 43.3)
 
 @dataclass(frozen=True)
 class MadeBlock:
-    """A block on the disk and what was put into it.
+    """A block in a folder and its contents.
 
     Attributes:
         folder: of the block.
         metadata: as written.
-        points: in the order of the block, with the ids they have there.
-        chips: (views, 101, 101) of the point of a row.
+        points: in the order of the block, with their ids in the block.
+        chips: from the row of a point to its chips, (views, 101, 101).
     """
 
     folder: Path
@@ -42,7 +42,7 @@ class MadeBlock:
 
 
 def images(count: int) -> tuple[Acquisition, ...]:
-    """Images taken a hundred days apart; the last one does not say when, nor by whom."""
+    """Images taken a hundred days apart; sensor and date of the last one are unknown."""
     first = datetime(2023, 3, 1, 10, 30, tzinfo=UTC)
     dated = tuple(
         Acquisition(
@@ -66,10 +66,14 @@ def control_points(
     n_images: int = 3,
     gsds_m: tuple[float, ...] = GSDS_M,
 ) -> ControlPoints:
-    """Points anywhere in a box, each seen by all images at every ground sampling.
+    """Random points in a box, each with a view by every image at every ground sampling.
 
     Args:
-        box: west, south, east, north; east below west crosses the antimeridian.
+        count: number of points.
+        rng: of the positions, covariances and directions.
+        box: west, south, east, north in degrees; a box with east below west crosses the antimeridian.
+        n_images: number of images.
+        gsds_m: ground samplings, metres.
     """
     outline = rectangle(*box)
     lon_lat_h = np.column_stack(
@@ -104,7 +108,7 @@ def control_points(
 
 
 def noise_chips(points: ControlPoints, dtype: type = np.uint16) -> Callable[[int], ChipArray]:
-    """Chips of noise; the same point has always the same, whatever its row."""
+    """Chips of noise that depend on the position of the point only, not on its row."""
 
     def chips(row: int) -> ChipArray:
         views = int(points.views.start[row + 1] - points.views.start[row])
@@ -116,7 +120,7 @@ def noise_chips(points: ControlPoints, dtype: type = np.uint16) -> Callable[[int
 
 
 def affine_model(centre_lon_lat: Array) -> RpcModel:
-    """An RPC that is plainly affine: 0.5 m pixels, north up, a lean with height."""
+    """An affine RPC: pixels of 0.5 m, north up, with a displacement by the height."""
     one = np.eye(20)[0]
     line_num, sample_num = np.zeros(20), np.zeros(20)
     line_num[[2, 3]] = -1.0, 0.02
@@ -139,7 +143,7 @@ def metadata(
     box: tuple[float, float, float, float] = BOX,
     gsds_m: tuple[float, ...] = GSDS_M,
 ) -> BlockMetadata:
-    """What a producer would say about a block."""
+    """The metadata of a block, as a producer states them."""
     return BlockMetadata(
         id=name,
         version=version,
@@ -167,19 +171,19 @@ def make_block(
     gsds_m: tuple[float, ...] = GSDS_M,
     dtype: type = np.uint16,
 ) -> MadeBlock:
-    """Write a small valid block: `count` points in a box with `n_images` x `len(gsds_m)` chips each."""
+    """Write a small valid block: `count` points, each with `n_images` x `len(gsds_m)` chips."""
     rng = np.random.default_rng(seed)
     points = control_points(count, rng, box, n_images, gsds_m)
-    said = metadata(name, version, box, gsds_m)
+    block_metadata = metadata(name, version, box, gsds_m)
     outline = rectangle(*box)
     typology = [("crossroads", "building corner", 'a "rare" kind', None)[i % 4] for i in range(count)]
     order = write_block(
         folder,
-        said,
+        block_metadata,
         points,
         noise_chips(points, dtype),
         {"IMG_00": affine_model(outline.mean(axis=0))},
         typology=typology,
     )
     written = replace(points.take(order), id=np.arange(count, dtype=np.int64))
-    return MadeBlock(folder, said, written, noise_chips(written, dtype))
+    return MadeBlock(folder, block_metadata, written, noise_chips(written, dtype))

@@ -10,6 +10,9 @@ from services.imagery.source import ImageSource, image_gsd_m
 from services.sensors.base import SensorModel
 from services.types import Acquisition, Array
 
+FOOTPRINT_PER_SIDE = 8
+"""Positions along each side of an image that are located for its footprint."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -41,12 +44,8 @@ def scene_gsd_m(scene: Scene) -> float:
     return image_gsd_m(scene.model, scene_centre(scene))
 
 
-def scene_footprint(scene: Scene, per_side: int = 8) -> Array:
+def scene_footprint(scene: Scene) -> Array:
     """Outline of the ground that the image can show at any height of its model.
-
-    Args:
-        scene: image and model.
-        per_side: number of positions along each side of the image that are located.
 
     Returns:
         (m, 2) lon, lat of the convex hull of the border of the image at both ends of the height range,
@@ -54,7 +53,7 @@ def scene_footprint(scene: Scene, per_side: int = 8) -> Array:
         outline crosses the antimeridian.
     """
     lines, samples = scene.image.shape
-    t = np.linspace(0.0, 1.0, per_side, endpoint=False)
+    t = np.linspace(0.0, 1.0, FOOTPRINT_PER_SIDE, endpoint=False)
     corners = np.array(
         [
             [-0.5, -0.5],

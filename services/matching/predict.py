@@ -5,7 +5,7 @@ import numpy as np
 from services.types import Array, BoolArray, IntArray
 
 
-def in_image(line_sample: Array, shape: tuple[int, int], margin_px: Array | float = 0.0) -> BoolArray:
+def in_image(line_sample: Array, shape: tuple[int, int], margin_px: Array | float) -> BoolArray:
     """Which positions (n, 2) lie in an image enlarged by a margin; NaN positions do not.
 
     Args:

@@ -13,7 +13,7 @@ from services.conventions import MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window
 from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, FloatImage, IntArray, Observations, Progress, no_progress
+from services.types import Array, BoolArray, FloatImage, IntArray, Observations, Progress
 
 _TILE_PX = 2048
 _TILE_MARGIN_PX = 32
@@ -58,7 +58,7 @@ class Features:
 
 
 def find_tie_points(
-    scenes: Sequence[Scene], options: FeatureOptions = FeatureOptions(), progress: Progress = no_progress
+    scenes: Sequence[Scene], options: FeatureOptions, progress: Progress
 ) -> Observations:
     """Image positions of details that two images or more show.
 

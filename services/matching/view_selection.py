@@ -52,7 +52,7 @@ def select_views(
     gsd_m: float,
     scene: Acquisition,
     count: int,
-    scales: ViewDistanceScales = ViewDistanceScales(),
+    scales: ViewDistanceScales,
 ) -> SelectedViews:
     """The views of every point, at one ground sampling, that look most like a scene.
 
@@ -74,9 +74,7 @@ def select_views(
     return SelectedViews(rows, start.astype(np.int64))
 
 
-def view_distances(
-    views: Views, scene: Acquisition, scales: ViewDistanceScales = ViewDistanceScales()
-) -> Array:
+def view_distances(views: Views, scene: Acquisition, scales: ViewDistanceScales) -> Array:
     """Distances (m,) of views from a scene, without unit; 0 for a view taken in the same way."""
     cosine = _unit_vectors(views.incidence_deg, views.azimuth_deg) @ _unit_vectors(
         np.array([scene.incidence_deg]), np.array([scene.azimuth_deg])

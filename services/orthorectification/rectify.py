@@ -23,6 +23,8 @@ MAX_READ_PIXELS = 24_000_000
 _SMALLEST_WINDOW = 16
 _MAX_MAP_PIXELS = 40_000_000_000
 _KERNEL_REACH_PX = 3
+_INTERVALS = 16
+"""Intervals along each side of an image between the positions that are located for its map."""
 _RATIO_STEP = 8
 """Map pixels between those whose size in the image is computed."""
 
@@ -341,9 +343,9 @@ def _resampled(
     return out
 
 
-def _grid_over(shape: tuple[int, int], per_side: int = 16) -> Array:
+def _grid_over(shape: tuple[int, int]) -> Array:
     """Positions (n, 2) on a regular grid over an image, its border included."""
-    axes = [np.linspace(-0.5, size - 0.5, per_side + 1) for size in shape]
+    axes = [np.linspace(-0.5, size - 0.5, _INTERVALS + 1) for size in shape]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 

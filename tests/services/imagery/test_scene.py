@@ -1,4 +1,4 @@
-"""What a scene says of itself: centre, sampling, outline and directions."""
+"""Centre, ground sampling, footprint and view directions of a scene."""
 
 from dataclasses import replace
 
@@ -26,8 +26,8 @@ def scene_of(geometry: ViewGeometry) -> Scene:
 def flown(incidence: float = 20.0, azimuth: float = 120.0, where: World | None = None) -> ViewGeometry:
     ground = world() if where is None else where
     lon, lat = (float(v) for v in ground.centre_lon_lat)
-    asked = plan(lon_lat=(lon, lat), shape=(500, 900), incidence_deg=incidence, azimuth_deg=azimuth)
-    return plan_geometry(ground, asked, np.random.default_rng(0))
+    requested = plan(lon_lat=(lon, lat), shape=(500, 900), incidence_deg=incidence, azimuth_deg=azimuth)
+    return plan_geometry(ground, requested, np.random.default_rng(0))
 
 
 def turned(degrees: Array) -> Array:
@@ -43,25 +43,25 @@ def test_the_centre_projects_to_the_middle_of_the_image() -> None:
 
 
 @pytest.mark.parametrize("gsd_m", [0.5, 1.0])
-def test_the_sampling_is_that_of_the_flight(gsd_m: float) -> None:
+def test_the_ground_sampling_is_that_of_the_planned_view(gsd_m: float) -> None:
     geometry = plan_geometry(world(), plan(gsd_m=gsd_m), np.random.default_rng(0))
     assert scene_gsd_m(scene_of(geometry)) == pytest.approx(gsd_m, rel=one_percent)
 
 
 @pytest.mark.parametrize(("incidence", "azimuth"), [(5.0, 0.0), (20.0, 120.0), (30.0, 275.0)])
-def test_directions_are_those_of_the_flight(incidence: float, azimuth: float) -> None:
+def test_directions_are_those_of_the_planned_view(incidence: float, azimuth: float) -> None:
     geometry = flown(incidence, azimuth)
     image = np.array([[249.5, 449.5]])
     ground = geometry.true_model.locate(image, world().height_m(np.array([geometry.plan.lon_lat])))
     for model in (geometry.true_model, geometry.rpc):
-        found = view_direction(model, image, ground)
-        assert found[0][0] == pytest.approx(incidence, abs=a_tenth_of_a_degree)
-        assert np.abs(turned(found[1] - azimuth)).max() < a_tenth_of_a_degree / np.sin(
+        directions = view_direction(model, image, ground)
+        assert directions[0][0] == pytest.approx(incidence, abs=a_tenth_of_a_degree)
+        assert np.abs(turned(directions[1] - azimuth)).max() < a_tenth_of_a_degree / np.sin(
             np.radians(incidence)
         )
 
 
-def test_directions_of_the_rpc_are_those_of_the_sensor_all_over_the_image() -> None:
+def test_directions_of_the_rpc_are_those_of_the_sensor_in_the_whole_image() -> None:
     geometry = flown()
     image = np.random.default_rng(0).uniform([0, 0], [499, 899], (50, 2))
     ground = geometry.true_model.locate(image, np.full(50, 180.0))
@@ -71,7 +71,7 @@ def test_directions_of_the_rpc_are_those_of_the_sensor_all_over_the_image() -> N
     np.testing.assert_allclose(turned(rpc[1] - true[1]), 0.0, atol=2.0 * a_tenth_of_a_degree)
 
 
-def test_the_footprint_holds_all_the_ground_the_image_can_show() -> None:
+def test_the_footprint_contains_all_the_ground_that_the_image_can_show() -> None:
     scene = scene_of(flown(30.0))
     outline = Polygon(scene_footprint(scene))
     assert outline.is_valid
@@ -83,7 +83,7 @@ def test_the_footprint_holds_all_the_ground_the_image_can_show() -> None:
     assert grown.covers(MultiPoint(ground[:, :2]))
 
 
-def test_the_footprint_is_no_larger_than_the_ground_the_image_can_show() -> None:
+def test_the_footprint_is_no_larger_than_the_ground_that_the_image_can_show() -> None:
     scene = scene_of(flown(30.0))
     corners = np.array([[-0.5, -0.5], [-0.5, 899.5], [499.5, 899.5], [499.5, -0.5]])
     ends = [scene.model.locate(corners, np.full(4, h))[:, :2] for h in scene.model.height_range_m]

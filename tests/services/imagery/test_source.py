@@ -1,4 +1,4 @@
-"""Chips show what lies where their geometry says, at their own resolution."""
+"""Chips show the ground of their geometry, at their own resolution."""
 
 from dataclasses import dataclass, replace
 
@@ -17,15 +17,19 @@ from services.imagery.source import (
     reduce_image,
     render_chip,
 )
+from services.map_grid import MapGrid
+from services.sensors.ortho import OrthoModel
 from services.types import Array, FloatImage
 
 a_millimetre = 1e-3
 half_a_percent_of_the_amplitude = 0.005
 a_fiftieth_of_a_pixel = 0.02
 bicubic_px = 0.048 + 0.016
-"""OpenCV's bicubic moves a slope by up to 0.048 px (its a is -0.75), and counts positions in 1/32 px."""
+"""Allowed displacement: OpenCV's bicubic (a = -0.75) moves a slope by up to 0.048 px, and its positions
+are multiples of 1/32 px."""
 a_quarter_is_left = 0.25
 a_float32 = 1e-4
+half_a_percent = 0.005
 
 ORIGIN = np.array([5.4, 43.6, 120.0])
 SHAPE = (900, 1000)
@@ -74,7 +78,7 @@ def east_north_of_pixels(model: PlaneModel) -> Array:
 
 
 def waves(east_north: Array, wavelength_m: float) -> Array:
-    """Something without any symmetry: two waves and a slope."""
+    """A pattern without symmetry: two waves and a slope."""
     east, north = east_north[..., 0], east_north[..., 1]
     turn = 2.0 * np.pi / wavelength_m
     value = 600.0 + AMPLITUDE * np.sin(turn * (east + 0.4 * north) + 0.3)
@@ -95,7 +99,7 @@ def noise_image(seed: int = 0, smooth_px: float = 3.0) -> ArrayImage:
 
 
 def shift_between(one: FloatImage, other: FloatImage) -> Array:
-    """Rows and columns by which `other` is moved against `one`, linearised at the middle of both."""
+    """Displacement (2,), rows and columns, of `other` relative to `one`, linearised at their mean."""
     middle = (one.astype(np.float64) + other) / 2.0
     slope = np.stack(np.gradient(middle), axis=-1)[2:-2, 2:-2].reshape(-1, 2)
     change = (one.astype(np.float64) - other)[2:-2, 2:-2].ravel()
@@ -138,7 +142,7 @@ def test_a_chip_finer_than_the_image_is_not_blurred() -> None:
 
 @pytest.mark.parametrize("turn_deg", [0.0, 45.0])
 @pytest.mark.parametrize("wavelength_px", [2.0, 2.5, 3.0, 4.0])
-def test_what_is_too_fine_for_a_chip_is_damped_not_aliased(
+def test_detail_too_fine_for_a_chip_is_damped_and_not_aliased(
     wavelength_px: float, turn_deg: float
 ) -> None:
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
@@ -148,7 +152,7 @@ def test_what_is_too_fine_for_a_chip_is_damped_not_aliased(
     assert chip.std() < a_quarter_is_left * fine.std()
 
 
-def test_a_chip_keeps_what_it_can_show() -> None:
+def test_a_chip_keeps_the_detail_that_it_can_show() -> None:
     model = PlaneModel(1.0)
     sample = np.broadcast_to(np.arange(SHAPE[1]), SHAPE)
     wave = np.sin(2.0 * np.pi * sample / 16.0).astype(np.float32)
@@ -157,7 +161,7 @@ def test_a_chip_keeps_what_it_can_show() -> None:
 
 
 @pytest.mark.parametrize("ratio", [1.5, 2.0, 6.0])
-def test_the_low_pass_keeps_the_mean_and_what_is_flat(ratio: float) -> None:
+def test_the_low_pass_keeps_the_mean_and_flat_images(ratio: float) -> None:
     pixels = noise_image(smooth_px=1.0).pixels
     smooth = low_pass(pixels, ratio)
     assert smooth.std() < pixels.std()
@@ -167,13 +171,13 @@ def test_the_low_pass_keeps_the_mean_and_what_is_flat(ratio: float) -> None:
 
 
 @pytest.mark.parametrize("ratio", [0.3, 1.0])
-def test_the_low_pass_leaves_what_is_coarser_as_it_is(ratio: float) -> None:
+def test_the_low_pass_leaves_coarser_images_unchanged(ratio: float) -> None:
     pixels = noise_image().pixels
     np.testing.assert_array_equal(low_pass(pixels, ratio), pixels)
 
 
 @pytest.mark.parametrize("gsd_m", [0.5, 1.0, 4.0])
-def test_a_chip_over_the_border_is_missing_where_the_image_is(gsd_m: float) -> None:
+def test_a_chip_across_the_border_is_missing_outside_the_image(gsd_m: float) -> None:
     model = PlaneModel(1.0)
     image = noise_image()
     point = point_at(-490.0, 0.0)  # 10 px inside the western border
@@ -205,23 +209,23 @@ def test_nodata_stays_missing_and_does_not_spread_far() -> None:
     assert np.abs(missing).max() <= 10
 
 
-def test_where_a_model_cannot_say_a_chip_misses_that_part_and_no_more() -> None:
+def test_a_chip_is_missing_beside_undefined_nodes_of_the_model_and_nowhere_else() -> None:
     @dataclass(frozen=True)
-    class Lost(PlaneModel):
+    class PartlyUndefined(PlaneModel):
         def project(self, lon_lat_h: Array) -> Array:
-            found = super().project(lon_lat_h)
-            found[0] = np.nan
-            return found
+            line_sample = super().project(lon_lat_h)
+            line_sample[0] = np.nan
+            return line_sample
 
-    chip = render_chip(noise_image(), Lost(), point_at(0.0, 0.0), 1.0)
+    chip = render_chip(noise_image(), PartlyUndefined(), point_at(0.0, 0.0), 1.0)
     whole = render_chip(noise_image(), PlaneModel(), point_at(0.0, 0.0), 1.0)
-    told = np.ones(chip.shape, dtype=bool)
-    told[:10, :10] = False
-    assert np.isnan(chip[~told]).all()
-    np.testing.assert_array_equal(chip[told], whole[told])
+    defined = np.ones(chip.shape, dtype=bool)
+    defined[:10, :10] = False
+    assert np.isnan(chip[~defined]).all()
+    np.testing.assert_array_equal(chip[defined], whole[defined])
 
 
-def test_windows_reach_beyond_the_image_with_nan() -> None:
+def test_windows_are_nan_beyond_the_image() -> None:
     pixels = np.arange(12, dtype=np.float32).reshape(3, 4)
     image = ArrayImage(pixels)
     window = image.read(Window(-1, -2, 6, 8))
@@ -234,7 +238,9 @@ def test_windows_reach_beyond_the_image_with_nan() -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 7])
 @pytest.mark.parametrize("strip_pixels", [1, 5_000, 16_000_000])
-def test_a_reduction_is_made_of_block_means_in_any_strips(factor: int, strip_pixels: int) -> None:
+def test_a_reduction_consists_of_block_means_for_any_size_of_the_strips(
+    factor: int, strip_pixels: int
+) -> None:
     image = ArrayImage(noise_image().pixels[:101, :130])
     reduced = reduce_image(image, factor, strip_pixels)
     lines, samples = 101 // factor, 130 // factor
@@ -254,9 +260,7 @@ def test_a_block_with_a_missing_pixel_has_no_mean() -> None:
 
 
 @pytest.mark.parametrize(("gsd_m", "factor"), [(8.0, 2), (8.0, 3), (8.0, 4), (5.0, 2)])
-def test_a_chip_from_a_reduction_lies_where_that_of_the_whole_image_does(
-    gsd_m: float, factor: int
-) -> None:
+def test_a_chip_from_a_reduction_is_not_displaced(gsd_m: float, factor: int) -> None:
     model = PlaneModel(1.0, 20.0)
     image = noise_image(smooth_px=2.0 * gsd_m)
     point = point_at(11.3, -7.9)
@@ -268,12 +272,12 @@ def test_a_chip_from_a_reduction_lies_where_that_of_the_whole_image_does(
 
 
 @pytest.mark.parametrize("gsd_m", [0.5, 3.0])
-def test_the_sampling_of_an_image_is_the_side_of_its_pixels_on_the_ground(gsd_m: float) -> None:
+def test_the_ground_sampling_of_an_image_is_the_side_of_its_pixels_on_the_ground(gsd_m: float) -> None:
     model = replace(PlaneModel(gsd_m), turn_deg=25.0)
     assert image_gsd_m(model, point_at(10.0, 20.0)) == pytest.approx(gsd_m, rel=1e-9)
 
 
-def test_a_window_inside_one_that_was_read_is_not_read_again() -> None:
+def test_a_window_inside_a_cached_one_is_not_read_again() -> None:
     image, model, read = noise_image(), PlaneModel(1.0), []
 
     class Counted(ArrayImage):
@@ -283,21 +287,34 @@ def test_a_window_inside_one_that_was_read_is_not_read_again() -> None:
 
     for gsd_m in (1.0, 4.5):
         read.clear()
-        kept = CachedImage(Counted(image.pixels))
-        render_chip(kept, model, point_at(0.0, 0.0), gsd_m, 141)
-        again = render_chip(kept, model, point_at(7.3, -4.1), gsd_m, 113)
+        cached = CachedImage(Counted(image.pixels))
+        render_chip(cached, model, point_at(0.0, 0.0), gsd_m, 141)
+        again = render_chip(cached, model, point_at(7.3, -4.1), gsd_m, 113)
         assert len(read) == 1
         np.testing.assert_array_equal(again, render_chip(image, model, point_at(7.3, -4.1), gsd_m, 113))
-        render_chip(kept, model, point_at(40.0, 0.0), gsd_m, 141)
+        render_chip(cached, model, point_at(40.0, 0.0), gsd_m, 141)
         assert len(read) == 2
 
 
-def test_windows_beyond_the_memory_they_may_take_are_read_again() -> None:
+def test_windows_beyond_the_limit_of_the_cache_are_read_again() -> None:
     image, model = noise_image(), PlaneModel(1.0)
-    kept = CachedImage(image, max_bytes=200_000)
+    cached = CachedImage(image, max_bytes=200_000)
     wanted = render_chip(image, model, point_at(90.0, 0.0), 1.0)
     for _ in range(2):
         for east_m in (0.0, 30.0, 60.0, 90.0):
-            chip = render_chip(kept, model, point_at(east_m, 0.0), 1.0)
+            chip = render_chip(cached, model, point_at(east_m, 0.0), 1.0)
     np.testing.assert_array_equal(chip, wanted)
-    assert 0 < kept.cached_bytes <= 200_000
+    assert 0 < cached.cached_bytes <= 200_000
+
+
+def test_a_geographic_ortho_image_at_60_degrees_north_has_half_the_sampling_to_the_east() -> None:
+    step_deg = 1e-4
+    grid = MapGrid(
+        "EPSG:4326", np.array([10.0, 60.0]), step_deg * np.array([[0.0, 1.0], [-1.0, 0.0]]), (3, 3)
+    )
+    derivative = OrthoModel(grid).project_derivative(np.array([[10.0, 60.0, 0.0]]))[0]
+    north_m, east_m = 1.0 / np.abs(derivative[[0, 1], [1, 0]])
+    assert east_m == pytest.approx(north_m / 2.0, rel=half_a_percent)
+    gsd_m = image_gsd_m(OrthoModel(grid), np.array([10.0, 60.0, 0.0]))
+    assert gsd_m == pytest.approx(np.sqrt(east_m * north_m), rel=1e-6)
+    assert gsd_m < 0.75 * north_m

@@ -1,4 +1,4 @@
-"""Where a scene ends beside a point, the middle of its chip is searched."""
+"""Where a scene ends beside a point, the central square of its chip is searched."""
 
 import numpy as np
 import pytest
@@ -26,22 +26,22 @@ def test_a_patch_without_gaps_shows_the_whole_chip() -> None:
 
 
 @pytest.mark.parametrize("missing", [1, 10, 25])
-def test_what_is_missing_at_one_side_is_left_out_at_all(missing: int) -> None:
+def test_a_gap_on_one_side_reduces_the_chip_on_all_sides(missing: int) -> None:
     assert visible_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF - missing
 
 
 @pytest.mark.parametrize("missing", [26, 56, SIDE])
-def test_less_than_half_of_a_chip_is_not_searched(missing: int) -> None:
+def test_a_chip_is_not_reduced_to_less_than_half(missing: int) -> None:
     assert visible_half_side(patch_without(missing), HALF, RADIUS_PX) == HALF
 
 
-def test_one_missing_pixel_decides_wherever_it_lies() -> None:
+def test_the_nearest_missing_pixel_limits_the_visible_square() -> None:
     patch = patch_without(0)
     patch[SIDE // 2 + 40, SIDE // 2 - 3] = np.nan
     assert visible_half_side(patch, HALF, RADIUS_PX) == 39 - RADIUS_PX
 
 
-def test_the_middle_of_a_chip_is_found_where_the_whole_one_is() -> None:
+def test_the_central_square_of_a_chip_is_found_where_the_whole_chip_would_be() -> None:
     ground = texture(np.random.default_rng(5), 128, 1.5)
     shift = 1.3, -2.4
     chip = as_pixels(ground[RADIUS_PX : RADIUS_PX + 2 * HALF + 1, RADIUS_PX : RADIUS_PX + 2 * HALF + 1])

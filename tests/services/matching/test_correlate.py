@@ -1,4 +1,4 @@
-"""A chip is found to a fraction of a pixel with a sigma to believe, or not at all and for a reason."""
+"""A chip is found to a fraction of a pixel with an honest sigma, or rejected with a reason."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ def patch_of(ground: Array) -> FloatImage:
 
 @dataclass(frozen=True)
 class Trials:
-    """What became of many chips that were looked for in moved and noisy patches."""
+    """Errors and sigmas of many chips searched in displaced and noisy patches."""
 
     error_px: Array
     sigma_px: Array
@@ -37,12 +37,12 @@ class Trials:
 
     @property
     def normalised_square(self) -> float:
-        """Mean square of the errors in units of their stated sigmas: one when these are true."""
+        """Mean square of the errors divided by their stated sigmas: 1 for honest sigmas."""
         return float(((self.error_px / self.sigma_px[:, None]) ** 2).mean())
 
 
 def trials(smoothness_px: float, noise: float, noise_smoothness_px: float | None, seed: int) -> Trials:
-    """Look for 100 chips; a noise without smoothness is white."""
+    """Search 100 chips; noise without smoothness is white."""
     rng = np.random.default_rng(seed)
     error, sigma, lost = [], [], 0
     for _ in range(100):
@@ -74,7 +74,7 @@ def test_a_shift_is_recovered_to_a_twentieth_of_a_pixel(smoothness_px: float) ->
 
 
 @pytest.mark.parametrize("smoothness_px", [1.5, 2.5])
-def test_white_noise_does_not_cost_a_twentieth_of_a_pixel(smoothness_px: float) -> None:
+def test_white_noise_moves_a_chip_by_less_than_a_twentieth_of_a_pixel(smoothness_px: float) -> None:
     noisy = trials(smoothness_px, 0.3, None, 2)
     assert noisy.lost == 0
     assert np.abs(noisy.error_px).max() < a_twentieth_of_a_pixel
@@ -84,29 +84,29 @@ def test_white_noise_does_not_cost_a_twentieth_of_a_pixel(smoothness_px: float) 
 @pytest.mark.parametrize("smoothness_px", [1.0, 1.5, 2.5])
 def test_measures_have_no_bias(smoothness_px: float, noise: float) -> None:
     for noise_smoothness in (None, smoothness_px):
-        found = trials(smoothness_px, noise, noise_smoothness, 3)
-        standard_error = found.error_px.std(axis=0) / np.sqrt(len(found.error_px))
-        assert np.abs(found.error_px.mean(axis=0) / standard_error).max() < 4.0
+        outcome = trials(smoothness_px, noise, noise_smoothness, 3)
+        standard_error = outcome.error_px.std(axis=0) / np.sqrt(len(outcome.error_px))
+        assert np.abs(outcome.error_px.mean(axis=0) / standard_error).max() < 4.0
 
 
 @pytest.mark.parametrize("noise", [0.2, 0.45])
 @pytest.mark.parametrize("noise_smoothness_px", [None, 1.0, 2.5])
 @pytest.mark.parametrize("smoothness_px", [1.0, 2.5])
-def test_a_stated_sigma_is_true_whatever_the_noise(
+def test_the_stated_sigma_is_honest_for_any_smoothness_of_the_noise(
     smoothness_px: float, noise_smoothness_px: float | None, noise: float
 ) -> None:
-    found = trials(smoothness_px, noise, noise_smoothness_px, 4)
-    assert found.lost == 0
-    assert 0.7 < found.normalised_square < 1.5
+    outcome = trials(smoothness_px, noise, noise_smoothness_px, 4)
+    assert outcome.lost == 0
+    assert 0.7 < outcome.normalised_square < 1.5
 
 
 @pytest.mark.parametrize("smoothness_px", [1.0, 2.5])
-def test_a_stated_sigma_is_never_too_small_under_haze(smoothness_px: float) -> None:
-    # Slow differences move a place less than squares of 20 pixels can tell.
+def test_the_stated_sigma_is_not_too_small_under_haze(smoothness_px: float) -> None:
+    # Slow differences move a position less than squares of 20 pixels can show.
     assert 0.4 < trials(smoothness_px, 0.45, 5.0, 4).normalised_square < 1.5
 
 
-def test_a_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
+def test_the_stated_sigma_grows_with_the_noise_and_with_the_smoothness() -> None:
     def sigma(smoothness_px: float, noise: float) -> float:
         return float(np.median(trials(smoothness_px, noise, smoothness_px, 6).sigma_px))
 
@@ -143,7 +143,7 @@ def test_a_chip_with_a_hole_has_nodata() -> None:
     assert find_chip(patch_of(ground), chip, OPTIONS).reason == "nodata"
 
 
-def test_a_patch_that_leaves_no_room_for_the_chip_has_nodata() -> None:
+def test_a_patch_with_gaps_everywhere_under_the_chip_has_nodata() -> None:
     ground = texture(np.random.default_rng(0), PERIOD, 1.5)
     for hole in (np.s_[:, :], np.s_[:, :60], np.s_[56:57, 56:57]):
         patch = patch_of(ground)
@@ -151,7 +151,7 @@ def test_a_patch_that_leaves_no_room_for_the_chip_has_nodata() -> None:
         assert find_chip(patch, chip_of(ground), OPTIONS).reason == "nodata"
 
 
-def test_something_else_has_a_low_score() -> None:
+def test_other_ground_has_a_low_score() -> None:
     rng = np.random.default_rng(0)
     peak = find_chip(patch_of(texture(rng, PERIOD, 1.5)), chip_of(texture(rng, PERIOD, 1.5)), OPTIONS)
     assert peak.reason == "low_score"
@@ -166,12 +166,12 @@ def test_the_negative_of_a_chip_has_a_low_score() -> None:
 
 
 @pytest.mark.parametrize("shift", [(7.0, 0.0), (0.0, -7.5), (-7.0, 7.0)])
-def test_what_lies_beyond_the_search_peaks_on_its_border(shift: tuple[float, float]) -> None:
+def test_a_chip_beyond_the_search_radius_has_a_border_peak(shift: tuple[float, float]) -> None:
     ground = texture(np.random.default_rng(0), PERIOD, 5.0)
     assert find_chip(patch_of(moved(ground, *shift)), chip_of(ground), OPTIONS).reason == "border_peak"
 
 
-def test_a_pattern_that_repeats_is_ambiguous() -> None:
+def test_a_repeated_pattern_is_ambiguous() -> None:
     rng = np.random.default_rng(0)
     side = SIDE + 40
     repeated = np.tile(texture(rng, 16, 1.5), (10, 10))[:side, :side] + 0.1 * rng.standard_normal(
@@ -190,7 +190,7 @@ def test_a_straight_edge_is_ambiguous() -> None:
     assert find_chip(as_pixels(seen), chip, OPTIONS).reason == "ambiguous"
 
 
-def test_missing_pixels_never_win() -> None:
+def test_positions_with_missing_pixels_have_the_lowest_score() -> None:
     rng = np.random.default_rng(0)
     for _ in range(40):
         ground = texture(rng, PERIOD, 1.5)
@@ -208,7 +208,7 @@ def test_a_chip_half_under_nodata_is_not_found_elsewhere() -> None:
     rng = np.random.default_rng(0)
     ground = texture(rng, PERIOD, 1.5)
     patch = patch_of(np.roll(ground, (0, 5), (0, 1)))
-    patch[:, 108:] = np.nan  # the chip's true place reaches to column 112
+    patch[:, 108:] = np.nan  # the chip at its true position ends at column 112
     peak = find_chip(patch, chip_of(ground), OPTIONS)
     assert peak.reason == "low_score"
 
@@ -223,7 +223,7 @@ def test_nodata_away_from_a_chip_does_not_move_it() -> None:
     np.testing.assert_allclose(beside.row_col, whole.row_col, atol=a_millipixel)
 
 
-def test_a_peak_beside_what_cannot_be_judged_is_not_believed():
+def test_a_peak_beside_missing_pixels_is_rejected() -> None:
     ground = texture(np.random.default_rng(3), 128, 1.5)
     chip = as_pixels(ground[6:107, 6:107])
     patch = as_pixels(np.roll(ground, (2, -1), (0, 1))[:113, :113])

@@ -1,4 +1,4 @@
-"""Points are chosen all over the image and over its heights."""
+"""The selection of points covers the image and its range of heights."""
 
 import numpy as np
 import pytest
@@ -8,14 +8,14 @@ from services.matching.predict import in_image, spread_over_image
 SHAPE = (1000, 2000)
 
 
-def test_an_image_ends_half_a_pixel_beyond_the_centres_of_its_pixels() -> None:
+def test_an_image_extends_half_a_pixel_beyond_its_outermost_pixel_centres() -> None:
     at = np.array([[-0.5, -0.5], [999.5, 1999.5], [-0.6, 0.0], [0.0, 1999.6], [np.nan, 3.0]])
-    np.testing.assert_array_equal(in_image(at, SHAPE), [True, True, False, False, False])
+    np.testing.assert_array_equal(in_image(at, SHAPE, 0.0), [True, True, False, False, False])
     np.testing.assert_array_equal(in_image(at, SHAPE, 1.0), [True, True, True, True, False])
 
 
 @pytest.mark.parametrize("count", [8, 40, 200])
-def test_points_are_chosen_all_over_the_image_though_most_lie_in_a_corner(count: int) -> None:
+def test_selected_points_cover_the_image_even_where_most_points_lie_in_a_corner(count: int) -> None:
     rng = np.random.default_rng(0)
     crowd, others = rng.uniform(0, [100, 200], (5000, 2)), rng.uniform([0, 0], SHAPE, (1000, 2))
     at = np.concatenate([crowd, others])
@@ -26,7 +26,7 @@ def test_points_are_chosen_all_over_the_image_though_most_lie_in_a_corner(count:
     assert len(cells) >= 0.9 * min(len(populated), count)
 
 
-def test_the_best_of_a_cell_comes_first() -> None:
+def test_the_best_point_of_a_cell_is_selected_first() -> None:
     at = np.array([[5.0, 5.0], [6.0, 6.0], [7.0, 7.0], [900.0, 1900.0]])
     rows = spread_over_image(at, np.zeros(4), np.array([0.2, 0.9, 0.5, 0.1]), SHAPE, 2)
     np.testing.assert_array_equal(rows, [1, 3])
@@ -35,7 +35,7 @@ def test_the_best_of_a_cell_comes_first() -> None:
     )
 
 
-def test_the_second_of_a_cell_lies_on_other_heights() -> None:
+def test_the_second_point_of_a_cell_lies_at_another_height() -> None:
     at = np.array(
         [[5.0, 5.0], [6.0, 6.0], [7.0, 7.0], [900.0, 1900.0], [910.0, 1900.0], [920.0, 1900.0]]
     )

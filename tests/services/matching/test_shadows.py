@@ -1,4 +1,4 @@
-"""Ends of shadows, which lie elsewhere under another sun, do not take a chip with them."""
+"""Shadows that differ under another sun do not displace a chip."""
 
 from dataclasses import replace
 from math import radians, tan
@@ -22,12 +22,12 @@ GSD_M = 2.0
 OPTIONS = CorrelationOptions(min_score=0.6)
 SIDE, RADIUS_PX, FINER = 101, 6, 4
 
-what_is_left_of_the_bias = 0.5
+remaining_bias = 0.5
 a_twentieth_of_a_pixel = 0.05
 
 
 def village(seed: int, image: Acquisition) -> FloatImage:
-    """Houses of 6 to 10 m on grass, with the shadows of a day, 8 cells of 0.5 m smooth."""
+    """Houses of 6 to 10 m on grass with the shadows of an acquisition, rendered on a finer grid."""
     rng = np.random.default_rng(seed)
     cells = (SIDE + 2 * RADIUS_PX) * FINER
     land = 0.5 + 0.08 * texture(rng, cells, 12.0)
@@ -49,32 +49,32 @@ def village(seed: int, image: Acquisition) -> FloatImage:
 
 
 def bias_px(chip_of: Acquisition, patch_of: Acquisition, known: bool) -> Array:
-    """Mean place (2,) of chips whose true place is zero."""
-    move = shadow_shift(chip_of, patch_of, GSD_M) if known else None
+    """Mean position (2,) of chips whose true position is zero."""
+    shift = shadow_shift(chip_of, patch_of, GSD_M) if known else None
     inner = slice(RADIUS_PX, RADIUS_PX + SIDE)
-    places = []
+    positions = []
     for seed in range(12):
         chip = np.ascontiguousarray(village(seed, chip_of)[inner, inner])
-        peak = find_chip(village(seed, patch_of), chip, OPTIONS, shadows=move)
+        peak = find_chip(village(seed, patch_of), chip, OPTIONS, shadows=shift)
         assert peak.reason == FOUND
-        places.append(peak.row_col)
-    return np.asarray(np.mean(places, axis=0))
+        positions.append(peak.row_col)
+    return np.asarray(np.mean(positions, axis=0))
 
 
-def test_a_lower_sun_moves_chips_along_the_shadows_and_knowing_it_takes_most_of_that_away() -> None:
-    taken = bias_px(JUNE, OCTOBER, known=False)
-    known = bias_px(JUNE, OCTOBER, known=True)
-    assert taken[0] < -a_twentieth_of_a_pixel
-    assert abs(known[0]) < what_is_left_of_the_bias * abs(taken[0])
+def test_shadow_weights_remove_most_of_the_bias_of_a_lower_sun() -> None:
+    ignored = bias_px(JUNE, OCTOBER, known=False)
+    corrected = bias_px(JUNE, OCTOBER, known=True)
+    assert ignored[0] < -a_twentieth_of_a_pixel
+    assert abs(corrected[0]) < remaining_bias * abs(ignored[0])
 
 
-def test_so_does_a_higher_one() -> None:
-    taken = bias_px(OCTOBER, JUNE, known=False)
-    known = bias_px(OCTOBER, JUNE, known=True)
-    assert abs(known[0]) < what_is_left_of_the_bias * abs(taken[0])
+def test_shadow_weights_remove_most_of_the_bias_of_a_higher_sun() -> None:
+    ignored = bias_px(OCTOBER, JUNE, known=False)
+    corrected = bias_px(OCTOBER, JUNE, known=True)
+    assert abs(corrected[0]) < remaining_bias * abs(ignored[0])
 
 
-def test_edges_that_no_sun_moves_keep_their_weight() -> None:
+def test_gradients_that_no_sun_moves_keep_their_weight() -> None:
     chip = village(0, JUNE)
     away_from_a_southern_sun = chip[2:, 1:-1] < chip[:-2, 1:-1]
     weights = shadow_weights(chip, 0.9, shadow_shift(JUNE, OCTOBER, GSD_M))
@@ -82,20 +82,20 @@ def test_edges_that_no_sun_moves_keep_their_weight() -> None:
     assert weights[away_from_a_southern_sun].min() < 0.1
 
 
-def test_under_the_same_sun_all_pixels_count_alike() -> None:
+def test_under_the_same_sun_all_pixels_have_the_same_weight() -> None:
     assert (shadow_weights(village(0, JUNE), 0.9, shadow_shift(JUNE, JUNE, GSD_M)) == 1.0).all()
 
 
-def test_a_shadow_moves_by_the_height_of_what_throws_it() -> None:
-    move = shadow_shift(JUNE, EVENING, GSD_M)
-    assert move is not None
+def test_the_shift_of_a_shadow_is_proportional_to_the_height_of_its_caster() -> None:
+    shift = shadow_shift(JUNE, EVENING, GSD_M)
+    assert shift is not None
     north = CASTER_M / tan(radians(63.0)) / GSD_M
     east = CASTER_M / tan(radians(38.0)) / GSD_M
-    np.testing.assert_allclose(move.shift_px, [north, east])
-    np.testing.assert_allclose(move.away / np.linalg.norm(move.away), [-1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(shift.shift_px, [north, east])
+    np.testing.assert_allclose(shift.away / np.linalg.norm(shift.away), [-1.0, 0.0], atol=1e-12)
 
 
-def test_where_a_sun_is_not_known_nothing_is_said_of_shadows() -> None:
+def test_an_unknown_sun_gives_no_shadow_shift() -> None:
     unknown = replace(JUNE, sun_elevation_deg=float("nan"))
     assert shadow_shift(unknown, OCTOBER, GSD_M) is None
     assert shadow_shift(JUNE, unknown, GSD_M) is None

@@ -1,4 +1,4 @@
-"""Of each point the views that look most like the scene are tried first."""
+"""The views of a point that look most like the scene are selected first."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from services.matching.view_selection import select_views, view_distances
+from services.matching.view_selection import ViewDistanceScales, select_views, view_distances
 from services.types import Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(
@@ -52,11 +52,11 @@ def point_with_views(
 
 def numbers(points: ControlPoints, gsd_m: float, scene: Acquisition, count: int) -> IntArray:
     """Views of the second point, numbered within it."""
-    chosen = select_views(points, gsd_m, scene, count)
-    return chosen.row[chosen.start[1] : chosen.start[2]] - points.views.start[1]
+    selected = select_views(points, gsd_m, scene, count, ViewDistanceScales())
+    return selected.row[selected.start[1] : selected.start[2]] - points.views.start[1]
 
 
-def test_views_most_like_the_scene_are_chosen_at_the_sampling_asked() -> None:
+def test_the_views_most_like_the_scene_are_selected_at_the_requested_sampling() -> None:
     points = point_with_views([1.0, 1.0, 1.0, 4.0], [20.0, 20.0, 5.0, 20.0], [180.0, 350.0, 90.0, 10.0])
     np.testing.assert_array_equal(numbers(points, 1.0, SCENE, 2), [1, 2])
     np.testing.assert_array_equal(numbers(points, 4.0, SCENE, 2), [3])
@@ -69,7 +69,7 @@ def test_azimuth_does_not_matter_to_vertical_views() -> None:
     assert numbers(points, 1.0, scene, 1)[0] == 0
 
 
-def test_views_are_chosen_though_no_direction_is_known() -> None:
+def test_views_are_selected_even_where_directions_are_unknown() -> None:
     points = point_with_views([1.0, 1.0], [np.nan, 8.0], [np.nan, 200.0])
     seen = replace(SCENE, incidence_deg=8.0, azimuth_deg=200.0)
     np.testing.assert_array_equal(numbers(points, 1.0, seen, 2), [1, 0])
@@ -78,7 +78,8 @@ def test_views_are_chosen_though_no_direction_is_known() -> None:
 
 def distance_of(image: Acquisition, health: float = 1.0) -> float:
     points = point_with_views([1.0], [SCENE.incidence_deg], [SCENE.azimuth_deg], image)
-    return float(view_distances(replace(points.views, health=np.array([1.0, health])), SCENE)[1])
+    views = replace(points.views, health=np.array([1.0, health]))
+    return float(view_distances(views, SCENE, ViewDistanceScales())[1])
 
 
 def test_a_view_taken_in_the_same_way_has_no_distance() -> None:
@@ -99,16 +100,16 @@ def test_a_view_taken_in_the_same_way_has_no_distance() -> None:
         ({}, {"acquired_at": None}),
     ],
 )
-def test_season_light_and_sensor_count_and_both_circles_close(near: dict, far: dict) -> None:
+def test_season_light_and_sensor_add_distance_and_angles_wrap_around(near: dict, far: dict) -> None:
     assert distance_of(replace(SCENE, **near)) < distance_of(replace(SCENE, **far))
 
 
-def test_a_view_that_often_failed_stands_back() -> None:
+def test_a_view_that_often_failed_has_a_larger_distance() -> None:
     assert distance_of(SCENE, 0.5) > distance_of(replace(SCENE, sensor="SPOT 6"))
 
 
-def test_nothing_is_chosen_of_no_points() -> None:
+def test_no_points_have_no_selected_views() -> None:
     points = point_with_views([1.0], [0.0], [0.0]).take(np.array([], dtype=np.int64))
-    chosen = select_views(points, 1.0, SCENE, 2)
-    assert len(chosen.row) == 0
-    np.testing.assert_array_equal(chosen.start, [0])
+    selected = select_views(points, 1.0, SCENE, 2, ViewDistanceScales())
+    assert len(selected.row) == 0
+    np.testing.assert_array_equal(selected.start, [0])

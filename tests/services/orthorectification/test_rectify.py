@@ -1,4 +1,4 @@
-"""Scenes laid on maps: pixel by pixel where the model and the terrain have them."""
+"""Ortho-images show each pixel where the model and the terrain place it."""
 
 from dataclasses import replace
 from functools import cache
@@ -49,17 +49,17 @@ def scene(incidence_deg: float = 25.0, azimuth_deg: float = 100.0) -> Scene:
 
 
 def ramps() -> list[ArrayImage]:
-    """Images whose pixels tell where they are: rectified, they are the mapping itself."""
+    """Images of line and sample numbers: orthorectified, they show the mapping itself."""
     return [ArrayImage(axis.astype(np.float32)) for axis in np.indices(SHAPE)]
 
 
 def assembled(images: list[ArrayImage], ground: Terrain, grid: MapGrid, **changes: object) -> FloatImage:
     out = np.zeros((len(images), *grid.shape), dtype=np.float32)
     options = replace(OrthoOptions(), **changes)  # type: ignore[arg-type]
-    for done in orthorectify(images, scene().model, ground, grid, options):
-        at = done.window
-        assert done.error_px <= options.tolerance_px
-        out[:, at.line : at.line + at.lines, at.sample : at.sample + at.samples] = done.pixels
+    for ortho in orthorectify(images, scene().model, ground, grid, options):
+        at = ortho.window
+        assert ortho.error_px <= options.tolerance_px
+        out[:, at.line : at.line + at.lines, at.sample : at.sample + at.samples] = ortho.pixels
     return out
 
 
@@ -75,20 +75,22 @@ def expected(ground: Terrain, grid: MapGrid) -> np.ndarray:
 
 @pytest.mark.parametrize("kernel", ["bilinear", "cubic"])
 @pytest.mark.parametrize("crs", [None, "EPSG:4326", "EPSG:2154"])
-def test_every_map_pixel_shows_what_the_model_sees_there(kernel: str, crs: str | None) -> None:
+def test_every_map_pixel_shows_the_position_that_the_model_projects(
+    kernel: str, crs: str | None
+) -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground, crs)
-    found, wanted = assembled(ramps(), ground, grid, kernel=kernel), expected(ground, grid)
+    rendered, wanted = assembled(ramps(), ground, grid, kernel=kernel), expected(ground, grid)
     inside = np.isfinite(wanted).all(axis=0)
     assert inside.mean() > 0.5
-    seen = np.isfinite(found).all(axis=0)
-    # Only pixels on the very border may fall on either side of it.
+    seen = np.isfinite(rendered).all(axis=0)
+    # Pixels on the border itself may fall on either side of it.
     assert (seen != inside).sum() <= 0.002 * inside.sum()
     both = seen & inside
-    assert np.abs(found - wanted)[:, both].max() < a_hundredth_of_a_pixel
+    assert np.abs(rendered - wanted)[:, both].max() < a_hundredth_of_a_pixel
 
 
-def test_a_coarse_tolerance_is_kept_and_a_fine_one_too() -> None:
+def test_coarse_and_fine_tolerances_are_respected() -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)
     exact = map_into_image(scene().model, ground, grid, Window(100, 100, 200, 200), 1e-4)
@@ -103,7 +105,7 @@ def test_a_coarse_tolerance_is_kept_and_a_fine_one_too() -> None:
     assert np.abs(exact.line_sample - wanted)[inside].max() < 5e-4
 
 
-def test_the_map_holds_all_the_ground_of_the_scene_and_little_more() -> None:
+def test_the_map_covers_the_ground_of_the_scene_and_little_more() -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)
     assert grid.crs == "EPSG:32631"
@@ -129,21 +131,21 @@ def test_small_windows_and_divided_ones_give_the_same_image(monkeypatch: pytest.
     )
 
 
-def test_a_coarser_map_shows_means_and_keeps_its_place() -> None:
+def test_a_coarser_map_shows_undisplaced_means() -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground, gsd_m=10.0)
-    found, wanted = assembled(ramps(), ground, grid), expected(ground, grid)
-    inside = np.isfinite(wanted).all(axis=0) & np.isfinite(found).all(axis=0)
+    rendered, wanted = assembled(ramps(), ground, grid), expected(ground, grid)
+    inside = np.isfinite(wanted).all(axis=0) & np.isfinite(rendered).all(axis=0)
     inside &= ((wanted > 15.0) & (wanted < np.array(SHAPE)[:, None, None] - 16.0)).all(axis=0)
     assert inside.sum() > 1000
-    assert np.abs(found - wanted)[:, inside].max() < the_tolerance_px
+    assert np.abs(rendered - wanted)[:, inside].max() < the_tolerance_px
     noise = ArrayImage(np.random.default_rng(1).normal(0.0, 100.0, SHAPE).astype(np.float32))
     smooth = assembled([noise], ground, grid)
-    # Noise of pixels of 2 m in means over 10 m: a fifth or less.
+    # Means over 10 m reduce the noise of pixels of 2 m to a fifth or less.
     assert np.nanstd(smooth) < 25.0
 
 
-def test_voids_of_image_and_terrain_show_nothing() -> None:
+def test_voids_of_image_and_terrain_are_nodata() -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)
     heights = np.array(ground.heights.read(Window(0, 0, *DEM.shape)))
@@ -157,14 +159,14 @@ def test_voids_of_image_and_terrain_show_nothing() -> None:
     line, sample = expected(ground, grid)
     beside = (line > 199.0) & (line < 220.0) & (sample > 199.0) & (sample < 230.0)
     assert beside.sum() > 400
-    # Positions on the very edge of the void may fall on either side of it.
+    # Positions on the edge of the void itself may fall on either side of it.
     assert (lost[0] != beside).sum() <= 3
     lost = np.isnan(assembled([ArrayImage(np.ones(SHAPE, np.float32))], holed, grid)) & ~np.isnan(full)
     # Ten nodes of some 8 by 11 m, in pixels of 2 m.
     assert 1800 < lost.sum() < 4500
 
 
-def test_hidden_ground_is_that_which_no_line_of_sight_meets() -> None:
+def test_occluded_ground_is_ground_that_no_line_of_sight_meets_first() -> None:
     ground = terrain(300.0)
     grid = choose_grid(scene(), ground)
     window = Window(150, 150, 200, 200)
@@ -180,7 +182,7 @@ def test_hidden_ground_is_that_which_no_line_of_sight_meets() -> None:
     assert hidden[inside & (np.abs(above_m) < 0.05)].mean() < 0.01
 
 
-def test_flat_ground_hides_nothing() -> None:
+def test_flat_ground_occludes_nothing() -> None:
     ground = terrain(0.0)
     grid = choose_grid(scene(), ground)
     window = Window(50, 50, 100, 100)
@@ -188,7 +190,7 @@ def test_flat_ground_hides_nothing() -> None:
     assert not occluded_ground(scene().model, ground, grid, window, height_m).any()
 
 
-def test_terrain_of_elsewhere_is_refused() -> None:
+def test_terrain_of_another_place_is_refused() -> None:
     far = replace(terrain(), grid=replace(DEM, origin_xy=np.array([50.0, 10.0])))
     with pytest.raises(CoverageError, match="does not cover"):
         choose_grid(scene(), far)
@@ -197,10 +199,10 @@ def test_terrain_of_elsewhere_is_refused() -> None:
 def test_an_ortho_image_is_a_cloud_optimised_geotiff_with_overviews(tmp_path: Path) -> None:
     ground = terrain()
     grid = choose_grid(scene(), ground)
-    done = list(orthorectify(ramps(), scene().model, ground, grid))
+    windows = list(orthorectify(ramps(), scene().model, ground, grid))
     path = tmp_path / "ortho.tif"
-    error_px = write_cog(path, grid, done, bands=2, dtype="uint16", nodata=0.0)
-    assert error_px == max(window.error_px for window in done)
+    error_px = write_cog(path, grid, windows, bands=2, dtype="uint16", nodata=0.0)
+    assert error_px == max(window.error_px for window in windows)
     assert [file.name for file in tmp_path.iterdir()] == ["ortho.tif"]
     with rasterio.open(path) as file:
         assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

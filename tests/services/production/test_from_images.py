@@ -1,4 +1,4 @@
-"""Points made of simulated views lie where the views say, but for one translation of all of them."""
+"""Points produced from simulated views are correct up to one translation of the whole block."""
 
 from dataclasses import dataclass, replace
 
@@ -32,7 +32,7 @@ def made() -> Production:
 
 @pytest.fixture(scope="module")
 def true_points(made: Production) -> Intersection:
-    """Where the true models say that the points are, seen where the adjusted models see them."""
+    """Positions by the true models of the details that the adjusted models project the points to."""
     n, count = len(made.points), len(made.adjustment.models)
     seen = np.stack([model.project(made.points.lon_lat_h) for model in made.adjustment.models], axis=1)
     observations = Observations(
@@ -55,25 +55,25 @@ def seen_by(made: Production, row: int) -> Array:
     return views.image[mine][views.gsd_m[mine] == OPTIONS.fine_gsd_m]
 
 
-def test_points_are_off_the_truth_by_one_translation(
+def test_points_differ_from_the_truth_by_one_translation(
     made: Production, true_points: Intersection
 ) -> None:
     error_m = difference_m(made.points.lon_lat_h, true_points.lon_lat_h)
     assert error_m.std(axis=0).max() < 2.0 * a_centimetre
 
 
-def test_adjusted_models_agree_as_the_true_ones_do(true_points: Intersection) -> None:
-    # Rays through the positions the adjusted models give meet for the true sensors as well.
+def test_adjusted_models_agree_like_the_true_models(true_points: Intersection) -> None:
+    # The rays of the true sensors through the positions of the adjusted models intersect as well.
     assert np.abs(true_points.residual_px).max() < a_tenth_of_a_pixel / 2.0
 
 
-def test_the_translation_is_within_what_the_models_promised(
+def test_the_translation_is_within_the_stated_accuracy_of_the_models(
     made: Production, true_points: Intersection
 ) -> None:
     shift_m = difference_m(made.points.lon_lat_h, true_points.lon_lat_h).mean(axis=0)
     sigma_m = BLOCK_SIGMA_M / np.sqrt(len(block_views()))
     assert np.abs(shift_m[:2]).max() < four_sigma * sigma_m
-    assert np.hypot(*shift_m[:2]) > a_centimetre  # the frame is not the truth, and cannot be
+    assert np.hypot(*shift_m[:2]) > a_centimetre  # images alone cannot give the true frame
 
 
 def test_images_agree_on_the_points_they_show(made: Production) -> None:
@@ -83,17 +83,17 @@ def test_images_agree_on_the_points_they_show(made: Production) -> None:
     assert made.relative_accuracy.tie_points > 500
 
 
-def test_chips_of_a_point_show_the_same_at_its_middle(made: Production) -> None:
-    heart = np.s_[CHIP_CENTRE - 25 : CHIP_CENTRE + 26, CHIP_CENTRE - 25 : CHIP_CENTRE + 26]
+def test_chips_of_a_point_show_the_same_ground_at_their_centres(made: Production) -> None:
+    core = np.s_[CHIP_CENTRE - 25 : CHIP_CENTRE + 26, CHIP_CENTRE - 25 : CHIP_CENTRE + 26]
     alike = []
     for row in range(len(made.points)):
         fine = made.chips(row)[: len(seen_by(made, row))].astype(np.float64)
-        alike += [np.corrcoef(fine[0][heart].ravel(), other[heart].ravel())[0, 1] for other in fine[1:]]
+        alike += [np.corrcoef(fine[0][core].ravel(), other[core].ravel())[0, 1] for other in fine[1:]]
     assert np.median(alike) > 0.7
     assert np.mean(np.array(alike) > 0.5) > 0.9
 
 
-def test_every_point_is_seen_by_enough_images_and_by_none_twice(made: Production) -> None:
+def test_every_point_has_enough_views_and_one_per_image(made: Production) -> None:
     for row in range(len(made.points)):
         images = seen_by(made, row)
         assert len(images) >= OPTIONS.min_views
@@ -118,18 +118,18 @@ def test_chips_are_those_of_the_views(made: Production) -> None:
             np.testing.assert_array_equal(chip, np.rint(rendered))
 
 
-def test_chips_are_whole(made: Production) -> None:
+def test_chips_have_no_missing_pixels(made: Production) -> None:
     for row in range(len(made.points)):
         assert (made.chips(row) > 0).all()
 
 
-def test_nodata_is_stored_as_nought_and_nothing_else_is() -> None:
+def test_only_nodata_is_stored_as_zero() -> None:
     pixels = np.array([[np.nan, -3.0, 0.2], [1.4, 4095.6, 1e6]], dtype=np.float32)
     np.testing.assert_array_equal(stored_chip(pixels), [[0, 1, 1], [1, 4096, 65535]])
     assert stored_chip(pixels).dtype == np.uint16
 
 
-def test_finest_views_come_first_and_rows_of_chips_follow_each_other(made: Production) -> None:
+def test_the_finest_views_come_first_and_the_rows_of_chips_are_contiguous(made: Production) -> None:
     points = made.points
     for row in range(len(points)):
         gsd_m = points.views.gsd_m[slice(*points.views.start[row : row + 2])]
@@ -139,17 +139,17 @@ def test_finest_views_come_first_and_rows_of_chips_follow_each_other(made: Produ
     assert len(set(points.id)) == len(points)
 
 
-def test_directions_of_views_are_those_of_their_images(made: Production) -> None:
+def test_directions_of_views_are_those_of_their_planned_images(made: Production) -> None:
     views = made.points.views
     for image, view in enumerate(block_views()):
         mine = views.image == image
-        asked = view.geometry.plan
-        assert np.abs(views.incidence_deg[mine] - asked.incidence_deg).max() < 0.2
-        turn = (views.azimuth_deg[mine] - asked.azimuth_deg + 180.0) % 360.0 - 180.0
-        assert np.abs(turn * np.sin(np.radians(asked.incidence_deg))).max() < 0.2
+        planned = view.geometry.plan
+        assert np.abs(views.incidence_deg[mine] - planned.incidence_deg).max() < 0.2
+        turn = (views.azimuth_deg[mine] - planned.azimuth_deg + 180.0) % 360.0 - 180.0
+        assert np.abs(turn * np.sin(np.radians(planned.incidence_deg))).max() < 0.2
 
 
-def test_points_are_well_spread_over_what_the_images_share(made: Production) -> None:
+def test_points_cover_the_ground_that_the_images_share(made: Production) -> None:
     seen = made.adjustment.models[0].project(made.points.lon_lat_h)
     margin_px = CHIP_CENTRE + 10.0
     cell = np.floor((seen - margin_px) / (np.array(SHAPE) - 2.0 * margin_px) * 4.0).astype(int)
@@ -158,7 +158,7 @@ def test_points_are_well_spread_over_what_the_images_share(made: Production) -> 
     assert 0.5 * OPTIONS.points <= len(made.points) <= 1.5 * OPTIONS.points
 
 
-def test_points_are_salient_and_as_good_as_asked(made: Production) -> None:
+def test_points_are_as_salient_and_precise_as_the_options_require(made: Production) -> None:
     sigma_m = np.sqrt(np.diagonal(made.points.covariance_m2, 0, 1, 2))
     assert (made.points.saliency >= OPTIONS.min_saliency).all()
     assert sigma_m[:, :2].max() <= OPTIONS.max_sigma_m
@@ -166,7 +166,7 @@ def test_points_are_salient_and_as_good_as_asked(made: Production) -> None:
     assert (np.linalg.eigvalsh(made.points.covariance_m2) > 0.0).all()
 
 
-def test_the_outline_holds_the_points(made: Production) -> None:
+def test_the_outline_contains_the_points(made: Production) -> None:
     low, high = made.outline.min(axis=0), made.outline.max(axis=0)
     assert ((made.points.lon_lat_h[:, :2] > low) & (made.points.lon_lat_h[:, :2] < high)).all()
     closed = np.vstack([made.outline, made.outline[:1]])
@@ -174,7 +174,7 @@ def test_the_outline_holds_the_points(made: Production) -> None:
     assert area > 0.0  # counter-clockwise
 
 
-def test_one_image_and_two_of_one_name_are_refused() -> None:
+def test_a_single_image_and_two_images_of_one_name_are_refused() -> None:
     one, other = scenes()[:2]
     with pytest.raises(InputError, match="1 image given, at least 2 needed"):
         produce_points([one], OPTIONS)
@@ -188,7 +188,7 @@ def test_images_of_different_places_have_nothing_in_common() -> None:
     lon, lat = (float(v) for v in world().centre_lon_lat)
     away = plan_geometry(world(), plan("away", lon_lat=(lon + 0.1, lat)), np.random.default_rng(0))
     scene = scenes()[0]
-    # The very same content: only the model tells that it is elsewhere.
+    # The content is the same: only the model places it elsewhere.
     elsewhere = replace(scene, model=away.delivered, acquisition=away.acquisition)
     with pytest.raises(NotEnoughPoints):
         produce_points([scene, elsewhere], OPTIONS)
@@ -196,7 +196,7 @@ def test_images_of_different_places_have_nothing_in_common() -> None:
 
 @dataclass(frozen=True)
 class Emptied:
-    """Pixels that show nothing of the ground."""
+    """Pixels without any ground."""
 
     name: str
     pixels: Array
@@ -211,18 +211,18 @@ class Emptied:
     ],
     ids=lambda e: e.name,
 )
-def test_images_without_the_ground_in_them_make_no_points(emptied: Emptied) -> None:
+def test_images_without_ground_give_no_points(emptied: Emptied) -> None:
     one, other = scenes()[:2]
     blank = replace(other, image=ArrayImage(emptied.pixels.astype(np.float32)))
     with pytest.raises(ComputationError):
         produce_points([one, blank], OPTIONS)
 
 
-def test_progress_only_grows_and_arrives() -> None:
-    told: list[float] = []
+def test_progress_grows_from_0_to_1() -> None:
+    fractions: list[float] = []
     few = ProductionOptions(fine_gsd_m=2.0, coarse_gsd_m=4.0, points=8, candidates=1)
-    made = produce_points(scenes()[:2], few, lambda fraction, message: told.append(fraction))
-    assert told[0] == 0.0
-    assert told[-1] == 1.0
-    assert (np.diff(told) >= -1e-9).all()
+    made = produce_points(scenes()[:2], few, lambda fraction, message: fractions.append(fraction))
+    assert fractions[0] == 0.0
+    assert fractions[-1] == 1.0
+    assert (np.diff(fractions) >= -1e-9).all()
     assert len(made.points) >= 6

@@ -1,4 +1,4 @@
-"""Points of an ortho-image lie where its map says, and find the same ground in another image."""
+"""Points of an ortho-image lie where its map places them, and are found in another image."""
 
 from dataclasses import replace
 from functools import cache
@@ -66,7 +66,7 @@ def test_every_square_of_the_image_gets_a_point() -> None:
     assert (made().points.saliency >= OPTIONS.min_saliency).all()
 
 
-def test_points_have_the_height_of_the_ground_and_the_sigmas_that_were_said() -> None:
+def test_points_have_the_height_of_the_ground_and_the_stated_sigmas() -> None:
     points = made().points
     assert (points.lon_lat_h[:, 2] == FLAT.flat_m).all()
     sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
@@ -74,7 +74,7 @@ def test_points_have_the_height_of_the_ground_and_the_sigmas_that_were_said() ->
     np.testing.assert_allclose(sigma_m[:, 2], FLAT.sigma_m)
 
 
-def test_chips_are_what_the_image_shows_and_whole() -> None:
+def test_chips_are_complete_and_show_the_image() -> None:
     scene, points = ortho(land()), made().points
     assert made().gsds_m == (10.0, 40.0)
     for row in range(len(points)):
@@ -88,7 +88,7 @@ def test_chips_are_what_the_image_shows_and_whole() -> None:
     assert (points.views.incidence_deg == 0.0).all()
 
 
-def test_the_same_land_moved_is_found_where_it_was_moved_to() -> None:
+def test_displaced_ground_is_found_at_its_displaced_position() -> None:
     scene = replace(ortho(moved(land(), *MOVED_PX)), sigma_m=30.0)
     found = register_scene(scene, made().points, chips_of(made()))
     middle = np.full((1, 2), (SIDE - 1) / 2.0)
@@ -97,7 +97,7 @@ def test_the_same_land_moved_is_found_where_it_was_moved_to() -> None:
     assert found.qualification.point_counts.active >= 20
 
 
-def test_missing_pixels_and_unknown_heights_get_no_point() -> None:
+def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     pixels = land().copy()
     pixels[:, : SIDE // 2] = np.nan
     scene = ortho(pixels)
@@ -112,7 +112,7 @@ def test_missing_pixels_and_unknown_heights_get_no_point() -> None:
     np.testing.assert_allclose(points.lon_lat_h[:, 2], 40.0)
 
 
-def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
+def test_points_on_both_sides_of_180_degrees_form_one_block() -> None:
     scene = ortho(land(), 1, AT_180_DEGREES_XY)
     found = produce_ortho_points(scene, FLAT, OPTIONS)
     lon = found.points.lon_lat_h[:, 0]
@@ -125,7 +125,7 @@ def test_points_on_both_sides_of_180_degrees_are_one_block() -> None:
     assert ((turned > west) & (turned < east)).any(axis=1).all()
 
 
-def test_an_image_without_detail_makes_no_points() -> None:
+def test_an_image_without_detail_gives_no_points() -> None:
     with pytest.raises(NotEnoughPoints, match="salient corners of known height in"):
         produce_ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
 
@@ -135,7 +135,7 @@ def test_an_image_that_is_not_rectified_is_refused() -> None:
         produce_ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
 
 
-def test_ground_samplings_the_wrong_way_round_are_refused() -> None:
+def test_a_fine_sampling_above_the_coarse_one_is_refused() -> None:
     options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
     with pytest.raises(InputError, match="20 and 10 m given: fine_gsd_m must be above 0 and below"):
         produce_ortho_points(ortho(land()), FLAT, options)
