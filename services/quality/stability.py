@@ -202,7 +202,7 @@ def predict_accuracy(
     shape: tuple[int, int],
     gsd_m: float,
     grid: int,
-    frame_sigma_m: float = float("nan"),
+    frame_sigma_m: float,
 ) -> PredictedAccuracy:
     """The covariance of the correction, propagated to a grid over the image.
 

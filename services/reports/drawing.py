@@ -1,4 +1,4 @@
-"""How the figures of a report are drawn: one style, one palette, and the way into a page."""
+"""Drawing of the figures of a report: one style, one palette, and SVG markup for the page."""
 
 import io
 import re
@@ -14,7 +14,7 @@ from services.reports.report import RegistrationReport
 
 INK, QUIET = "#0a0b0c", "#0a0b0d"
 _PAGE_COLOURS = {INK: "var(--ink)", QUIET: "var(--quiet)"}
-"""Colours that the page decides on, so that a figure follows its light or dark scheme."""
+"""Colours that the style sheet of the page sets, so that figures follow its light or dark scheme."""
 
 ACTIVE, DEACTIVATED, NOT_MATCHED = "#2f7ed8", "#e8862e", "#8b939c"
 MATCHED = "#8db7ea"
@@ -22,10 +22,12 @@ ARROW = "#ffb000"
 WIDTH_IN = 5.0
 TEXT_PT = 10.0
 MANY_POINTS = 1500
+_UNCROWDED = 300
+_LABEL_LENGTH = 34
 
 
 def svg(draw: Callable[[RegistrationReport], Figure], report: RegistrationReport) -> str:
-    """A figure as markup for a page: no address, no fixed size, colours and fonts of the page.
+    """A figure as SVG markup without addresses or fixed size, in the colours and fonts of the page.
 
     Args:
         draw: one of `services.reports.figures.FIGURES`.
@@ -64,7 +66,7 @@ def plain_axes(height_in: float) -> tuple[Figure, Axes]:
 
 
 def style(axes: Axes) -> None:
-    """Thin lines, small text, no box."""
+    """Set thin lines, small text and no box."""
     axes.patch.set_alpha(0.0)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(QUIET)
@@ -96,7 +98,7 @@ def image_axes(report: RegistrationReport, darkness: float) -> tuple[Figure, Axe
 
 
 def _show_quicklook(axes: Axes, quicklook: Quicklook, darkness: float) -> None:
-    """The reduced scene, stretched and darkened so that what lies on it is seen."""
+    """Draw the reduced scene, stretched and darkened so that marks on it stand out."""
     pixels = np.where(quicklook.pixels == 0.0, np.nan, quicklook.pixels)
     finite = pixels[np.isfinite(pixels)]
     if not len(finite):
@@ -119,20 +121,20 @@ def _show_quicklook(axes: Axes, quicklook: Quicklook, darkness: float) -> None:
     )
 
 
-def crowding(n: int, roomy: int = 300) -> float:
-    """How much smaller n marks are drawn than few of them, 1 and less."""
-    return float(np.sqrt(min(1.0, roomy / max(n, 1))))
+def crowding(n: int) -> float:
+    """Factor, at most 1, by which the size of n marks is reduced so that they do not overlap much."""
+    return float(np.sqrt(min(1.0, _UNCROWDED / max(n, 1))))
 
 
 def round_number(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten; 1 for nothing."""
+    """The nearest of 1, 2, 5 times a power of ten; 1 for values that are not positive."""
     if not value > 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * min((1.0, 2.0, 5.0, 10.0), key=lambda step: abs(step - value / power)))
 
 
-def shortened(text: str, length: int = 34) -> str:
-    """Text that fits a label; signs that matplotlib would read as formulas are taken as they are."""
-    short = text if len(text) <= length else text[: length - 1] + "…"
+def shortened(text: str) -> str:
+    """Text that fits a label, with the signs escaped that matplotlib reads as formulas."""
+    short = text if len(text) <= _LABEL_LENGTH else text[: _LABEL_LENGTH - 1] + "…"
     return short.replace("$", r"\$")

@@ -79,15 +79,13 @@ def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
     return sorted(unmet, key=lambda criterion: criterion.needed_for == "good")
 
 
-def choose_pairs(
-    gallery: tuple[ChipPair, ...], count: int = PAIRS_PER_GROUP
-) -> tuple[GalleryGroup, ...]:
-    """The best, middle and worst scores of a gallery, no pair twice.
+def choose_pairs(gallery: tuple[ChipPair, ...]) -> tuple[GalleryGroup, ...]:
+    """The pairs of the best, middle and worst scores of a gallery, no pair twice.
 
     Args:
         gallery: any order; pairs without a score are the worst.
-        count: pairs in each group.
     """
+    count = PAIRS_PER_GROUP
     ordered = sorted(gallery, key=lambda pair: -np.nan_to_num(pair.score, nan=-2.0))
     if len(ordered) <= 3 * count:
         return (GalleryGroup("All pairs, best score first", tuple(ordered)),) if ordered else ()

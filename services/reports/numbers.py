@@ -19,15 +19,15 @@ def percent(ratio: float) -> str:
     return number(100.0 * ratio, 0, "%")
 
 
-def quantile(estimate: Quantile, unit: str = "m") -> str:
-    """A quantile with its confidence interval and the size of its sample."""
+def quantile(estimate: Quantile) -> str:
+    """A quantile in metres with its confidence interval and the size of its sample."""
     if estimate.lower != estimate.lower:
         bounds = f"not bounded, n = {estimate.n}"
     elif estimate.upper != estimate.upper:
-        bounds = f"at least {number(estimate.lower, 2, unit)}, n = {estimate.n}"
+        bounds = f"at least {number(estimate.lower, 2, 'm')}, n = {estimate.n}"
     else:
-        bounds = f"{number(estimate.lower)} to {number(estimate.upper, 2, unit)}, n = {estimate.n}"
-    value = number(estimate.value, 2, unit)
+        bounds = f"{number(estimate.lower)} to {number(estimate.upper, 2, 'm')}, n = {estimate.n}"
+    value = number(estimate.value, 2, "m")
     return f"{value} ({100 * estimate.confidence:.0f} % interval: {bounds})"
 
 

@@ -12,6 +12,8 @@ from services.quality.accuracy import Statistics
 from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
 from services.reports.report import Check, RegistrationReport
 
+_WIDTH = 100
+
 
 def report_tables(report: RegistrationReport) -> RenderableType:
     """All tables of a report, to print on a rich console."""
@@ -27,10 +29,10 @@ def report_tables(report: RegistrationReport) -> RenderableType:
     return Group(*tables)
 
 
-def format_tables(report: RegistrationReport, width: int = 100) -> str:
+def format_tables(report: RegistrationReport) -> str:
     """All tables of a report as plain text."""
     text = io.StringIO()
-    Console(file=text, width=width, no_color=True, force_terminal=False).print(report_tables(report))
+    Console(file=text, width=_WIDTH, no_color=True, force_terminal=False).print(report_tables(report))
     return text.getvalue()
 
 

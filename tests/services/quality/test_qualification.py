@@ -133,7 +133,7 @@ def test_the_predicted_accuracy_is_honest_about_the_true_correction(registered):
     inside = []
     for seed in range(60):
         scene = registered(n=40, seed=seed, wrong=0)
-        predicted = predict_accuracy(scene.adjustment, scene.shape, scene.gsd_m, 7)
+        predicted = predict_accuracy(scene.adjustment, scene.shape, scene.gsd_m, 7, float("nan"))
         corner = np.array([[0.0, scene.shape[1] - 1.0]])
         error = scene.adjustment.correction.apply(corner) - scene.truth.apply(corner)
         inside.append(np.hypot(*error[0]) <= predicted.ce90_px[0, -1])
@@ -155,7 +155,9 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     scene = registered()
     covariance = np.diag([0.01, 0.03, 0.0, 0.01, 0.0, 0.0])
-    result = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3)
+    result = predict_accuracy(
+        replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3, float("nan")
+    )
     assert result.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
     assert result.std_line_px[1, 0] == pytest.approx(0.1)
     assert result.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
