@@ -11,11 +11,11 @@ from pyproj import CRS
 from services.errors import FormatError, InputError, VerticalDatumError
 from services.formats.gcp.marked_points import (
     MarkedPoints,
-    load_json,
     marked_points,
     parse_crs,
     to_wgs84,
 )
+from services.formats.text_files import load_json
 from services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"

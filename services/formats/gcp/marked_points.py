@@ -15,7 +15,6 @@ Only the readers and writers of these formats convert: everywhere else the centr
 (0, 0) and heights are above the WGS 84 ellipsoid.
 """
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -164,15 +163,3 @@ def _with_heights(crs: CRS, heights: str | None, source: str) -> CRS:
             f"{source}: heights: {heights} given, {ELLIPSOID!r} or a vertical reference system expected"
         )
     return CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical])
-
-
-def load_json(text: str, source: str) -> Any:
-    """The value of a JSON document.
-
-    Raises:
-        FormatError: the text is not JSON.
-    """
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{source}: expected a JSON document: {error}") from None

@@ -9,7 +9,7 @@ from services.formats.gcp.marked_points import MarkedPoints
 from services.formats.gcp.odm import parse_gcp_list
 from services.formats.gcp.pci import is_pci_text, parse_pci_text
 from services.formats.gcp.text_formats import parse_asp_gcp, parse_envi_pts, parse_qgis_points
-from services.formats.sensor_models.rpc_files import read_text
+from services.formats.text_files import read_text
 
 Parser = Callable[[str, str | None, str], MarkedPoints]
 """Called with the text, the datum of its heights where the format cannot state it, and the file name."""

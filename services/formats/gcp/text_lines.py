@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from services.formats.sensor_models.rpc_text import parse_number
+from services.formats.text_files import parse_number
 from services.types import Array
 
 

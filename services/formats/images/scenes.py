@@ -12,8 +12,9 @@ from services.formats.images.bands import BandMix
 from services.formats.images.masks import apply_mask
 from services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from services.formats.sensor_models.dimap import parse_dimap_acquisition, parse_imaging_time
-from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image, read_text
+from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
 from services.formats.sensor_models.rpc_text import rpb_satellite
+from services.formats.text_files import read_text
 from services.imagery.scene import Scene, view_direction
 from services.imagery.source import ImageSource
 from services.sensors.ortho import OrthoModel

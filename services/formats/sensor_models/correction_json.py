@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.gcp.marked_points import load_json
+from services.formats.text_files import load_json
 from services.sensors.correction import ImageCorrection
 from services.types import Array
 

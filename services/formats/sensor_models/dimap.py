@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.sensor_models.rpc_text import parse_number, rpc_from_numbers
+from services.formats.sensor_models.rpc_text import rpc_from_numbers
+from services.formats.text_files import parse_number
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_to_ground
 from services.types import Acquisition, Array

@@ -13,12 +13,12 @@ from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_r
 from services.formats.sensor_models.rpc_text import (
     format_rpb,
     format_rpc_text,
-    parse_number,
     parse_rpb,
     parse_rpc_text,
     rpb_satellite,
     rpc_from_numbers,
 )
+from services.formats.text_files import parse_number, read_text
 from services.sensors.rpc import RpcModel, check_rpc
 
 _RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
@@ -26,7 +26,6 @@ _RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 1
 
 Convention = Literal["tags", "text", "rpb", "dimap"]
 
-_MAX_TEXT_BYTES = 20_000_000
 _CROP_EVIDENCE = 2.0
 """How many times nearer to the first pixel the range of a model must start for an unambiguous choice."""
 
@@ -275,26 +274,6 @@ def _check_coverage(model: RpcModel, image: RasterImage, path: Path) -> None:
             f"{path.name}: the RPC does not cover the image {image.path.name}: {outside} of its 4 "
             "corners are outside the ground range of the RPC"
         )
-
-
-def read_text(path: Path) -> str:
-    """The content of a small text file in UTF-8, or else in Latin-1.
-
-    Raises:
-        FormatError: the file cannot be read, or is larger than 20 MB.
-    """
-    try:
-        if not path.is_file() or path.stat().st_size > _MAX_TEXT_BYTES:
-            raise FormatError(
-                f"{path}: expected an existing text file of at most {_MAX_TEXT_BYTES} bytes"
-            )
-        data = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
 
 
 def _encoding(text: str) -> str:

@@ -11,15 +11,15 @@ from collections.abc import Callable
 import numpy as np
 
 from services.errors import FormatError
+from services.formats.text_files import NUMBER_PATTERN, parse_number
 from services.sensors.rpc import RpcModel
 from services.types import Array
 
 Numbers = Callable[[str], float]
 """Returns the number of a key in the names of GDAL, such as `LINE_OFF` or `SAMP_DEN_COEFF_20`."""
 
-_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-_TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({_NUMBER})(?:\s+[A-Za-z]+)?\s*")
-_RPB_NUMBER = re.compile(rf"\s*(\w+)\s*=\s*({_NUMBER})\s*;?\s*")
+_TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({NUMBER_PATTERN})(?:\s+[A-Za-z]+)?\s*")
+_RPB_NUMBER = re.compile(rf"\s*(\w+)\s*=\s*({NUMBER_PATTERN})\s*;?\s*")
 _RPB_LIST = re.compile(r"\b(\w+)\s*=\s*\(([^()]*)\)")
 
 _POLYNOMIALS = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")
@@ -155,17 +155,6 @@ def rpc_from_numbers(number: Numbers, first_pixel: tuple[float, float] = (0.0, 0
         error_bias_m=_known_error(number("ERR_BIAS")),
         error_random_m=_known_error(number("ERR_RAND")),
     )
-
-
-def parse_number(text: str, key: str, source: str) -> float:
-    """The decimal number of a text.
-
-    Raises:
-        FormatError: the text is not a decimal number; "nan" and "inf" are not.
-    """
-    if re.fullmatch(_NUMBER, text.strip()) is None:
-        raise FormatError(f"{source}: {key}: expected a number, found {text.strip()[:60]!r}")
-    return float(text)
 
 
 def _known_error(value: float) -> float:

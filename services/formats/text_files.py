@@ -1,0 +1,56 @@
+"""Contents of small text files: text, decimal numbers, JSON."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from services.errors import FormatError
+
+NUMBER_PATTERN = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+"""Pattern of a decimal number; "nan" and "inf" do not match."""
+
+_MAX_TEXT_BYTES = 20_000_000
+
+
+def read_text(path: Path) -> str:
+    """The content of a small text file in UTF-8, or else in Latin-1.
+
+    Raises:
+        FormatError: the file cannot be read, or is larger than 20 MB.
+    """
+    try:
+        if not path.is_file() or path.stat().st_size > _MAX_TEXT_BYTES:
+            raise FormatError(
+                f"{path}: expected an existing text file of at most {_MAX_TEXT_BYTES} bytes"
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def parse_number(text: str, key: str, source: str) -> float:
+    """The decimal number of a text.
+
+    Raises:
+        FormatError: the text is not a decimal number; "nan" and "inf" are not.
+    """
+    if re.fullmatch(NUMBER_PATTERN, text.strip()) is None:
+        raise FormatError(f"{source}: {key}: expected a number, found {text.strip()[:60]!r}")
+    return float(text)
+
+
+def load_json(text: str, source: str) -> Any:
+    """The value of a JSON document.
+
+    Raises:
+        FormatError: the text is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{source}: expected a JSON document: {error}") from None
