@@ -144,13 +144,13 @@ def find_tie_points(python: str, folder: Path, size: int) -> TiePoints:
     grid_px = int(size / np.sqrt(ReferenceOptions().places))
     script = Path(__file__).with_name("_arosics_run.py")
     names = [str(folder / f"ortho_{number}.tif") for number in range(2)]
-    done = subprocess.run(
+    result = subprocess.run(
         [python, str(script), *names, str(grid_px), str(LARGEST_SHIFT_PX)],
         check=True,
         capture_output=True,
         text=True,
         cwd=folder,
     )
-    told = json.loads(done.stdout.strip().splitlines()[-1])
-    shift_m = np.column_stack([told.pop("east_m"), told.pop("north_m")])
-    return TiePoints(again_s=float("nan"), accepted=len(shift_m), errors=errors_of(shift_m), **told)
+    output = json.loads(result.stdout.strip().splitlines()[-1])
+    shift_m = np.column_stack([output.pop("east_m"), output.pop("north_m")])
+    return TiePoints(again_s=float("nan"), accepted=len(shift_m), errors=errors_of(shift_m), **output)

@@ -183,8 +183,8 @@ def latencies(servers: Sequence[Server], ground: Ground, repeats: int) -> list[T
     found = []
     for what, ask in kinds(ground).items():
         turns = max(5, repeats // 6) if "page" in what else repeats
-        asked = [server for server in servers if ask(server, np.random.default_rng(0))]
-        found += in_turn(what, {server.name: (server, ask) for server in asked}, turns)
+        answering = [server for server in servers if ask(server, np.random.default_rng(0))]
+        found += in_turn(what, {server.name: (server, ask) for server in answering}, turns)
     return found
 
 
@@ -285,9 +285,9 @@ def chips(store: Store, repeats: int) -> Times:
     open_one, taken, size = store.server.connect(), [], 0
     for turn in range(repeats + WARM_UP):
         chosen = np.random.default_rng(turn).choice(ids, CHIP_POINTS, replace=False)
-        asked = json.dumps({"ids": chosen.tolist()}).encode()
+        body = json.dumps({"ids": chosen.tolist()}).encode()
         start = time.perf_counter()
-        size = len(get(open_one, "/collections/points/chips", asked))
+        size = len(get(open_one, "/collections/points/chips", body))
         if turn >= WARM_UP:
             taken.append(time.perf_counter() - start)
     what = f"chips of {CHIP_POINTS} points, {CHIP_POINTS * CHIP_VIEWS:,} views"

@@ -196,9 +196,9 @@ def looked_over(dsn: str, siege: Siege, caller: Caller) -> dict[str, Any]:
 
 def wrong_jobs(connection: Connection, jobs: list[dict[str, Any]], caller: Caller) -> list[str]:
     """Promised jobs that are gone, ended never or twice, and results that are not whole."""
-    known = {str(job["id"]): job for job in jobs}
-    wrong = [f"job {job} is gone" for job in caller.jobs if job not in known]
-    for name, job in known.items():
+    jobs_by_id = {str(job["id"]): job for job in jobs}
+    wrong = [f"job {job} is gone" for job in caller.jobs if job not in jobs_by_id]
+    for name, job in jobs_by_id.items():
         ends = run_sql(
             connection,
             "select count(*) as n from audit where kind = 'job' and subject = %s"
@@ -256,14 +256,14 @@ def wrong_blocks(connection: Connection, jobs: list[dict[str, Any]]) -> list[str
         "images": IMAGES,
         "files": 1,
     }
-    found = {row.pop("id"): row for row in rows}
-    wrong = [f"block {name} is not whole: {row}" for name, row in found.items() if row != whole]
+    rows_by_id = {row.pop("id"): row for row in rows}
+    wrong = [f"block {name} is not whole: {row}" for name, row in rows_by_id.items() if row != whole]
     for name, there in ingested.items():
-        if there != (name in found):
+        if there != (name in rows_by_id):
             wrong.append(
-                f"block {name}: the job ended {'well' if there else 'badly'}, rows: {name in found}"
+                f"block {name}: the job ended {'well' if there else 'badly'}, rows: {name in rows_by_id}"
             )
-    return [*wrong, *(f"block {name} has no job" for name in found.keys() - ingested.keys())]
+    return [*wrong, *(f"block {name} has no job" for name in rows_by_id.keys() - ingested.keys())]
 
 
 def wrong_files(connection: Connection, storage: Storage) -> list[str]:

@@ -68,15 +68,15 @@ def main() -> None:
                 sizes = (1_000, 2_000)
                 outcomes = [measure(connection, ground, size, arguments.repeats) for size in sizes]
     show(outcomes, arguments.points)
-    found = [asdict(outcome) for outcome in outcomes]
-    keep("footprint", {"points": arguments.points, "outcomes": found})
+    records = [asdict(outcome) for outcome in outcomes]
+    keep("footprint", {"points": arguments.points, "outcomes": records})
 
 
 def measure(connection: Connection, ground: Ground, size: int, repeats: int) -> Outcome:
     """Time both ways in turn on the same boxes, the first of each not counted."""
     rng = np.random.default_rng(size)
     times: dict[str, list[float]] = {"sql": [], "python": []}
-    found = []
+    counts = []
     for turn in range(repeats + 5):
         box = Box(*ground.box(rng, size))
         in_sql, sql_s = timed(lambda box=box: in_database(connection, box))
@@ -86,9 +86,9 @@ def measure(connection: Connection, ground: Ground, size: int, repeats: int) -> 
         if turn >= 5:
             times["sql"].append(sql_s)
             times["python"].append(python_s)
-            found.append(json.loads(in_sql)["numberReturned"])
+            counts.append(json.loads(in_sql)["numberReturned"])
     sql_ms, python_ms = (1000.0 * median(times[way]) for way in ("sql", "python"))
-    return Outcome(size, median(found), sql_ms, python_ms, python_ms / sql_ms)
+    return Outcome(size, median(counts), sql_ms, python_ms, python_ms / sql_ms)
 
 
 def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
@@ -101,10 +101,10 @@ def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
 def in_database(connection: Connection, box: Box) -> bytes:
     """The way of the service."""
     bbox = f"{box.west!r},{box.south!r},{box.east!r},{box.north!r}"
-    asked = resolve(find_collection("points"), Viewer(), FeatureQuery(limit=10_000, bbox=bbox), SECRET)
-    found = page(connection, asked, "geojson", SECRET)
-    rest = f'"numberReturned":{found.returned},"numberMatched":{found.matched.number}'
-    return b'{"type":"FeatureCollection","features":[' + found.body + f"],{rest}}}".encode()
+    query = resolve(find_collection("points"), Viewer(), FeatureQuery(limit=10_000, bbox=bbox), SECRET)
+    feature_page = page(connection, query, "geojson", SECRET)
+    rest = f'"numberReturned":{feature_page.returned},"numberMatched":{feature_page.matched.number}'
+    return b'{"type":"FeatureCollection","features":[' + feature_page.body + f"],{rest}}}".encode()
 
 
 def in_rows(connection: Connection, box: Box) -> bytes:

@@ -256,8 +256,8 @@ class _Jobs:
                 )
                 self._end(client, self._block(client, name, True), "ingestion", ended)
                 body = {"inputs": {"scene": scene}}
-                asked = client.post("/processes/register-scene/execution", json=body)
-                self._end(client, asked, "registration", ended)
+                reply = client.post("/processes/register-scene/execution", json=body)
+                self._end(client, reply, "registration", ended)
         return dict(ended)
 
     def _block(self, client: httpx.Client, path: str, publish: bool) -> httpx.Response:

@@ -74,14 +74,14 @@ class Service:
 
 
 def users_of(file: Path) -> list[int]:
-    found = set()
+    pids = set()
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         try:
             if link.samefile(file):
-                found.add(int(link.parts[2]))
+                pids.add(int(link.parts[2]))
         except OSError:
             continue
-    return sorted(found)
+    return sorted(pids)
 
 
 def until(condition) -> bool:

@@ -121,8 +121,8 @@ def _write_block(
         return np.rint(np.stack(cut)).astype(np.uint16)
 
     low, high = points.lon_lat_h[:, :2].min(axis=0) - 1e-4, points.lon_lat_h[:, :2].max(axis=0) + 1e-4
-    said = metadata("flat", "1", (low[0], low[1], high[0], high[1]), GSDS_M)
-    write_block(folder, said, points, chips, {})
+    block_metadata = metadata("flat", "1", (low[0], low[1], high[0], high[1]), GSDS_M)
+    write_block(folder, block_metadata, points, chips, {})
 
 
 def _control_points(lon_lat_h: Array, count: int) -> ControlPoints:

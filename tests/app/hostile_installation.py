@@ -78,14 +78,14 @@ class Installation:
                     if name not in without
                 ),
             ).fetchall()
-        found = {row["name"]: str(row["sum"]) for row in sums}
+        digests = {row["name"]: str(row["sum"]) for row in sums}
         folder = self.settings.data_folder / "storage"
         for path in sorted(folder.rglob("*")):
             key = path.relative_to(folder)
             if path.is_file() and key.parts[0] not in without:
-                found[str(key)] = hashlib.sha256(path.read_bytes()).hexdigest()
-        self.looked.append(found)
-        return found
+                digests[str(key)] = hashlib.sha256(path.read_bytes()).hexdigest()
+        self.looked.append(digests)
+        return digests
 
     def known_digest(self) -> dict[str, str]:
         """The digest of the last check; computed anew after a failed test."""
@@ -106,8 +106,8 @@ class Installation:
             job = attempts.claim(connection, job_id, "a worker", 60.0)
         assert job is not None
         do_attempt(self.database, self.settings, job_id, job.attempt)
-        told = self.client.get(f"/jobs/{job_id}", headers=self.headers["admin"])
-        document: dict[str, Any] = told.json()
+        job_reply = self.client.get(f"/jobs/{job_id}", headers=self.headers["admin"])
+        document: dict[str, Any] = job_reply.json()
         return document
 
 
@@ -164,29 +164,33 @@ def _bearer(secret: str) -> dict[str, str]:
 def _names(client: TestClient, headers: dict[str, dict[str, str]], world: FlatWorld) -> dict[str, str]:
     image = world.tagged.read_bytes()
     post: Callable[..., httpx.Response] = client.post
-    found = {
+    names = {
         f"{whose}_scene": post(
             f"/scenes?name=a.tif&sigma_m={SIGMA_M}", content=image, headers=me
         ).json()["id"]
         for whose, me in (("own", headers["register"]), ("others", headers["other"]))
     }
-    said = {"Tus-Resumable": "1.0.0", "Upload-Length": "100", "Upload-Metadata": "filename YS50aWY="}
+    tus_headers = {
+        "Tus-Resumable": "1.0.0",
+        "Upload-Length": "100",
+        "Upload-Metadata": "filename YS50aWY=",
+    }
     for whose, role in (("own", "register"), ("others", "other")):
-        begun = post("/uploads", headers=headers[role] | said)
-        found[f"{whose}_upload"] = begun.headers["location"].rsplit("/", 1)[1]
-    body = {"inputs": {"scene": found["others_scene"]}}
+        begun = post("/uploads", headers=headers[role] | tus_headers)
+        names[f"{whose}_upload"] = begun.headers["location"].rsplit("/", 1)[1]
+    body = {"inputs": {"scene": names["others_scene"]}}
     job = post("/processes/register-scene/execution", json=body, headers=headers["other"])
-    found["others_job"] = job.json()["jobID"]
+    names["others_job"] = job.json()["jobID"]
     items = client.get("/collections/points/items?limit=1", headers=headers["read"]).json()
-    found["point"] = str(items["features"][0]["id"])
+    names["point"] = str(items["features"][0]["id"])
     secret = headers["read"]["Authorization"].split()[1]
-    found["secret"] = secret
-    found["secret_cut"] = secret[:-1]
-    found["secret_but_one"] = secret[:-1] + ("A" if secret[-1] != "A" else "B")
+    names["secret"] = secret
+    names["secret_cut"] = secret[:-1]
+    names["secret_but_one"] = secret[:-1] + ("A" if secret[-1] != "A" else "B")
     blocks = client.get("/collections/blocks/items", headers=headers["admin"]).json()["features"]
     staged = next(one for one in blocks if one["properties"]["state"] == "staged")
-    found["staged"] = str(staged["properties"].get("number", staged["id"]))
-    return found
+    names["staged"] = str(staged["properties"].get("number", staged["id"]))
+    return names
 
 
 def told(reply: httpx.Response) -> str:

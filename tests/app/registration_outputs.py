@@ -22,14 +22,14 @@ CHECK_POINTS = 36
 COMMON_FILES = set(OUTPUTS)
 
 
-def largest_error_px(found: RpcModel, truth: SensorModel) -> float:
+def largest_error_px(model: RpcModel, truth: SensorModel) -> float:
     """Largest distance in the image between two models, over the ground of the scene."""
     step = np.linspace(-0.003, 0.003, 5)
     lon, lat, h = np.meshgrid(
         step + CENTRE[0], step + CENTRE[1], GROUND_H + np.array([-50.0, 0.0, 50.0])
     )
     ground = np.column_stack([lon.ravel(), lat.ravel(), h.ravel()])
-    return float(np.linalg.norm(found.project(ground) - truth.project(ground), axis=1).max())
+    return float(np.linalg.norm(model.project(ground) - truth.project(ground), axis=1).max())
 
 
 def assert_registered(folder: Path, world: FlatWorld) -> None:

@@ -207,8 +207,8 @@ def test_a_geometry_in_metres_goes_on_beyond_the_edge_of_the_map(
         "filter-crs": EPSG_3857.uri,
         "limit": 1000,
     }
-    found = client.post("/collections/points/search", json=question, headers=bearer("read")).json()
-    assert found["numberReturned"] == len(check_block(made.block).points)
+    page = client.post("/collections/points/search", json=question, headers=bearer("read")).json()
+    assert page["numberReturned"] == len(check_block(made.block).points)
 
 
 @pytest.mark.parametrize(
@@ -241,8 +241,8 @@ def test_a_scene_across_is_a_stac_item_whose_box_begins_in_the_east(
     item = client.get(f"/collections/scenes/items/{sent['id']}", headers=headers).json()
     assert item["geometry"]["type"] == "MultiPolygon"
     assert item["bbox"] == [179.5, -17.0, -179.5, -16.0]
-    found = client.get("/search?bbox=-180,-17,-179.9,-16", headers=headers).json()
-    assert [one["id"] for one in found["features"]] == [sent["id"]]
+    document = client.get("/search?bbox=-180,-17,-179.9,-16", headers=headers).json()
+    assert [one["id"] for one in document["features"]] == [sent["id"]]
 
 
 @pytest.mark.parametrize(

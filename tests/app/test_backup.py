@@ -69,15 +69,15 @@ def features(tile: bytes, folder: Path) -> list[tuple[object, ...]]:
 
 
 def amers(service: Service, *words: str | Path) -> dict[str, object]:
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-m", "app.cli.main", *map(str, words), "--json"],
         env=service.environment,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    answer: dict[str, object] = json.loads(done.stdout)
+    assert result.returncode == 0, result.stderr
+    answer: dict[str, object] = json.loads(result.stdout)
     return answer
 
 

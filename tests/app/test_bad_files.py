@@ -68,10 +68,13 @@ def keeps_secrets(store: Installation, text: str) -> None:
 
 def sent(store: Installation, content: bytes, who: str, **metadata: str) -> httpx.Response:
     """The reply to the only piece of a tus upload."""
-    said = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in metadata.items())
+    metadata_header = ",".join(
+        f"{key} {b64encode(value.encode()).decode()}" for key, value in metadata.items()
+    )
     headers = store.headers[who] | TUS
     begun = store.client.post(
-        "/uploads", headers=headers | {"Upload-Length": str(len(content)), "Upload-Metadata": said}
+        "/uploads",
+        headers=headers | {"Upload-Length": str(len(content)), "Upload-Metadata": metadata_header},
     )
     assert begun.status_code == 201, begun.text
     headers |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
@@ -95,11 +98,11 @@ def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(
         beside = store.client.put(f"/scenes/{scene}/files/{name}", content=content, headers=me)
         assert beside.status_code == 200, beside.text
     inputs = {"scene": scene} | ({"model": store.filled(case.model)} if case.model else {})
-    asked = store.client.post("/processes/register-scene/execution", json={"inputs": inputs}, headers=me)
-    if asked.status_code == 201:
-        failed(store, store.outcome(asked), case.says)
+    reply = store.client.post("/processes/register-scene/execution", json={"inputs": inputs}, headers=me)
+    if reply.status_code == 201:
+        failed(store, store.outcome(reply), case.says)
     else:
-        refused(store, asked, case.says)
+        refused(store, reply, case.says)
     assert store.digest(LEFT_BY_JOBS) == before
 
 
@@ -319,9 +322,9 @@ def test_a_bad_block_is_refused_by_its_job_with_the_reason(
     uploaded = sent(store, folder_archive(block, spoil), "admin", filename="b.zip", purpose="block")
     assert uploaded.status_code == 204, uploaded.text
     body = {"upload": uploaded.headers["amers-upload"], "publish": True}
-    asked = store.client.post("/blocks", json=body, headers=store.headers["admin"])
-    assert asked.status_code == 201, asked.text
-    failed(store, store.outcome(asked), says)
+    reply = store.client.post("/blocks", json=body, headers=store.headers["admin"])
+    assert reply.status_code == 201, reply.text
+    failed(store, store.outcome(reply), says)
     assert store.digest(LEFT_BY_JOBS) == before
 
 
@@ -330,20 +333,20 @@ def test_a_bad_block_is_refused_by_its_job_with_the_reason(
 )
 def test_a_folder_that_is_not_to_be_ingested_is_refused(store: Installation, path: str):
     before = store.digest(LEFT_BY_JOBS)
-    asked = store.client.post("/blocks", json={"path": path}, headers=store.headers["admin"])
-    if asked.status_code == 201:
-        failed(store, store.outcome(asked), "")
+    reply = store.client.post("/blocks", json={"path": path}, headers=store.headers["admin"])
+    if reply.status_code == 201:
+        failed(store, store.outcome(reply), "")
     else:
-        refused(store, asked, "")
+        refused(store, reply, "")
     assert store.digest(LEFT_BY_JOBS) == before
 
 
 def test_the_pattern_of_the_bad_blocks_is_good(store: Installation, block):
     uploaded = sent(store, folder_archive(block, signed), "admin", filename="b.zip", purpose="block")
-    asked = store.client.post(
+    reply = store.client.post(
         "/blocks", json={"upload": uploaded.headers["amers-upload"]}, headers=store.headers["admin"]
     )
-    assert store.outcome(asked)["status"] == "successful"
+    assert store.outcome(reply)["status"] == "successful"
 
 
 def test_no_two_bad_files_have_one_name():

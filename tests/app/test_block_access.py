@@ -23,10 +23,10 @@ from tests.factories import BOX, make_block
 
 def ingested_by_job(client, settings, admin, body: dict) -> dict:
     """The outcome of an ingestion requested over HTTP and done by the code of the worker process."""
-    asked = client.post("/blocks", json=body, headers=admin)
-    assert asked.status_code == 201, asked.text
-    job_id = UUID(asked.json()["jobID"])
-    assert asked.headers["Location"].endswith(f"/jobs/{job_id}")
+    reply = client.post("/blocks", json=body, headers=admin)
+    assert reply.status_code == 201, reply.text
+    job_id = UUID(reply.json()["jobID"])
+    assert reply.headers["Location"].endswith(f"/jobs/{job_id}")
     ingesting = settings.model_copy(update={"ingest_folder": client.app.state.settings.ingest_folder})
     with engine.opened(ingesting) as database:
         with database.transaction() as connection:
@@ -82,18 +82,18 @@ def hostile_zip(path: Path, name: str) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected_message"),
     [("../../etc/x", "etc/x"), ("/etc/x", "etc/x"), ("elsewhere/x", "outside the folder")],
 )
 def test_an_archive_that_reaches_out_of_its_folder_is_refused(
-    client, settings, bearer, tmp_path, name, said
+    client, settings, bearer, tmp_path, name, expected_message
 ):
     admin = bearer("admin")
     content = hostile_zip(tmp_path / "bad.zip", name)
     upload = client.put("/blocks/uploads/bad.zip", content=content, headers=admin).json()
     job = ingested_by_job(client, settings, admin, upload)
     assert job["status"] == "failed"
-    assert said in job["message"]
+    assert expected_message in job["message"]
 
 
 @pytest.mark.parametrize("body", [{}, {"path": "a", "upload": str(UUID(int=1))}, {"folder": "a"}])
@@ -102,8 +102,8 @@ def test_an_ingestion_names_either_a_folder_or_an_upload(client, bearer, body):
 
 
 def test_an_upload_that_is_not_there_is_not_ingested(client, bearer):
-    asked = client.post("/blocks", json={"upload": str(UUID(int=1))}, headers=bearer("admin"))
-    assert asked.status_code == 404
+    reply = client.post("/blocks", json={"upload": str(UUID(int=1))}, headers=bearer("admin"))
+    assert reply.status_code == 404
 
 
 def test_an_administrator_runs_the_whole_life_over_http(settings, bearer, tmp_path):

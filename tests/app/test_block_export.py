@@ -151,11 +151,11 @@ def test_a_block_is_exported_by_a_job_as_an_archive(
     lifecycle.publish_block(connection, "calanques")
     connection.commit()
     reader = bearer("read")
-    asked = client.post(
+    response = client.post(
         "/processes/export-block/execution", json={"inputs": {"bbox": list(BOX)}}, headers=reader
     )
-    assert asked.status_code == 201, asked.text
-    job_id = UUID(asked.json()["jobID"])
+    assert response.status_code == 201, response.text
+    job_id = UUID(response.json()["jobID"])
     with engine.opened(settings) as database:
         with database.transaction() as own:
             job = attempts.claim(own, job_id, "a worker", 30.0)

@@ -52,11 +52,11 @@ def test_a_scene_is_registered_with_all_files_in_a_bucket(
     )
     scene = upload.json()["id"]
     client.put(f"/scenes/{scene}/files/scene_RPC.TXT", content=world.rpc_text.read_bytes(), headers=me)
-    asked = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me)
+    reply = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me)
     with running_worker(settings, tmp_path / "log"):
-        done = ended(client, asked.headers["location"], me)
-    assert done["status"] == "successful", done
-    results = client.get(f"{asked.headers['location']}/results", headers=me).json()
+        ended_job = ended(client, reply.headers["location"], me)
+    assert ended_job["status"] == "successful", ended_job
+    results = client.get(f"{reply.headers['location']}/results", headers=me).json()
     refined = client.get(results["refined_RPC.TXT"]["href"], headers=me)
     assert refined.headers["content-length"] == str(len(refined.content))
     (tmp_path / "refined_RPC.TXT").write_bytes(refined.content)
@@ -65,7 +65,7 @@ def test_a_scene_is_registered_with_all_files_in_a_bucket(
     item = client.get(f"/collections/scenes/items/{scene}", headers=me).json()
     assert client.get(item["assets"]["image"]["href"], headers=me).content == world.image.read_bytes()
     assert not [path for path in settings.data_folder.rglob("*") if path.is_file()], "all in the bucket"
-    assert len(storage.keys(f"results/{done['jobID']}")) == len(
+    assert len(storage.keys(f"results/{ended_job['jobID']}")) == len(
         [value for value in results.values() if isinstance(value, dict)]
     )
     assert client.delete(f"/scenes/{scene}", headers=me).status_code == 204

@@ -42,27 +42,29 @@ def arrays(reply):
 
 def test_chips_of_many_points_are_those_of_each_with_all_that_is_known_of_them(made, get):
     ids = [FIRST + 31, FIRST + 2, FIRST + 3]
-    found = arrays(get(CHIPS, ids=",".join(map(str, ids))))
-    assert_array_equal(found["point_id"], np.repeat(sorted(ids), 6))
-    assert_array_equal(found["view"], np.tile(np.arange(6), 3))
-    assert found["chips"].dtype == np.uint16
+    chip_arrays = arrays(get(CHIPS, ids=",".join(map(str, ids))))
+    assert_array_equal(chip_arrays["point_id"], np.repeat(sorted(ids), 6))
+    assert_array_equal(chip_arrays["view"], np.tile(np.arange(6), 3))
+    assert chip_arrays["chips"].dtype == np.uint16
     for point in sorted(ids):
         alone = arrays(get(f"/collections/points/items/{point}/chips"))
-        rows = found["point_id"] == point
+        rows = chip_arrays["point_id"] == point
         for name, expected in alone.items():
             if name == "lon_lat_h":
                 expected = np.tile(expected, (6, 1))
             if expected.dtype.kind == "f":
-                assert_allclose(found[name][rows], expected, rtol=in_single_precision, err_msg=name)
+                assert_allclose(
+                    chip_arrays[name][rows], expected, rtol=in_single_precision, err_msg=name
+                )
             else:
-                assert_array_equal(found[name][rows], expected, err_msg=name)
+                assert_array_equal(chip_arrays[name][rows], expected, err_msg=name)
 
 
 def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, bearer):
     lon, lat = made.points.lon_lat_h[:, 0], made.points.lon_lat_h[:, 1]
     in_box = (lon >= 5.22) & (lon <= 5.27) & (lat >= 43.21) & (lat <= 43.26)
-    found = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26"))
-    assert_array_equal(np.unique(found["point_id"]), FIRST + np.flatnonzero(in_box))
+    chips = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26"))
+    assert_array_equal(np.unique(chips["point_id"]), FIRST + np.flatnonzero(in_box))
     strong = arrays(get(CHIPS, bbox="5.22,43.21,5.27,43.26", filter="saliency > 0.5"))
     expected = in_box & (made.points.saliency > 0.5)
     assert_array_equal(np.unique(strong["point_id"]), FIRST + np.flatnonzero(expected))
@@ -74,9 +76,9 @@ def test_chips_of_a_footprint_are_those_of_the_points_in_it(made, get, client, b
 
 
 def test_chips_come_as_pages_of_a_geotiff_too(get, tmp_path):
-    asked = {"ids": f"{FIRST + 2},{FIRST + 3}"}
-    expected, path = arrays(get(CHIPS, **asked)), tmp_path / "chips.tif"
-    reply = get(CHIPS, f="tif", **asked)
+    parameters = {"ids": f"{FIRST + 2},{FIRST + 3}"}
+    expected, path = arrays(get(CHIPS, **parameters)), tmp_path / "chips.tif"
+    reply = get(CHIPS, f="tif", **parameters)
     assert reply.headers["content-type"] == "image/tiff; application=geotiff"
     path.write_bytes(reply.content)
     for page, chip in enumerate(expected["chips"], start=1):
@@ -85,9 +87,9 @@ def test_chips_come_as_pages_of_a_geotiff_too(get, tmp_path):
 
 
 def test_a_place_without_points_is_an_archive_without_chips(get):
-    found = arrays(get(CHIPS, bbox="0,0,1,1"))
-    assert found["chips"].shape == (0, 101, 101)
-    assert {len(column) for column in found.values()} == {0}
+    chip_arrays = arrays(get(CHIPS, bbox="0,0,1,1"))
+    assert chip_arrays["chips"].shape == (0, 101, 101)
+    assert {len(column) for column in chip_arrays.values()} == {0}
 
 
 def test_chips_of_8_and_16_bits_come_together_with_their_values(
@@ -99,11 +101,11 @@ def test_chips_of_8_and_16_bits_come_together_with_their_values(
     lifecycle.ingest_block(connection, storage, small.folder)
     lifecycle.publish_block(connection, "small")
     connection.commit()
-    found = arrays(get(CHIPS, ids=f"{FIRST},{2 * FIRST}"))
-    assert found["chips"].dtype == np.uint16
+    chip_arrays = arrays(get(CHIPS, ids=f"{FIRST},{2 * FIRST}"))
+    assert chip_arrays["chips"].dtype == np.uint16
     for point in (FIRST, 2 * FIRST):
         alone = arrays(get(f"/collections/points/items/{point}/chips"))
-        assert_array_equal(found["chips"][found["point_id"] == point], alone["chips"])
+        assert_array_equal(chip_arrays["chips"][chip_arrays["point_id"] == point], alone["chips"])
 
 
 def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monkeypatch):
@@ -140,11 +142,11 @@ def test_a_wrong_question_for_chips_is_refused(get, parameters, status, named):
 
 def test_more_points_than_are_sent_at_once_are_refused(get, monkeypatch):
     monkeypatch.setattr(points, "MOST_POINTS_WITH_CHIPS", 39)
-    for asked in (
+    for parameters in (
         {"bbox": "5,43,6,44"},
         {"ids": ",".join(str(FIRST + i) for i in range(40))},
     ):
-        reply = get(CHIPS, **asked)
+        reply = get(CHIPS, **parameters)
         assert reply.status_code == 400
         assert "39" in reply.json()["detail"]
 

@@ -61,8 +61,8 @@ def source(served, header_file) -> Iterator[str]:
 
 def fetched(capture) -> list[str]:
     """The item requests of GDAL since the last call."""
-    said = "".join(capture.readouterr())
-    return [line for line in said.splitlines() if "Fetch(" in line and "/items?" in line]
+    output = "".join(capture.readouterr())
+    return [line for line in output.splitlines() if "Fetch(" in line and "/items?" in line]
 
 
 def test_gdal_knows_layers_their_fields_number_and_reference_system_without_reading_them(source):
@@ -96,10 +96,10 @@ def test_gdal_leaves_a_box_and_a_filter_to_the_service(served, source, in_box, i
         np.sort(served.points.lon_lat_h[in_box_and_strong, 0]),
         atol=a_tenth_of_a_millimetre_deg,
     )
-    asked = fetched(capfd)[-1]
-    assert "bbox=5.2" in asked
+    request = fetched(capfd)[-1]
+    assert "bbox=5.2" in request
     for word in ("saliency", "n_views", "filter-lang=cql-text"):
-        assert word in asked
+        assert word in request
 
 
 @pytest.mark.parametrize(
@@ -137,15 +137,15 @@ def test_ogrinfo_and_ogr2ogr_of_the_machine_do_the_same(
     box, copied = [str(value) for value in BOX], tmp_path / "copied.gpkg"
 
     def run(*arguments: str) -> str:
-        done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
-        return done.stdout + done.stderr
+        result = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
+        return result.stdout + result.stderr
 
-    said = run("ogrinfo", "-so", f"OAPIF:{served.url}", "points")
-    assert "Feature Count: 60" in said
-    assert "Geometry: 3D Point" in said
+    output = run("ogrinfo", "-so", f"OAPIF:{served.url}", "points")
+    assert "Feature Count: 60" in output
+    assert "Geometry: 3D Point" in output
     layer = (f"OAPIF:{served.url}", "points")
-    said = run("ogr2ogr", "-spat", *box, "-where", WHERE, str(copied), *layer)
-    assert "filter=" in said
+    output = run("ogr2ogr", "-spat", *box, "-where", WHERE, str(copied), *layer)
+    assert "filter=" in output
     frame = geopandas.read_file(copied)
     assert len(frame) == in_box_and_strong.sum() > 0
     assert_allclose(

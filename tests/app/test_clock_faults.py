@@ -122,8 +122,8 @@ def test_a_worker_whose_clock_jumps_keeps_its_job(
                 lambda before=before: client.get(job, headers=me).json()["updated"] != before,
                 "the lease is renewed, or the job has ended",
             )
-        done = ended(client, job, me)
-    assert done["status"] == "successful", done
+        ended_job = ended(client, job, me)
+    assert ended_job["status"] == "successful", ended_job
     with engine.connect(dsn) as connection:
         row = run_sql(connection, "select attempt, failures from job").fetchone()
     assert row == {"attempt": 1, "failures": 0}

@@ -86,8 +86,8 @@ def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
     ]
     replies = anyio.run(answered, app, requests)
     assert len(replies) == many
-    told = {(reply.request.method, str(reply.url), reply.status_code) for reply in replies}
-    assert told == set(kinds)
+    statuses = {(reply.request.method, str(reply.url), reply.status_code) for reply in replies}
+    assert statuses == set(kinds)
     pages = [reply.json() for reply in replies if reply.url.path.endswith("/items")]
     assert {page["numberReturned"] for page in pages} == {POINTS}
 

@@ -127,9 +127,9 @@ def test_it_listens_on_no_tcp_port(own):
 
 def test_only_its_user_can_reach_the_socket(own):
     with own.lease():
-        found = own.sockets.stat()
-        assert found.st_mode & 0o077 == 0
-        assert found.st_uid == server_user(own.folder).uid != 0
+        socket_status = own.sockets.stat()
+        assert socket_status.st_mode & 0o077 == 0
+        assert socket_status.st_uid == server_user(own.folder).uid != 0
 
 
 def test_the_kill_of_one_user_leaves_the_other_undisturbed(own):

@@ -53,9 +53,9 @@ class Disk:
 
     def _mount(self, options: str, *more: str) -> None:
         command = ["mount", *more, "-o", options, "amers-test", str(self.folder)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode != 0:
+            pytest.skip(f"no file system can be mounted here: {result.stderr.strip()}")
 
 
 @pytest.fixture
@@ -130,8 +130,8 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
     storage = Storage(settings.data_folder / "storage")
 
     def ingested() -> dict[str, object]:
-        asked = client.post("/blocks", json={"path": "block"}, headers=admin)
-        return ended(client, asked.headers["location"], admin)
+        reply = client.post("/blocks", json={"path": "block"}, headers=admin)
+        return ended(client, reply.headers["location"], admin)
 
     with running_worker(settings, tmp_path / "log.txt") as worker:
         failed = ingested()

@@ -305,8 +305,8 @@ def test_a_point_that_fails_where_others_serve_is_proposed_and_served_until_some
     reader, admin = bearer("read"), bearer("admin")
 
     def proposed() -> list[int]:
-        asked = {"filter": "state = 'proposed'", "limit": 100}
-        page = client.get("/collections/point-history/items", params=asked, headers=reader).json()
+        parameters = {"filter": "state = 'proposed'", "limit": 100}
+        page = client.get("/collections/point-history/items", params=parameters, headers=reader).json()
         return [feature["id"] for feature in page["features"]]
 
     def served() -> set[int]:
@@ -327,8 +327,8 @@ def test_a_point_that_fails_where_others_serve_is_proposed_and_served_until_some
     assert client.post(f"/points/{bad}/suspend", json=because, headers=reader).status_code == 403
     assert client.post("/points/1/suspend", json=because, headers=admin).status_code == 404
     assert client.post(f"/points/{bad}/suspend", json={"because": " "}, headers=admin).status_code == 422
-    done = client.post(f"/points/{bad}/suspend", json=because, headers=admin)
-    assert (done.status_code, done.json()["state"]) == (200, "suspended")
+    reply = client.post(f"/points/{bad}/suspend", json=because, headers=admin)
+    assert (reply.status_code, reply.json()["state"]) == (200, "suspended")
     assert client.post(f"/points/{bad}/suspend", json=because, headers=admin).status_code == 409
     assert served() == set(range(first_id, first_id + 40)) - {bad}
     assert bad not in proposed()
@@ -356,8 +356,8 @@ def test_a_suspended_point_is_not_given_to_registrations(
     outline = np.array([[5.2, 43.2], [5.3, 43.2], [5.3, 43.3], [5.2, 43.3]])
     assert history.suspend(connection, first_id + 3, "moved")
     connection.commit()
-    found = points_of_store(database, storage)(outline).points.id
-    assert set(found.tolist()) == set(range(first_id, first_id + 40)) - {first_id + 3}
+    ids = points_of_store(database, storage)(outline).points.id
+    assert set(ids.tolist()) == set(range(first_id, first_id + 40)) - {first_id + 3}
 
 
 def test_suspensions_are_decided_on_the_command_line(
@@ -371,10 +371,10 @@ def test_suspensions_are_decided_on_the_command_line(
     monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
 
     def points(*words: object) -> list[dict]:
-        done = CliRunner().invoke(amers, ["points", *(str(word) for word in words), "--json"])
-        assert done.exit_code == 0, done.output
-        said: list[dict] = json.loads(done.stdout)
-        return said
+        result = CliRunner().invoke(amers, ["points", *(str(word) for word in words), "--json"])
+        assert result.exit_code == 0, result.output
+        printed: list[dict] = json.loads(result.stdout)
+        return printed
 
     for scene in range(10):
         remembered(connection, stored, str(scene))

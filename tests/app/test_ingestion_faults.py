@@ -172,15 +172,15 @@ def kill(cluster: Cluster) -> None:
 
 
 def children(parent: int) -> list[int]:
-    found = []
+    pids = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rsplit(")", 1)[1].split()
         except (OSError, IndexError):
             continue
         if int(fields[1]) == parent:
-            found.append(int(stat.parent.name))
-    return found
+            pids.append(int(stat.parent.name))
+    return pids
 
 
 def alive(process: int) -> bool:
@@ -195,10 +195,10 @@ def wait_until_rows_arrive(dsn: str, table: str) -> None:
     deadline = time.monotonic() + PATIENCE_S
     with psycopg.connect(dsn, autocommit=True) as watcher:
         while True:
-            found = watcher.execute(
+            progress = watcher.execute(
                 "select tuples_processed from pg_stat_progress_copy where relid = %s::regclass", [table]
             ).fetchone()
-            if found and found[0] > 0:
+            if progress and progress[0] > 0:
                 return
             assert time.monotonic() < deadline, f"no row of {table} arrived"
             time.sleep(0.01)

@@ -138,20 +138,20 @@ def test_entries_of_the_queue_that_died_with_their_worker_are_forgotten(database
 
 
 def test_the_sweep_removes_the_files_of_attempts_that_do_not_count(database: Database, storage: Storage):
-    done, running, dead = new_job(database), new_job(database), new_job(database)
-    for job in (done, running, dead):
+    finished, running, dead = new_job(database), new_job(database), new_job(database)
+    for job in (finished, running, dead):
         claimed(database, job.id)
         let_lease_lapse(database, job.id)
     sweep_jobs(database, LEASE_S)
-    for job in (done, running):
+    for job in (finished, running):
         claimed(database, job.id)
     with database.transaction() as connection:
-        attempts.succeed(connection, done.id, 2, {})
+        attempts.succeed(connection, finished.id, 2, {})
         jobs.dismiss(connection, dead.id)
-    for job in (done, running, dead):
+    for job in (finished, running, dead):
         for attempt in (1, 2):
             storage.put(f"results/{job.id}/{attempt}/report.json", [b"{}"])
     sweep_files(database, storage, LEASE_S)
     assert storage.keys("results") == sorted(
-        f"results/{job.id}/2/report.json" for job in (done, running)
+        f"results/{job.id}/2/report.json" for job in (finished, running)
     )

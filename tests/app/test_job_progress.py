@@ -64,8 +64,8 @@ def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
     attempts.try_again(connection, job.id, 1, 0.0)
     attempts.claim(connection, job.id, "w", LEASE_S)
     attempts.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
-    said = progress.read_messages(connection, job.id, 100)
-    assert [(entry.attempt, entry.progress, entry.message) for entry in said] == [
+    messages = progress.read_messages(connection, job.id, 100)
+    assert [(entry.attempt, entry.progress, entry.message) for entry in messages] == [
         (0, 0, "waiting for a worker"),
         (1, 0, "started"),
         (1, 10, "looking for points"),
@@ -73,8 +73,8 @@ def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
         (2, 0, "started"),
         (2, 0, "3 found"),
     ]
-    assert [entry.at for entry in said] == sorted(entry.at for entry in said)
-    assert progress.read_messages(connection, job.id, 2) == said[-2:]
+    assert [entry.at for entry in messages] == sorted(entry.at for entry in messages)
+    assert progress.read_messages(connection, job.id, 2) == messages[-2:]
 
 
 def test_the_expected_end_is_the_median_of_past_jobs_of_its_process(connection: Connection):
@@ -158,9 +158,9 @@ def test_results_go_after_a_while_and_the_job_says_so(
         sweep_files(database, storage, LONGEST_JOB_S)
     old, young = urls
     assert storage.keys("results") == [f"results/{young.rsplit('/', 1)[1]}/1/report.json"]
-    told = client.get(old, headers=me).json()
-    assert told["status"] == "successful"
-    assert not any(link["rel"].endswith("/results") for link in told["links"])
+    document = client.get(old, headers=me).json()
+    assert document["status"] == "successful"
+    assert not any(link["rel"].endswith("/results") for link in document["links"])
     gone = client.get(f"{old}/results", headers=me)
     assert gone.status_code == 410
     assert "removed on" in gone.json()["detail"]

@@ -55,8 +55,8 @@ def test_a_request_for_work_becomes_a_job_in_the_queue(
     job = reply.json()
     assert (job["status"], job["progress"], job["processID"]) == ("accepted", 0, "register-scene")
     assert reply.headers["location"] == job["links"][0]["href"]
-    told = client.get(reply.headers["location"], headers=me).json()
-    assert told == {**job, "amers:queuePosition": 1}
+    document = client.get(reply.headers["location"], headers=me).json()
+    assert document == {**job, "amers:queuePosition": 1}
     with engine.connect(dsn) as connection:
         assert queue_entries(connection, UUID(job["jobID"])) == 1
         stored = jobs.find(connection, UUID(job["jobID"]))
@@ -186,8 +186,12 @@ def test_a_failed_job_tells_why_with_its_numbers(
     }
     with database.transaction() as connection:
         attempts.fail(connection, UUID(job["jobID"]), attempt, error)
-    told = client.get(f"/jobs/{job['jobID']}", headers=me).json()
-    assert (told["status"], told["message"], told["error"]) == ("failed", error["detail"], error)
+    document = client.get(f"/jobs/{job['jobID']}", headers=me).json()
+    assert (document["status"], document["message"], document["error"]) == (
+        "failed",
+        error["detail"],
+        error,
+    )
     results = client.get(f"/jobs/{job['jobID']}/results", headers=me)
     assert (results.status_code, results.json()["found"]) == (409, 3)
     assert results.headers["content-type"] == "application/problem+json"
@@ -224,11 +228,12 @@ def test_a_waiting_job_says_its_place_in_the_queue_and_its_scene(
         client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()["jobID"]
         for _ in range(2)
     )
-    told = client.get(f"/jobs/{second}", headers=me).json()
-    assert told["amers:queuePosition"] == 2
-    assert told["inputs"]["scene"] == scene
+    document = client.get(f"/jobs/{second}", headers=me).json()
+    assert document["amers:queuePosition"] == 2
+    assert document["inputs"]["scene"] == scene
     assert any(
-        link["rel"] == "related" and link["href"].endswith(f"/scenes/{scene}") for link in told["links"]
+        link["rel"] == "related" and link["href"].endswith(f"/scenes/{scene}")
+        for link in document["links"]
     )
     claimed(database, UUID(first))
     assert client.get(f"/jobs/{second}", headers=me).json()["amers:queuePosition"] == 1

@@ -152,14 +152,14 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
         (process,) = children(worker.pid)
         lost.line("down")
         with running_worker(by(reached[1]), tmp_path / "other.log", *other.enter):
-            done = ended(client, job, me)
-        assert done["status"] == "successful", done
+            ended_job = ended(client, job, me)
+        assert ended_job["status"] == "successful", ended_job
         lost.line("up")
         wait_until(lambda: not alive(process), "the process of the lost attempt ends")
         again = ended(client, ask(1), me)
         assert again["status"] == "successful", "the worker that was cut off is back at work"
         assert worker.poll() is None
-    assert client.get(job, headers=me).json() == done, "what came late changed nothing"
+    assert client.get(job, headers=me).json() == ended_job, "what came late changed nothing"
     with engine.connect(dsn) as connection:
         rows = run_sql(
             connection,
@@ -167,4 +167,4 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
             " from job j order by created_at",
         ).fetchall()
     assert [(row["attempt"], row["results"]) for row in rows] == [(2, 1), (1, 1)]
-    assert {key.split("/")[2] for key in storage.keys(f"results/{done['jobID']}")} == {"2"}
+    assert {key.split("/")[2] for key in storage.keys(f"results/{ended_job['jobID']}")} == {"2"}

@@ -25,8 +25,8 @@ from tests.statements import run_sql
 
 def changes(connection, **chosen) -> list:
     """The recorded changes, the oldest first."""
-    found = {"before": None, "kind": None, "subject": None, **chosen}
-    return list_changes(connection, 1000, **found)[::-1]
+    filters = {"before": None, "kind": None, "subject": None, **chosen}
+    return list_changes(connection, 1000, **filters)[::-1]
 
 
 def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
@@ -35,13 +35,13 @@ def test_every_step_of_a_block_is_recorded_with_its_state_before_and_after(
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 5).folder)
     lifecycle.publish_block(connection, "calanques")
     lifecycle.withdraw_block(connection, "calanques")
-    found = changes(connection, kind="block", subject="calanques@1")
-    assert [change.action for change in found] == ["created", "changed", "changed"]
-    assert found[0].before is None
-    assert [(change.after or {})["state"] for change in found] == ["staged", "published", "withdrawn"]
-    assert found[2].before is not None
-    assert found[2].before["state"] == "published"
-    assert found[0].actor_name.endswith("on the command line")
+    recorded = changes(connection, kind="block", subject="calanques@1")
+    assert [change.action for change in recorded] == ["created", "changed", "changed"]
+    assert recorded[0].before is None
+    assert [(change.after or {})["state"] for change in recorded] == ["staged", "published", "withdrawn"]
+    assert recorded[2].before is not None
+    assert recorded[2].before["state"] == "published"
+    assert recorded[0].actor_name.endswith("on the command line")
 
 
 @pytest.mark.parametrize(
@@ -61,8 +61,8 @@ def test_a_change_over_the_api_names_caller_and_request(client, connection, bear
         headers={**admin, "X-Request-ID": "morning-1"},
     )
     assert made.headers["X-Request-ID"] == "morning-1"
-    found = changes(connection, kind="token", subject=made.json()["id"])
-    (change,) = found
+    recorded = changes(connection, kind="token", subject=made.json()["id"])
+    (change,) = recorded
     assert (change.actor_name, change.request_id) == ("a token to admin", "morning-1")
     assert "secret_hash" not in (change.after or {})
     listed = client.get("/audit", params={"kind": "token", "limit": 1}, headers=admin).json()
@@ -75,8 +75,12 @@ def test_the_progress_of_a_job_is_no_change_and_its_states_are(connection):
     attempt = attempts.claim(connection, job.id, "w", 30.0)
     attempts.report(connection, job.id, attempt.attempt, 10, "on the way")
     attempts.succeed(connection, job.id, attempt.attempt, {})
-    found = changes(connection, kind="job")
-    assert [(change.after or {})["state"] for change in found] == ["accepted", "running", "successful"]
+    recorded = changes(connection, kind="job")
+    assert [(change.after or {})["state"] for change in recorded] == [
+        "accepted",
+        "running",
+        "successful",
+    ]
 
 
 def test_work_of_a_job_is_recorded_with_the_owner_of_the_job(dsn, connection):
@@ -164,18 +168,18 @@ def test_metrics_tell_requests_jobs_points_and_disk(client, connection, storage,
     client.get("/healthz")
     client.get("/no/such/thing")
     client.request("ODD", "/healthz")
-    found = families(client.get("/metrics", headers=bearer("monitor")).text)
-    value = {name: family.samples[0].value for name, family in found.items() if family.samples}
+    metric_families = families(client.get("/metrics", headers=bearer("monitor")).text)
+    value = {name: family.samples[0].value for name, family in metric_families.items() if family.samples}
     assert value["amers_points_published"] == 7
     assert value["amers_queue_length"] == 1
     assert value["amers_oldest_waiting_job_seconds"] > 0
     assert 0 < value["amers_disk_free_bytes"] < value["amers_disk_total_bytes"]
     assert value["amers_database_bytes"] > 1_000_000
-    (waiting,) = found["amers_jobs"].samples
+    (waiting,) = metric_families["amers_jobs"].samples
     assert waiting.labels == {"kind": "register-scene", "state": "accepted"}
     counts = {
         (sample.labels["method"], sample.labels["route"], sample.labels["status"]): sample.value
-        for sample in found["amers_request_duration_seconds"].samples
+        for sample in metric_families["amers_request_duration_seconds"].samples
         if sample.name.endswith("_count")
     }
     assert counts["GET", "/healthz", "200"] == 1
@@ -206,14 +210,19 @@ def test_an_unexpected_error_names_its_request(client):
 
 
 def test_pages_of_other_sites_may_call_only_where_a_setting_names_them(settings):
-    asked = {"Origin": "https://map.example", "Access-Control-Request-Method": "GET"}
+    preflight_headers = {"Origin": "https://map.example", "Access-Control-Request-Method": "GET"}
     with TestClient(create_app(settings)) as closed:
-        assert "access-control-allow-origin" not in closed.options("/healthz", headers=asked).headers
+        assert (
+            "access-control-allow-origin"
+            not in closed.options("/healthz", headers=preflight_headers).headers
+        )
     chosen = settings.model_copy(update={"cors_origins": ("https://map.example",)})
     with TestClient(create_app(chosen)) as opened:
-        reply = opened.options("/healthz", headers=asked)
+        reply = opened.options("/healthz", headers=preflight_headers)
         assert reply.headers["access-control-allow-origin"] == "https://map.example"
-        other = opened.options("/healthz", headers={**asked, "Origin": "https://evil.example"})
+        other = opened.options(
+            "/healthz", headers={**preflight_headers, "Origin": "https://evil.example"}
+        )
         assert "access-control-allow-origin" not in other.headers
 
 

@@ -63,21 +63,25 @@ def write_inputs(folder: Path) -> tuple[Path, Path]:
 
 
 def ortho(*words: object) -> dict:
-    done = CliRunner().invoke(app, ["scene", "ortho", *(str(word) for word in words), "--json"])
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == 0, done.output
-    said: dict = json.loads(done.stdout)
-    return said
+    result = CliRunner().invoke(app, ["scene", "ortho", *(str(word) for word in words), "--json"])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    printed: dict = json.loads(result.stdout)
+    return printed
 
 
 def test_a_scene_is_laid_on_a_map_by_one_command(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
-    said = ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "out" / "ortho.tif")
-    assert said["error_px"] < 0.1
-    assert 0.4 < said["seen"] <= 1.0
+    output = ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "out" / "ortho.tif")
+    assert output["error_px"] < 0.1
+    assert 0.4 < output["seen"] <= 1.0
     with rasterio.open(tmp_path / "out" / "ortho.tif") as file:
-        assert (file.height, file.width, file.count) == (said["lines"], said["samples"], said["bands"])
+        assert (file.height, file.width, file.count) == (
+            output["lines"],
+            output["samples"],
+            output["bands"],
+        )
         row, column = file.height // 2, file.width // 2
         x, y = file.transform @ (column + 0.5, row + 0.5)
         shown = int(file.read(1)[row, column])
@@ -126,11 +130,11 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     laid = client.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes(), headers=me)
     assert laid.status_code == 200, laid.text
 
-    def outcome(**said: object) -> dict:
-        body = {"inputs": {"scene": scene, "dem": "dem.tif", **said}}
-        asked = client.post("/processes/orthorectify/execution", json=body, headers=me)
-        assert asked.status_code == 201, asked.text
-        job_id = asked.json()["jobID"]
+    def outcome(**more_inputs: object) -> dict:
+        body = {"inputs": {"scene": scene, "dem": "dem.tif", **more_inputs}}
+        reply = client.post("/processes/orthorectify/execution", json=body, headers=me)
+        assert reply.status_code == 201, reply.text
+        job_id = reply.json()["jobID"]
         with engine.pooled(dsn, settings) as database:
             with database.transaction() as connection:
                 assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
@@ -138,8 +142,8 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
         job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
         if job["status"] == "failed":
             return job
-        found: dict = client.get(f"/jobs/{job_id}/results", headers=me).json()
-        return found
+        job_results: dict = client.get(f"/jobs/{job_id}/results", headers=me).json()
+        return job_results
 
     unsaid = outcome()
     assert unsaid["error"]["error"] == "VerticalDatumError"
@@ -213,7 +217,7 @@ def test_two_views_of_one_place_lie_on_each_other_once_rectified(
             images.append(vrt.read(1).astype(np.float32))
     seen = (images[0] > 0) & (images[1] > 0)
     assert seen.mean() > 0.5
-    found = []
+    offsets = []
     for row in range(40, 560, 40):
         for column in range(40, 560, 40):
             if seen[row : row + 40, column : column + 40].all():
@@ -221,8 +225,8 @@ def test_two_views_of_one_place_lie_on_each_other_once_rectified(
                 chip = images[1][row + 8 : row + 32, column + 8 : column + 32]
                 score = cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED)
                 if score.max() > 0.8:
-                    found.append(np.unravel_index(score.argmax(), score.shape))
-    assert len(found) > 30
-    off = np.array(found) - 8.0
+                    offsets.append(np.unravel_index(score.argmax(), score.shape))
+    assert len(offsets) > 30
+    off = np.array(offsets) - 8.0
     assert np.abs(np.median(off, axis=0)).max() <= 2 * a_pixel
     assert np.median(np.abs(off - np.median(off, axis=0))) <= a_pixel

@@ -52,24 +52,24 @@ def amers(
         monkeypatch.setattr(sys, "argv", ["amers", "reference", *map(str, words)])
         with pytest.raises(SystemExit) as end:
             main()
-        said = capsys.readouterr()
-        return Said(int(end.value.code or 0), said.out, said.err)
+        output = capsys.readouterr()
+        return Said(int(end.value.code or 0), output.out, output.err)
 
     return run
 
 
 def listed(amers: Amers) -> list[dict[str, object]]:
-    done = amers("list", "--json")
-    assert done.returncode == 0, done.stderr
-    found: list[dict[str, object]] = json.loads(done.stdout)
-    return found
+    result = amers("list", "--json")
+    assert result.returncode == 0, result.stderr
+    output: list[dict[str, object]] = json.loads(result.stdout)
+    return output
 
 
 def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
     heights = ("--dem", "heights.tif", "--vertical", "ellipsoid", "--sigma-m", 2.5)
-    done = amers("add", "land.tif", "--name", "Ventoux", *heights, "--json")
-    assert done.returncode == 0, done.stderr
-    added = json.loads(done.stdout)
+    result = amers("add", "land.tif", "--name", "Ventoux", *heights, "--json")
+    assert result.returncode == 0, result.stderr
+    added = json.loads(result.stdout)
     assert (added["name"], added["image"], added["dem"]) == ("Ventoux", "land.tif", "heights.tif")
     assert (added["vertical"], added["sigma_m"]) == ("ellipsoid", 2.5)
     the_scale_of_the_map = 1e-3
@@ -79,8 +79,8 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
     assert "Ventoux" in amers("list").stdout
     again = amers("add", "land.tif", "--name", "Ventoux")
     assert (again.returncode, "there is a reference" in again.stderr) == (2, True)
-    done = amers("remove", "Ventoux")
-    assert (done.returncode, done.stdout.strip()) == (0, "removed Ventoux")
+    result = amers("remove", "Ventoux")
+    assert (result.returncode, result.stdout.strip()) == (0, "removed Ventoux")
     assert [one["name"] for one in listed(amers)] == ["Alps"]
     assert (folder / "land.tif").exists(), "its files stay in their folder"
     gone = amers("remove", "Ventoux")
@@ -88,7 +88,7 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("../beside/land.tif", "--name", "x"), "not a file below the folder"),
         (("none.tif", "--name", "x"), "not a file below the folder"),
@@ -99,11 +99,11 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
     ],
 )
 def test_what_can_be_no_reference_is_refused_in_one_line(
-    amers: Amers, words: tuple[str, ...], told: str
+    amers: Amers, words: tuple[str, ...], message: str
 ):
-    done = amers("add", *words)
-    assert (done.returncode, told in done.stderr) == (2, True), done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    result = amers("add", *words)
+    assert (result.returncode, message in result.stderr) == (2, True), result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
     assert listed(amers) == []
 
 
@@ -111,6 +111,6 @@ def test_without_a_folder_of_references_the_setting_is_named(
     amers: Amers, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("AMERS_REFERENCE_FOLDER")
-    done = amers("add", "land.tif", "--name", "x")
-    assert done.returncode == 2
-    assert "AMERS_REFERENCE_FOLDER" in done.stderr
+    result = amers("add", "land.tif", "--name", "x")
+    assert result.returncode == 2
+    assert "AMERS_REFERENCE_FOLDER" in result.stderr

@@ -118,8 +118,8 @@ def places(connection: Connection) -> list[tuple[int, int]]:
 def test_only_files_of_the_folder_that_lie_on_a_map_become_references(
     connection: Connection, settings: Settings, folder: Path
 ) -> None:
-    def refused(reason: str, **said: object) -> None:
-        new = replace(NewReference("land", "reference.tif"), **said)  # type: ignore[arg-type]
+    def refused(reason: str, **changed: object) -> None:
+        new = replace(NewReference("land", "reference.tif"), **changed)  # type: ignore[arg-type]
         with pytest.raises(InputError, match=reason):
             add_reference(connection, settings, new)
 
@@ -163,26 +163,26 @@ def test_places_found_are_kept_and_searched_first_in_the_next_scene(
     assert first.report.verdict == "good"
     assert first.report.run.method == "reference image"
     assert [block.id for block in first.report.run.blocks] == ["land"]
-    found = first.registration.adjustment.correction.parameters[:, 0]
-    assert np.abs(found - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+    shift_px = first.registration.adjustment.correction.parameters[:, 0]
+    assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
     once = places(connection)
     connection.rollback()
     assert 20 < len(once) <= int(first.registration.measures.active.sum())
     assert set(once) == {(1, 1)}
 
     find = references_of_store(database, settings)
-    known = find(first.footprint)
-    assert known is not None
-    assert known.earlier_places is not None
-    assert len(known.earlier_places) == len(once)
+    found_reference = find(first.footprint)
+    assert found_reference is not None
+    assert found_reference.earlier_places is not None
+    assert len(found_reference.earlier_places) == len(once)
 
     second = registered(database, settings, folder / "second.tif", tmp_path / "second")
-    found = second.registration.adjustment.correction.parameters[:, 0]
-    assert np.abs(found + SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
+    shift_px = second.registration.adjustment.correction.parameters[:, 0]
+    assert np.abs(shift_px + SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
     twice = places(connection)
     again = [counts for counts in twice if counts[0] == 2]
     assert len(again) > 0.8 * len(once)
-    assert sum(found for _, found in again) > 1.9 * len(again)
+    assert sum(successes for _, successes in again) > 1.9 * len(again)
     assert len(twice) < 1.5 * len(once)
 
 
@@ -240,9 +240,9 @@ def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked
 
         def outcome(method: str) -> dict:
             body = {"inputs": {"scene": scene, "method": method}}
-            asked = client.post("/processes/register-scene/execution", json=body, headers=me)
-            assert asked.status_code == 201, asked.text
-            job_id = asked.json()["jobID"]
+            reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+            assert reply.status_code == 201, reply.text
+            job_id = reply.json()["jobID"]
             with database.transaction() as connection:
                 assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
@@ -283,17 +283,17 @@ def test_a_service_whose_files_are_in_a_bucket_registers_on_a_reference(
             assert client.post("/references", json=body, headers=admin).status_code == 201
             image = (folder / "first.tif").read_bytes()
             upload = client.post(f"/scenes?name=first.tif&sigma_m={SIGMA_M}", content=image, headers=me)
-            asked = {"inputs": {"scene": upload.json()["id"]}}
-            job = client.post("/processes/register-scene/execution", json=asked, headers=me)
-            done = ended(client, job.headers["location"], me)
-            assert done["status"] == "successful", done
+            request_inputs = {"inputs": {"scene": upload.json()["id"]}}
+            job = client.post("/processes/register-scene/execution", json=request_inputs, headers=me)
+            ended_job = ended(client, job.headers["location"], me)
+            assert ended_job["status"] == "successful", ended_job
             results = client.get(f"{job.headers['location']}/results", headers=me).json()
             assert (results["verdict"], results["method"]) == ("good", "reference image")
             report = client.get(results["report.json"]["href"], headers=me).json()
         shift_px = np.array(report["correction"]["shift_px"])
         assert np.abs(shift_px - SHIFT_PX).max() < A_TENTH_OF_A_PIXEL
-        kept = open_storage(elsewhere).keys(f"results/{done['jobID']}")
-        assert any(key.endswith("report.json") for key in kept)
+        result_keys = open_storage(elsewhere).keys(f"results/{ended_job['jobID']}")
+        assert any(key.endswith("report.json") for key in result_keys)
     assert not [path for path in settings.data_folder.rglob("*") if path.is_file()], "all in the bucket"
     with engine.connect(dsn) as connection:
         assert len(places(connection)) > 20, "where the scene was found is kept for the next"

@@ -73,7 +73,7 @@ def test_the_command_registers_straight_from_a_block_folder(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):
     folder = tmp_path / "out"
-    done = amers(
+    result = amers(
         "scene",
         "register",
         world.tagged,
@@ -85,10 +85,10 @@ def test_the_command_registers_straight_from_a_block_folder(
         folder,
         "--json",
     )
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["verdict"] in ("good", "usable")
-    assert np.allclose(told["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
+    assert result.returncode == 0, result.stderr
+    output = json.loads(result.stdout)
+    assert output["verdict"] in ("good", "usable")
+    assert np.allclose(output["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
     assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged_RPC.TXT"}
     assert_registered(folder, world)
     beside = read_rpc(world.tagged, folder / "tagged_RPC.TXT").model
@@ -101,11 +101,11 @@ def test_points_held_out_are_told_in_the_report_and_can_take_a_good_verdict_away
     def register(moved_px: float) -> dict:
         write_check_points(tmp_path / "checks.geojson", world, moved_px)
         command = ("scene", "register", world.tagged, "--block", world.block, "--sigma-m", SIGMA_M)
-        done = amers(
+        result = amers(
             *command, "--check-points", tmp_path / "checks.geojson", "-o", tmp_path / "out", "--json"
         )
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout)["check_points"] == CHECK_POINTS
+        assert result.returncode == 0, result.stderr
+        assert json.loads(result.stdout)["check_points"] == CHECK_POINTS
         report: dict = json.loads((tmp_path / "out" / "report.json").read_text())
         validate(report, report_schema())
         return report
@@ -131,7 +131,7 @@ def test_check_points_of_another_image_are_refused_by_name(
     write_check_points(tmp_path / "checks.geojson", world)
     document = json.loads((tmp_path / "checks.geojson").read_text())
     (tmp_path / "checks.geojson").write_text(json.dumps({**document, "image": "other.tif"}))
-    done = amers(
+    result = amers(
         "scene",
         "register",
         world.tagged,
@@ -142,8 +142,8 @@ def test_check_points_of_another_image_are_refused_by_name(
         "--check-points",
         tmp_path / "checks.geojson",
     )
-    assert done.returncode == 2
-    assert "checks.geojson: expected marks in tagged.tif, found marks in other.tif" in done.stderr
+    assert result.returncode == 2
+    assert "checks.geojson: expected marks in tagged.tif, found marks in other.tif" in result.stderr
 
 
 def test_the_command_registers_with_the_store_and_remembers_the_measures(
@@ -151,9 +151,9 @@ def test_the_command_registers_with_the_store_and_remembers_the_measures(
 ):
     folder = tmp_path / "out"
     command = ("scene", "register", world.image, "--sigma-m", SIGMA_M, "-o", folder)
-    done = amers(*command, "--model", world.rpc_text)
-    assert done.returncode == 0, done.stderr
-    assert "verdict" in done.stdout
+    result = amers(*command, "--model", world.rpc_text)
+    assert result.returncode == 0, result.stderr
+    assert "verdict" in result.stdout
     assert_registered(folder, world)
     with engine.connect(dsn) as connection:
         rows = run_sql(
@@ -167,9 +167,9 @@ def test_the_command_says_by_its_exit_code_what_went_wrong(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):
     def register(*arguments: object) -> tuple[int, str]:
-        done = amers("scene", "register", *arguments, "--block", world.block, "-o", tmp_path / "out")
-        assert "Traceback" not in done.stderr
-        return done.returncode, done.stderr
+        result = amers("scene", "register", *arguments, "--block", world.block, "-o", tmp_path / "out")
+        assert "Traceback" not in result.stderr
+        return result.returncode, result.stderr
 
     half = tmp_path / "half.tif"
     half.write_bytes(world.tagged.read_bytes()[:100_000])
@@ -177,13 +177,13 @@ def test_the_command_says_by_its_exit_code_what_went_wrong(
     assert register(tmp_path / "missing.tif")[0] == 2
     bare = tmp_path / "bare.tif"
     bare.write_bytes(world.image.read_bytes())
-    code, told = register(bare)
+    code, message = register(bare)
     assert code == 2
-    assert "no sensor model" in told
+    assert "no sensor model" in message
     # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
-    code, told = register(world.tagged, "--sigma-m", 0.1)
+    code, message = register(world.tagged, "--sigma-m", 0.1)
     assert code == 3
-    assert "found" in told
+    assert "found" in message
 
 
 def test_the_command_lets_a_service_register(
@@ -202,9 +202,9 @@ def test_the_command_lets_a_service_register(
     with running_service(settings, log) as url:
         refused = amers(*scene, "--server", url, "--token", "wrong")
         assert (refused.returncode, "token" in refused.stderr) == (2, True), refused.stderr
-        done = amers(*scene, *beside, "--server", url, "--token", token("register"), "--json")
-        assert done.returncode == 0, done.stderr + log.read_text()
-        assert json.loads(done.stdout)["check_points"] == CHECK_POINTS
+        result = amers(*scene, *beside, "--server", url, "--token", token("register"), "--json")
+        assert result.returncode == 0, result.stderr + log.read_text()
+        assert json.loads(result.stdout)["check_points"] == CHECK_POINTS
         assert_registered(folder, world)
         assert_masked(folder)
         (check,) = json.loads((folder / "report.json").read_text())["checks"]
@@ -219,7 +219,7 @@ def test_the_command_lets_a_service_register(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--reference", "land.tif"), "--server: the service uses its own"),
         (("--block", "folder"), "--server: the service uses its own"),
@@ -227,9 +227,9 @@ def test_the_command_lets_a_service_register(
     ],
 )
 def test_what_a_service_has_of_its_own_is_not_sent_to_it(
-    amers: Amers, world: FlatWorld, tmp_path: Path, words: tuple[str, str], told: str
+    amers: Amers, world: FlatWorld, tmp_path: Path, words: tuple[str, str], message: str
 ):
     scene = ("scene", "register", world.tagged, "--server", "http://127.0.0.1:1", "-o", tmp_path / "out")
     refused = amers(*scene, *words)
-    assert (refused.returncode, told in refused.stderr) == (2, True), refused.stderr
+    assert (refused.returncode, message in refused.stderr) == (2, True), refused.stderr
     assert not (tmp_path / "out").exists()

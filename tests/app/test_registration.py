@@ -97,11 +97,11 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     execution = "/processes/register-scene/execution"
     assert client.post(execution, json=wrong, headers=me).status_code == 422
     body = {"inputs": inputs}
-    asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+    response = client.post("/processes/register-scene/execution", json=body, headers=me)
     with running_worker(settings, tmp_path / "log"):
-        done = ended(client, asked.headers["location"], me)
-    assert (done["status"], done["progress"]) == ("successful", 100), done
-    results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
+        ended_job = ended(client, response.headers["location"], me)
+    assert (ended_job["status"], ended_job["progress"]) == ("successful", 100), ended_job
+    results = client.get(f"/jobs/{ended_job['jobID']}/results", headers=me).json()
     assert results.pop("verdict") in ("good", "usable")
     assert results.pop("method") == "control points"
     assert set(results) == COMMON_FILES | {"scene_RPC.TXT", "scene.tif"}
@@ -116,7 +116,7 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     page = client.get(results["report.html"]["href"], headers=me)
     assert "default-src 'none'" in page.headers["content-security-policy"]
     for name in ("..%2Freport.json", "nothing.json", "%2e%2e"):
-        assert client.get(f"/jobs/{done['jobID']}/results/{name}", headers=me).status_code == 404
+        assert client.get(f"/jobs/{ended_job['jobID']}/results/{name}", headers=me).status_code == 404
     assert client.get(f"/scenes/{scene}", headers=me).json()["footprint"]["type"] == "Polygon"
     assert largest_error_px(read_rpc(folder / "scene.tif").model, world.true_model) < A_TENTH_OF_A_PIXEL
     report = json.loads((folder / "report.json").read_text())
@@ -153,9 +153,9 @@ def test_a_block_is_ingested_by_a_job_of_an_administrator(
     bad = {"inputs": {"path": "../world0"}}
     outside = client.post(execution, json=bad, headers=admin).headers["location"]
     with running_worker(settings, tmp_path / "log"):
-        done = [ended(client, job, admin) for job in (first, again, outside)]
-    assert [job["status"] for job in done] == ["successful", "failed", "failed"]
-    assert [job.get("error", {}).get("error") for job in done] == [None, "Conflict", "InputError"]
+        ended_jobs = [ended(client, job, admin) for job in (first, again, outside)]
+    assert [job["status"] for job in ended_jobs] == ["successful", "failed", "failed"]
+    assert [job.get("error", {}).get("error") for job in ended_jobs] == [None, "Conflict", "InputError"]
     results = client.get(f"{first}/results", headers=admin).json()
     assert (results["id"], results["state"], results["points"]) == ("flat", "published", 40)
 

@@ -51,11 +51,11 @@ def test_a_scene_is_registered_on_a_reference_without_any_database(
     images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reference, scene = images
-    asked = ["scene", "register", scene, "--reference", reference, "--sigma-m", "40", "--json"]
-    assert run(*asked, "-o", tmp_path) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["verdict"] == "good"
-    assert np.abs(np.array(said["shift_px"]) - SHIFT_PX).max() < SHIFT_ALLOWED_PX
+    command = ["scene", "register", scene, "--reference", reference, "--sigma-m", "40", "--json"]
+    assert run(*command, "-o", tmp_path) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert output["verdict"] == "good"
+    assert np.abs(np.array(output["shift_px"]) - SHIFT_PX).max() < SHIFT_ALLOWED_PX
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["run"]["blocks"] == [{"id": "reference.tif", "version": "reference image"}]
     assert {"report.html", "correction.json", "control_points.geojson"} <= {
@@ -75,6 +75,6 @@ def test_a_reference_that_lies_on_no_map_is_refused_by_name(
     plain = tmp_path / "plain.tif"
     with rasterio.open(plain, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8") as file:
         file.write(np.full((64, 64), 7, np.uint8), 1)
-    asked = ["scene", "register", images[1], "--reference", plain, "--sigma-m", "40", "-o", tmp_path]
-    assert run(*asked) == 2
+    command = ["scene", "register", images[1], "--reference", plain, "--sigma-m", "40", "-o", tmp_path]
+    assert run(*command) == 2
     assert "plain.tif: expected an ortho-image on a map" in capsys.readouterr().err

@@ -234,7 +234,7 @@ def test_any_text_becomes_a_name_the_storage_takes_or_is_refused(text: str):
 
 
 def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, bearer: Bearer):
-    kept = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
+    uploaded = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
     app = client.app
     database, storage = app.state.database, app.state.storage  # type: ignore[attr-defined]
     with database.transaction() as connection:
@@ -254,7 +254,9 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
     os.utime(old, (0, 0))
     sweep_files(database, storage, longest_job_s=3600.0)
     assert (old.exists(), new.exists()) == (False, True)
-    assert storage.keys("scenes") == sorted([f"scenes/{kept['id']}/a.tif", f"scenes/{arriving}/b.tif"])
+    assert storage.keys("scenes") == sorted(
+        [f"scenes/{uploaded['id']}/a.tif", f"scenes/{arriving}/b.tif"]
+    )
 
 
 def test_an_upload_survives_no_failure_of_the_database(settings: Settings, bearer: Bearer, dsn: str):

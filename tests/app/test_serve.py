@@ -73,13 +73,15 @@ def test_requests_under_way_are_answered_when_the_service_is_told_to_end(service
     with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
         publish_block(connection, str(ingest_block(connection, storage, made.folder).block.number))
         secret = create_token(connection, "slow", ["register"]).secret
-    said = f"Host: amers\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
+    headers = f"Host: amers\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
     with slow_line(service.port) as reading, slow_line(service.port) as sending:
         # A streamed reply with a slow reader, and an upload whose second half is missing.
-        reading.sendall(f"GET /collections/points/items?limit={POINTS} HTTP/1.1\r\n{said}\r\n".encode())
+        reading.sendall(
+            f"GET /collections/points/items?limit={POINTS} HTTP/1.1\r\n{headers}\r\n".encode()
+        )
         streamed = reading.recv(SMALL_WINDOW)
         sending.sendall(
-            f"POST /scenes?name=a.tif HTTP/1.1\r\n{said}Content-Length: {len(IMAGE)}\r\n\r\n".encode()
+            f"POST /scenes?name=a.tif HTTP/1.1\r\n{headers}Content-Length: {len(IMAGE)}\r\n\r\n".encode()
             + IMAGE[: len(IMAGE) // 2]
         )
         assert until(lambda: list(storage.scratch().glob("tmp*"))), "the upload has begun"

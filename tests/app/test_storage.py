@@ -128,10 +128,10 @@ def test_a_key_that_could_lead_elsewhere_is_refused(storage, key):
 def test_whatever_the_key_nothing_is_named_outside_the_folder(key):
     storage = Storage(Path("/nonexistent/storage"))
     try:
-        found = storage.path(key)
+        file_path = storage.path(key)
     except (InputError, NotFound):
         return
-    raise AssertionError(found)
+    raise AssertionError(file_path)
 
 
 def test_a_link_is_not_followed_out_of_the_folder(storage, tmp_path):

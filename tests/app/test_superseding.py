@@ -26,11 +26,11 @@ def made(
     """A block with points at these positions."""
     points = control_points(len(lon_lat), np.random.default_rng(5), box)
     points = replace(points, lon_lat_h=np.column_stack([lon_lat, points.lon_lat_h[:, 2]]))
-    said = metadata(name, version, box)
+    block_metadata = metadata(name, version, box)
     if frame_sigma_m is not None:
         frame = AccuracyFigure("absolute", "frame_sigma_m", frame_sigma_m, 30, "survey")
-        said = replace(said, accuracy=(*said.accuracy, frame))
-    write_block(folder, said, points, noise_chips(points), {})
+        block_metadata = replace(block_metadata, accuracy=(*block_metadata.accuracy, frame))
+    write_block(folder, block_metadata, points, noise_chips(points), {})
     return folder
 
 
@@ -46,8 +46,8 @@ def places():
 def ingest(connection, storage, tmp_path):
     """Ingests a block with points at these positions, staged."""
 
-    def ingest(name: str, lon_lat: Array, priority: int = 0, **said):
-        folder = made(tmp_path / f"{name}{said.get('version', '')}", name, lon_lat, **said)
+    def ingest(name: str, lon_lat: Array, priority: int = 0, **changes):
+        folder = made(tmp_path / f"{name}{changes.get('version', '')}", name, lon_lat, **changes)
         return lifecycle.ingest_block(connection, storage, folder, priority=priority).block.number
 
     return ingest
@@ -123,18 +123,18 @@ def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, 
     for name in names:
         jitter = rng.normal(0.0, 6.0, places.shape) * metre_of_latitude_deg
         ingest(name, places + jitter, frame_sigma_m=float(rng.uniform(0.5, 3.0)))
-    found = []
+    served_counts = []
     for order in permutations(names):
         for name in order:
             lifecycle.publish_block(connection, name)
         rows = run_sql(connection, "select id, superseded_by from point order by id").fetchall()
-        found.append([tuple(row.values()) for row in rows])
+        served_counts.append([tuple(row.values()) for row in rows])
         for name in order[::-1]:
             lifecycle.withdraw_block(connection, name)
         left = run_sql(connection, "select count(superseded_by) as n from point").fetchone()
         assert left["n"] == 0
-    assert all(one == found[0] for one in found)
-    assert any(superseded for _, superseded in found[0])
+    assert all(one == served_counts[0] for one in served_counts)
+    assert any(superseded for _, superseded in served_counts[0])
 
 
 def test_a_new_version_takes_the_places_of_the_old_one(connection, ingest, places):

@@ -35,8 +35,8 @@ with storage.writing("kept/a") as file, storage.scratch_folder("job-") as folder
 
 @pytest.fixture
 def database(client: TestClient) -> Database:
-    found: Database = client.app.state.database  # type: ignore[attr-defined]
-    return found
+    opened_database: Database = client.app.state.database  # type: ignore[attr-defined]
+    return opened_database
 
 
 @pytest.fixture
@@ -46,8 +46,8 @@ def me(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
 
 def begun(client: TestClient, me: dict[str, str]) -> str:
     """The address of an upload with ten bytes received."""
-    said = {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="}
-    url: str = client.post("/uploads", headers=me | said).headers["location"]
+    upload_headers = {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="}
+    url: str = client.post("/uploads", headers=me | upload_headers).headers["location"]
     assert client.patch(url, content=TIFF[:10], headers=me | {"Upload-Offset": "0"}).status_code == 204
     return url
 
@@ -57,8 +57,8 @@ def clocks_jump(database: Database, storage: Storage, hours: int) -> None:
     with database.transaction() as connection:
         jump(connection, hours)
     for path in storage.folder.rglob("*"):
-        found = path.stat()
-        os.utime(path, (found.st_atime - 3600 * hours, found.st_mtime - 3600 * hours))
+        status = path.stat()
+        os.utime(path, (status.st_atime - 3600 * hours, status.st_mtime - 3600 * hours))
 
 
 @pytest.mark.parametrize("hours", [25, A_YEAR_H, -A_YEAR_H])

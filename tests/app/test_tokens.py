@@ -39,7 +39,7 @@ def test_the_database_holds_no_secret(connection):
 @pytest.mark.parametrize("scope", ALLOWED)
 def test_a_scope_includes_the_lesser_ones(connection, scope):
     token = create_token(connection, "survey office", [scope]).token
-    assert {asked for asked in Scope if allows(token, asked)} == ALLOWED[scope]
+    assert {other for other in Scope if allows(token, other)} == ALLOWED[scope]
 
 
 def test_a_revoked_token_is_refused_like_one_that_never_was(connection):

@@ -127,9 +127,9 @@ def test_an_upload_interrupted_and_resumed_ten_times_arrives_intact(
         resumed = tus.uploader(file_stream=io.BytesIO(TIFF), chunk_size=100_000, url=url)
         assert resumed.offset == arrived
         resumed.upload()
-        told = http.get(url).json()
-        scene = http.get(f"{base}/scenes/{told['scene']}").json()
-    assert (told["state"], told["offset"]) == ("finished", len(TIFF))
+        document = http.get(url).json()
+        scene = http.get(f"{base}/scenes/{document['scene']}").json()
+    assert (document["state"], document["offset"]) == ("finished", len(TIFF))
     assert (scene["state"], scene["sha256"]) == ("uploaded", metadata["sha256"])
     assert storage.path(f"scenes/{scene['id']}/a.tif").read_bytes() == TIFF
 
@@ -141,15 +141,15 @@ def probe(http: httpx.Client, url: str) -> int:
 
 
 def test_the_service_says_what_of_tus_it_speaks(client: TestClient, me: dict[str, str]):
-    told = client.options("/uploads").headers
-    assert told["tus-version"] == "1.0.0"
-    assert set(told["tus-extension"].split(",")) == {
+    reply_headers = client.options("/uploads").headers
+    assert reply_headers["tus-version"] == "1.0.0"
+    assert set(reply_headers["tus-extension"].split(",")) == {
         "creation",
         "termination",
         "checksum",
         "expiration",
     }
-    assert int(told["tus-max-size"]) == LIMIT_BYTES
+    assert int(reply_headers["tus-max-size"]) == LIMIT_BYTES
     refused = client.post("/uploads", headers=me | {"Tus-Resumable": "0.2.2", "Upload-Length": "1"})
     assert (refused.status_code, refused.headers["tus-version"]) == (412, "1.0.0")
 
@@ -165,12 +165,16 @@ def test_an_image_and_the_file_with_its_model_become_one_scene(
     assert piece(client, model.headers["location"], me, 0, b"<a/>").status_code == 204
     url = reply.headers["location"]
     assert piece(client, url, me, 0, TIFF[:1000]).headers["upload-offset"] == "1000"
-    asked = client.head(url, headers=me).headers
-    assert (asked["upload-offset"], asked["upload-length"]) == ("1000", str(len(TIFF)))
-    assert asked["cache-control"] == "no-store"
+    reply_headers = client.head(url, headers=me).headers
+    assert (reply_headers["upload-offset"], reply_headers["upload-length"]) == ("1000", str(len(TIFF)))
+    assert reply_headers["cache-control"] == "no-store"
     assert piece(client, url, me, 1000, TIFF[1000:]).status_code == 204
-    told = client.get(f"/scenes/{scene}", headers=me).json()
-    assert (told["state"], told["models"], told["sigma_m"]) == ("uploaded", ["RPC_IMG.XML"], 7.5)
+    document = client.get(f"/scenes/{scene}", headers=me).json()
+    assert (document["state"], document["models"], document["sigma_m"]) == (
+        "uploaded",
+        ["RPC_IMG.XML"],
+        7.5,
+    )
     assert storage.path(f"scenes/{scene}/RPC_IMG.XML").read_bytes() == b"<a/>"
     assert list(storage.scratch().iterdir()) == []
 
@@ -216,7 +220,7 @@ def tar_with_a_broken_later_header() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("data", "metadata", "told"),
+    ("data", "metadata", "message"),
     [
         (b"<VRTDataset/>", {"filename": "a.tif"}, "neither TIFF"),
         (TIFF, {"filename": "a.tif", "sha256": "0" * 64}, "sha256"),
@@ -230,12 +234,12 @@ def test_a_file_that_is_not_what_it_should_be_is_refused_and_forgotten(
     storage: Storage,
     data: bytes,
     metadata: dict[str, str],
-    told: str,
+    message: str,
 ):
     reply = begun(client, me, len(data), **metadata)
     refused = piece(client, reply.headers["location"], me, 0, data)
     assert refused.status_code == 422
-    assert told in refused.json()["detail"]
+    assert message in refused.json()["detail"]
     assert client.head(reply.headers["location"], headers=me).status_code == 404
     assert client.get("/scenes", headers=me).json() == {"scenes": []}
     assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
@@ -287,7 +291,7 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
 
 
 @pytest.mark.parametrize(
-    ("files", "told"),
+    ("files", "message"),
     [
         ({"../IMG.TIF": TIFF}, "not accepted"),
         ({"a.tif": TIFF, "b.tif": TIFF[:9]}, "a.tif, b.tif"),
@@ -297,11 +301,11 @@ def test_an_archive_with_an_image_and_its_model_becomes_a_scene(
     ],
 )
 def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
-    client: TestClient, me: dict[str, str], storage: Storage, files: dict[str, bytes], told: str
+    client: TestClient, me: dict[str, str], storage: Storage, files: dict[str, bytes], message: str
 ):
     reply = whole(client, me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 422
-    assert told in reply.json()["detail"]
+    assert message in reply.json()["detail"]
     assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
 
 
@@ -390,8 +394,12 @@ def test_archives_lie_alike_and_are_swept_alike_whichever_way_they_came(
     keys = sorted(f"uploads/{upload}/a.zip" for upload in (put, tus))
     assert storage.keys("uploads") == keys
     for upload in (put, tus):
-        told = client.get(f"/uploads/{upload}", headers=admin).json()
-        assert (told["state"], told["purpose"], told["size_bytes"]) == ("finished", "block", 40)
+        document = client.get(f"/uploads/{upload}", headers=admin).json()
+        assert (document["state"], document["purpose"], document["size_bytes"]) == (
+            "finished",
+            "block",
+            40,
+        )
     assert settings.database_url is not None
     with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
         storage.put(f"uploads/{uuid4()}/left.zip", [b"by a killed service"])

@@ -111,8 +111,8 @@ def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
         wait_until(lambda: not alive(process), "the job's process dies with its worker", 5.0)
     assert client.get(job, headers=me).json()["status"] == "running", "nobody has noticed yet"
     with running_worker(settings, log):
-        done = ended(client, job, me)
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+        ended_job = ended(client, job, me)
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
     attempts = {key.split("/")[2] for key in storage.keys("results")}
     assert attempts == {"2"}
 
@@ -130,9 +130,9 @@ def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
         under_way(client, job, me)
         (process,) = children(worker.pid)
         kill(process)
-        done = ended(client, job, me)
+        ended_job = ended(client, job, me)
         assert worker.poll() is None
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
 
 
 def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
@@ -175,10 +175,10 @@ def test_a_worker_told_to_stop_gives_its_job_back_at_once(
         assert not alive(process)
     assert client.get(job, headers=me).json()["status"] == "accepted"
     with running_worker(patient, log):
-        done = ended(client, job, me)
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+        ended_job = ended(client, job, me)
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
     with engine.connect(dsn) as connection:
-        stopped = jobs.find(connection, UUID(done["jobID"]))
+        stopped = jobs.find(connection, UUID(ended_job["jobID"]))
     assert stopped is not None
     assert stopped.failures == 0
 
@@ -194,10 +194,10 @@ def test_a_job_over_its_memory_limit_fails_cleanly_and_the_worker_lives_on(
     narrow = settings.model_copy(update={"job_memory_bytes": 64 * MEBIBYTE})
     job = ask()
     with running_worker(narrow, log) as worker:
-        done = ended(client, job, me)
+        ended_job = ended(client, job, me)
         assert worker.poll() is None
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
-    assert "64 MiB" in done["message"]
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
+    assert "64 MiB" in ended_job["message"]
 
 
 def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
@@ -211,10 +211,10 @@ def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
     hasty = settings.model_copy(update={"job_seconds": 1.0})
     job = ask()
     with running_worker(hasty, log) as worker:
-        done = ended(client, job, me)
+        ended_job = ended(client, job, me)
         assert worker.poll() is None
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
-    assert "1 s" in done["message"]
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("failed", 1, 0)
+    assert "1 s" in ended_job["message"]
 
 
 def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
@@ -232,12 +232,12 @@ def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
         sleeper.send_signal(signal.SIGSTOP)
         os.kill(process, signal.SIGSTOP)
         with running_worker(settings, log):
-            done = ended(client, job, me)
+            ended_job = ended(client, job, me)
             os.kill(process, signal.SIGCONT)
             sleeper.send_signal(signal.SIGCONT)
             wait_until(lambda: not alive(process), "the late process ends", 30.0)
-    assert (done["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
-    assert client.get(job, headers=me).json() == done
+    assert (ended_job["status"], attempt_of(dsn, job), results_of(dsn, job)) == ("successful", 2, 1)
+    assert client.get(job, headers=me).json() == ended_job
 
 
 def test_a_scene_without_points_fails_for_good_at_the_first_attempt(
@@ -249,10 +249,10 @@ def test_a_scene_without_points_fails_for_good_at_the_first_attempt(
             "/scenes?name=scene.tif", content=world.tagged.read_bytes(), headers=me
         ).json()
         body = {"inputs": {"scene": upload["id"]}}
-        asked = client.post("/processes/register-scene/execution", json=body, headers=me)
-        done = ended(client, asked.headers["location"], me)
-    assert (done["status"], done["error"]["error"]) == ("failed", "CoverageError")
-    assert attempt_of(dsn, asked.headers["location"]) == 1
+        reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+        ended_job = ended(client, reply.headers["location"], me)
+    assert (ended_job["status"], ended_job["error"]["error"]) == ("failed", "CoverageError")
+    assert attempt_of(dsn, reply.headers["location"]) == 1
 
 
 def test_a_truncated_scene_fails_for_good_and_says_so(
@@ -263,10 +263,10 @@ def test_a_truncated_scene_fails_for_good_and_says_so(
         half = world.tagged.read_bytes()[: world.tagged.stat().st_size // 2]
         upload = client.post("/scenes?name=scene.tif", content=half, headers=me).json()
         body = {"inputs": {"scene": upload["id"]}}
-        asked = client.post("/processes/register-scene/execution", json=body, headers=me)
-        done = ended(client, asked.headers["location"], me)
-    assert (done["status"], done["error"]["error"]) == ("failed", "FormatError")
-    assert str(settings.data_folder) not in done["message"], "no path of the server is told"
+        reply = client.post("/processes/register-scene/execution", json=body, headers=me)
+        ended_job = ended(client, reply.headers["location"], me)
+    assert (ended_job["status"], ended_job["error"]["error"]) == ("failed", "FormatError")
+    assert str(settings.data_folder) not in ended_job["message"], "no path of the server is told"
 
 
 def test_a_worker_outlives_the_loss_of_all_its_connections(
@@ -287,8 +287,8 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(
                 "select pg_terminate_backend(pid) from pg_stat_activity"
                 " where datname = current_database() and pid <> pg_backend_pid()",
             )
-        done = ended(client, job, me)
+        ended_job = ended(client, job, me)
         other = ended(client, ask(1), me)
         assert worker.poll() is None
-    assert (done["status"], results_of(dsn, job)) == ("successful", 1)
+    assert (ended_job["status"], results_of(dsn, job)) == ("successful", 1)
     assert other["status"] == "successful", "the worker still hears of new jobs"

@@ -58,15 +58,15 @@ def running_worker(
 
 def children(pid: int) -> list[int]:
     """The living child processes of a process."""
-    found = []
+    pids = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             state, parent = path.read_text().rpartition(")")[2].split()[:2]
         except OSError:
             continue
         if int(parent) == pid and state != "Z":
-            found.append(int(path.parent.name))
-    return found
+            pids.append(int(path.parent.name))
+    return pids
 
 
 def alive(pid: int) -> bool:

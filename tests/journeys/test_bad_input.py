@@ -55,11 +55,11 @@ def registered(client: httpx.Client, image: bytes, model: str | None) -> dict:
     )
     if model is not None:
         client.put(f"/scenes/{scene}/files/scene_RPC.TXT", content=model.encode()).raise_for_status()
-    asked = client.post("/processes/register-scene/execution", json={"inputs": {"scene": scene}})
-    assert asked.status_code == 201, asked.text
+    reply = client.post("/processes/register-scene/execution", json={"inputs": {"scene": scene}})
+    assert reply.status_code == 201, reply.text
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
-        job = client.get(asked.headers["location"]).json()
+        job = client.get(reply.headers["location"]).json()
         if job["status"] in ("successful", "failed", "dismissed"):
             return job
         time.sleep(0.3)
@@ -102,10 +102,10 @@ def test_a_scene_that_cannot_be_used_ends_its_job_with_the_reason(
         client, spoil_image(world.image.read_bytes()), spoil_model(world.rpc_text.read_text())
     )
     assert job["status"] == "failed", job
-    told = json.dumps(job)
-    assert says in told
-    assert "Traceback" not in told
-    assert "/tmp/" not in told
+    job_text = json.dumps(job)
+    assert says in job_text
+    assert "Traceback" not in job_text
+    assert "/tmp/" not in job_text
     results = client.get(f"/jobs/{job['jobID']}/results")
     assert results.status_code >= 400
     assert results.headers["content-type"] == "application/problem+json"

@@ -27,10 +27,11 @@ def test_the_may_scene_of_berlin_is_registered_on_points_of_the_june_one(
     assert (ingested["state"], ingested["points"]) == ("published", made["points"])
 
     out = tmp_path / "may"
-    done = amers("scene", "register", may, "-o", out)
-    line_px, sample_px = done["shift_px"]
+    result = amers("scene", "register", may, "-o", out)
+    line_px, sample_px = result["shift_px"]
     found_m = np.array([sample_px, -line_px]) * GSD_M
-    print(f"{found_m} m east and north, {done['active']} of {done['visible']} points, {done['verdict']}")
+    counts = f"{result['active']} of {result['visible']} points"
+    print(f"{found_m} m east and north, {counts}, {result['verdict']}")
     assert np.abs(found_m - SHIFT_M).max() < SHIFT_ALLOWED_M
-    assert done["verdict"] == "good"
-    assert done["matched"] < 0.8 * done["visible"]  # The other points lie under the clouds of May.
+    assert result["verdict"] == "good"
+    assert result["matched"] < 0.8 * result["visible"]  # The other points lie under the clouds of May.

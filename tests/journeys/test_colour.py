@@ -32,11 +32,11 @@ same_moment_px = 0.02
 
 def rpc_text_of_geom(geom: str) -> str:
     """An OSSIM keyword list as RPC text; the numbers are the same."""
-    said = dict(line.split(":", 1) for line in geom.splitlines() if ":" in line)
+    entries = dict(line.split(":", 1) for line in geom.splitlines() if ":" in line)
     parts = ("line", "samp", "lat", "long", "height")
-    rows = [f"{part}_{kind}: {said[f'{part}_{kind}']}" for part in parts for kind in ("off", "scale")]
+    rows = [f"{part}_{kind}: {entries[f'{part}_{kind}']}" for part in parts for kind in ("off", "scale")]
     rows += [
-        f"{name}_coeff_{k + 1}: {said[f'{name}_coeff_{k:02d}']}"
+        f"{name}_coeff_{k + 1}: {entries[f'{name}_coeff_{k:02d}']}"
         for name in ("line_num", "line_den", "samp_num", "samp_den")
         for k in range(20)
     ]
@@ -108,31 +108,33 @@ def test_a_colour_crop_is_registered_to_a_third_of_its_pixel(
     height_m = float(np.median(points.lon_lat_h[:, 2]))
     delivered = colour.model
     wrong = replace(delivered, image_offset=delivered.image_offset + SPOILED_PX)  # type: ignore[type-var]
-    found = register_scene(replace(colour, model=wrong), points, FolderChips(block))
+    registration = register_scene(replace(colour, model=wrong), points, FolderChips(block))
 
     # The points lie where the two views overlap; beyond them the model is an extrapolation.
     seen = left.project(points.lon_lat_h)
     among = ((ties[1] >= seen.min(axis=0)) & (ties[1] <= seen.max(axis=0))).all(axis=1)
     delivered_px, registered_px = (
-        np.hypot(*differences_px(model, left, ties, height_m).T) for model in (delivered, found.model)
+        np.hypot(*differences_px(model, left, ties, height_m).T)
+        for model in (delivered, registration.model)
     )
-    std_px = np.sqrt(np.trace(found.adjustment.covariance_at(ties[0]), axis1=1, axis2=2) / 2.0)
+    std_px = np.sqrt(np.trace(registration.adjustment.covariance_at(ties[0]), axis1=1, axis2=2) / 2.0)
     print(
-        f"{among.sum()} ties among {found.qualification.point_counts.active} points: "
+        f"{among.sum()} ties among {registration.qualification.point_counts.active} points: "
         f"{np.median(delivered_px[among]):.3f} px as delivered, "
         f"{np.median(registered_px[among]):.3f} px registered; {(~among).sum()} ties beyond: "
         f"{np.median(registered_px[~among]):.3f} px, expected {np.median(std_px[~among]):.3f} px; "
-        f"pixels of {scene_gsd_m(colour):.2f} m, {found.qualification.verdict}"
+        f"pixels of {scene_gsd_m(colour):.2f} m, {registration.qualification.verdict}"
     )
     assert among.sum() > 50
     assert np.median(registered_px[among]) < three_tenths_of_a_pixel
     assert np.quantile(registered_px[among], 0.9) < three_tenths_of_a_pixel
     assert np.median(registered_px[~among]) < 3.0 * np.median(std_px[~among])
-    assert found.qualification.verdict in ("good", "usable")
-    assert found.search_stages[-1].chip_gsd_m == 0.5  # Few points have chips of 1 m.
+    assert registration.qualification.verdict in ("good", "usable")
+    assert registration.search_stages[-1].chip_gsd_m == 0.5  # Few points have chips of 1 m.
 
     # Both images were taken at the same moment, so the height of the ground hardly matters.
-    higher = differences_px(found.model, left, ties, height_m + 1.0)
+    higher = differences_px(registration.model, left, ties, height_m + 1.0)
     assert (
-        np.hypot(*(higher - differences_px(found.model, left, ties, height_m)).T).max() < same_moment_px
+        np.hypot(*(higher - differences_px(registration.model, left, ties, height_m)).T).max()
+        < same_moment_px
     )

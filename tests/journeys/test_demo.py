@@ -25,9 +25,9 @@ def amers(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    done = amers("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    result = amers("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
 
 
 def test_all_points_made_are_ingested_and_served(demo):

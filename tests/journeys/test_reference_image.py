@@ -37,10 +37,10 @@ def registered(reference: Path, scene: Path, sigma_m: float) -> tuple[Registrati
     image, model = ortho(reference)
     held = Reference(image, model, None, sigma_m=1.0, height_sigma_m=5.0, common_sigma_m=0.5)
     scene_image, scene_model = ortho(scene)
-    found = register_on_reference(
+    registration = register_on_reference(
         Scene(scene_image, scene_model, Acquisition(scene.stem), sigma_m), held
     )
-    return found, scene_model
+    return registration, scene_model
 
 
 def test_the_may_scene_of_berlin_is_found_eighteen_metres_north_and_its_clouds_are_left_out(
@@ -48,19 +48,19 @@ def test_the_may_scene_of_berlin_is_found_eighteen_metres_north_and_its_clouds_a
 ) -> None:
     (june,) = (real_data / "s2a_berlin_pair").glob("ref_*.tif")
     (may,) = (real_data / "s2a_berlin_pair").glob("tgt_*.tif")
-    found, model = registered(june, may, sigma_m=30.0)
+    registration, model = registered(june, may, sigma_m=30.0)
     centre = (np.array([[3152.0, 2074.0]]) - 1.0) / 2.0
-    shift_xy = model.grid.step_xy @ (found.model.correction.apply(centre) - centre)[0]
+    shift_xy = model.grid.step_xy @ (registration.model.correction.apply(centre) - centre)[0]
     assert shift_xy[0] == pytest.approx(SHIFT_EAST_M, abs=SHIFT_ALLOWED_M)
     assert shift_xy[1] == pytest.approx(SHIFT_NORTH_M, abs=SHIFT_ALLOWED_M)
-    assert found.qualification.verdict == "good"
-    not_found = np.isin(found.measures.reason, ["low_score", "nodata"])
+    assert registration.qualification.verdict == "good"
+    not_found = np.isin(registration.measures.reason, ["low_score", "nodata"])
     assert 0.2 < not_found.mean() < 0.7
 
 
 def plain_displacement(left: FloatImage, right: FloatImage, line_sample: Array) -> Array:
     """Displacements (n, 2) of windows between two images, by plain correlation; NaN at edges."""
-    found = np.full((len(line_sample), 2), np.nan)
+    displacements = np.full((len(line_sample), 2), np.nan)
     for i, (line, sample) in enumerate(np.round(line_sample).astype(int)):
         piece = left[line - 15 : line + 16, sample - 15 : sample + 16]
         around = right[line - 19 : line + 20, sample - 19 : sample + 20]
@@ -70,8 +70,8 @@ def plain_displacement(left: FloatImage, right: FloatImage, line_sample: Array) 
         row, col = np.unravel_index(scores.argmax(), scores.shape)
         if 0 < row < 8 and 0 < col < 8:
             tops = [_top(scores[row - 1 : row + 2, col]), _top(scores[row, col - 1 : col + 2])]
-            found[i] = np.array([row, col]) - 4 + tops
-    return found
+            displacements[i] = np.array([row, col]) - 4 + tops
+    return displacements
 
 
 def _top(scores: FloatImage) -> float:
@@ -83,12 +83,12 @@ def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_
     real_data: Path,
 ) -> None:
     folder = real_data / "s2_maricopa_pair"
-    found, _ = registered(folder / "left.tif", folder / "right.tif", sigma_m=20.0)
+    registration, _ = registered(folder / "left.tif", folder / "right.tif", sigma_m=20.0)
     left, right = (
         image.read(Window(0, 0, *image.shape))
         for image, _ in (ortho(folder / "left.tif"), ortho(folder / "right.tif"))
     )
-    measures = found.measures
+    measures = registration.measures
     plain = plain_displacement(left, right, measures.predicted)
     difference = (measures.line_sample - measures.predicted - plain)[measures.matched]
     difference = difference[np.isfinite(difference).all(axis=1)]
@@ -96,5 +96,5 @@ def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_
     assert np.abs(np.median(difference, axis=0)).max() < MEDIAN_ALLOWED_PX
     assert np.median(np.abs(difference), axis=0).max() < TYPICAL_ALLOWED_PX
     # One shift cannot follow fields that moved separately, and the residuals show it.
-    assert np.abs(found.adjustment.correction.parameters[:, 0]).max() < LARGEST_LOCAL_SHIFT_PX
-    assert found.adjustment.sigma0 > 2.0
+    assert np.abs(registration.adjustment.correction.parameters[:, 0]).max() < LARGEST_LOCAL_SHIFT_PX
+    assert registration.adjustment.sigma0 > 2.0

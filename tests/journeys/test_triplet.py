@@ -49,8 +49,8 @@ def tracks(pixels):
 
 
 def median_residual_px(models: list[RpcModel], tracks) -> float:
-    found = intersect(models, tracks, int(tracks.point[-1]) + 1)
-    return float(np.median(np.linalg.norm(found.residual_px, axis=1)))
+    intersections = intersect(models, tracks, int(tracks.point[-1]) + 1)
+    return float(np.median(np.linalg.norm(intersections.residual_px, axis=1)))
 
 
 def spoiled(model: RpcModel, shape: tuple[int, int]) -> RpcModel:
@@ -90,7 +90,7 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     wrong = spoiled(delivered, pixels[third].shape)
     write_raster(scene, pixels[third].astype(np.uint16), wrong)
     out = tmp_path / "registered"
-    done = amers(
+    result = amers(
         *("scene", "register", scene, "--sigma-m", injected_sigma_m, "-o", out),
         *("--server", service.url, "--token", secret),
     )
@@ -105,11 +105,11 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     )  # With such an error no rays intersect.
     models[third] = parse_rpc_text((out / "refined_RPC.TXT").read_text())
     left_px = median_residual_px(list(models.values()), tracks)
-    print(f"{third} from {injected_shift_px} px: {left_px:.3f} px, {done['verdict']}")
+    print(f"{third} from {injected_shift_px} px: {left_px:.3f} px, {result['verdict']}")
     assert left_px < three_tenths_of_a_pixel
-    assert done["verdict"] in ("good", "usable")
+    assert result["verdict"] in ("good", "usable")
     drift_there_px = injected_drift_px * np.abs(injected_shift_px) / pixels[third].shape
-    found_px = np.array(done["shift_px"])
+    found_px = np.array(result["shift_px"])
     assert (np.abs(found_px + injected_shift_px) < delivered_shift_px + drift_there_px).all()
     for name in ("report.json", "report.html", "control_points.geojson", f"{scene.stem}_RPC.TXT"):
         assert (out / name).stat().st_size > 0

@@ -44,9 +44,9 @@ def _features(pixels: FloatImage) -> tuple[Array, FloatImage]:
     image = np.clip((pixels - low) / (high - low) * 255.0, 0.0, 255.0).astype(np.uint8)
     sift = cv2.SIFT.create(contrastThreshold=0.01)
     smallest = FeatureOptions().largest_px
-    kept = [point for point in sift.detect(image) if smallest < point.size < LARGEST_PX]
-    kept, descriptor = sift.compute(image, kept)
-    return np.array([point.pt[::-1] for point in kept]), descriptor
+    keypoints = [point for point in sift.detect(image) if smallest < point.size < LARGEST_PX]
+    keypoints, descriptor = sift.compute(image, keypoints)
+    return np.array([point.pt[::-1] for point in keypoints]), descriptor
 
 
 def _matches(one: Array, one_d: FloatImage, other: Array, other_d: FloatImage) -> dict[int, int]:
