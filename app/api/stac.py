@@ -8,7 +8,15 @@ from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    field_validator,
+)
 
 from app.api import features
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
@@ -98,11 +106,16 @@ class SortedBy(BaseModel):
         return ("-" if self.direction == "desc" else "") + self.field.removeprefix("properties.")
 
 
-def _sort_text(value: Any) -> Any:
-    """The text of `sortby`, out of a text or a list of objects; names may begin with `properties.`."""
-    if isinstance(value, list):
-        return ",".join(SortedBy.model_validate(item).text for item in value) or None
+def _without_prefix(value: Any) -> Any:
+    """The text of `sortby`, where names may begin with `properties.`."""
     return value.replace("properties.", "") if isinstance(value, str) else value
+
+
+def _sort_text(value: Any) -> Any:
+    """A list of properties to sort by, as the parameter `sortby` has it."""
+    if not isinstance(value, list):
+        return value
+    return ",".join(SortedBy.model_validate(item).text for item in value) or None
 
 
 Names = Annotated[tuple[str, ...], BeforeValidator(_split)]
@@ -134,7 +147,7 @@ class SceneSearch(SceneRestriction, FeatureQuery):
 
     crs: None = None
     properties: None = None
-    sortby: Annotated[str | None, BeforeValidator(_sort_text)] = Field(
+    sortby: Annotated[str | None, BeforeValidator(_without_prefix)] = Field(
         default=None, description="Properties to sort by; `-` before one sorts it descending."
     )
 
@@ -150,6 +163,13 @@ class SceneSearchBody(SceneSearch):
     sortby: Annotated[str | None, BeforeValidator(_sort_text), SORTED_BY] = Field(
         default=None, description="Properties to sort by."
     )
+
+    @field_validator("bbox", "intersects", "sortby", mode="before")
+    @classmethod
+    def _refuse_text(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            raise ValueError("text found, a JSON value expected")
+        return value
 
 
 async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
