@@ -104,7 +104,7 @@ def column_property(
     column: Column[Any], title: str, unit: str = "", *, name: str = "", choices: tuple[str, ...] = ()
 ) -> Property:
     """The property of a column of a table, nullable as the column is; of the same name unless given."""
-    return Property(name or column.name, title, column, unit, bool(column.nullable), choices)
+    return Property(name or str(column.name), title, column, unit, bool(column.nullable), choices)
 
 
 @dataclass(frozen=True, eq=False)
