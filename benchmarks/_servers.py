@@ -1,4 +1,4 @@
-"""Services of points as processes of their own: ours, tipg and pygeoapi, each as its documents say."""
+"""Services of points as separate processes: ours, tipg and pygeoapi, each run as documented."""
 
 import http.client
 import json
@@ -34,13 +34,13 @@ create index point_peer on point using gist ((st_setsrid(geom, 4326)::geometry(P
 
 @dataclass(frozen=True)
 class Server:
-    """A service that answers.
+    """A running service.
 
     Attributes:
         name: of the software.
-        process: its first process; servers of this module have one that answers.
+        process: its first process; each service has one process that replies.
         items: path of the collection of points.
-        page: what a request for a page says beside its box.
+        page: parameters of a page request besides its box.
         tiles: path of its vector tiles, up to the zoom; "" without any.
     """
 
@@ -52,19 +52,19 @@ class Server:
     tiles: str = ""
 
     def connect(self) -> http.client.HTTPConnection:
-        """A connection that is kept alive."""
+        """A kept-alive connection."""
         return http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
 
 
 def show_to_peers(connection: Connection) -> None:
-    """The same table as others can read it: positions in EPSG:4326 with an index, only what we tell."""
+    """Create a view for other services: positions in EPSG:4326 with an index, published columns."""
     run_sql(connection, VIEW)
     run_sql(connection, "analyze point")
 
 
 @contextmanager
 def amers(data_folder: Path) -> Iterator[Server]:
-    """`amers serve` without its worker, open to everybody."""
+    """`amers serve` without its worker and with public points."""
     settings = {"AMERS_DATA_FOLDER": str(data_folder), "AMERS_PUBLIC_POINTS": "true"}
     port = _free_port()
     command = [sys.executable, "-m", "app.cli.main", "serve", "--no-worker", "--port", str(port)]
@@ -76,7 +76,7 @@ def amers(data_folder: Path) -> Iterator[Server]:
 
 @contextmanager
 def tipg(python: Path, dsn: str) -> Iterator[Server]:
-    """tipg under uvicorn, one process, connections kept."""
+    """tipg under uvicorn: one process with kept connections."""
     database = conninfo_to_dict(dsn)
     settings = {
         "POSTGRES_USER": str(database["user"]),
@@ -98,7 +98,7 @@ def tipg(python: Path, dsn: str) -> Iterator[Server]:
 
 @contextmanager
 def pygeoapi(python: Path, dsn: str, folder: Path, threads: int) -> Iterator[Server]:
-    """pygeoapi under gunicorn: one worker with as many threads as there are clients."""
+    """pygeoapi under gunicorn: one worker with one thread per client."""
     port = _free_port()
     configuration, description = folder / "pygeoapi.json", folder / "openapi.yml"
     configuration.write_text(json.dumps(_pygeoapi_document(port, conninfo_to_dict(dsn))))

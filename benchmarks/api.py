@@ -1,11 +1,13 @@
-"""What the API takes for what clients ask most, beside tipg and pygeoapi on the same table.
+"""Latency and throughput of the commonest requests, beside tipg and pygeoapi on the same table.
 
-A private cluster is filled with five million points; each service is one process, and all are asked in
-turn by the same client for the same boxes. tipg and pygeoapi read a view of the table with only what we
-tell of a point and an index of its own; neither asks who may see what, as ours does. Every reply is read
-to its end, none is parsed but the first of each, which must hold the same points.
+A private cluster is filled with five million points. Each service is one process, and the same client
+sends the same requests to all of them in turn. tipg and pygeoapi read a view of the table with the
+columns that our API serves, with an index of its own; unlike ours, they check no access rights. Every
+reply is read to its end; only the first reply of each kind is parsed, and all services must give the
+same points.
 
-With `--beside N` a second cluster holds N points of the same density, and ratios of latencies are told.
+With `--beside N` a second cluster has N points of the same density, and the ratios of latencies are
+printed.
 Run: python -m benchmarks.api [--tipg PYTHON] [--pygeoapi PYTHON] [--points 20000000 --beside 1000000]
 """
 
@@ -51,7 +53,7 @@ Ask = Callable[[Server, np.random.Generator], str]
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds that one service took for one kind of request, at the client."""
+    """Milliseconds of one service for one kind of request, measured at the client."""
 
     what: str
     server: str
@@ -70,7 +72,7 @@ class Store:
 
 
 def main() -> None:
-    """Fill, ask, print, keep."""
+    """Fill the stores, measure, print and save the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=5_000_000)
     parser.add_argument("--beside", type=int, help="points of a second store to compare latencies with")
@@ -80,7 +82,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measure of throughput")
     arguments = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # stopped by `timeout`, it cleans up too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # Clean up on SIGTERM too.
     console = Console()
     with ExitStack() as stack:
         store = stack.enter_context(filled(arguments.points, console))
@@ -105,7 +107,7 @@ def main() -> None:
 
 @contextmanager
 def filled(count: int, console: Console) -> Iterator[Store]:
-    """A store of so many points and one small block with chips, and our service on it."""
+    """A store with this many points and one small block with chips, and our service on it."""
     with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name, ExitStack() as stack:
         folder = Path(name)
         folder.chmod(0o755)
@@ -132,7 +134,7 @@ def filled(count: int, console: Console) -> Iterator[Store]:
 def peers(
     stack: ExitStack, store: Store, arguments: argparse.Namespace, console: Console
 ) -> Iterator[Server]:
-    """The other services whose interpreters are given."""
+    """The other services, where their interpreters are given."""
     if arguments.tipg or arguments.pygeoapi:
         with engine.connect(store.dsn) as connection:
             _servers.show_to_peers(connection)
@@ -149,7 +151,7 @@ def peers(
 
 
 def kinds(ground: Ground) -> dict[str, Ask]:
-    """What is asked, by name; a path may be empty where a service has nothing of the kind."""
+    """The requests, by name; a path is empty where a service has no such resource."""
 
     def in_box(count: int) -> Ask:
         def ask(server: Server, rng: np.random.Generator) -> str:
@@ -179,7 +181,7 @@ def kinds(ground: Ground) -> dict[str, Ask]:
 
 
 def latencies(servers: Sequence[Server], ground: Ground, repeats: int) -> list[Times]:
-    """Times of each kind of request, all services asked in turn for the same."""
+    """Times of each kind of request; all services get the same requests in turn."""
     found = []
     for what, ask in kinds(ground).items():
         turns = max(5, repeats // 6) if "page" in what else repeats
@@ -189,13 +191,13 @@ def latencies(servers: Sequence[Server], ground: Ground, repeats: int) -> list[T
 
 
 def in_turn(what: str, ways: Mapping[str, tuple[Server, Ask]], repeats: int) -> list[Times]:
-    """Times of services asked one after the other, the same of each in every turn."""
+    """Times of services that get the same request one after the other in every turn."""
     taken: dict[str, list[float]] = {name: [] for name in ways}
     size: dict[str, list[int]] = {name: [] for name in ways}
     for turn in range(repeats + WARM_UP):
         for name, (server, ask) in ways.items():
             path = ask(server, np.random.default_rng(turn))
-            connection = server.connect()  # its turn comes after the pause that servers allow
+            connection = server.connect()  # Its turn may come after the keep-alive time of the server.
             connection.connect()
             start = time.perf_counter()
             body = get(connection, path)
@@ -207,13 +209,13 @@ def in_turn(what: str, ways: Mapping[str, tuple[Server, Ask]], repeats: int) -> 
 
 
 def times_of(what: str, server: str, taken_s: Sequence[float], size: float) -> Times:
-    """The median and the 95 % of times, and the size of a reply."""
+    """The median and the 95 % quantile of times, and the size of a reply."""
     median_s, most_s = np.quantile(taken_s, [0.5, 0.95])
     return Times(what, server, 1000.0 * float(median_s), 1000.0 * float(most_s), size / 1e6)
 
 
 def kept_open(store: Store, repeats: int) -> list[Times]:
-    """Times of our service alone, on a connection that is kept, as most clients do."""
+    """Times of our service alone on a kept connection, as most clients use it."""
     found, open_one = [], store.server.connect()
     for what, ask in list(kinds(store.ground).items())[:2]:
         taken, size = [], 0
@@ -228,7 +230,7 @@ def kept_open(store: Store, repeats: int) -> list[Times]:
 
 
 def get(connection: http.client.HTTPConnection, path: str, body: bytes | None = None) -> bytes:
-    """The reply to a request, which must be a good one."""
+    """The body of a reply with status 200."""
     headers = {} if body is None else {"Content-Type": "application/json"}
     connection.request("GET" if body is None else "POST", path, body, headers)
     reply = connection.getresponse()
@@ -239,7 +241,7 @@ def get(connection: http.client.HTTPConnection, path: str, body: bytes | None = 
 
 
 def same_points(servers: Sequence[Server], ground: Ground) -> None:
-    """All services give the same points of a box."""
+    """Check that all services give the same points of a box."""
     ask = next(iter(kinds(ground).values()))
     found = []
     for server in servers:
@@ -252,7 +254,7 @@ def same_points(servers: Sequence[Server], ground: Ground) -> None:
 def throughput(
     servers: Sequence[Server], ground: Ground, clients: int, seconds: float
 ) -> dict[str, float]:
-    """Footprints a second of each service, asked by several clients at once."""
+    """Footprints per second of each service, with several concurrent clients."""
     ask = next(iter(kinds(ground).values()))
     rates = {}
     for server in servers:
@@ -319,7 +321,7 @@ def resident_mib(process: int, line: str) -> float:
 
 
 def grown(store: Store, other: Store, repeats: int, console: Console) -> dict[str, dict[str, float]]:
-    """Latencies on the one store over those on the other, asked in turn."""
+    """Ratios of latencies on two stores, measured in turn."""
     table = Table("request", f"{other.ground.points:,}", f"{store.ground.points:,}", "ratio")
     ratios: dict[str, dict[str, float]] = {}
     here = kinds(store.ground)
@@ -340,7 +342,7 @@ def show(
     clients: int,
     console: Console,
 ) -> None:
-    """Print what was found."""
+    """Print the results."""
     table = Table("request", "service", "median", "95 %", "MB", "beside amers")
     ours = {one.what: one.median_ms for one in times if one.server == "amers"}
     for one in times:

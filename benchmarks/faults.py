@@ -1,9 +1,10 @@
 """Registrations and ingestions of an installation whose processes are killed at random moments.
 
-API, two workers, the processes of their jobs and PostgreSQL are killed (SIGKILL) again and again while
-scenes are uploaded and registered and blocks ingested; whoever is killed is started again within a
-second. What must hold at the end: every upload and every job that was accepted is there, every job ended
-once, every result and every block is whole or absent, rows and files name each other after the sweep.
+The API, two workers, the processes of their jobs and PostgreSQL are killed (SIGKILL) again and again
+while scenes are uploaded and registered and blocks are ingested. A killed process is restarted within a
+second. At the end, every accepted upload and job must exist, every job must have ended once, every
+result and block must be complete or absent, and rows and files must refer to each other after the
+sweep.
 Run: python -m benchmarks.faults --registrations 50 --ingestions 20 --seed 1
 """
 
@@ -29,8 +30,8 @@ from app.db.engine import Connection
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.worker.sweep import sweep_files
+from benchmarks._killed_installation import LEASE_S, KilledInstallation
 from benchmarks._measuring import keep
-from benchmarks._siege import LEASE_S, Siege
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -39,22 +40,22 @@ OPEN_AT_ONCE = 4
 LONGEST_RUN_S = 1800.0
 POINTS, IMAGES = 200, 2
 MOST_PASSES = 30
-"""One pass is done in a blink; many leave time to do harm in the middle."""
+"""Largest number of fine searches: one takes little time, many leave time to kill a process within."""
 ENDED = ("successful", "failed", "dismissed")
 BROKEN = {500, 501, 502, 504}
 
 
 @dataclass
 class Caller:
-    """Somebody who asks again until he is answered, and remembers what was promised to him.
+    """A client that repeats requests until they are answered, and remembers what was accepted.
 
     Attributes:
         scenes: id to checksum of the uploads that were accepted.
-        jobs: id to what was asked for: the scene, or the name of the block.
+        jobs: id to the scene, or to the name of the block.
         unexpected: replies that no outage explains.
     """
 
-    siege: Siege
+    installation: KilledInstallation
     client: httpx.Client
     deadline: float
     scenes: dict[str, str] = field(default_factory=dict)
@@ -62,10 +63,10 @@ class Caller:
     unexpected: list[str] = field(default_factory=list)
 
     def ask(self, method: str, path: str, **more: Any) -> httpx.Response:
-        """The reply of a service that is there and whose database is.
+        """The reply to a request, which is repeated while the service or its database is down.
 
         Raises:
-            TimeoutError: there was none until the deadline.
+            TimeoutError: there was no reply until the deadline.
         """
         while time.monotonic() < self.deadline:
             with suppress(httpx.TransportError):
@@ -75,10 +76,10 @@ class Caller:
                 elif reply.status_code != 503:
                     return reply
             time.sleep(0.1)
-        raise TimeoutError(f"{method} {path}: not answered: see {self.siege.log}")
+        raise TimeoutError(f"{method} {path}: not answered: see {self.installation.log}")
 
     def register(self, image: bytes, passes: int, key: str) -> None:
-        """Upload a scene and have it registered."""
+        """Upload a scene and request its registration."""
         name = f"/scenes?name=scene.tif&sigma_m={SIGMA_M}"
         scene = self._promised(self.ask("POST", name, content=image))["id"]
         self.scenes[scene] = hashlib.sha256(image).hexdigest()
@@ -88,13 +89,13 @@ class Caller:
         self.jobs[job["jobID"]] = scene
 
     def ingest(self, name: str, key: str) -> None:
-        """Have a block ingested."""
+        """Request the ingestion of a block."""
         body = {"path": name, "publish": True}
         job = self._promised(self.ask("POST", "/blocks", json=body, headers={"Idempotency-Key": key}))
         self.jobs[job["jobID"]] = name
 
     def wait(self, open_jobs: int) -> None:
-        """Return once no more jobs than so many have not ended."""
+        """Wait until at most this many jobs are open."""
         waiting = set(self.jobs)
         while len(waiting) > open_jobs:
             for job in tuple(waiting):
@@ -109,29 +110,29 @@ class Caller:
         return document
 
 
-def besiege(
+def run(
     folder: Path, registrations: int, ingestions: int, seed: int, kill_every_s: float
 ) -> dict[str, Any]:
-    """Run an installation under fire; what was asked, what became of it, and what is wrong with it.
+    """Run an installation whose processes are killed; returns requests, outcomes and errors.
 
     Args:
-        folder: for everything; others must be able to pass it.
+        folder: for all files; other users must be able to enter it.
     """
     rng = random.Random(seed)
     world = make_flat_world(folder / "world", size=800)
     image = world.tagged.read_bytes()
     started = time.monotonic()
-    with Siege(folder / "data", rng, kill_every_s) as siege:
-        storage = Storage(siege.folder / "storage")
-        with siege.inside() as connection:
+    with KilledInstallation(folder / "data", rng, kill_every_s) as installation:
+        storage = Storage(installation.folder / "storage")
+        with installation.inside() as connection:
             block = ingest_block(connection, storage, world.block).block
             publish_block(connection, str(block.number))
         tasks = ["registration"] * registrations + ["ingestion"] * ingestions
         random.Random(seed).shuffle(tasks)
-        headers = {"Authorization": f"Bearer {siege.token()}"}
-        siege.open_fire()
-        with httpx.Client(base_url=siege.url, headers=headers, timeout=15.0) as client:
-            caller = Caller(siege, client, started + LONGEST_RUN_S)
+        headers = {"Authorization": f"Bearer {installation.token()}"}
+        installation.start_killing()
+        with httpx.Client(base_url=installation.url, headers=headers, timeout=15.0) as client:
+            caller = Caller(installation, client, started + LONGEST_RUN_S)
             for number, task in enumerate(tasks):
                 if task == "registration":
                     passes = random.Random(seed + number).randint(1, MOST_PASSES)
@@ -139,37 +140,37 @@ def besiege(
                 else:
                     name = f"faults-{number}"
                     box = (5.2 + number, 43.2, 5.3 + number, 43.3)
-                    into = siege.ingest_folder / name
+                    into = installation.ingest_folder / name
                     make_block(
                         into, POINTS, seed=number, name=name, box=box, n_images=IMAGES, gsds_m=(2.0,)
                     )
                     caller.ingest(name, f"task {number}")
                 caller.wait(OPEN_AT_ONCE - 1)
-                told = ", ".join(f"{kind} {count}" for kind, count in siege.killed.items())
-                print(f"{number + 1} of {len(tasks)} asked for; killed: {told}", file=sys.stderr)
+                counts = ", ".join(f"{kind} {count}" for kind, count in installation.killed.items())
+                print(f"{number + 1} of {len(tasks)} requested; killed: {counts}", file=sys.stderr)
             caller.wait(0)
-            siege.cease_fire()
-            siege.wait_ready()
+            installation.stop_killing()
+            installation.wait_ready()
     taken_s = time.monotonic() - started
-    with siege.cluster.lease() as dsn:
-        outcome = looked_over(dsn, siege, caller)
+    with installation.cluster.lease() as dsn:
+        outcome = check_outcome(dsn, installation, caller)
     return {
         "registrations": registrations,
         "ingestions": ingestions,
         "seed": seed,
         "taken_s": round(taken_s, 1),
-        "killed": dict(siege.killed),
+        "killed": dict(installation.killed),
         **outcome,
     }
 
 
-def looked_over(dsn: str, siege: Siege, caller: Caller) -> dict[str, Any]:
-    """What became of all that was asked, and everything that is wrong; nobody runs any more."""
-    settings = Settings(database_url=dsn, data_folder=siege.folder, lease_seconds=LEASE_S)
-    storage = Storage(siege.folder / "storage")
+def check_outcome(dsn: str, installation: KilledInstallation, caller: Caller) -> dict[str, Any]:
+    """The outcomes of all requests, and all errors, after all processes have ended."""
+    settings = Settings(database_url=dsn, data_folder=installation.folder, lease_seconds=LEASE_S)
+    storage = Storage(installation.folder / "storage")
     with engine.pooled(dsn, settings) as database:
         with database.transaction() as connection:
-            # Uploads that were cut off are given up after a day: let it pass.
+            # Abandoned uploads are deleted after a day: simulate two days.
             run_sql(
                 connection,
                 "update scene set created_at = created_at - interval '2 days' where state = 'uploading'",
@@ -195,7 +196,7 @@ def looked_over(dsn: str, siege: Siege, caller: Caller) -> dict[str, Any]:
 
 
 def wrong_jobs(connection: Connection, jobs: list[dict[str, Any]], caller: Caller) -> list[str]:
-    """Promised jobs that are gone, ended never or twice, and results that are not whole."""
+    """Accepted jobs that are missing, have not ended or ended twice, and incomplete results."""
     jobs_by_id = {str(job["id"]): job for job in jobs}
     wrong = [f"job {job} is gone" for job in caller.jobs if job not in jobs_by_id]
     for name, job in jobs_by_id.items():
@@ -221,7 +222,7 @@ def wrong_jobs(connection: Connection, jobs: list[dict[str, Any]], caller: Calle
 
 
 def wrong_scenes(connection: Connection, storage: Storage, caller: Caller) -> list[str]:
-    """Promised uploads that are gone or are not what was sent."""
+    """Accepted uploads that are missing or differ from what was sent."""
     wrong = []
     for scene, sha256 in caller.scenes.items():
         row = run_sql(connection, "select file_key, state from scene where id = %s", [scene]).fetchone()
@@ -233,7 +234,7 @@ def wrong_scenes(connection: Connection, storage: Storage, caller: Caller) -> li
 
 
 def wrong_blocks(connection: Connection, jobs: list[dict[str, Any]]) -> list[str]:
-    """Blocks that are there without their job, not there with it, or not whole."""
+    """Blocks that are present without a successful job, absent with one, or incomplete."""
     ingested = {
         job["inputs"]["path"]: job["state"] == "successful"
         for job in jobs
@@ -267,7 +268,7 @@ def wrong_blocks(connection: Connection, jobs: list[dict[str, Any]]) -> list[str
 
 
 def wrong_files(connection: Connection, storage: Storage) -> list[str]:
-    """Files that no row names, rows whose file is missing, chips that are not what their name says."""
+    """Files without rows, rows without files, and chips with another checksum than their name."""
     named = {
         row["key"]
         for row in run_sql(
@@ -292,19 +293,19 @@ def wrong_files(connection: Connection, storage: Storage) -> list[str]:
 
 
 def main() -> int:
-    """Besiege an installation, print and keep what became of it; 1 when anything is wrong."""
+    """Run, print and save the results; returns 1 if anything is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--registrations", type=int, default=50)
     parser.add_argument("--ingestions", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kill-every-s", type=float, default=2.0)
     arguments = parser.parse_args()
-    # What was started ends with this command, however that one is ended.
+    # The started processes end with this command, also when it is stopped.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
-    with tempfile.TemporaryDirectory(prefix="amers-siege-", dir="/tmp") as name:
+    with tempfile.TemporaryDirectory(prefix="amers-faults-", dir="/tmp") as name:
         folder = Path(name)
         folder.chmod(0o755)
-        outcome = besiege(
+        outcome = run(
             folder,
             arguments.registrations,
             arguments.ingestions,

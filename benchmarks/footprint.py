@@ -1,8 +1,9 @@
-"""The points of a footprint as GeoJSON: built by the database, against rows decoded in Python.
+"""The points of a footprint as GeoJSON: built by the database, compared with rows decoded in Python.
 
-A private cluster is filled with a million points in Hilbert order, one for 2 km2 on average. Boxes that
-hold about 1,000 and 2,000 points are asked for in turn by both ways, on one connection, warm; both give
-the same features. Run: python -m benchmarks.footprint
+A private cluster is filled with a million points in Hilbert order, on average one per 2 km2. Boxes with
+about 1,000 and 2,000 points are read in turn in both ways, on one warm connection; both ways give the
+same features.
+Run: python -m benchmarks.footprint
 """
 
 import argparse
@@ -54,7 +55,7 @@ class Outcome:
 
 
 def main() -> None:
-    """Fill, measure, print, keep."""
+    """Fill the store, measure, print and save the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=60)
@@ -73,7 +74,7 @@ def main() -> None:
 
 
 def measure(connection: Connection, ground: Ground, size: int, repeats: int) -> Outcome:
-    """Time both ways in turn on the same boxes, the first of each not counted."""
+    """Time both ways in turn on the same boxes, without the first run of each."""
     rng = np.random.default_rng(size)
     times: dict[str, list[float]] = {"sql": [], "python": []}
     counts = []
@@ -92,14 +93,14 @@ def measure(connection: Connection, ground: Ground, size: int, repeats: int) -> 
 
 
 def timed(work: Callable[[], bytes]) -> tuple[bytes, float]:
-    """What the work gives, and how long it took."""
+    """The result of the work, and its time in milliseconds."""
     start = time.perf_counter()
     out = work()
     return out, time.perf_counter() - start
 
 
 def in_database(connection: Connection, box: Box) -> bytes:
-    """The way of the service."""
+    """The reply as the service builds it."""
     bbox = f"{box.west!r},{box.south!r},{box.east!r},{box.north!r}"
     query = resolve(find_collection("points"), Viewer(), FeatureQuery(limit=10_000, bbox=bbox), SECRET)
     feature_page = page(connection, query, "geojson", SECRET)
@@ -123,7 +124,7 @@ def in_rows(connection: Connection, box: Box) -> bytes:
 
 
 def assert_same(one: bytes, other: bytes) -> None:
-    """Both replies say the same."""
+    """Check that both replies have the same features."""
     first, second = json.loads(one), json.loads(other)
     assert first["numberReturned"] == second["numberReturned"] > 0
     for a, b in zip(first["features"], second["features"], strict=True):

@@ -1,9 +1,10 @@
-"""Points ingested a second, checks and commit included, each with 8 chips of 16 bits.
+"""Points ingested per second, with all checks and the commit, each with 8 chips of 16 bits.
 
-One block is made and ingested into a private cluster that keeps every commit, as an installation's does.
-The time is told by steps; without the step that passes over the bytes of the chip files (copy, checksum,
-bring to the disk) what is left is the work on rows. Beside it the same files are copied and brought to
-the disk by as many threads and nothing else: what the disk gives. Run: python -m benchmarks.ingestion
+One block is made and ingested into a private cluster with durable commits, as in an installation. The
+time is reported by steps. Without the step that copies the chip files (copy, checksum, sync to the
+disk), the rest is the work on rows. For comparison, the same files are only copied and synced by as
+many threads, which shows the speed of the disk.
+Run: python -m benchmarks.ingestion
 """
 
 import argparse
@@ -27,7 +28,7 @@ IMAGES = 8
 
 
 def main() -> None:
-    """Make a block, ingest it, print and keep what it took."""
+    """Make a block, ingest it, print and save the times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=10_000)
     arguments = parser.parse_args()
@@ -66,7 +67,7 @@ def main() -> None:
 
 
 def plain_copy(files: list[Path], folder: Path) -> float:
-    """Seconds to copy files, some at once, until they are on the disk."""
+    """Seconds to copy files in parallel until they are on the disk."""
     folder.mkdir()
 
     def copy(file: Path) -> None:

@@ -1,8 +1,8 @@
-"""Many clients at once on one API process, while a block is ingested and a scene registered.
+"""Many concurrent clients on one API process, while blocks are ingested and scenes registered.
 
-Each client asks for footprints, single points, tiles and chips in turn, as fast as it is answered.
-Nothing may be refused or fail; the times to the last byte are told by kind, and the resident memory of
-the API and of the worker over the run. The clients run on the same cores.
+Each client requests footprints, single points, tiles and chips in turn, without pauses. No request may
+be refused or fail. The results are the times to the last byte by kind of request, and the resident
+memory of the API and of the worker over the run. The clients run on the same cores.
 Run: python -m benchmarks.load --clients 64 --seconds 60
 """
 
@@ -41,22 +41,22 @@ BOX = (5.2, 43.2, 5.6, 43.6)
 POINTS, IMAGES = 6_000, 2
 INGESTED_POINTS = 2_000
 FOOTPRINT_DEG = 0.16
-"""Holds a sixth of the points: some thousand."""
+"""Contains a sixth of the points, about a thousand."""
 ZOOMS = (8, 10, 12)
 SAMPLE_EVERY_S = 0.25
 PATIENCE_S = 300.0
 MOST_GROWTH = 1.15
-"""Of resident memory from the second quarter of the run to the last: the first one warms up."""
+"""Limit of the growth of resident memory from the second to the last quarter of the run."""
 ENDED = ("successful", "failed", "dismissed")
 
 
 @dataclass
 class Load:
-    """What clients were told and how long it took them.
+    """Replies that clients received, and their times.
 
     Attributes:
         seconds: by kind of request.
-        errors: how often each wrong answer was given.
+        errors: number of each kind of wrong reply.
     """
 
     seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -64,10 +64,10 @@ class Load:
 
 
 def run(folder: Path, clients: int, seconds: float, seed: int) -> dict[str, Any]:
-    """Load an installation; what it answered.
+    """Load an installation; returns the results.
 
     Args:
-        folder: for everything; others must be able to pass it.
+        folder: for all files; other users must be able to enter it.
     """
     service = Service(folder / "data", AMERS_INGEST_FOLDER=str(folder))
     try:
@@ -89,7 +89,7 @@ def run(folder: Path, clients: int, seconds: float, seed: int) -> dict[str, Any]
 
 
 def _fill(service: Service, folder: Path) -> tuple[str, int]:
-    """Publish a block to be asked for; a token, and the id of the first point."""
+    """Publish a block; returns a token and the id of the first point."""
     made = make_block(
         folder / "served",
         POINTS,
@@ -206,7 +206,7 @@ KINDS: tuple[Callable[[random.Random, int], tuple[str, str]], ...] = (_footprint
 
 
 def _asked(line: http.client.HTTPConnection, path: str, secret: str) -> str:
-    """What was wrong with a reply; nothing if it is whole."""
+    """The error of a reply; an empty text if it is complete."""
     try:
         line.request("GET", path, headers={"Authorization": f"Bearer {secret}"})
         reply = line.getresponse()
@@ -221,7 +221,7 @@ def _asked(line: http.client.HTTPConnection, path: str, secret: str) -> str:
 
 @dataclass
 class _Jobs:
-    """A block ingested and a scene registered, again and again until the time is over."""
+    """Ingestions and registrations, repeated until the time is over."""
 
     service: Service
     folder: Path
@@ -229,7 +229,7 @@ class _Jobs:
     seconds: float
 
     def done(self) -> dict[str, int]:
-        """How many jobs of each kind ended how."""
+        """The number of jobs by kind and final state."""
         headers = {"Authorization": f"Bearer {self.secret}"}
         ended: Counter[str] = Counter()
         world = make_flat_world(self.folder / "world", size=800)
@@ -286,7 +286,7 @@ def _resident_bytes(pid: int) -> int:
 
 
 def _growth(samples: list[int]) -> float | None:
-    """Median of the last quarter over that of the second one; None for too short a run."""
+    """Ratio of the medians of the last and the second quarter; None if the run is too short."""
     quarter = len(samples) // 4
     if quarter < 4:
         return None
@@ -299,13 +299,13 @@ def _spread_ms(times: list[float]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Load an installation, print and keep what it answered; 1 when anything failed or memory grew."""
+    """Load an installation, print and save the results; returns 1 if a request failed or memory grew."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clients", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    # What was started ends with this command, however that one is ended.
+    # The started processes end with this command, also when it is stopped.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
     with tempfile.TemporaryDirectory(prefix="amers-load-", dir="/tmp") as name:
         folder = Path(name)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.faults import besiege
+from benchmarks.faults import run
 
 pytestmark = pytest.mark.long
 
@@ -16,7 +16,7 @@ SEED = 7
 def test_whoever_is_killed_whenever_every_job_ends_once_and_nothing_is_half(open_folder: Path):
     folder = open_folder / "faults"
     folder.mkdir(mode=0o755)
-    outcome = besiege(folder, REGISTRATIONS, INGESTIONS, SEED, KILL_EVERY_S)
+    outcome = run(folder, REGISTRATIONS, INGESTIONS, SEED, KILL_EVERY_S)
     assert outcome["wrong"] == [], outcome
     assert sum(outcome["ended"].values()) == REGISTRATIONS + INGESTIONS
     assert sum(outcome["killed"].values()) >= 1, "nobody was killed: this shows nothing"

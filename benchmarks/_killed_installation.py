@@ -1,4 +1,4 @@
-"""An installation whose processes are killed at random and started again, as an operator's would be."""
+"""An installation whose processes are killed at random and restarted, as by a service manager."""
 
 import os
 import random
@@ -25,14 +25,14 @@ from tests.service_process import free_port
 LEASE_S = 2.0
 WORKERS = 2
 LONGEST_REST_S = 1.0
-"""A process that was killed is started again after so long at most."""
+"""Longest time until a killed process is restarted."""
 PATIENCE_S = 120.0
 VICTIMS = ("api", "worker", "attempt", "database")
 
 
 @dataclass
 class Service:
-    """A command that is started again whenever it has died.
+    """A command that is restarted whenever it has died.
 
     Attributes:
         command: of `amers`.
@@ -47,7 +47,7 @@ class Service:
     rests_until: float = 0.0
 
     def tend(self, rest_s: float) -> None:
-        """Start the command if it has died and has rested."""
+        """Restart the command if it has died and its pause is over."""
         if self.process is not None and self.process.poll() is not None:
             self.process, self.rests_until = None, time.monotonic() + rest_s
         if self.process is None and time.monotonic() >= self.rests_until:
@@ -61,19 +61,19 @@ class Service:
                 )
 
     def end(self) -> None:
-        """Ask the command to end, and see that it does."""
+        """Stop the command by SIGTERM and wait until it has ended."""
         if self.process is not None and self.process.poll() is None:
             self.process.terminate()
             self.process.wait(PATIENCE_S)
 
 
 @dataclass
-class Siege:
-    """A running installation and who kills it.
+class KilledInstallation:
+    """A running installation, and the thread that kills its processes.
 
     Attributes:
         folder: its data folder.
-        rng: of the moments and the victims.
+        rng: draws the moments and the victims.
         kill_every_s: from the moment the service is ready again to the next kill, in the mean;
             exponentially distributed.
         killed: how often each kind of process was.
@@ -88,7 +88,7 @@ class Siege:
     _stop: threading.Event = field(default_factory=threading.Event)
     _quiet: threading.Event = field(default_factory=threading.Event)
 
-    def __enter__(self) -> "Siege":
+    def __enter__(self) -> "KilledInstallation":
         self.port = free_port()
         self.ingest_folder.mkdir(parents=True)
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
@@ -125,17 +125,17 @@ class Siege:
 
     @property
     def url(self) -> str:
-        """Where the API is."""
+        """Address of the API."""
         return f"http://127.0.0.1:{self.port}"
 
     @property
     def ingest_folder(self) -> Path:
-        """Where blocks to be ingested lie."""
+        """Folder of the blocks to ingest."""
         return self.folder.with_name("ingest")
 
     @property
     def log(self) -> Path:
-        """What all processes say."""
+        """Log of all processes."""
         return self.folder.with_name("log.txt")
 
     @property
@@ -144,7 +144,7 @@ class Siege:
         return Cluster(self.folder / "postgres")
 
     def wait_ready(self) -> None:
-        """Return once the API and the database answer.
+        """Wait until the API and the database answer.
 
         Raises:
             TimeoutError: they do not.
@@ -162,17 +162,17 @@ class Siege:
         with self.cluster.lease() as dsn, connect(dsn) as connection:
             return create_token(connection, "faults", ["admin"]).secret
 
-    def open_fire(self) -> None:
-        """Begin to kill."""
+    def start_killing(self) -> None:
+        """Start to kill processes."""
         self._start(self._kill)
 
-    def cease_fire(self) -> None:
-        """Kill no more."""
+    def stop_killing(self) -> None:
+        """Stop killing processes."""
         self._quiet.set()
 
     @contextmanager
     def inside(self) -> Iterator[psycopg.Connection[dict[str, object]]]:
-        """A connection to the database, for those who look at what is left."""
+        """A connection to the database, to check what is left."""
         with self.cluster.lease() as dsn, connect(dsn) as connection:
             yield connection
 
@@ -201,7 +201,7 @@ class Siege:
                 self.wait_ready()
 
     def _numbers(self, victim: str) -> list[int]:
-        """The processes of a kind; all of the server's are one."""
+        """The processes of a kind; those of the database server count as one."""
         if victim == "database":
             with suppress(OSError, IndexError, ValueError):
                 server = int((self.cluster.data / "postmaster.pid").read_text().splitlines()[0])
