@@ -27,7 +27,7 @@ def make_block(images: list[Path], folder: Path) -> None:
     # `sigma_m` states how wrong the models of the images may be: one standard deviation per coordinate.
     production = run_production(images, folder, identity, options, sigma_m=3.0)
 
-    accuracy = production.relative
+    accuracy = production.relative_accuracy
     print(f"{len(production.points)} points in {folder}")
     print(f"median distance between rays and tie points: {accuracy.before_px:.2f} px as delivered,")
     print(f"{accuracy.after_px:.2f} px after the adjustment of the images")
