@@ -11,7 +11,7 @@ straight to the driver.
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import Any
 
@@ -21,6 +21,8 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 
 DIALECT: Dialect = postgresql.psycopg.dialect()  # type: ignore[no-untyped-call]
+KEPT_STRUCTURES = 512
+"""Compiled statements of users' filters that are kept."""
 NAME = re.compile(r"^-- name: (\w+)$", re.MULTILINE)
 
 
@@ -46,6 +48,36 @@ def hot(statement: ClauseElement) -> HotStatement:
     compiled = statement.compile(dialect=DIALECT, compile_kwargs={"render_postcompile": True})
     constants = {name: value for name, value in compiled.params.items() if value is not None}
     return HotStatement(str(compiled).encode(), constants)
+
+
+def hot_like(statement: Select[Any]) -> HotStatement:
+    """`hot`, compiled once for all statements that differ only in the values of literals."""
+    structure = _Structure(statement)
+    compiled, sql = _compiled(structure)
+    values = compiled.construct_params(extracted_parameters=structure.key.bindparams)
+    return HotStatement(sql, {name: value for name, value in values.items() if value is not None})
+
+
+class _Structure:
+    """A statement; equal to every other of the same structure, as SQLAlchemy's own cache sees it."""
+
+    def __init__(self, statement: Select[Any]) -> None:
+        key = statement._generate_cache_key()
+        assert key is not None
+        self.statement, self.key = statement, key
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self.key.key == other.key.key
+
+    def __hash__(self) -> int:
+        return hash(self.key.key)
+
+
+@lru_cache(KEPT_STRUCTURES)
+def _compiled(structure: _Structure) -> tuple[SQLCompiler, bytes]:
+    compiled = structure.statement.compile(dialect=DIALECT, cache_key=structure.key)
+    assert isinstance(compiled, SQLCompiler)
+    return compiled, str(compiled).encode()
 
 
 class CopyIn(ClauseElement):

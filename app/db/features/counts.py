@@ -17,8 +17,8 @@ from app.db.engine import Connection, driver
 from app.db.features.bbox import WORLD
 from app.db.features.collection import Collection, Viewer
 from app.db.features.predicates import ANYTHING, BoxShape, height_predicate
-from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible, unprepared
-from app.db.statements import HotStatement, hot
+from app.db.features.query import KEPT_STATEMENTS, Selection, select_visible
+from app.db.statements import HotStatement, hot, hot_like
 
 EXACT_COUNT = 10_000
 COUNTING_MS = 1_000
@@ -75,12 +75,11 @@ def count(connection: Connection, selection: Selection) -> Count:
 def _count_few(connection: Connection, selection: Selection) -> int:
     """The number of selected features, at most one more than is counted exactly."""
     predicate = selection.condition.non_bbox_predicate
-    if predicate is not None:
+    if predicate is None:
+        statement = _few_statement(selection.collection, selection.box_shape)
+    else:
         few = select_visible(selection.collection, selection.box_shape, integer_constant(1))
-        few = few.where(predicate).limit(integer_constant(EXACT_COUNT + 1))
-        with unprepared(connection):
-            return int(connection.execute(_counted(few), selection.parameters).scalar_one())
-    statement = _few_statement(selection.collection, selection.box_shape)
+        statement = hot_like(_counted(few.where(predicate).limit(integer_constant(EXACT_COUNT + 1))))
     with driver(connection).cursor() as cursor:
         cursor.execute(statement.sql, statement.parameters(selection.parameters), prepare=False)
         row = cursor.fetchone()

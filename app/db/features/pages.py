@@ -27,7 +27,6 @@ from app.db.features.query import (
     page_parameters,
     page_select,
     sortable,
-    unprepared,
 )
 from app.db.features.serialization import csv_text, feature_text, plain_value
 from app.db.schema import installation
@@ -141,11 +140,6 @@ def _rows(
     Row by row: one text of all features would be twice as long on the way, most of it spent on memory.
     """
     parameters = page_parameters(selection, after, limit)
-    if selection.condition.non_bbox_predicate is not None:
-        # SQLAlchemy keeps the text of statements that differ in values only.
-        with unprepared(connection):
-            result = connection.execute(page_select(selection, columns, after), parameters)
-            return result.cursor.fetchall()
     statement = hot_page(selection, columns, after)
     with driver(connection).cursor() as cursor:
         cursor.execute(statement.sql, statement.parameters(parameters), prepare=False)

@@ -4,8 +4,7 @@ A statement is built once for each layout and shape of a request; boxes, keys an
 its bind parameters. Only the predicate of a user's filter is added to it request by request.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -25,13 +24,12 @@ from sqlalchemy import (
 )
 
 from app.db.constants import integer_constant
-from app.db.engine import Connection, driver
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.crs import Crs
 from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
 from app.db.opaque import opaque
 from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot
+from app.db.statements import HotStatement, hot, hot_like
 
 KEPT_STATEMENTS = 512
 """Statements kept for each step: of the layouts and orders that users ask for."""
@@ -136,10 +134,11 @@ def page_select(selection: Selection, columns: Columns, after: Key | None) -> Se
 
 
 def hot_page(selection: Selection, columns: Columns, after: Key | None) -> HotStatement:
-    """`page_select` compiled; kept unless a user's filter is part of it."""
-    if selection.condition.non_bbox_predicate is not None:
-        return hot(page_select(selection, columns, after))
-    return _kept_hot(page_select(selection, columns, after))
+    """`page_select` compiled, once for all requests of the same structure."""
+    statement = page_select(selection, columns, after)
+    if selection.condition.non_bbox_predicate is None:
+        return _kept_hot(statement)
+    return hot_like(statement)
 
 
 def page_parameters(selection: Selection, after: Key | None, limit: int) -> dict[str, Any]:
@@ -153,20 +152,6 @@ def page_parameters(selection: Selection, after: Key | None, limit: int) -> dict
     if after is not None:
         parameters |= {_after_name(place): value for place, value in enumerate(after)}
     return parameters
-
-
-@contextmanager
-def unprepared(connection: Connection) -> Iterator[Connection]:
-    """The connection, on which the driver prepares no statement until the end of the context.
-
-    The best plan for a box or a filter depends on its values.
-    """
-    own = driver(connection)
-    threshold, own.prepare_threshold = own.prepare_threshold, None
-    try:
-        yield connection
-    finally:
-        own.prepare_threshold = threshold
 
 
 def select_visible(
