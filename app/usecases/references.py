@@ -12,8 +12,8 @@ from app.db.engine import Connection, Database
 from app.db.references import ReferenceRow
 from app.errors import Conflict, InputError, NotFound
 from app.usecases.registration.reference_source import (
+    CoveringReference,
     FindReference,
-    FoundReference,
     ReferenceFiles,
     read_reference,
 )
@@ -98,13 +98,13 @@ def remove_reference(connection: Connection, name: str) -> None:
 def references_of_store(database: Database, settings: Settings) -> FindReference:
     """A source of the installation's references, with the places where earlier scenes matched them."""
 
-    def find(outline: Array) -> FoundReference | None:
+    def find(outline: Array) -> CoveringReference | None:
         with database.snapshot() as connection:
             row = references.best_reference(connection, outline)
             if row is None:
                 return None
             places = references.places_inside(connection, row.id, outline, worthwhile=True)
-        return FoundReference(
+        return CoveringReference(
             row.name, _reference_files(settings, row), row.id, row.gsd_m, places.lon_lat_h
         )
 
@@ -112,7 +112,7 @@ def references_of_store(database: Database, settings: Settings) -> FindReference
 
 
 def record_places(
-    connection: Connection, found: FoundReference, registration: Registration, outline: Array
+    connection: Connection, covering: CoveringReference, registration: Registration, outline: Array
 ) -> None:
     """Record where a scene matched a reference, for later scenes of the same ground.
 
@@ -121,18 +121,18 @@ def record_places(
 
     Args:
         connection: with the transaction that stores the registration.
-        found: the reference.
+        covering: the reference.
         registration: of the scene on the reference.
         outline: (m, 2) lon, lat that contains the scene.
     """
-    if found.id is None or registration.qualification.verdict == "failed":
+    if covering.id is None or registration.qualification.verdict == "failed":
         return
-    if not references.lock_reference(connection, found.id):
+    if not references.lock_reference(connection, covering.id):
         return
     measures = registration.measures
     is_tried = np.isfinite(measures.lon_lat_h).all(axis=1) & (measures.reason != "nodata")
-    earlier = references.places_inside(connection, found.id, outline, worthwhile=False)
-    apart_m = ReferenceMatchingOptions().window_px / 2.0 * found.gsd_m
+    earlier = references.places_inside(connection, covering.id, outline, worthwhile=False)
+    apart_m = ReferenceMatchingOptions().window_px / 2.0 * covering.gsd_m
     place = ecef_from_lon_lat_h(measures.lon_lat_h[is_tried])
     is_active = measures.active[is_tried]
     nearest = np.full(len(place), len(earlier.id))
@@ -145,7 +145,7 @@ def record_places(
     references.count_places(connection, earlier.id[rows], is_matched)
     new = np.flatnonzero(~is_again & is_active)
     new = new[_mutually_apart(place[new], apart_m)]
-    references.insert_places(connection, found.id, measures.lon_lat_h[is_tried][new])
+    references.insert_places(connection, covering.id, measures.lon_lat_h[is_tried][new])
 
 
 def _mutually_apart(ecef: Array, apart_m: float) -> BoolArray:

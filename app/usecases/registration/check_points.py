@@ -1,4 +1,4 @@
-"""Check points that a user gives: known ground, marked in a scene, held out of its registration."""
+"""Read the check points of a scene: known ground marked in it, and held out of its registration."""
 
 from pathlib import Path
 
@@ -10,39 +10,43 @@ from services.formats.gcp.reader import read_control_points
 from services.imagery.scene import Scene
 from services.quality.check_points import CheckPoints
 from services.sensors.ortho import OrthoModel
+from services.types import Array
 
 
 def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene) -> CheckPoints:
-    """The check points of a scene: where its file says which points are held out, those; else all.
+    """The check points of a scene: the points that its file flags as such; all points if it flags none.
 
     Args:
-        path: of any format that `read_control_points` reads.
-        heights: what its heights are above, where it does not say; see `read_control_points`.
-        image: of the scene; marks in images of other names are left aside.
-        scene: an ortho-image needs no heights.
+        path: of the file, in any format that `read_control_points` reads.
+        heights: vertical datum of its heights, where it states none; see `read_control_points`.
+        image: of the scene; marks in other images are not used.
+        scene: needs no heights if it is an ortho-image.
 
     Raises:
         InputError: the file cannot be used, or has no check point of this scene.
     """
     marks = read_control_points(path, heights)
     names = np.char.lower(marks.image)
-    own = np.isin(names, ["", image.name.lower(), image.stem.lower()])
-    if not own.any():
+    is_in_scene = np.isin(names, ["", image.name.lower(), image.stem.lower()])
+    if not is_in_scene.any():
         others = ", ".join(sorted(set(marks.image.tolist()))[:3]) or "no image"
         raise InputError(f"{path.name}: expected marks in {image.name}, found marks in {others}")
-    marks = marks.take(own)
+    marks = marks.take(is_in_scene)
     marks = marks.take(marks.check if marks.check.any() else marks.active)
     if len(marks) == 0:
-        raise InputError(f"{path.name}: all {int(own.sum())} points are switched off")
-    return CheckPoints(_ground(marks, path, scene), marks.line_sample, marks.sigma_m, marks.sigma_px)
+        raise InputError(
+            f"{path.name}: all {int(is_in_scene.sum())} points are switched off; switch some on"
+        )
+    lon_lat_h = _ground_positions(marks, path, scene)
+    return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px)
 
 
-def _ground(marks: MarkedPoints, path: Path, scene: Scene) -> np.ndarray:
-    """The points; without heights where an ortho-image needs none."""
+def _ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:
+    """Ground positions (n, 3) of the points; missing heights are 0 where an ortho-image needs none."""
     missing = np.isnan(marks.lon_lat_h[:, 2])
     if missing.any() and not isinstance(scene.model, OrthoModel):
         raise InputError(
-            f"{path.name}: {int(missing.sum())} of {len(marks)} points have no height, which a scene "
-            "that is not an ortho-image needs"
+            f"{path.name}: {int(missing.sum())} of {len(marks)} points have no height; a scene that is "
+            "not an ortho-image needs heights"
         )
     return np.nan_to_num(marks.lon_lat_h, nan=0.0)

@@ -43,7 +43,7 @@ class ReferenceFiles:
 
 
 @dataclass(frozen=True)
-class FoundReference:
+class CoveringReference:
     """A reference that shows the ground of a scene.
 
     Attributes:
@@ -61,31 +61,31 @@ class FoundReference:
     earlier_places: Array | None = None
 
 
-FindReference = Callable[[Array], FoundReference | None]
+FindReference = Callable[[Array], CoveringReference | None]
 """Finds a reference that shows the ground of an outline (n, 2) of lon, lat; None without any."""
 
 
 def given_reference(files: ReferenceFiles) -> FindReference:
     """A source of one reference, whatever the outline."""
-    return lambda outline: FoundReference(files.image.name, files)
+    return lambda outline: CoveringReference(files.image.name, files)
 
 
 def register_on(
-    found: FoundReference, scene: Scene, options: RegistrationOptions, progress: Progress
+    covering: CoveringReference, scene: Scene, options: RegistrationOptions, progress: Progress
 ) -> tuple[Registration, ControlSet]:
     """Register a scene on a reference.
 
     Returns:
         The registration, and its places on the reference as control points.
     """
-    reference = read_reference(found.files)
+    reference = read_reference(covering.files)
     registration = register_on_reference(
-        scene, reference, options, progress=progress, earlier_places=found.earlier_places
+        scene, reference, options, progress=progress, earlier_places=covering.earlier_places
     )
     lon_lat_h = registration.measures.lon_lat_h
     points = reference_points(lon_lat_h, reference)
     chips = ReferenceChips(reference, lon_lat_h)
-    used = BlockUsed(found.name, "reference image")
+    used = BlockUsed(covering.name, "reference image")
     return registration, ControlSet(points, chips, (used,), reference.frame_sigma_m)
 
 

@@ -17,7 +17,7 @@ from app.usecases.references import record_places
 from app.usecases.registration.check_points import read_check_points
 from app.usecases.registration.control_sources import ControlSet, FindPoints
 from app.usecases.registration.deliverables import write_outputs
-from app.usecases.registration.reference_source import FindReference, FoundReference, register_on
+from app.usecases.registration.reference_source import CoveringReference, FindReference, register_on
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import CoverageError
 from services.formats.images.bands import parse_bands
@@ -86,7 +86,7 @@ class RegisteredScene:
 
     scene: Scene
     registration: Registration
-    reference: FoundReference | None
+    reference: CoveringReference | None
     report: RegistrationReport
     footprint: Array
     files: dict[str, Path]
@@ -207,7 +207,7 @@ def image_key(image: Path) -> str:
 
 def _register(
     scene: Scene, sources: ControlSources, options: RegistrationOptions, progress: Progress
-) -> tuple[Registration, ControlSet, FoundReference | None]:
+) -> tuple[Registration, ControlSet, CoveringReference | None]:
     """The registration of a scene on control points, or else on a reference image; and its control."""
     outline = _grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
