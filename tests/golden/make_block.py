@@ -1,4 +1,4 @@
-"""Writes a small Amers block from its description alone: JSON, Parquet and NumPy, without the code."""
+"""Writes a small Amers block from the format description alone, without the code under test."""
 
 import hashlib
 import json
@@ -93,7 +93,7 @@ def table(fields, metadata):
 
 
 def chips():
-    """Ramps whose numbers tell chip, row and column apart; the format's header by hand."""
+    """Chips of ramps that differ by chip, row and column, with a header written by hand."""
     count = len(POINTS) * len(IMAGES)
     number, row, column = np.indices((count, 101, 101))
     pixels = ((31 * number + 3 * row + 5 * column) % 255 + 1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Writes the same marked points in the formats of the field, without the code under test."""
+"""Writes the same marked points in all formats, without the code under test."""
 
 import hashlib
 import json

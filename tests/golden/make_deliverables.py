@@ -1,4 +1,4 @@
-"""Writes what a registration delivers, without the code under test."""
+"""Writes the deliverables of a registration, without the code under test."""
 
 import json
 from pathlib import Path
@@ -41,7 +41,7 @@ def correction():
 
 
 def dimap(name, first):
-    """The delivered document with four other numbers: offsets and scales of the image."""
+    """The delivered document with four changed numbers: offsets and scales of the image."""
     text = (HERE / name).read_text()
     line, sample = make_rpc.LINE_OFF + first, make_rpc.SAMP_OFF + first
     for was, becomes, key in (
@@ -56,7 +56,7 @@ def dimap(name, first):
 
 
 def sidecar():
-    """A turned and mirrored map of UTM zone 33; the geotransform is of the first pixel's corner."""
+    """A rotated and mirrored map grid in UTM zone 33, with the geotransform of the pixel corner."""
     crs = CRS.from_epsg(32633).to_wkt("WKT2_2019").replace("&", "&amp;").replace("<", "&lt;")
     return (
         '<PAMDataset>\n  <SRS dataAxisToSRSAxisMapping="1,2">' + crs + "</SRS>\n"
@@ -66,7 +66,7 @@ def sidecar():
 
 
 def metres_per_degree(lat, height):
-    """East and north, by the radii of curvature of the ellipsoid."""
+    """Metres per degree east and north, from the radii of curvature of the ellipsoid."""
     e2 = FLATTENING * (2.0 - FLATTENING)
     w2 = 1.0 - e2 * np.sin(np.radians(lat)) ** 2
     across, along = SEMI_MAJOR_M / np.sqrt(w2), SEMI_MAJOR_M * (1.0 - e2) / w2**1.5
@@ -74,7 +74,7 @@ def metres_per_degree(lat, height):
 
 
 def residuals():
-    """The points, what their rows say, and both ends of the line of each point that was found."""
+    """The points, their attributes, and both ends of the line of each matched point."""
     rows = [dict(zip(NAMES, values, strict=True)) for values in POINTS]
     for row in rows:
         row["status"] = {"": "active", "deactivated": "deactivated"}.get(row["reason"], "not matched")

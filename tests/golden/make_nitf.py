@@ -1,4 +1,4 @@
-"""Writes two NITF 2.1 files to the byte, with RPC00B and RPC00A, and where they show points.
+"""Writes two NITF 2.1 files byte by byte, with RPC00B and RPC00A, and projected points.
 
 Source: MIL-STD-2500C for the headers, NGA STDI-0002 for the records.
 """
@@ -18,7 +18,7 @@ TERMS_B = [
     (0, 0, 2), (1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0), (0, 1, 2), (2, 0, 1),
     (0, 2, 1), (0, 0, 3),
 ]  # fmt: skip
-# RPC00A: the product of all three before the squares, the third degree by falling powers.
+# RPC00A: the product of all three before the squares, the third degree by descending powers.
 TERMS_A = [
     (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1, 1), (2, 0, 0),
     (0, 2, 0), (0, 0, 2), (3, 0, 0), (2, 1, 0), (2, 0, 1), (1, 2, 0), (0, 3, 0), (0, 2, 1), (1, 0, 2),
@@ -82,7 +82,7 @@ def nitf(name, terms):
 
 
 def places():
-    """Ground points and where the ratios, term by term, have them in the image."""
+    """Ground points, and their image positions by the ratios, computed term by term."""
     rng = np.random.default_rng(1)
     normalised = np.round(rng.uniform(-0.9, 0.9, (12, 3)), 6)
     ground = normalised * np.array(SCALE) + np.array(OFFSET)

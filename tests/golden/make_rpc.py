@@ -1,4 +1,4 @@
-"""Writes the invented RPC beside this file, in four conventions, without the code under test."""
+"""Writes the invented RPC into this folder in four formats, without the code under test."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A registration with a known truth, small enough to be made in every test."""
+"""A small simulated registration with a known truth, made anew in each test."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ METRE_DEG = 1.0 / 111_320.0
 
 @dataclass(frozen=True)
 class FlatModel:
-    """A vertical view of a plane at the equator: 0.5 m pixels, lines to the south."""
+    """A vertical view of a plane at the equator, with pixels of 0.5 m and lines towards the south."""
 
     height_range_m: tuple[float, float] = (-100.0, 100.0)
 

@@ -1,4 +1,4 @@
-"""Small simulated worlds, views, blocks and productions, each made once for all tests."""
+"""Small simulated worlds, views, blocks and productions, each computed once for all tests."""
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -26,7 +26,7 @@ OPTIONS = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=4.0, points=60)
 
 @cache
 def world(seed: int = 1) -> World:
-    """A square kilometre."""
+    """A world of one square kilometre."""
     return make_world(np.random.default_rng(seed), size_m=1000.0, posting_m=1.0)
 
 
@@ -49,13 +49,13 @@ def block_views() -> tuple[SimulatedView, ...]:
 
 @cache
 def production() -> Production:
-    """The points of the three views."""
+    """The points produced from the three views."""
     return produce_points([view.as_scene(BLOCK_SIGMA_M) for view in block_views()], OPTIONS)
 
 
 @dataclass(frozen=True)
 class MemoryChips:
-    """Chips of a production, row after row as in one file."""
+    """The chips of a production, in consecutive rows as in one file."""
 
     chips: ChipArray
 
@@ -72,7 +72,7 @@ def block() -> tuple[ControlPoints, MemoryChips]:
 
 
 def plan(name: str = "scene", **changes: object) -> ViewPlan:
-    """A view of the middle of the world, from a direction that no view of the block has."""
+    """The plan of a view of the middle of the world, from a direction that no view of the block has."""
     lon, lat = (float(v) for v in world().centre_lon_lat)
     base = ViewPlan(
         name,

@@ -1,4 +1,4 @@
-"""Coordinates agree with PROJ everywhere on the globe, and come back from every frame."""
+"""Coordinates agree with PROJ over the whole globe and survive round trips between frames."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ metres = st.floats(-50e3, 50e3)
 
 @pytest.fixture(scope="module")
 def globe() -> Array:
-    """Positions of all latitudes and longitudes, poles and antimeridian among them."""
+    """Positions at all latitudes and longitudes, including the poles and the antimeridian."""
     rng = np.random.default_rng(0)
     corners = np.stack(np.meshgrid(LONGITUDES, LATITUDES, HEIGHTS), axis=-1).reshape(-1, 3)
     anywhere = np.column_stack(
@@ -49,33 +49,33 @@ def test_ecef_agrees_with_proj_over_the_globe(globe: Array) -> None:
     np.testing.assert_allclose(ecef_from_lon_lat_h(globe), proj, rtol=0.0, atol=a_micrometre)
 
 
-def test_positions_come_back_from_proj_s_ecef_over_the_globe(globe: Array) -> None:
+def test_geodetic_positions_agree_with_proj_over_the_globe(globe: Array) -> None:
     ecef = np.column_stack(
         Transformer.from_crs(GEODETIC, GEOCENTRIC, always_xy=True).transform(*globe.T)
     )
-    found = lon_lat_h_from_ecef(ecef)
-    np.testing.assert_allclose(found[:, 1], globe[:, 1], rtol=0.0, atol=a_micrometre_deg)
-    np.testing.assert_allclose(found[:, 2], globe[:, 2], rtol=0.0, atol=a_micrometre)
-    turn = (found[:, 0] - globe[:, 0] + 180.0) % 360.0 - 180.0
+    actual = lon_lat_h_from_ecef(ecef)
+    np.testing.assert_allclose(actual[:, 1], globe[:, 1], rtol=0.0, atol=a_micrometre_deg)
+    np.testing.assert_allclose(actual[:, 2], globe[:, 2], rtol=0.0, atol=a_micrometre)
+    turn = (actual[:, 0] - globe[:, 0] + 180.0) % 360.0 - 180.0
     assert np.abs(turn * np.cos(np.radians(globe[:, 1]))).max() < a_micrometre_deg
-    assert np.abs(found[:, 0]).max() <= 180.0
+    assert np.abs(actual[:, 0]).max() <= 180.0
 
 
 def test_the_poles_have_a_latitude_and_a_height() -> None:
     polar_radius = 6_356_752.314_245
-    found = lon_lat_h_from_ecef(np.array([[0.0, 0.0, polar_radius + 5.0], [0.0, 0.0, -polar_radius]]))
-    np.testing.assert_allclose(found[:, 1:], [[90.0, 5.0], [-90.0, 0.0]], atol=a_micrometre)
+    actual = lon_lat_h_from_ecef(np.array([[0.0, 0.0, polar_radius + 5.0], [0.0, 0.0, -polar_radius]]))
+    np.testing.assert_allclose(actual[:, 1:], [[90.0, 5.0], [-90.0, 0.0]], atol=a_micrometre)
 
 
 @given(longitudes, st.floats(-90.0, 90.0), st.floats(-11e3, 800e3))
-def test_geodetic_and_ecef_are_each_other_s_inverse(lon: float, lat: float, h: float) -> None:
+def test_geodetic_and_ecef_conversions_are_inverse(lon: float, lat: float, h: float) -> None:
     ecef = ecef_from_lon_lat_h(np.array([[lon, lat, h]]))
     again = ecef_from_lon_lat_h(lon_lat_h_from_ecef(ecef))
     np.testing.assert_allclose(again, ecef, rtol=0.0, atol=a_micrometre)
 
 
 @given(longitudes, latitudes, heights, metres, metres, st.floats(-5e3, 5e3))
-def test_east_north_up_comes_back(
+def test_east_north_up_survives_a_round_trip(
     lon: float, lat: float, h: float, east: float, north: float, up: float
 ) -> None:
     origin, enu = np.array([lon, lat, h]), np.array([[east, north, up]])
@@ -105,7 +105,7 @@ def test_axes_point_east_north_and_up() -> None:
 
 
 @pytest.mark.parametrize("lat", [-70.0, 0.0, 43.6, 85.0])
-def test_a_degree_is_as_long_as_the_geodesic_says(lat: float) -> None:
+def test_the_length_of_a_degree_agrees_with_the_geodesic(lat: float) -> None:
     geod, step = Geod(ellps="WGS84"), 1e-4
     east_m, north_m = metres_per_degree(lat, 0.0)
     assert geod.inv(5.0, lat, 5.0 + step, lat)[2] == pytest.approx(east_m * step, abs=a_micrometre)
@@ -113,7 +113,7 @@ def test_a_degree_is_as_long_as_the_geodesic_says(lat: float) -> None:
     assert along == pytest.approx(north_m * step, abs=a_micrometre)
 
 
-def test_a_degree_grows_with_the_height() -> None:
+def test_the_length_of_a_degree_grows_with_the_height() -> None:
     above = ecef_from_lon_lat_h(np.array([[5.0, 43.0, 3000.0], [5.000_1, 43.0, 3000.0]]))
     east_m, _ = metres_per_degree(43.0, 3000.0)
     assert np.linalg.norm(above[1] - above[0]) == pytest.approx(east_m * 1e-4, abs=a_micrometre)

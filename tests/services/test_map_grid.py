@@ -1,4 +1,4 @@
-"""Map grids, held against GDAL and PROJ through rasterio."""
+"""Map grids agree with GDAL and PROJ through rasterio."""
 
 import numpy as np
 import pytest
@@ -28,8 +28,8 @@ def positions(grid: MapGrid, n: int = 200) -> np.ndarray:
 
 
 @pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
-def test_pixels_lie_where_gdal_has_them(grid: MapGrid) -> None:
-    """GDAL counts from the corner of the first pixel: half a pixel between both."""
+def test_positions_of_pixels_agree_with_gdal(grid: MapGrid) -> None:
+    """GDAL counts from the corner of the first pixel, which is a difference of half a pixel."""
     lines, samples = positions(grid).T
     (a, b), (c, d) = grid.step_xy
     corner = grid.origin_xy - grid.step_xy @ [0.5, 0.5]
@@ -41,7 +41,7 @@ def test_pixels_lie_where_gdal_has_them(grid: MapGrid) -> None:
 
 
 @pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
-def test_a_pixel_comes_back_through_the_ground(grid: MapGrid) -> None:
+def test_a_pixel_survives_a_round_trip_through_the_ground(grid: MapGrid) -> None:
     lon_lat = grid.lon_lat(positions(grid))
     assert (np.abs(lon_lat[:, 0]) <= 180.0).all()
     np.testing.assert_allclose(grid.line_sample(lon_lat), positions(grid), atol=a_micropixel)
@@ -57,7 +57,7 @@ def test_a_grid_across_the_antimeridian_has_no_seam(grid: MapGrid) -> None:
 
 
 @pytest.mark.parametrize("grid", [NORTH_UP, ROTATED, DEGREES, UTM_1])
-def test_the_derivative_is_that_of_small_moves_in_metres(grid: MapGrid) -> None:
+def test_the_derivative_agrees_with_differences_in_metres(grid: MapGrid) -> None:
     place = np.append(grid.lon_lat(np.array([[100.0, 200.0]]))[0], 0.0)
     near = np.column_stack([grid.lon_lat(np.array([[100.5, 200.0], [100.0, 200.5]])), np.zeros(2)])
     moved_m = east_north_up(near, place)[:, :2]
@@ -65,15 +65,15 @@ def test_the_derivative_is_that_of_small_moves_in_metres(grid: MapGrid) -> None:
     np.testing.assert_allclose(moved_m @ derivative.T, 0.5 * np.eye(2), atol=1e-4)
 
 
-def test_no_place_on_the_map_is_nan() -> None:
-    found = NORTH_UP.line_sample(np.array([[15.0, 52.0], [np.nan, 52.0], [15.0, 91.0]]))
-    assert np.isfinite(found[0]).all()
-    assert np.isnan(found[1:]).all()
+def test_positions_outside_the_map_are_nan() -> None:
+    actual = NORTH_UP.line_sample(np.array([[15.0, 52.0], [np.nan, 52.0], [15.0, 91.0]]))
+    assert np.isfinite(actual[0]).all()
+    assert np.isnan(actual[1:]).all()
 
 
 @pytest.mark.parametrize(
     ("lon", "lat", "zone"),
     [(5.4, 43.6, "EPSG:32631"), (-180.0, -1.0, "EPSG:32701"), (179.9, 1.0, "EPSG:32660")],
 )
-def test_every_place_has_its_utm_zone(lon: float, lat: float, zone: str) -> None:
+def test_every_position_has_its_utm_zone(lon: float, lat: float, zone: str) -> None:
     assert utm_of(lon, lat) == zone

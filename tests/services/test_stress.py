@@ -1,4 +1,4 @@
-"""The stress campaign in small: hard scenes of a small world, and the conditions SRP is described by."""
+"""A small stress campaign: difficult scenes of a small world, and the conditions that describe SRP."""
 
 import json
 from dataclasses import asdict, replace
@@ -59,7 +59,7 @@ def clear(block: Block) -> list:
 
 
 def clear_trial(number: int, **changes: object) -> Trial:
-    """The scene of a number without anything that makes it hard."""
+    """The trial of a number without its difficult conditions."""
     return replace(draw_trial(SEED, number, (SMALL,)), **{**CLEAR, **changes})
 
 
@@ -70,7 +70,7 @@ def registration_of(trial: Trial, block: Block) -> Registration:
     )
 
 
-def test_no_scene_that_is_delivered_is_wrong_by_more_than_stated(hard: list, clear: list) -> None:
+def test_no_delivered_scene_has_a_larger_error_than_stated(hard: list, clear: list) -> None:
     assert not [trial.number for trial, outcome in hard + clear if outcome.delivered and outcome.wrong]
 
 
@@ -84,7 +84,7 @@ def test_most_hard_scenes_are_delivered_too(hard: list) -> None:
     assert sum(outcome.delivered for _, outcome in hard) > SCENES / 2
 
 
-def test_errors_are_as_large_as_stated(hard: list, clear: list) -> None:
+def test_errors_agree_with_the_stated_accuracy(hard: list, clear: list) -> None:
     squares = [outcome.normalised for _, outcome in hard + clear if outcome.delivered]
     low, high = chi2.interval(0.999, FREE_ERRORS * len(squares)) / np.float64(FREE_ERRORS * len(squares))
     assert low < np.mean(squares) < high
@@ -107,7 +107,7 @@ def test_inverted_contrast_is_found_by_its_gradient_and_reported(block: Block) -
     assert as_it_was.by_gradient[as_it_was.active].mean() < 0.1
 
 
-def test_points_that_clouds_hide_are_reported_under_a_cloud(block: Block) -> None:
+def test_points_hidden_by_clouds_are_reported_as_cloudy(block: Block) -> None:
     without = registration_of(clear_trial(1), block).measures
     below = registration_of(clear_trial(1, cloud_cover=0.4), block).measures
     hidden = without.matched & ~below.matched
@@ -116,7 +116,7 @@ def test_points_that_clouds_hide_are_reported_under_a_cloud(block: Block) -> Non
     assert not (without.reason == "cloud").any()
 
 
-def test_a_scene_follows_from_the_seed_and_its_number(block: Block) -> None:
+def test_a_scene_is_determined_by_the_seed_and_its_number(block: Block) -> None:
     trials = [draw_trial(SEED, 4, (SMALL,)) for _ in range(2)]
     assert trials[0] == trials[1]
     assert draw_trial(SEED, 5, (SMALL,)) != trials[0]
@@ -137,7 +137,7 @@ def test_points_have_the_errors_of_the_trial(block: Block) -> None:
     assert north_m.std() == pytest.approx(2.0 * declared_m, rel=few)
 
 
-def test_outcomes_are_read_again_without_a_broken_line(tmp_path: Path) -> None:
+def test_outcomes_are_read_back_without_a_broken_line(tmp_path: Path) -> None:
     trial = draw_trial(SEED, 0, (SMALL,))
     nothing = float("nan")
     outcome = Outcome("refused", "why", 0, 0, 0, "", *[nothing] * 7, 1.5)

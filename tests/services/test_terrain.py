@@ -1,4 +1,4 @@
-"""Heights on a grid, and where lines of sight meet them."""
+"""Heights of a terrain, and the intersection of lines of sight with it."""
 
 from dataclasses import replace
 
@@ -52,11 +52,11 @@ def pixels_of(count: int = 400) -> Array:
 
 def test_heights_are_bilinear_between_the_nodes() -> None:
     expected = map_coordinates(hills().astype(np.float64), places().T, order=1)
-    found = terrain().height_m(GRID.lon_lat(places()))
-    np.testing.assert_allclose(found, expected, atol=a_millimetre)
+    actual_m = terrain().height_m(GRID.lon_lat(places()))
+    np.testing.assert_allclose(actual_m, expected, atol=a_millimetre)
 
 
-def test_a_grid_read_by_pieces_gives_the_same_heights(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_grid_read_by_windows_gives_the_same_heights(monkeypatch: pytest.MonkeyPatch) -> None:
     lon_lat = GRID.lon_lat(places(margin=-2.0))
     whole, whole_range_m = terrain().height_m(lon_lat), terrain().range_m()
     monkeypatch.setattr(terrain_module, "_TILE", 64)
@@ -66,7 +66,7 @@ def test_a_grid_read_by_pieces_gives_the_same_heights(monkeypatch: pytest.Monkey
     np.testing.assert_allclose(terrain().around(lon_lat[:9]).height_m(lon_lat[:9]), whole[:9])
 
 
-def test_no_piece_is_larger_than_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_window_is_larger_than_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Window] = []
 
     class Watched(ArrayImage):
@@ -80,14 +80,14 @@ def test_no_piece_is_larger_than_a_tile(monkeypatch: pytest.MonkeyPatch) -> None
     assert max(max(window.lines, window.samples) for window in read) <= 65
 
 
-def test_there_is_no_height_outside_nor_beside_a_void() -> None:
+def test_heights_outside_the_grid_and_next_to_a_void_are_nan() -> None:
     heights = hills()
     heights[100, 100] = np.nan
     outside = [[-0.6, 5.0], [5.0, SHAPE[1] - 0.4], [99.5, 100.5], [100.0, 100.0]]
     inside = [[-0.4, 5.0], [99.0, 99.0], [100.0, 101.0], [101.5, 102.0]]
     holed = replace(terrain(), heights=ArrayImage(heights))
     assert np.isnan(holed.height_m(GRID.lon_lat(np.array(outside)))).all()
-    # On the nodes themselves, up to the rounding of the map projection.
+    # At the nodes, up to the rounding of the map projection.
     assert np.isfinite(holed.height_m(GRID.lon_lat(np.array(inside) + [1e-7, 1e-7]))[[0, 2, 3]]).all()
     assert np.isfinite(holed.height_m(GRID.lon_lat(np.array(inside[1:2]) - 1e-7))).all()
 
@@ -119,7 +119,7 @@ def test_lines_of_sight_end_on_the_ground(incidence_deg: float) -> None:
 
 
 def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
-    """Slopes steeper than the line of sight: several places of the ground lie on one line."""
+    """On slopes steeper than the line of sight, several points of the ground lie on one line."""
     model, ground = view(40.0), terrain(400.0)
     met = intersect_terrain(model, pixels_of(), ground)
     hidden_by_m = np.zeros(len(met))
@@ -135,18 +135,18 @@ def test_a_line_of_sight_ends_on_the_side_of_a_ridge_the_sensor_sees() -> None:
     assert hidden_by_m.max() < a_millimetre
 
 
-def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_ends_nowhere() -> None:
+def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersection() -> None:
     heights = hills(60.0)
     heights[:, :140] = np.nan
     met = intersect_terrain(view(12.0), pixels_of(), replace(terrain(60.0), heights=ArrayImage(heights)))
-    known = np.isfinite(met[:, 2])
-    assert 0.3 < known.mean() < 0.7
+    valid = np.isfinite(met[:, 2])
+    assert 0.3 < valid.mean() < 0.7
     far = replace(GRID, origin_xy=GRID.origin_xy + 1e5)
     with pytest.raises(CoverageError, match="does not cover"):
         intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
 
 
-def test_the_verticals_of_an_ortho_image_end_straight_below() -> None:
+def test_the_lines_of_sight_of_an_ortho_image_end_vertically_below() -> None:
     model, ground = OrthoModel(GRID), terrain()
     met = intersect_terrain(model, places(), ground)
     np.testing.assert_allclose(met[:, 2], ground.height_m(GRID.lon_lat(places())), atol=a_millimetre)

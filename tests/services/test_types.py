@@ -1,4 +1,4 @@
-"""What is taken out of points and observations is what was there, in the order asked."""
+"""Selected points and observations are the requested rows, in the requested order."""
 
 import numpy as np
 from hypothesis import given
@@ -10,7 +10,7 @@ view_counts = st.lists(st.integers(0, 4), min_size=1, max_size=8)
 
 
 def points_with(counts: list[int]) -> ControlPoints:
-    """Points with the given numbers of views; every value tells where it comes from."""
+    """Points with given numbers of views; each value identifies its row."""
     n, m = len(counts), sum(counts)
     return ControlPoints(
         id=100 + np.arange(n),
@@ -38,7 +38,7 @@ def rows_of(data: st.DataObject, n: int) -> IntArray:
 
 
 @given(view_counts, st.data())
-def test_taken_points_keep_everything_that_was_theirs(counts: list[int], data: st.DataObject) -> None:
+def test_selected_points_keep_all_their_attributes(counts: list[int], data: st.DataObject) -> None:
     points = points_with(counts)
     rows = rows_of(data, len(counts))
     taken = points.take(rows)
@@ -59,7 +59,9 @@ def test_taken_points_keep_everything_that_was_theirs(counts: list[int], data: s
 
 
 @given(view_counts, st.data())
-def test_taking_twice_is_taking_the_rows_of_the_rows(counts: list[int], data: st.DataObject) -> None:
+def test_two_selections_are_the_selection_of_the_selected_rows(
+    counts: list[int], data: st.DataObject
+) -> None:
     points = points_with(counts)
     first = np.array(data.draw(st.permutations(range(len(counts)))), dtype=np.int64)
     second = rows_of(data, len(counts))
@@ -69,26 +71,26 @@ def test_taking_twice_is_taking_the_rows_of_the_rows(counts: list[int], data: st
     np.testing.assert_array_equal(twice.views.gsd_m, once.views.gsd_m)
 
 
-def test_health_is_one_without_a_history_and_falls_with_every_failure() -> None:
+def test_health_is_one_without_a_history_and_falls_with_each_failure() -> None:
     tried = np.array([0, 1, 5, 5, 100])
     np.testing.assert_allclose(health(tried, np.array([0, 0, 0, 5, 0])), [1, 5 / 6, 0.5, 1, 5 / 105])
 
 
-def test_a_point_that_serves_where_others_fail_is_no_better_than_one_without_a_history() -> None:
+def test_the_health_of_a_point_never_exceeds_that_without_a_history() -> None:
     expected_of_ten_tries_where_half_serve = np.array([5.0, 5.0, 5.0])
-    found = health(expected_of_ten_tries_where_half_serve, np.array([10, 5, 0]))
-    np.testing.assert_allclose(found, [1.0, 1.0, 0.5])
+    actual = health(expected_of_ten_tries_where_half_serve, np.array([10, 5, 0]))
+    np.testing.assert_allclose(actual, [1.0, 1.0, 0.5])
 
 
 @given(st.integers(1, 20), st.data())
-def test_taken_observations_are_the_rows_asked_for(m: int, data: st.DataObject) -> None:
+def test_selected_observations_are_the_requested_rows(m: int, data: st.DataObject) -> None:
     numbers = np.arange(m)
     observations = Observations(
         numbers // 2, numbers % 2, np.column_stack([numbers, -numbers]) * 1.0, 1.0 + numbers
     )
     rows = rows_of(data, m)
-    kept = np.array(data.draw(st.lists(st.booleans(), min_size=m, max_size=m)), dtype=bool)
-    for chosen, expected in ((rows, rows), (kept, np.flatnonzero(kept))):
+    mask = np.array(data.draw(st.lists(st.booleans(), min_size=m, max_size=m)), dtype=bool)
+    for chosen, expected in ((rows, rows), (mask, np.flatnonzero(mask))):
         taken = observations.take(chosen)
         assert len(taken) == len(expected)
         np.testing.assert_array_equal(taken.point, expected // 2)

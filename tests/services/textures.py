@@ -1,4 +1,4 @@
-"""Periodic noise of known smoothness, and the same noise moved by any fraction of a pixel."""
+"""Periodic noise of known smoothness, and its shifts by fractions of a pixel."""
 
 import numpy as np
 from scipy import fft
@@ -7,7 +7,7 @@ from services.types import Array, FloatImage
 
 
 def texture(rng: np.random.Generator, side: int, smoothness_px: float) -> Array:
-    """White noise under a Gaussian of the given standard deviation; mean zero, spread one."""
+    """White noise smoothed by a Gaussian of a given standard deviation; mean 0, standard deviation 1."""
     gain = np.exp(-2.0 * (np.pi * _frequency(side) * smoothness_px) ** 2)
     noise = fft.irfft2(fft.rfft2(rng.standard_normal((side, side))) * gain, s=(side, side))
     return np.asarray((noise - noise.mean()) / noise.std())
@@ -21,7 +21,7 @@ def moved(pixels: Array, rows: float, columns: float) -> Array:
 
 
 def as_pixels(pixels: Array) -> FloatImage:
-    """Grey values round 500."""
+    """The noise as grey values around 500."""
     return (500.0 + 100.0 * pixels).astype(np.float32)
 
 

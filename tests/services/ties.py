@@ -1,4 +1,4 @@
-"""Tie points between simulated views, without pixels: observations and truth."""
+"""Simulated tie points without pixels: observations and truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,11 +13,11 @@ from tests.services.simulated import world
 
 @dataclass(frozen=True)
 class Ties:
-    """Image positions of points with known ground.
+    """Observations of points with known ground positions.
 
     Attributes:
-        lon_lat_h: (p, 3) where the points are.
-        observations: of them.
+        lon_lat_h: (p, 3) true positions of the points.
+        observations: of the points.
         wrong: (m,) observations that are blunders.
     """
 
@@ -35,16 +35,16 @@ def make_ties(
     shift_px: Array | None = None,
     seen: float = 1.0,
 ) -> Ties:
-    """Observations of points in images, with noise and blunders.
+    """Simulated observations of points in images, with noise and blunders.
 
     Args:
         geometries: the images; their RPCs project the points.
-        rng: places, noise and blunders.
-        count: points.
-        noise_px: of every coordinate; it is also the stated sigma.
+        rng: source of positions, noise and blunders.
+        count: number of points.
+        noise_px: noise of each coordinate, which is also the stated sigma.
         blunders: share of observations that are up to 30 px away.
         shift_px: (n, 2) error of the RPC of each image.
-        seen: share of the images that see a point; two do in any case.
+        seen: share of the images that observe a point; at least two do.
     """
     n_images, shape = len(geometries), np.array(geometries[0].plan.shape)
     image = rng.uniform(0.1, 0.9, (count, 2)) * shape
@@ -69,13 +69,13 @@ def make_ties(
 
 
 def difference_m(lon_lat_h: Array, truth: Array) -> Array:
-    """Metres (n, 3) east, north and up from true to computed points."""
+    """Errors (n, 3) of computed points, metres east, north and up."""
     east, north = metres_per_degree(float(truth[0, 1]), float(truth[0, 2]))
     return np.asarray((lon_lat_h - truth) * [east, north, 1.0])
 
 
 def whitened_square(error: Array, covariance: Array) -> Array:
-    """(n,) mean square of errors (n, k) in units of their covariances (n, k, k)."""
+    """Mean square (n,) of errors (n, k) normalised by their covariances (n, k, k)."""
     solved = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
     return np.asarray((error * solved).sum(axis=1) / error.shape[1])
 

@@ -1,4 +1,4 @@
-"""What a registration delivers, beside files made without the code: to the byte, or number by number."""
+"""Deliverables compared with golden files, to the byte or number by number."""
 
 import json
 import re
@@ -43,22 +43,22 @@ both_versions = pytest.mark.parametrize("name", ["RPC_invented_v2", "RPC_invente
 
 
 def ground() -> np.ndarray:
-    """Places (60, 3) all over the range of the invented RPC."""
+    """Ground points (60, 3) over the whole range of the invented RPC."""
     normalised = np.random.default_rng(5).uniform(-0.9, 0.9, (60, 3))
     return MODEL.ground_offset + normalised * MODEL.ground_scale
 
 
 def refined() -> RpcModel:
-    """The model that the golden correction makes of the invented one: offsets and scales, no more."""
-    told = json.loads(CORRECTION)["parameters_px"]
+    """The invented model with the golden correction, which changes offsets and scales only."""
+    parameters_px = json.loads(CORRECTION)["parameters_px"]
     return replace(
         MODEL,
-        image_offset=MODEL.image_offset + [told[0][0], told[1][0]],
-        image_scale=MODEL.image_scale + [told[0][1], told[1][2]],
+        image_offset=MODEL.image_offset + [parameters_px[0][0], parameters_px[1][0]],
+        image_scale=MODEL.image_scale + [parameters_px[0][1], parameters_px[1][2]],
     )
 
 
-def test_a_correction_is_written_to_the_byte() -> None:
+def test_a_written_correction_is_identical_to_the_byte() -> None:
     correction = parse_correction(CORRECTION)
     covariance = np.full((6, 6), np.nan)
     np.fill_diagonal(covariance, 0.25)
@@ -93,8 +93,8 @@ def test_a_refined_dimap_differs_from_the_delivered_one_in_four_numbers(name: st
 @both_versions
 def test_a_refined_dimap_is_read_as_the_corrected_model(name: str) -> None:
     model = parse_dimap_rpc((GOLDEN / f"{name}_refined.XML").read_text())
-    found, expected = model.project(ground()), refined().project(ground())
-    np.testing.assert_allclose(found, expected, atol=a_millionth_of_a_pixel, rtol=0)
+    actual, expected = model.project(ground()), refined().project(ground())
+    np.testing.assert_allclose(actual, expected, atol=a_millionth_of_a_pixel, rtol=0)
 
 
 @both_versions
@@ -107,11 +107,11 @@ def test_gdal_reads_a_refined_dimap_as_the_corrected_model(name: str, tmp_path: 
         file.write(np.ones((1, 8, 8), np.uint8))
     with rasterio.open(tmp_path / "IMG_a_R1C1.TIF") as file, RPCTransformer(file.rpcs) as gdal:
         line, sample = gdal.rowcol(*ground().T, op=np.positive)
-    found = np.column_stack([line, sample]) - CORNER_OF_FIRST_PIXEL
-    np.testing.assert_allclose(found, refined().project(ground()), atol=a_millionth_of_a_pixel, rtol=0)
+    actual = np.column_stack([line, sample]) - CORNER_OF_FIRST_PIXEL
+    np.testing.assert_allclose(actual, refined().project(ground()), atol=a_millionth_of_a_pixel, rtol=0)
 
 
-def test_the_sidecar_of_a_map_has_the_golden_place_for_any_reader(tmp_path: Path) -> None:
+def test_the_sidecar_of_an_ortho_image_has_the_golden_map_grid_for_any_reader(tmp_path: Path) -> None:
     step_xy = np.array([[0.0625, 0.5], [-0.5, 0.03125]])
     corner = np.array([300000.25, 4640000.75])
     grid = MapGrid("EPSG:32633", corner + step_xy @ [0.5, 0.5], step_xy, (30, 40))
@@ -132,12 +132,12 @@ def test_the_sidecar_of_a_map_has_the_golden_place_for_any_reader(tmp_path: Path
         x, y = file.xy(7, 11, offset="center")
         assert file.crs.to_epsg() == 32633
     (lon,), (lat,) = transform("EPSG:32633", "EPSG:4326", [x], [y])
-    found = OrthoModel(grid).project(np.array([[lon, lat, 0.0]]))
-    np.testing.assert_allclose(found, [[7.0, 11.0]], atol=a_millionth_of_a_pixel, rtol=0)
+    actual = OrthoModel(grid).project(np.array([[lon, lat, 0.0]]))
+    np.testing.assert_allclose(actual, [[7.0, 11.0]], atol=a_millionth_of_a_pixel, rtol=0)
 
 
 def measures() -> Measures:
-    """The golden points as a registration has them."""
+    """The golden points as the measures of a registration."""
     points = RESIDUALS["points"]
 
     def column(name: str) -> np.ndarray:
@@ -187,7 +187,7 @@ def rows_of(path: Path, layer: str) -> tuple[list[dict], list[np.ndarray]]:
     return rows, shapes
 
 
-def test_the_layers_of_residuals_hold_the_golden_rows_and_lines(tmp_path: Path) -> None:
+def test_the_layers_of_residuals_have_the_golden_rows_and_lines(tmp_path: Path) -> None:
     path = tmp_path / "residuals.gpkg"
     write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
     golden = RESIDUALS["points"]
@@ -197,17 +197,17 @@ def test_the_layers_of_residuals_hold_the_golden_rows_and_lines(tmp_path: Path) 
         assert place.tolist() == [[expected["lon"], expected["lat"], expected["height_m"]]]
         for name in set(expected) - {"lon", "lat", "line_to", "residual_m"}:
             assert row[name] == expected[name]
-    found = [point for point in golden if "line_to" in point]
+    actual = [point for point in golden if "line_to" in point]
     rows, lines = rows_of(path, "residuals")
-    assert [row["point_id"] for row in rows] == [point["point_id"] for point in found]
-    for row, line, expected in zip(rows, lines, found, strict=True):
+    assert [row["point_id"] for row in rows] == [point["point_id"] for point in actual]
+    for row, line, expected in zip(rows, lines, actual, strict=True):
         assert row["exaggeration"] == RESIDUALS["exaggeration"]
         assert row["residual_m"] == pytest.approx(expected["residual_m"], rel=rounding)
         assert line[0].tolist() == [expected["lon"], expected["lat"], expected["height_m"]]
         np.testing.assert_allclose(line[1], expected["line_to"], atol=a_nanodegree, rtol=0)
 
 
-def test_gdal_finds_both_layers_of_residuals_with_their_reference_system(tmp_path: Path) -> None:
+def test_gdal_reads_both_layers_of_residuals_with_their_reference_system(tmp_path: Path) -> None:
     path = tmp_path / "residuals.gpkg"
     write_residual_layers(path, measures(), "invented", RESIDUALS["exaggeration"])
     kinds = {name: pyogrio.read_info(path, layer=name) for name, _ in pyogrio.list_layers(path)}

@@ -1,4 +1,4 @@
-"""Corrections in image space: undone exactly, folded exactly, refused where they cannot be."""
+"""Corrections in image space: inverted exactly, folded exactly, refused where that is impossible."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ def ground() -> np.ndarray:
     return MODEL.ground_offset + grid * MODEL.ground_scale
 
 
-def test_a_displacement_is_what_its_parameters_say_at_the_edges_and_the_centre() -> None:
+def test_displacements_at_the_edges_and_the_centre_follow_from_the_parameters() -> None:
     moved = correction([[3.0, 2.0, 0.5], [-1.0, 0.25, 4.0]])
     centre = (np.array(SHAPE) - 1.0) / 2.0
     bottom, right = centre + [SHAPE[0] / 2.0, 0.0], centre + [0.0, SHAPE[1] / 2.0]
@@ -41,7 +41,7 @@ def test_a_displacement_is_what_its_parameters_say_at_the_edges_and_the_centre()
 
 
 @given(st.lists(st.lists(pixels, min_size=3, max_size=3), min_size=2, max_size=2))
-def test_what_is_applied_is_undone(rows: list[list[float]]) -> None:
+def test_invert_is_the_inverse_of_apply(rows: list[list[float]]) -> None:
     at = np.random.default_rng(3).uniform(0.0, 26000.0, (50, 2))
     moved = correction(rows)
     back = moved.invert(moved.apply(at))
@@ -79,7 +79,7 @@ def test_a_corrected_model_is_consistent_with_itself() -> None:
     np.testing.assert_array_equal(direction, base_direction)
 
 
-def test_the_derivative_of_a_corrected_model_is_that_of_small_steps() -> None:
+def test_the_derivative_of_a_corrected_model_agrees_with_differences() -> None:
     model = CorrectedModel(MODEL, correction([[40.0, 900.0, 700.0], [-25.0, -400.0, 1500.0]]))
     at = np.array([MODEL.ground_offset])
     up = np.array([[0.0, 0.0, 1.0]])

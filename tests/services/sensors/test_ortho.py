@@ -1,4 +1,4 @@
-"""Ortho-images as models: no parallax, and a correction that folds into the map grid."""
+"""The model of an ortho-image has no parallax, and corrections fold into its map grid."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ def pixels(n: int = 100) -> np.ndarray:
     return np.random.default_rng(2).uniform(0.0, np.array(SHAPE) - 1.0, (n, 2))
 
 
-def test_heights_move_nothing() -> None:
+def test_image_positions_do_not_depend_on_the_height() -> None:
     heights = np.linspace(-400.0, 8000.0, 100)
     ground = MODEL.locate(pixels(), heights)
     np.testing.assert_array_equal(ground[:, 2], heights)
@@ -59,9 +59,9 @@ def test_wrong_heights_of_points_do_not_reach_the_adjustment_of_an_ortho_image()
     covariance = np.tile(np.diag([1.0, 1.0, 1e6]), (100, 1, 1))
     ground[:, 2] += rng.normal(0.0, 1000.0, 100)
     observations = ControlObservations(ground, seen, np.full(100, 0.1), covariance)
-    found = adjust_scene(MODEL, SHAPE, observations, AdjustmentOptions(order="affine"))
-    assert found.active.sum() > 90
-    # Points of 1 m on pixels of 10 m: 0.1 px, beside 0.1 px of the measures.
-    std_px = np.sqrt(np.diag(found.covariance).reshape(2, 3))
+    adjusted = adjust_scene(MODEL, SHAPE, observations, AdjustmentOptions(order="affine"))
+    assert adjusted.active.sum() > 90
+    # Points of 1 m in pixels of 10 m add 0.1 px to the 0.1 px of the measures.
+    std_px = np.sqrt(np.diag(adjusted.covariance).reshape(2, 3))
     assert (std_px < 0.06).all()
-    assert (np.abs(found.correction.parameters - PARAMETERS) < 4.0 * std_px).all()
+    assert (np.abs(adjusted.correction.parameters - PARAMETERS) < 4.0 * std_px).all()

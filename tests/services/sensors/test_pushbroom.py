@@ -1,4 +1,4 @@
-"""The rigorous pushbroom: its three directions agree, and it says where it ends."""
+"""The rigorous pushbroom: project, locate and line of sight agree, and are NaN outside its range."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ a_hundredth_of_a_degree = 0.01
 
 
 def a_model(incidence_deg: float, azimuth_deg: float, lon: float = 5.4) -> PushbroomModel:
-    """A jittering pushbroom; numbers as asked."""
+    """A pushbroom with jitter, seen from a given direction."""
     target = np.array([lon, *TARGET[1:]])
     return pushbroom_over(
         target,
@@ -35,7 +35,7 @@ def a_model(incidence_deg: float, azimuth_deg: float, lon: float = 5.4) -> Pushb
 
 
 def image_and_heights(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions in and somewhat around the image, at heights of the model."""
+    """Positions in and around the image, at heights of the model."""
     rng = np.random.default_rng(11)
     return rng.uniform(-0.3, 1.3, (n, 2)) * SHAPE, rng.uniform(100.0, 900.0, n)
 
@@ -73,7 +73,7 @@ def test_the_line_of_sight_starts_on_the_orbit() -> None:
     assert 680e3 < lon_lat_h_from_ecef(origin)[0, 2] < 720e3
 
 
-def test_the_derivative_is_that_of_project() -> None:
+def test_the_derivative_agrees_with_differences_of_project() -> None:
     model = a_model(25.0, 130.0)
     ground = model.locate(*image_and_heights(20))
     derivative = model.project_derivative(ground)
@@ -86,7 +86,7 @@ def test_the_derivative_is_that_of_project() -> None:
 
 
 @pytest.mark.parametrize(("incidence", "azimuth"), [(8.0, 10.0), (25.0, 100.0), (25.0, 300.0)])
-def test_the_target_is_seen_in_the_middle_from_where_it_was_asked(
+def test_the_target_is_at_the_image_centre_in_the_given_direction(
     incidence: float, azimuth: float
 ) -> None:
     model = pushbroom_over(TARGET, SHAPE, 0.7, (incidence, azimuth), (100.0, 900.0))
@@ -104,7 +104,7 @@ def test_north_is_up_and_east_to_the_right_so_that_images_are_not_mirrored() -> 
     assert derivative[0, 1] < 0.0 < derivative[1, 0]
 
 
-def test_far_outside_the_image_nothing_is_said() -> None:
+def test_positions_far_outside_the_image_are_nan() -> None:
     model = a_model(20.0, 100.0)
     far = lon_lat_h_from_east_north_up(
         np.array([[5e3, 0.0, 0.0], [0.0, 5e3, 0.0], [0.0, 0.0, -12.7e6]]), TARGET

@@ -1,4 +1,4 @@
-"""The RPC against two other implementations, against itself, and at the edges of its range."""
+"""The RPC agrees with two other implementations and with itself, also at the limits of its range."""
 
 import math
 from dataclasses import replace
@@ -42,7 +42,7 @@ def fast(model: RpcModel) -> rpcfast.RPCModel:
     return rpcfast.RPCModel(**{name: np.asarray(getattr(rpc, name)) for name in names})
 
 
-def test_it_projects_where_another_library_does() -> None:
+def test_project_agrees_with_another_library() -> None:
     ground = ground_of(MODEL)
     sample, line = rpcfast.project(fast(MODEL), *ground.T)
     np.testing.assert_allclose(
@@ -50,7 +50,7 @@ def test_it_projects_where_another_library_does() -> None:
     )
 
 
-def test_it_projects_where_gdal_does_half_a_pixel_aside() -> None:
+def test_project_agrees_with_gdal_except_for_its_half_pixel() -> None:
     ground = ground_of(MODEL)
     with RPCTransformer(gdal_rpc(MODEL)) as gdal:
         line, sample = gdal.rowcol(*ground.T, op=lambda x: x)
@@ -59,7 +59,7 @@ def test_it_projects_where_gdal_does_half_a_pixel_aside() -> None:
 
 
 @given(within, within, within)
-def test_it_locates_what_it_projects(x: float, y: float, z: float) -> None:
+def test_locate_inverts_project(x: float, y: float, z: float) -> None:
     ground = (MODEL.ground_offset + np.array([x, y, z]) * MODEL.ground_scale)[None, :]
     line_sample = MODEL.project(ground)
     located = MODEL.locate(line_sample, ground[:, 2])
@@ -69,7 +69,7 @@ def test_it_locates_what_it_projects(x: float, y: float, z: float) -> None:
 
 
 @pytest.mark.parametrize("far", [1e6, 1e9, 1e12, 1e300, math.inf, math.nan])
-def test_positions_far_away_are_nan_and_leave_the_others_alone(far: float) -> None:
+def test_positions_far_away_are_nan_and_do_not_affect_others(far: float) -> None:
     near = [13000.0, 13000.0]
     line_sample = np.array([[far, 0.0], [0.0, -far], [far, far], near])
     located = MODEL.locate(line_sample, np.full(4, 300.0))
@@ -101,14 +101,14 @@ def test_any_number_of_rows_gives_the_same_result_as_one_by_one(rows: int) -> No
             np.testing.assert_allclose(together, alone, rtol=1e-12, atol=a_nanopixel)
 
 
-def test_rows_in_any_layout_are_taken() -> None:
+def test_arrays_of_any_memory_layout_are_accepted() -> None:
     ground = ground_of(MODEL, 50)
     columns_first = np.asfortranarray(ground)
     np.testing.assert_array_equal(MODEL.project(columns_first), MODEL.project(ground))
 
 
 @pytest.mark.parametrize("centre", [179.99, -179.99])
-def test_a_scene_over_the_antimeridian_is_as_good_as_any(centre: float) -> None:
+def test_a_scene_over_the_antimeridian_has_the_same_precision(centre: float) -> None:
     model = replace(MODEL, ground_offset=np.array([centre, *MODEL.ground_offset[1:]]))
     ground = ground_of(model)
     wrapped = ground.copy()
@@ -122,7 +122,7 @@ def test_a_scene_over_the_antimeridian_is_as_good_as_any(centre: float) -> None:
     np.testing.assert_allclose(located, wrapped, rtol=0.0, atol=a_nanodegree)
 
 
-def test_the_derivative_is_that_of_small_steps_on_the_ground() -> None:
+def test_the_derivative_agrees_with_differences_on_the_ground() -> None:
     ground, step_m = ground_of(MODEL, 50), 1.0
     derivative = MODEL.project_derivative(ground)
     for axis in range(3):
@@ -134,7 +134,7 @@ def test_the_derivative_is_that_of_small_steps_on_the_ground() -> None:
         np.testing.assert_allclose(derivative[:, :, axis], by_steps, rtol=0.0, atol=1e-6)
 
 
-def test_lines_of_sight_pass_through_the_ground_they_see() -> None:
+def test_lines_of_sight_pass_through_the_located_ground() -> None:
     line_sample = np.array([[100.0, 200.0], [13000.0, 13000.0], [25000.0, 20000.0]])
     origin, direction = MODEL.line_of_sight(line_sample)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, rtol=1e-15)
@@ -146,7 +146,7 @@ def test_lines_of_sight_pass_through_the_ground_they_see() -> None:
     assert ((along * direction).sum(axis=1) > 0).all()
 
 
-def test_a_good_model_passes_its_check_as_it_is() -> None:
+def test_a_good_model_passes_its_check_unchanged() -> None:
     assert check_rpc(MODEL, "invented") is MODEL
 
 
@@ -172,6 +172,6 @@ den_through_zero[:2] = 0.5, 1.0
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_model_that_cannot_work_is_refused_with_the_reason(model: RpcModel, says: str) -> None:
+def test_an_unusable_model_is_refused_with_the_reason(model: RpcModel, says: str) -> None:
     with pytest.raises(FormatError, match=f"a file: .*{says}"):
         check_rpc(model, "a file")

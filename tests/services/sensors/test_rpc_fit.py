@@ -1,4 +1,4 @@
-"""An RPC follows a smooth model within a hundredth of a pixel, and says so honestly when it cannot."""
+"""An RPC fits a smooth model within a hundredth of a pixel, and its stated error is honest otherwise."""
 
 import numpy as np
 import pytest
@@ -16,13 +16,13 @@ a_thousandth_of_a_pixel = 0.001
 
 
 def a_pushbroom(shape: tuple[int, int], jitter_px: float = 0.0, lon: float = 5.4) -> PushbroomModel:
-    """A pushbroom that looks 25 degrees to the side."""
+    """A pushbroom with an incidence of 25 degrees."""
     target = np.array([lon, 43.6, 300.0])
     return pushbroom_over(target, shape, 0.5, (25.0, 110.0), HEIGHTS_M, jitter_px=jitter_px)
 
 
 def error_px(model, fitted, shape: tuple[int, int]) -> np.ndarray:
-    """Distance between two models at random places of the image and heights."""
+    """Distance between two models at random positions and heights, pixels."""
     rng = np.random.default_rng(6)
     image = rng.uniform(0.0, 1.0, (3000, 2)) * (np.array(shape) - 1.0)
     ground = model.locate(image, rng.uniform(*HEIGHTS_M, len(image)))
@@ -30,7 +30,7 @@ def error_px(model, fitted, shape: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [(300, 400), (3000, 3000), (20_000, 20_000)])
-def test_an_rpc_follows_a_pushbroom_within_a_thousandth_of_a_pixel(shape: tuple[int, int]) -> None:
+def test_an_rpc_fits_a_pushbroom_within_a_thousandth_of_a_pixel(shape: tuple[int, int]) -> None:
     model = a_pushbroom(shape)
     fit = fit_rpc(model, shape, HEIGHTS_M)
     check_rpc(fit.model, "the fit")
@@ -48,14 +48,14 @@ def test_an_rpc_is_fitted_across_the_antimeridian() -> None:
     assert fit_rpc(a_pushbroom(shape, lon=180.0), shape, HEIGHTS_M).max_error_px < 0.001
 
 
-def test_what_no_rpc_can_follow_is_reported_as_large_as_it_is() -> None:
+def test_the_error_of_a_bad_fit_is_reported_in_full() -> None:
     shape = (40_000, 2000)
     model = a_pushbroom(shape, jitter_px=3.0)
     fit = fit_rpc(model, shape, HEIGHTS_M)
-    found = error_px(model, fit.model, shape)
+    actual_px = error_px(model, fit.model, shape)
     assert fit.max_error_px > 0.5
-    assert fit.rms_error_px == pytest.approx(np.sqrt((found**2).mean()), rel=0.2)
-    assert fit.max_error_px >= 0.8 * found.max()
+    assert fit.rms_error_px == pytest.approx(np.sqrt((actual_px**2).mean()), rel=0.2)
+    assert fit.max_error_px >= 0.8 * actual_px.max()
 
 
 def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
@@ -71,7 +71,7 @@ def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
     assert error_px(corrected, fit.model, shape).max() < a_hundredth_of_a_pixel
 
 
-def test_a_drift_is_refitted_to_what_folding_gives_exactly() -> None:
+def test_a_refitted_drift_agrees_with_the_folded_one() -> None:
     shape = (3000, 3000)
     rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
     plain = no_correction(shape)
@@ -82,13 +82,13 @@ def test_a_drift_is_refitted_to_what_folding_gives_exactly() -> None:
     assert error_px(fold_into_rpc(rpc, drift), refitted, shape).max() < a_hundredth_of_a_pixel
 
 
-def test_a_model_that_does_not_reach_the_heights_is_refused_with_numbers() -> None:
+def test_a_model_that_does_not_cover_the_heights_is_refused_with_numbers() -> None:
     with pytest.raises(CoverageError, match=r"only \d+ of 2048 positions"):
         fit_rpc(a_pushbroom((300, 400)), (300, 400), (-6.4e6, 100.0))
 
 
 @pytest.mark.parametrize("lon", [5.4, 180.0])
-def test_an_rpc_is_turned_round_within_a_hundredth_of_a_pixel(lon: float) -> None:
+def test_an_rpc_is_inverted_within_a_hundredth_of_a_pixel(lon: float) -> None:
     shape = (3000, 4000)
     model = fit_rpc(a_pushbroom(shape, lon=lon), shape, HEIGHTS_M).model
     fit = fit_to_ground(model)

@@ -1,4 +1,4 @@
-"""Conditions change what they say, by as much as they say."""
+"""Each condition changes the image by the stated amount."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -40,18 +40,18 @@ def silent(geometry: ViewGeometry) -> ViewGeometry:
 
 
 @pytest.mark.parametrize("cover", [0.1, 0.4, 0.7])
-def test_clouds_cover_the_share_of_the_image_that_was_asked_for(cover: float) -> None:
+def test_clouds_cover_the_given_share_of_the_image(cover: float) -> None:
     clouds = clouds_over(SHAPE, cover, np.random.default_rng(1))
     assert clouds is not None
     opacity = clouds.opacity(np.arange(SHAPE[0], dtype=float), np.arange(SHAPE[1], dtype=float))
     assert np.mean(opacity > 0.5) == pytest.approx(cover, abs=a_twentieth)
 
 
-def test_no_cloud_cover_is_no_clouds() -> None:
+def test_zero_cloud_cover_gives_no_clouds() -> None:
     assert clouds_over(SHAPE, 0.0, np.random.default_rng(1)) is None
 
 
-def test_below_a_thick_cloud_nothing_of_the_ground_is_left(world: World, geometry: ViewGeometry) -> None:
+def test_a_thick_cloud_hides_the_ground_completely(world: World, geometry: ViewGeometry) -> None:
     under = Conditions(cloud_cover=0.5)
     clouds = clouds_over(SHAPE, 0.5, np.random.default_rng([5, 0]))
     assert clouds is not None
@@ -65,9 +65,7 @@ def test_below_a_thick_cloud_nothing_of_the_ground_is_left(world: World, geometr
     assert np.median(cloudy[thick]) == pytest.approx(expected, rel=3.0 * a_twentieth)
 
 
-def test_haze_takes_the_share_of_the_contrast_that_was_asked_for(
-    world: World, geometry: ViewGeometry
-) -> None:
+def test_haze_removes_the_given_share_of_the_contrast(world: World, geometry: ViewGeometry) -> None:
     clear = image(world, silent(geometry))
     hazy = image(world, silent(geometry), Conditions(haze=0.6))
     assert hazy.std() / clear.std() == pytest.approx(0.4, abs=0.01)
@@ -79,12 +77,12 @@ def test_inverted_contrast_is_the_opposite(world: World, geometry: ViewGeometry)
     assert np.corrcoef(clear.ravel(), opposite.ravel())[0, 1] < -0.9
 
 
-def test_noise_is_as_large_as_asked(world: World, geometry: ViewGeometry) -> None:
+def test_noise_has_the_given_standard_deviation(world: World, geometry: ViewGeometry) -> None:
     noisy = image(world, geometry, Conditions(noise=80.0)) - image(world, silent(geometry))
     assert noisy.std() == pytest.approx(80.0, rel=a_twentieth)
 
 
-def test_a_season_changes_what_grows_and_leaves_the_roofs(world: World) -> None:
+def test_a_season_changes_vegetation_and_not_roofs(world: World) -> None:
     sun = 50.0, 150.0
     rows, columns = world.albedo.shape
     now, later = (
@@ -96,6 +94,6 @@ def test_a_season_changes_what_grows_and_leaves_the_roofs(world: World) -> None:
     assert np.corrcoef(now[~built], later[~built])[0, 1] < 0.8
 
 
-def test_a_share_that_is_none_is_refused() -> None:
+def test_a_share_outside_0_to_1_is_refused() -> None:
     with pytest.raises(InputError, match=r"cloud_cover: 1.2 given, 0 to 1 expected"):
         Conditions(cloud_cover=1.2)

@@ -1,4 +1,4 @@
-"""An image rendered where it is read is the image, whatever is read of it first."""
+"""An image rendered by tiles is the same image, whatever is read first."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_pixels_do_not_depend_on_the_windows_they_are_read_by(world: World) -> N
         np.testing.assert_array_equal(pieces.read(window), expected)
 
 
-def test_there_is_nothing_beyond_the_image(world: World) -> None:
+def test_pixels_outside_the_image_are_nan(world: World) -> None:
     view = TiledView(world, geometry(world), 1)
     pixels = view.read(Window(-10, SHAPE[1] - 20, 30, 40))
     assert np.isnan(pixels[:10]).all()
@@ -60,7 +60,7 @@ def test_there_is_nothing_beyond_the_image(world: World) -> None:
     assert np.isnan(view.read(Window(-50, -50, 20, 20))).all()
 
 
-def test_a_window_of_a_huge_image_costs_only_itself(world: World) -> None:
+def test_a_window_of_a_huge_image_renders_only_its_tiles(world: World) -> None:
     side = 40_000
     view = TiledView(world, geometry(world, shape=(side, side)), 1)
     pixels = view.read(Window(31_000, 22_000, 2 * TILE_PX, TILE_PX))
@@ -69,7 +69,7 @@ def test_a_window_of_a_huge_image_costs_only_itself(world: World) -> None:
     assert pixels.std() > 0.0
 
 
-def test_two_seeds_take_the_same_ground_with_other_noise(world: World) -> None:
+def test_two_seeds_give_the_same_ground_with_different_noise(world: World) -> None:
     taken = geometry(world)
     first, again, other = (
         TiledView(world, taken, seed).read(Window(0, 0, *SHAPE)) for seed in (1, 1, 2)

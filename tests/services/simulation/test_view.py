@@ -1,4 +1,4 @@
-"""Simulated images agree with the truth they are made of."""
+"""Simulated images agree with their true geometry."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -45,12 +45,12 @@ def plan(world: World, **changes: object) -> ViewPlan:
 
 
 def centroid(chip: np.ndarray) -> np.ndarray:
-    """Centre of a bright Gaussian, from the middle of its chip: the top of the parabola of its log."""
+    """Centre of a bright Gaussian relative to its chip, by a parabola fitted to its logarithm."""
     r = len(chip) // 2
     line, sample = np.mgrid[-r : r + 1, -r : r + 1]
     light = chip - np.median(np.concatenate([chip[0], chip[-1], chip[:, 0], chip[:, -1]]))
-    kept = light > 0.3 * light.max()
-    y, x, weight = line[kept], sample[kept], light[kept]
+    bright = light > 0.3 * light.max()
+    y, x, weight = line[bright], sample[bright], light[bright]
     design = np.column_stack([np.ones(len(y)), y, x, y * y, x * y, x * x])
     k = np.linalg.lstsq(design * weight[:, None], np.log(weight) * weight, rcond=None)[0]
     return np.linalg.solve([[2.0 * k[3], k[4]], [k[4], 2.0 * k[5]]], -k[1:3])
@@ -113,7 +113,7 @@ def test_the_true_ground_lies_on_the_surface_and_on_the_line_of_sight(world: Wor
 
 
 def a_tower(world: World) -> World:
-    """The world with nothing built but one tower, 20 m square and 30 m high, on flat bare ground."""
+    """The world with a single tower, 20 m square and 30 m high, on flat bare ground."""
     n = len(world.terrain_m)
     roof = np.full_like(world.roof_m, NO_ROOF)
     middle = slice(n // 2 - 20, n // 2 + 20)
@@ -166,19 +166,19 @@ def zncc(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def correlations(world: World, first: SimulatedView, second: SimulatedView) -> np.ndarray:
-    """Correlation of the two views around points of open ground, through their true models."""
+    """Correlation of two views around points of open ground, projected by their true models."""
     image = np.stack(np.meshgrid(*[np.arange(80.0, 640.0, 70.0)] * 2), axis=-1).reshape(-1, 2)
     ground = true_ground(first, world, image)
     ground = ground[np.abs(ground[:, 2] - world.height_m(ground[:, :2])) < a_millimetre]
-    found = []
+    scores = []
     for point in ground:
         chips = [
             render_chip(view.image, view.geometry.true_model, point, 0.5, 51) for view in (first, second)
         ]
         if np.isfinite(chips).all():
-            found.append(zncc(*chips))
-    assert len(found) > 40
-    return np.array(found)
+            scores.append(zncc(*chips))
+    assert len(scores) > 40
+    return np.array(scores)
 
 
 def test_two_views_of_one_day_correlate(world: World) -> None:
@@ -188,7 +188,7 @@ def test_two_views_of_one_day_correlate(world: World) -> None:
     assert np.median(correlations(world, first, second)) > 0.85
 
 
-def test_views_of_different_days_correlate_less_but_mostly_still_do(world: World) -> None:
+def test_views_of_different_days_correlate_less_but_mostly_well(world: World) -> None:
     rng = np.random.default_rng(0)
     first = simulate_view(world, plan(world, acquired_at=SUMMER), rng)
     same = simulate_view(world, plan(world, acquired_at=SUMMER, azimuth_deg=200.0), rng)
@@ -198,21 +198,21 @@ def test_views_of_different_days_correlate_less_but_mostly_still_do(world: World
     assert np.mean(across > 0.5) > 0.7
 
 
-def test_the_delivered_model_is_wrong_by_exactly_what_was_asked(world: World) -> None:
-    asked = np.array([[0.0, 2.0, -1.0], [0.0, 0.5, 1.5]])
-    geometry = plan_geometry(world, plan(world), np.random.default_rng(0), (30.0, -40.0), asked)
+def test_the_delivered_model_has_exactly_the_given_error(world: World) -> None:
+    error_px = np.array([[0.0, 2.0, -1.0], [0.0, 0.5, 1.5]])
+    geometry = plan_geometry(world, plan(world), np.random.default_rng(0), (30.0, -40.0), error_px)
     rng = np.random.default_rng(2)
     image = rng.uniform(0.0, 699.0, (500, 2))
     ground = geometry.true_model.locate(image, rng.uniform(*world.height_range_m, 500))
     wrong = CorrectedModel(geometry.true_model, geometry.error).project(ground)
     error_px = np.linalg.norm(geometry.delivered.project(ground) - wrong, axis=1)
     assert error_px.max() < 2.0 * a_hundredth_of_a_pixel
-    np.testing.assert_allclose(geometry.error.parameters[:, 1:], asked[:, 1:])
+    np.testing.assert_allclose(geometry.error.parameters[:, 1:], error_px[:, 1:])
     moved = np.hypot(*geometry.error.parameters[:, 0])
     assert moved == pytest.approx(50.0 / 0.5, rel=0.1)
 
 
-def test_the_rpc_follows_the_true_model(world: World) -> None:
+def test_the_rpc_fits_the_true_model(world: World) -> None:
     geometry = plan_geometry(world, plan(world), np.random.default_rng(0))
     image = np.random.default_rng(2).uniform(0.0, 699.0, (500, 2))
     ground = geometry.true_model.locate(image, np.full(500, 190.0))
@@ -220,7 +220,7 @@ def test_the_rpc_follows_the_true_model(world: World) -> None:
     assert error_px.max() < a_hundredth_of_a_pixel
 
 
-def test_the_same_seed_takes_the_same_images(world: World) -> None:
+def test_the_same_seed_gives_the_same_images(world: World) -> None:
     first, again = (
         simulate_block(world, np.random.default_rng(7), n_views=2, shape=(150, 150)) for _ in range(2)
     )
@@ -248,7 +248,7 @@ def test_shadows_fall_away_from_the_sun(world: World) -> None:
     assert radiance[n // 2 - 20 - 70, n // 2] == radiance[n // 2 + 20 + 40, n // 2]
 
 
-def test_terrain_that_would_hide_itself_is_refused(world: World) -> None:
+def test_terrain_that_would_occlude_itself_is_refused(world: World) -> None:
     steep = replace(world, terrain_m=world.terrain_m * np.float32(20.0))
     with pytest.raises(InputError, match="slopes up to"):
         simulate_view(steep, plan(steep, incidence_deg=40.0), np.random.default_rng(0))

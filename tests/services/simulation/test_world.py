@@ -1,4 +1,4 @@
-"""A simulated world: drawn from its seed alone, continuous, and what it says about itself is so."""
+"""A simulated world: determined by its seed, continuous, with the stated properties."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ def world() -> World:
     return make_world(np.random.default_rng(8), size_m=800.0, relief_m=50.0)
 
 
-def test_the_same_seed_draws_the_same_world(world: World) -> None:
+def test_the_same_seed_gives_the_same_world(world: World) -> None:
     again = make_world(np.random.default_rng(8), size_m=800.0, relief_m=50.0)
     other = make_world(np.random.default_rng(9), size_m=800.0, relief_m=50.0)
     np.testing.assert_array_equal(again.albedo, world.albedo)
@@ -35,12 +35,12 @@ def test_heights_are_those_of_the_nodes_and_bilinear_between(world: World) -> No
     assert middle[0] == pytest.approx(at_nodes.mean(), abs=a_micrometre)
 
 
-def test_the_relief_is_as_asked(world: World) -> None:
+def test_the_relief_is_the_given_one(world: World) -> None:
     assert np.ptp(world.terrain_m) == pytest.approx(50.0, abs=0.001)
     assert world.height_range_m[0] == pytest.approx(150.0, abs=0.001)
 
 
-def test_the_world_goes_on_where_it_ends(world: World) -> None:
+def test_the_world_repeats_beyond_its_border(world: World) -> None:
     rows, columns = world.terrain_m.shape
     rng = np.random.default_rng(1)
     inside = rng.uniform(0.0, columns, (50, 2))
@@ -52,13 +52,13 @@ def test_the_world_goes_on_where_it_ends(world: World) -> None:
     assert seam < 2.0 * np.abs(np.diff(world.terrain_m, axis=1)).max()
 
 
-def test_grid_positions_come_back_through_longitude_and_latitude(world: World) -> None:
+def test_grid_positions_survive_a_round_trip_through_longitude_and_latitude(world: World) -> None:
     positions = np.random.default_rng(2).uniform(-100.0, 3000.0, (100, 2))
     back = world.column_row(world.lon_lat(positions))
     np.testing.assert_allclose(back, positions, atol=a_micrometre)
 
 
-def test_the_posting_is_that_of_the_ground() -> None:
+def test_the_posting_is_the_distance_of_nodes_on_the_ground() -> None:
     world = make_world(np.random.default_rng(1), 200.0, 0.5, centre_lon_lat=(-70.0, -33.0))
     centre = np.append(world.centre_lon_lat, 180.0)
     moved = np.append(world.centre_lon_lat + world.step_deg, 180.0)
@@ -75,7 +75,7 @@ def test_roofs_stand_above_their_ground_and_are_flat(world: World) -> None:
     assert np.mean(steps == 0.0) > 0.97
 
 
-def test_the_texture_reaches_down_to_the_posting_as_in_nature(world: World) -> None:
+def test_the_texture_has_details_down_to_the_posting(world: World) -> None:
     spectrum = np.abs(np.fft.fft2(world.albedo - world.albedo.mean())) ** 2
     n = len(world.albedo)
     radius = np.hypot(*np.meshgrid(np.fft.fftfreq(n), np.fft.fftfreq(n)))
@@ -85,9 +85,9 @@ def test_the_texture_reaches_down_to_the_posting_as_in_nature(world: World) -> N
     assert -3.5 < slope < -1.5
 
 
-def test_details_of_patterned_land_have_doubles_nearby() -> None:
+def test_details_of_patterned_land_repeat_nearby() -> None:
     def best_double(patterned_share: float) -> float:
-        """Median over small pieces of land of how well the land a house away looks like them."""
+        """Median over small pieces of land of their correlation with the land one lot away."""
         world = make_world(
             np.random.default_rng(8), 1000.0, 1.0, relief_m=1.0, patterned_share=patterned_share
         )

@@ -1,4 +1,4 @@
-"""Everything that may be wrong with an Amers block: found, named, never believed."""
+"""Every error that a delivered Amers block may have is detected and named."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ def block(tmp_path: Path) -> MadeBlock:
 
 
 def resigned(folder: Path) -> None:
-    """Make the checksums true again, so that only what was changed on purpose is wrong."""
+    """Recompute the checksums, so that only the deliberate change is wrong."""
     path = folder / "block.json"
     document = json.loads(path.read_text())
     document["amers:checksums"] = {
@@ -45,14 +45,14 @@ def edit_json(folder: Path, edit: Callable[[dict], None]) -> None:
 
 
 def edit_column(folder: Path, table: str, column: str, row: int, value: object) -> None:
-    """Change one value of a table."""
+    """Change one value in a table of the block."""
     path = folder / f"{table}.parquet"
-    found = pq.read_table(path)
-    index = found.schema.get_field_index(column)
-    values = found[column].to_pylist()
+    table = pq.read_table(path)
+    index = table.schema.get_field_index(column)
+    values = table[column].to_pylist()
     values[row] = value
-    field = found.schema.field(index)
-    pq.write_table(found.set_column(index, field, pa.array(values, field.type)), path)
+    field = table.schema.field(index)
+    pq.write_table(table.set_column(index, field, pa.array(values, field.type)), path)
     resigned(folder)
 
 
@@ -79,12 +79,12 @@ def test_a_missing_file_is_named(block, name):
     assert [(p.file, p.found) for p in problems.problems] == [(name, "no file")]
 
 
-def test_a_file_nobody_listed_is_named(block):
+def test_an_unlisted_file_is_named(block):
     (block.folder / "chips/extra.bin").write_bytes(b"?")
     assert problems_of(block.folder).problems[0].file == "chips/extra.bin"
 
 
-def test_a_folder_without_a_block_says_so(tmp_path):
+def test_a_folder_without_a_block_is_refused(tmp_path):
     with pytest.raises(FormatError, match=r"block\.json"):
         check_block(tmp_path)
 
@@ -140,13 +140,13 @@ def test_a_wrong_value_is_named_with_its_file_field_row_and_what_was_found(
     assert match[0].expected
 
 
-def test_views_that_are_not_as_many_as_the_chips_of_their_points_are_counted(block):
+def test_a_number_of_views_that_differs_from_the_number_of_chips_is_reported(block):
     edit_column(block.folder, "points", "chip_count", 7, 5)
     problems = problems_of(block.folder)
     assert "views.parquet: 240 rows found, 239, the sum of chip_count expected" in str(problems)
 
 
-def test_a_point_that_claims_more_images_than_its_views_show_is_named(block):
+def test_a_point_with_a_wrong_number_of_images_is_named(block):
     for row in (1, 4):
         edit_column(block.folder, "views", "image_id", row, "IMG_00")
     problem = problems_of(block.folder).problems[0]
@@ -198,7 +198,7 @@ def fewer(path: Path) -> None:
 
 
 @pytest.mark.parametrize("spoil", [wrong_shape, wrong_type, column_major, truncated, pickled, fewer])
-def test_a_chip_file_that_is_not_what_it_should_be_is_refused(block, spoil):
+def test_a_wrong_chip_file_is_refused(block, spoil):
     spoil(block.folder / "chips/0000.npy")
     resigned(block.folder)
     assert "chips/0000.npy" in str(problems_of(block.folder))
@@ -239,7 +239,7 @@ def test_garbled_tables_raise_nothing_but_format_errors(tmp_path_factory, data):
 
 
 @pytest.mark.parametrize("table", ["points.parquet", "views.parquet"])
-def test_a_table_whose_names_are_no_text_is_refused(block, table):
+def test_a_table_with_column_names_that_are_not_text_is_refused(block, table):
     path = block.folder / table
     path.write_bytes(path.read_bytes().replace(b"chip_file", b"chip_\x80ile"))
     resigned(block.folder)
@@ -297,7 +297,7 @@ def test_paths_that_leave_the_folder_are_refused_and_not_read(block, name):
         chips.read(name, 0, 1)
 
 
-def test_links_are_refused_even_when_what_they_point_to_is_right(block):
+def test_links_are_refused_even_to_the_right_file(block):
     path = block.folder / "chips/0000.npy"
     outside = block.folder.parent / "outside.npy"
     os.rename(path, outside)

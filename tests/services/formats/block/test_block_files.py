@@ -1,4 +1,4 @@
-"""Amers blocks: written, and read back as they were."""
+"""An Amers block reads back as it was written."""
 
 import json
 from contextlib import suppress
@@ -45,7 +45,7 @@ def assert_same_points(found: ControlPoints, expected: ControlPoints) -> None:
     assert repr(found.views.images) == repr(expected.views.images)
 
 
-def test_a_block_comes_back_as_it_was_written(block):
+def test_a_block_reads_back_as_it_was_written(block):
     contents = check_block(block.folder)
 
     assert_same_points(contents.points, block.points)
@@ -60,7 +60,7 @@ def test_a_block_comes_back_as_it_was_written(block):
     assert set(contents.typology) == {"crossroads", "building corner", 'a "rare" kind', None}
 
 
-def test_chips_come_back_bit_by_bit_from_the_folder(block):
+def test_chips_of_a_folder_are_identical_to_those_written(block):
     contents = read_block(block.folder)
     with FolderChips(block.folder) as chips:
         for row in range(len(contents.points)):
@@ -68,9 +68,7 @@ def test_chips_come_back_bit_by_bit_from_the_folder(block):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_chips_that_fill_a_file_go_on_in_the_next_without_splitting_a_point(
-    tmp_path, monkeypatch, dtype
-):
+def test_chips_continue_in_a_second_file_without_splitting_a_point(tmp_path, monkeypatch, dtype):
     chip_bytes = 101 * 101 * np.dtype(dtype).itemsize
     monkeypatch.setattr(writer, "CHIP_FILE_BYTES", 14 * chip_bytes)
 
@@ -113,7 +111,7 @@ def test_neighbours_in_the_file_are_neighbours_on_the_ground():
     assert step.mean() < 1.2 * mean_spacing
 
 
-def test_a_full_grid_is_walked_one_step_at_a_time():
+def test_the_hilbert_order_of_a_full_grid_moves_one_step_at_a_time():
     axis = np.arange(16.0)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     walk = np.diff(grid[hilbert_order(grid)], axis=0)
@@ -127,7 +125,7 @@ def test_a_block_is_never_overwritten(block):
     assert (block.folder / "block.json").read_bytes() == before
 
 
-def test_a_writer_that_fails_midway_leaves_nothing(tmp_path):
+def test_a_writer_that_fails_leaves_no_files(tmp_path):
     points = control_points(10, np.random.default_rng(1))
 
     def chips(row: int) -> np.ndarray:
@@ -150,7 +148,7 @@ def test_chips_of_another_shape_or_type_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../escape", "a/b", "", ".hidden", "x" * 300])
-def test_names_that_could_not_be_files_are_refused(tmp_path, name):
+def test_names_that_are_not_file_names_are_refused(tmp_path, name):
     points = control_points(2, np.random.default_rng(1))
     with pytest.raises(InputError):
         write_block(
@@ -185,5 +183,5 @@ def block_text(tmp_path_factory) -> str:
     return (block.folder / "block.json").read_text()
 
 
-def test_a_document_comes_back_as_it_was_written(block_text):
+def test_a_document_reads_back_as_it_was_written(block_text):
     assert format_block_json(parse_block_json(block_text)) == block_text

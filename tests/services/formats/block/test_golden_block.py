@@ -1,4 +1,4 @@
-"""The Amers block, beside one made from its description alone."""
+"""Amers blocks compared with a golden block, which was made from the format description alone."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ def contents() -> BlockContents:
 
 @pytest.fixture(scope="module")
 def written(contents: BlockContents, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden block read and written again."""
+    """The golden block, read and written again."""
     folder = tmp_path_factory.mktemp("golden") / "block"
     with FolderChips(FOLDER) as chips:
         order = write_block(
@@ -43,7 +43,7 @@ def written(contents: BlockContents, tmp_path_factory: pytest.TempPathFactory) -
     return folder
 
 
-def test_a_block_is_read_as_it_is_described(contents: BlockContents) -> None:
+def test_the_golden_block_is_read_as_the_format_describes(contents: BlockContents) -> None:
     points = contents.points
     assert points.lon_lat_h.tolist() == [
         [12.29, 41.86, 105.25],
@@ -68,8 +68,8 @@ def test_a_block_is_read_as_it_is_described(contents: BlockContents) -> None:
 def test_the_chips_of_a_point_are_its_rows_of_the_file(contents: BlockContents) -> None:
     number, row, column = np.indices((6, 101, 101))
     with FolderChips(FOLDER) as chips:
-        found = point_chips(contents.points, chips, 1)
-    np.testing.assert_array_equal(found, ((31 * number + 3 * row + 5 * column) % 255 + 1)[2:4])
+        actual = point_chips(contents.points, chips, 1)
+    np.testing.assert_array_equal(actual, ((31 * number + 3 * row + 5 * column) % 255 + 1)[2:4])
 
 
 def test_another_reader_of_geoparquet_finds_the_same_points(
@@ -78,11 +78,11 @@ def test_another_reader_of_geoparquet_finds_the_same_points(
     for folder in (FOLDER, written):
         table = geopandas.read_parquet(folder / "points.parquet")
         assert table.crs.to_epsg() == 4979
-        found = np.column_stack([table.geometry.x, table.geometry.y, table.geometry.z])
-        np.testing.assert_array_equal(found, contents.points.lon_lat_h)
+        actual = np.column_stack([table.geometry.x, table.geometry.y, table.geometry.z])
+        np.testing.assert_array_equal(actual, contents.points.lon_lat_h)
 
 
-def test_chips_are_written_to_the_byte(written: Path) -> None:
+def test_written_chips_are_identical_to_the_byte(written: Path) -> None:
     assert (written / "chips/0000.npy").read_bytes() == (FOLDER / "chips/0000.npy").read_bytes()
     np.testing.assert_array_equal(
         np.load(written / "chips/0000.npy"), np.load(FOLDER / "chips/0000.npy")
@@ -90,30 +90,30 @@ def test_chips_are_written_to_the_byte(written: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["points.parquet", "views.parquet"])
-def test_tables_are_written_row_by_row_and_type_by_type(written: Path, name: str) -> None:
-    golden, found = pq.read_table(FOLDER / name), pq.read_table(written / name)
-    assert found.schema.equals(golden.schema, check_metadata=False)
-    assert [found.schema.field(n).nullable for n in found.schema.names] == [
+def test_written_tables_have_the_same_rows_and_types(written: Path, name: str) -> None:
+    golden, actual = pq.read_table(FOLDER / name), pq.read_table(written / name)
+    assert actual.schema.equals(golden.schema, check_metadata=False)
+    assert [actual.schema.field(n).nullable for n in actual.schema.names] == [
         golden.schema.field(n).nullable for n in golden.schema.names
     ]
     for column in set(golden.schema.names) - {"corr_east_north", "corr_east_up", "corr_north_up"}:
-        assert found[column].equals(golden[column]), column
+        assert actual[column].equals(golden[column]), column
     if name == "points.parquet":
         for column in ("corr_east_north", "corr_east_up", "corr_north_up"):
-            np.testing.assert_allclose(found[column], golden[column], atol=rounding)
-        geo = [json.loads(table.schema.metadata[b"geo"]) for table in (found, golden)]
+            np.testing.assert_allclose(actual[column], golden[column], atol=rounding)
+        geo = [json.loads(table.schema.metadata[b"geo"]) for table in (actual, golden)]
         assert geo[0] == geo[1]
 
 
-def test_the_document_says_the_same_again(written: Path) -> None:
-    golden, found = (json.loads((folder / "block.json").read_text()) for folder in (FOLDER, written))
-    checksums = golden.pop("amers:checksums"), found.pop("amers:checksums")
-    assert found == golden
-    assert found.keys() == golden.keys()
+def test_the_written_document_is_equal(written: Path) -> None:
+    golden, actual = (json.loads((folder / "block.json").read_text()) for folder in (FOLDER, written))
+    checksums = golden.pop("amers:checksums"), actual.pop("amers:checksums")
+    assert actual == golden
+    assert actual.keys() == golden.keys()
     assert checksums[1].keys() == checksums[0].keys()
     assert checksums[1]["chips/0000.npy"] == checksums[0]["chips/0000.npy"]
 
 
-def test_a_model_is_written_number_by_number(written: Path) -> None:
-    golden, found = (parse_rpc_text(read_text(folder / MODEL)) for folder in (FOLDER, written))
-    assert repr(found) == repr(golden)
+def test_a_written_model_has_the_same_numbers(written: Path) -> None:
+    golden, actual = (parse_rpc_text(read_text(folder / MODEL)) for folder in (FOLDER, written))
+    assert repr(actual) == repr(golden)

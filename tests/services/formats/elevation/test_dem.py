@@ -1,4 +1,4 @@
-"""Terrain out of files: no height without its datum, no void taken for a height."""
+"""Terrain from files: heights have a known datum, and voids are not heights."""
 
 import struct
 from pathlib import Path
@@ -64,18 +64,18 @@ def nodes(terrain: Terrain) -> np.ndarray:
     return terrain.grid.lon_lat(position)
 
 
-def test_heights_above_the_ellipsoid_are_read_as_they_are(tmp_path: Path) -> None:
+def test_heights_above_the_ellipsoid_are_read_unchanged(tmp_path: Path) -> None:
     terrain = read_dem(write_dem(tmp_path / "a.tif"), "ellipsoid")
     position = np.array([[0.0, 0.0], [10.5, 20.25], [59.0, 79.0]])
     expected = 500.0 + 3.0 * position[:, 0] - 2.0 * position[:, 1]
-    found = terrain.height_m(terrain.grid.lon_lat(position))
-    np.testing.assert_allclose(found, expected, atol=a_millimetre)
-    # GDAL's corner of the first pixel lies half a step before the first node.
+    actual_m = terrain.height_m(terrain.grid.lon_lat(position))
+    np.testing.assert_allclose(actual_m, expected, atol=a_millimetre)
+    # In GDAL the corner of the first pixel lies half a step before the first node.
     np.testing.assert_allclose(terrain.grid.origin_xy, [7e5 + 15.0, 4.8e6 - 15.0])
     assert terrain.posting_m == pytest.approx(30.0, rel=1e-3)
 
 
-def test_a_file_that_does_not_say_its_datum_is_refused_until_the_caller_does(tmp_path: Path) -> None:
+def test_a_file_without_a_datum_needs_one_from_the_caller(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "a.tif")
     with pytest.raises(VerticalDatumError, match=r"a\.tif.*does not state its vertical datum"):
         read_dem(path)
@@ -88,7 +88,7 @@ def test_a_file_with_three_axes_has_ellipsoidal_heights(tmp_path: Path) -> None:
     assert terrain.geoid is None
 
 
-def test_a_geoid_grid_lifts_the_heights_the_file_counts_from_it(tmp_path: Path) -> None:
+def test_the_heights_of_a_geoid_are_added_to_heights_above_it(tmp_path: Path) -> None:
     grid = write_geoid(tmp_path / "geoid of a place.gtx")
     terrain = read_dem(write_dem(tmp_path / "a.tif", "EPSG:4326+5773"), geoid=grid)
     above = read_dem(write_dem(tmp_path / "b.tif", "EPSG:4326"), "ellipsoid")
@@ -109,7 +109,7 @@ def test_heights_in_feet_become_metres(tmp_path: Path) -> None:
 
 
 def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> None:
-    """Unless PROJ has been given the grid on this machine, which then gives what the grid gives."""
+    """Where PROJ has the grid installed, the heights are those with the grid instead."""
     path = write_dem(tmp_path / "a.tif")
     try:
         terrain = read_dem(path, "EGM96")
@@ -120,7 +120,7 @@ def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("crs", "said", "grid", "expected"),
+    ("crs", "vertical", "grid", "expected"),
     [
         ("EPSG:4326+5773", "ellipsoid", False, "above EGM96 height, the caller the ellipsoid"),
         ("EPSG:4979", "EGM96", False, "above the ellipsoid, the caller EGM96 height"),
@@ -130,15 +130,15 @@ def test_a_geoid_without_its_grid_is_an_error_that_names_it(tmp_path: Path) -> N
         ("EPSG:4326+6357", None, True, "NAVD88 depth found, which counts depths"),
     ],
 )
-def test_contradictions_about_the_datum_are_refused(
-    tmp_path: Path, crs: str, said: str | None, grid: bool, expected: str
+def test_contradictory_datums_are_refused(
+    tmp_path: Path, crs: str, vertical: str | None, grid: bool, expected: str
 ) -> None:
     geoid = write_geoid(tmp_path / "geoid.gtx") if grid else None
     with pytest.raises(VerticalDatumError, match=expected):
-        read_dem(write_dem(tmp_path / "a.tif", crs), said, geoid)
+        read_dem(write_dem(tmp_path / "a.tif", crs), vertical, geoid)
 
 
-def test_a_geoid_of_elsewhere_is_refused(tmp_path: Path) -> None:
+def test_a_geoid_of_another_region_is_refused(tmp_path: Path) -> None:
     grid = write_geoid(tmp_path / "geoid.gtx", west=100.0)
     with pytest.raises(CoverageError, match="does not cover the terrain"):
         read_dem(write_dem(tmp_path / "a.tif"), geoid=grid)
@@ -146,7 +146,7 @@ def test_a_geoid_of_elsewhere_is_refused(tmp_path: Path) -> None:
 
 @settings(max_examples=40)
 @given(cut=st.integers(0, 6700), start=st.integers(0, 60), noise=st.binary(min_size=1, max_size=40))
-def test_a_damaged_geoid_is_refused_or_is_one(
+def test_a_damaged_geoid_is_refused_or_still_a_geoid(
     tmp_path_factory: pytest.TempPathFactory, cut: int, start: int, noise: bytes
 ) -> None:
     folder = tmp_path_factory.mktemp("damaged")
@@ -164,7 +164,7 @@ def test_a_damaged_geoid_is_refused_or_is_one(
         assert heights.shape == (2,)
 
 
-def test_an_image_without_a_place_is_no_terrain(tmp_path: Path) -> None:
+def test_an_image_without_a_map_grid_is_refused_as_terrain(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     with rasterio.open(path, "w", driver="GTiff", height=9, width=9, count=1, dtype="int16") as file:
         file.write(np.ones((9, 9), np.int16), 1)
@@ -172,7 +172,7 @@ def test_an_image_without_a_place_is_no_terrain(tmp_path: Path) -> None:
         read_dem(path, "ellipsoid")
 
 
-def test_voids_are_voids_whether_declared_or_not(tmp_path: Path) -> None:
+def test_declared_and_undeclared_voids_are_nan(tmp_path: Path) -> None:
     heights = HEIGHTS.astype(np.int16)
     heights[10, 10], heights[20, 20], heights[30, 30], heights[40, 40] = -32768, -9999, 32767, 77
     terrain = read_dem(write_dem(tmp_path / "a.tif", heights=heights, nodata=77), "ellipsoid")
@@ -181,7 +181,7 @@ def test_voids_are_voids_whether_declared_or_not(tmp_path: Path) -> None:
     assert terrain.range_m() == (float(HEIGHTS.min()), float(HEIGHTS.max()))
 
 
-def test_scaled_heights_are_scaled(tmp_path: Path) -> None:
+def test_scale_and_offset_of_a_file_are_applied(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "a.tif", heights=(HEIGHTS * 10.0).astype(np.int16))
     with rasterio.open(path, "r+") as file:
         file.scales, file.offsets = (0.1,), (5.0,)
@@ -190,27 +190,27 @@ def test_scaled_heights_are_scaled(tmp_path: Path) -> None:
     assert (low, high) == pytest.approx((HEIGHTS.min() + 5.0, HEIGHTS.max() + 5.0), abs=a_decimetre)
 
 
-def test_filled_voids_do_not_depend_on_the_window_they_are_read_in() -> None:
+def test_filled_voids_do_not_depend_on_the_window() -> None:
     rng = np.random.default_rng(3)
     heights = HEIGHTS.copy()
     heights[rng.random(SHAPE) < 0.2] = np.nan
     heights[20:45, 30:60] = np.nan
     filled = FilledVoids(ArrayImage(heights), 5)
     whole = filled.read(Window(0, 0, *SHAPE))
-    known = np.isfinite(heights)
-    np.testing.assert_array_equal(whole[known], heights[known])
+    valid = np.isfinite(heights)
+    np.testing.assert_array_equal(whole[valid], heights[valid])
     part = filled.read(Window(15, 25, 20, 30))
     np.testing.assert_allclose(part, whole[15:35, 25:55], atol=a_millimetre)
     assert np.isnan(whole[30:35, 40:50]).all()
     assert np.isfinite(whole[:15]).all()
-    # Filled from within 5 nodes of a plane that rises by 3.6 m a node.
+    # The void is filled from nodes within 5 nodes, of a plane that rises by 3.6 m per node.
     assert np.nanmax(np.abs(whole - HEIGHTS)) < 5 * 3.61
     assert np.isnan(filled.read(Window(-3, -3, 3, 3))).all()
 
 
 @pytest.mark.real_data
-def test_the_egm96_grid_gives_the_values_its_makers_published(real_data: Path) -> None:
-    """Source: NGA, test values of EGM96 beside its programme F477."""
+def test_the_egm96_grid_gives_the_published_test_values(real_data: Path) -> None:
+    """Source: NGA, test values of EGM96 for its program F477."""
     published = np.array(
         [
             [-90.2208450, 38.6281550, -31.628],
@@ -221,12 +221,12 @@ def test_the_egm96_grid_gives_the_values_its_makers_published(real_data: Path) -
             [0.0023000, -0.4667440, 17.329],
         ]
     )
-    found = geoid_of_grid(real_data / "geoid" / "egm96_15.gtx")(published[:, :2])
-    np.testing.assert_allclose(found, published[:, 2], atol=between_nodes_of_15_arc_minutes_m)
+    actual_m = geoid_of_grid(real_data / "geoid" / "egm96_15.gtx")(published[:, :2])
+    np.testing.assert_allclose(actual_m, published[:, 2], atol=between_nodes_of_15_arc_minutes_m)
 
 
 @pytest.mark.real_data
-def test_srtm_heights_of_the_ventoux_rise_by_its_geoid(real_data: Path) -> None:
+def test_srtm_heights_of_the_ventoux_include_its_geoid_height(real_data: Path) -> None:
     path = real_data / "phr_ventoux_pair" / "dem" / "N44E005_UTM.tif"
     summit = np.array([[5.2786, 44.1741]])
     above_geoid = read_dem(path, "ellipsoid").height_m(summit)

@@ -1,4 +1,4 @@
-"""Marked points: every format reads to the same points, in the pixels of GDAL, and comes back."""
+"""Marked points: all formats give the same points, agree with GDAL, and survive a round trip."""
 
 import json
 import re
@@ -69,14 +69,14 @@ def golden_points() -> MarkedPoints:
 
 
 def gdal_position(points: MarkedPoints) -> np.ndarray:
-    """Line and sample of ground points by GDAL, from the corner of the first pixel."""
+    """Line and sample of ground points computed by GDAL, from the corner of the first pixel."""
     with RPCTransformer(gdal_rpc(MODEL)) as transformer:
         rows, columns = transformer.rowcol(*points.lon_lat_h.T, op=np.positive)
     return np.column_stack([rows, columns])
 
 
 def numbers(text: str) -> list[list[float]]:
-    """All numbers of the lines that are not comments, without the code under test."""
+    """All numbers in the lines that are not comments, read without the code under test."""
     lines = [line for line in text.splitlines() if line[:1] not in "#;m"]
     fields = [[v for v in re.split(r"[ ,]+", line) if re.fullmatch(r"[-\d.]+", v)] for line in lines]
     return [[float(v) for v in row] for row in fields if row]
@@ -127,7 +127,7 @@ def test_what_is_written_is_the_golden_file(write, parse, golden: str) -> None:
 @every_format
 @given(data=st.data())
 @settings(max_examples=60)
-def test_any_point_comes_back(write, parse, golden: str, data: st.DataObject) -> None:
+def test_any_point_survives_a_round_trip(write, parse, golden: str, data: st.DataObject) -> None:
     n = data.draw(st.integers(0, 4))
     pixel = st.floats(-1e5, 1e6)
     positive = st.floats(1e-3, 1e3)
@@ -151,8 +151,8 @@ def test_any_point_comes_back(write, parse, golden: str, data: st.DataObject) ->
     assert np.abs(moved).max(initial=0) < a_micrometre
 
 
-def test_qgis_marks_of_a_map_image_give_gdal_back_its_geotransform() -> None:
-    """QGIS hands its points to GDAL as column and minus row."""
+def test_gdal_recovers_the_geotransform_of_a_map_image_from_qgis_marks() -> None:
+    """QGIS passes its points to GDAL as column and negative row."""
     origin_lon, origin_lat, step = 12.0, 42.0, 1e-4
     line_sample = np.array([[0.0, 0.0], [0.0, 999.0], [799.0, 999.0], [799.0, 0.0], [400.0, 500.0]])
     lon = origin_lon + (line_sample[:, 1] + 0.5) * step
@@ -167,15 +167,15 @@ def test_qgis_marks_of_a_map_image_give_gdal_back_its_geotransform() -> None:
     assert (fitted.a, fitted.e) == pytest.approx((step, -step), rel=1e-9)
 
 
-def test_the_middle_of_an_image_is_the_middle_for_odm() -> None:
-    """ODM counts from the middle of an image in sizes of its longer side, half a pixel added first."""
+def test_the_image_centre_is_the_centre_for_odm() -> None:
+    """ODM adds half a pixel and counts from the image centre, in units of the longer side."""
     lines, samples = 3000, 4000
     middle = marked_points(["a"], [(12.0, 42.0, 0.0)], [((lines - 1) / 2, (samples - 1) / 2)])
     _, _, _, im_x, im_y, *_ = numbers(format_gcp_list(middle))[0]
     assert ((im_x + 0.5 - samples / 2) / samples, (im_y + 0.5 - lines / 2) / samples) == (0.0, 0.0)
 
 
-def test_the_points_of_a_pci_text_in_a_file_of_pci_give_gdal_back_the_place_of_a_map_image(
+def test_gdal_recovers_the_geotransform_of_a_map_image_from_a_pci_file_with_pci_text_points(
     tmp_path: Path,
 ) -> None:
     place = Affine(1e-4, 0.0, 12.0, 0.0, -1e-4, 42.0)
@@ -190,11 +190,11 @@ def test_the_points_of_a_pci_text_in_a_file_of_pci_give_gdal_back_the_place_of_a
     with rasterio.open(path, "w", "PCIDSK", 1000, 800, 1, dtype=np.uint8, gcps=gcps, crs="EPSG:4326"):
         pass
     with rasterio.open(path) as file:
-        found = from_gcps(file.gcps[0])
-    assert found.almost_equals(place, precision=a_nanodegree)
+        transform = from_gcps(file.gcps[0])
+    assert transform.almost_equals(place, precision=a_nanodegree)
 
 
-def test_only_active_points_are_control_and_qgis_keeps_the_others_switched_off() -> None:
+def test_only_active_points_are_written_and_qgis_has_the_others_disabled() -> None:
     points = replace(golden_points(), active=np.array([True, False, True, True, True]))
     held_out = replace(points, check=np.array([False, False, False, True, False]))
     assert len(numbers(format_asp_gcp(held_out))) == len(numbers(format_envi_pts(held_out))) == 3
@@ -218,23 +218,23 @@ def test_a_point_seen_in_two_images_is_one_point_with_two_marks() -> None:
     assert len(json.loads(format_opf(twice))["gcps"]) == 4
 
 
-def test_blanks_in_the_name_of_an_image_do_not_break_an_asp_line() -> None:
+def test_spaces_in_the_name_of_an_image_do_not_break_an_asp_line() -> None:
     points = replace(golden_points(), image=np.full(5, "my image, 2.tif"))
     assert parse_asp_gcp(format_asp_gcp(points), "ellipsoid").image[0] == "my_image__2.tif"
 
 
-def test_residuals_go_to_qgis_as_computed_minus_observed_with_lines_upwards() -> None:
+def test_residuals_in_qgis_are_computed_minus_observed_with_lines_upwards() -> None:
     points = replace(golden_points(), residual_px=np.tile([0.3, -0.4], (5, 1)))
     assert numbers(format_qgis_points(points))[0][5:] == [0.4, 0.3, 0.5]
 
 
 @pytest.mark.parametrize("write", [format_asp_gcp, format_opf])
-def test_a_format_that_asks_for_sigmas_is_not_given_invented_ones(write) -> None:
+def test_unknown_sigmas_are_an_error_in_a_format_that_needs_them(write) -> None:
     with pytest.raises(InputError, match=r"point 11: .*unknown"):
         write(replace(golden_points(), sigma_px=np.full(5, np.nan)))
 
 
-def test_a_gcp_list_in_utm_is_read_and_points_without_names_are_told_apart_by_their_ground() -> None:
+def test_a_gcp_list_in_utm_is_read_and_unnamed_points_are_distinguished_by_their_ground() -> None:
     marks = numbers(TEXTS["invented_utm.pts"])
     lines = [
         f"{x!r}\t{y!r}\t{h!r}\t{px - 1.5!r} {py - 1.5!r} {i}.tif"
@@ -264,7 +264,7 @@ def test_a_pci_text_may_have_its_columns_in_any_order_with_names_of_several_word
     assert np.isnan(points.sigma_px).all()
 
 
-def test_a_pci_text_holds_errors_of_pixels_only_when_all_are_known() -> None:
+def test_a_pci_text_has_pixel_errors_only_when_all_are_known() -> None:
     points = golden_points()
     partly = replace(points, sigma_px=np.array([0.1, np.nan, 0.1, 0.1, 0.1]))
     assert "ePeL" not in format_pci_text(partly)
@@ -272,7 +272,7 @@ def test_a_pci_text_holds_errors_of_pixels_only_when_all_are_known() -> None:
 
 
 @pytest.mark.parametrize("name", ["invented.gcp", "invented.pts", "invented_gcp_list.txt"])
-def test_heights_whose_datum_nobody_says_are_refused(name: str) -> None:
+def test_heights_without_a_datum_are_refused(name: str) -> None:
     with pytest.raises(VerticalDatumError, match="does not state the datum of its heights"):
         read_control_points(GOLDEN / name)
     with pytest.raises(
@@ -283,7 +283,7 @@ def test_heights_whose_datum_nobody_says_are_refused(name: str) -> None:
         read_control_points(GOLDEN / name, "sea")
 
 
-def test_an_opf_point_with_a_constant_geoid_is_brought_to_the_ellipsoid() -> None:
+def test_the_geoid_height_of_an_opf_point_is_added() -> None:
     document = json.loads(TEXTS["invented_opf.json"])
     for gcp in document["gcps"]:
         gcp["geolocation"]["crs"] = {"definition": "EPSG:4326+5773", "geoid_height": 48.5}
@@ -300,13 +300,13 @@ def test_an_opf_of_a_two_dimensional_system_has_ellipsoidal_heights_and_its_own_
     assert points.sigma_m[0].tolist() == [0.75, 0.5, 1.5]
 
 
-def test_an_opf_of_others_names_images_by_their_camera() -> None:
+def test_an_opf_without_our_extension_names_images_by_camera_id() -> None:
     document = json.loads(TEXTS["invented_opf.json"])
     del document["extensions"]
     assert parse_opf(json.dumps(document)).image[0] == str(opf_camera_id("invented.tif"))
 
 
-def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
+def test_points_that_a_registration_did_not_match_are_no_marks() -> None:
     document = json.loads(TEXTS["invented.geojson"])
     document["features"][1]["properties"] |= {"line": None, "sample": None, "status": "not matched"}
     document["features"][2]["properties"] |= {"status": "deactivated"}
@@ -316,7 +316,7 @@ def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "was", "becomes", "says"),
+    ("name", "was", "becomes", "message"),
     [
         ("invented.gcp", " 105.25", "", "line 2: expected id, lat"),
         ("invented.gcp", "105.25", "high", "line 2: height: expected a number, found 'high'"),
@@ -354,11 +354,11 @@ def test_what_a_registration_did_not_find_is_not_read_as_a_mark() -> None:
         ("invented.geojson", '"line": 44', '"line": "a', "JSON|expected 2 numbers"),
     ],
 )
-def test_a_wrong_field_is_named(tmp_path: Path, name: str, was: str, becomes: str, says: str) -> None:
+def test_a_wrong_field_is_named(tmp_path: Path, name: str, was: str, becomes: str, message: str) -> None:
     assert was in TEXTS[name]
     path = tmp_path / name
     path.write_text(TEXTS[name].replace(was, becomes))
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(FormatError, match=message):
         read_control_points(path, "ellipsoid")
 
 
@@ -378,7 +378,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", FILES)
 @given(data=st.data())
 @settings(max_examples=60)
-def test_a_garbled_file_gives_points_or_an_error_of_ours(name: str, data: st.DataObject) -> None:
+def test_a_garbled_file_gives_points_or_an_amers_error(name: str, data: st.DataObject) -> None:
     text = TEXTS[name]
     start = data.draw(st.integers(0, len(text)))
     cut = data.draw(st.integers(0, 200))

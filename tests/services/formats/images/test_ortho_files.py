@@ -1,4 +1,4 @@
-"""Ortho-images: recognised, mixed, masked, and given back with a corrected place."""
+"""Ortho-images: recognition, band mixes, masks, and the corrected map grid."""
 
 from pathlib import Path
 
@@ -77,14 +77,14 @@ def test_an_image_on_a_map_is_an_ortho_scene(
     assert model_files(tmp_path / name) == []
 
 
-def test_a_sensor_that_the_name_tells_has_its_known_accuracy(tmp_path: Path) -> None:
+def test_a_sensor_known_by_the_file_name_has_its_accuracy(tmp_path: Path) -> None:
     scene = read_scene(write(tmp_path / "x_S2A_20160608T153121_T33UUU_sub.tif"))
     assert scene.acquisition.sensor == "S2A"
     assert str(scene.acquisition.acquired_at).startswith("2016-06-08 15:31:21")
     assert scene.sigma_m == pytest.approx(17.5 * CE90_TO_SIGMA)
 
 
-def test_a_landsat_scene_is_as_good_as_its_tier_says_and_the_second_says_nothing(tmp_path: Path) -> None:
+def test_a_landsat_scene_has_the_accuracy_of_tier_1_and_none_of_tier_2(tmp_path: Path) -> None:
     largest_radial_rms_m = 12.0
     scene = read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T1_B8.TIF"))
     assert scene.acquisition.sensor == "LC08"
@@ -93,14 +93,14 @@ def test_a_landsat_scene_is_as_good_as_its_tier_says_and_the_second_says_nothing
         read_scene(write(tmp_path / "LC08_L1TP_193024_20200507_20200509_02_T2_B8.TIF"))
 
 
-def test_an_ortho_scene_of_an_unknown_sensor_asks_for_its_accuracy(tmp_path: Path) -> None:
+def test_an_ortho_scene_of_an_unknown_sensor_needs_an_accuracy(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif")
     with pytest.raises(FormatError, match="sigma_m"):
         read_scene(path)
     assert read_scene(path, sigma_m=3.0).sigma_m == 3.0
 
 
-def test_an_image_on_no_map_and_without_a_model_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_an_image_without_map_grid_and_model_is_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     with rasterio.open(path, "w", driver="GTiff", height=9, width=9, count=1, dtype="uint8") as file:
         file.write(np.ones((1, 9, 9), np.uint8))
@@ -108,7 +108,7 @@ def test_an_image_on_no_map_and_without_a_model_is_refused_with_the_reason(tmp_p
         read_scene(path)
 
 
-def test_an_unusable_place_is_refused(tmp_path: Path) -> None:
+def test_an_unusable_map_grid_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="its centre is not on the Earth"):
         read_scene(write(tmp_path / "far.tif", transform=Affine(10, 0, 9e9, 0, -10, 9e9)), sigma_m=1.0)
     with pytest.raises(FormatError, match="on a line"):
@@ -117,9 +117,7 @@ def test_an_unusable_place_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:4326"])
 @pytest.mark.parametrize("transform", [NORTH_UP, ROTATED])
-def test_a_correction_comes_back_from_the_sidecar_and_from_the_copy(
-    tmp_path: Path, crs: str, transform: Affine
-) -> None:
+def test_sidecar_and_copy_contain_the_correction(tmp_path: Path, crs: str, transform: Affine) -> None:
     if crs == "EPSG:4326":
         transform = (
             Affine.translation(12.0, 52.0)
@@ -141,7 +139,7 @@ def test_a_correction_comes_back_from_the_sidecar_and_from_the_copy(
     ground = corrected.locate(np.random.default_rng(1).uniform(0, 79, (30, 2)), np.zeros(30))
     again = read_scene(copy, sigma_m=5.0).model
     np.testing.assert_allclose(again.project(ground), corrected.project(ground), atol=a_micropixel)
-    # GDAL believes the sidecar before the image: the delivered image moves too.
+    # GDAL prefers the sidecar to the image, so that the delivered image moves too.
     beside = tmp_path / "beside"
     beside.mkdir()
     (beside / "a.tif").write_bytes(before)
@@ -170,14 +168,14 @@ def test_a_jpeg_2000_gets_a_sidecar_and_no_copy(tmp_path: Path) -> None:
         ("1:1,2:.5,4:2.5", (1, 2, 4), (0.25, 0.125, 0.625)),
     ],
 )
-def test_bands_are_read_as_said(text: str, bands: tuple, weights: tuple) -> None:
+def test_a_text_of_bands_is_parsed(text: str, bands: tuple, weights: tuple) -> None:
     mix = parse_bands(text)
     assert mix.bands == bands
     assert mix.weights == pytest.approx(weights)
 
 
 @given(st.text(max_size=20))
-def test_any_other_words_for_bands_are_refused(text: str) -> None:
+def test_any_other_text_of_bands_is_refused(text: str) -> None:
     try:
         mix = parse_bands(text)
     except FormatError as error:
@@ -188,7 +186,7 @@ def test_any_other_words_for_bands_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "0", "1,1", "1:0", "1:-2", "1:nan", "a", "1;2", "1:1e3"])
-def test_bands_that_cannot_be_are_refused(text: str) -> None:
+def test_impossible_bands_are_refused(text: str) -> None:
     with pytest.raises(FormatError, match="expected band numbers"):
         parse_bands(text)
 
@@ -205,7 +203,7 @@ def test_a_mix_is_the_weighted_mean_of_its_bands(tmp_path: Path) -> None:
         read_scene(path, sigma_m=1.0, bands=parse_bands("1,5"))
 
 
-def test_colours_are_seen_as_their_mean_by_default(tmp_path: Path) -> None:
+def test_the_default_of_a_colour_image_is_the_mean_of_its_colours(tmp_path: Path) -> None:
     read = read_scene(write(tmp_path / "a.tif", PIXELS), sigma_m=1.0).image.read(ALL)
     np.testing.assert_allclose(read, PIXELS[:3].mean(axis=0), rtol=a_millionth_of_a_number)
     assert default_mix(("nir", "blue", "green", "red")).bands == (4, 3, 2)
@@ -213,14 +211,14 @@ def test_colours_are_seen_as_their_mean_by_default(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("options", "white"), [({}, 65535), ({"NBITS": 12}, 4095)])
-def test_saturated_pixels_are_not_looked_at(tmp_path: Path, options: dict, white: int) -> None:
+def test_saturated_pixels_are_nan(tmp_path: Path, options: dict, white: int) -> None:
     pixels = PIXELS[:1].copy()
     pixels[0, 3:5, 6:9] = white
     read = read_scene(write(tmp_path / "a.tif", pixels, **options), sigma_m=1.0).image.read(ALL)
     np.testing.assert_array_equal(np.isnan(read), pixels[0] == white)
 
 
-def test_white_is_a_colour_in_eight_bits_and_in_real_numbers(tmp_path: Path) -> None:
+def test_the_largest_value_is_valid_in_eight_bits_and_in_floating_point(tmp_path: Path) -> None:
     for dtype in (np.uint8, np.float32):
         pixels = np.full((1, *SHAPE), 255, dtype)
         read = read_scene(write(tmp_path / f"{dtype.__name__}.tif", pixels), sigma_m=1.0).image.read(ALL)
@@ -228,7 +226,7 @@ def test_white_is_a_colour_in_eight_bits_and_in_real_numbers(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("factor", [1, 4])
-def test_pixels_under_a_mask_are_not_looked_at(tmp_path: Path, factor: int) -> None:
+def test_pixels_that_a_mask_excludes_are_nan(tmp_path: Path, factor: int) -> None:
     cloud = (np.random.default_rng(2).random((1, SHAPE[0] // factor, SHAPE[1] // factor)) < 0.3).astype(
         np.uint8
     )
@@ -248,7 +246,7 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.real_data
-def test_sentinel_2_crops_lie_on_each_other_but_for_their_known_shift(real_data: Path) -> None:
+def test_sentinel_2_crops_agree_except_for_their_known_shift(real_data: Path) -> None:
     folder = real_data / "s2a_berlin_pair"
     june = read_scene(folder / "ref_S2A_20160608T153121_T33UUU_sub.tif")
     may = read_scene(folder / "tgt_S2A_20160529T153631_T33UUU_sub.tif")

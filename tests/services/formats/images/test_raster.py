@@ -1,4 +1,4 @@
-"""Images in files: what is read, and what is refused."""
+"""Image files: windows, bands and nodata are read; unusable files are refused."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def write(path: Path, pixels: np.ndarray = PIXELS, driver: str = "GTiff", **opti
 
 
 @given(st.integers(-100, 150), st.integers(-150, 200), st.integers(1, 200), st.integers(1, 200))
-def test_any_window_reads_as_from_memory(
+def test_any_window_of_a_file_is_the_window_of_the_array(
     tmp_path_factory: pytest.TempPathFactory, line: int, sample: int, lines: int, samples: int
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "windows.tif"
@@ -66,7 +66,7 @@ def test_every_allowed_kind_of_file_is_read(
     np.testing.assert_array_equal(image.read(Window(0, 0, *PIXELS.shape)), PIXELS)
 
 
-def test_nodata_is_nan_and_nothing_else_is(tmp_path: Path) -> None:
+def test_only_nodata_is_nan(tmp_path: Path) -> None:
     image = open_raster(write(tmp_path / "a.tif", nodata=int(PIXELS[3, 4])))
     read = image.read(Window(0, 0, *PIXELS.shape))
     np.testing.assert_array_equal(np.isnan(read), PIXELS[3, 4] == PIXELS)
@@ -80,7 +80,7 @@ def test_pixels_under_a_mask_are_nan(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.isfinite(read), valid > 0)
 
 
-def test_the_band_that_was_chosen_is_read(tmp_path: Path) -> None:
+def test_the_requested_band_is_read(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif", np.stack([PIXELS, PIXELS + 1]))
     np.testing.assert_array_equal(open_raster(path, 2).read(Window(0, 0, *PIXELS.shape)), PIXELS + 1)
     with pytest.raises(FormatError, match="band 3 requested, the image has 2 bands"):
@@ -110,7 +110,7 @@ def test_other_kinds_of_files_are_refused_whatever_their_name(tmp_path: Path, co
         ".",
     ],
 )
-def test_addresses_archives_and_folders_are_no_images(name: str) -> None:
+def test_urls_archives_and_folders_are_refused(name: str) -> None:
     with pytest.raises(FormatError, match="expected the name of an existing image file"):
         open_raster(Path(name))
 
@@ -121,7 +121,7 @@ def test_a_file_is_read_whatever_its_name(tmp_path: Path, name: str) -> None:
     assert open_raster(tmp_path / name).shape == PIXELS.shape
 
 
-def test_sidecars_are_not_looked_at(tmp_path: Path) -> None:
+def test_sidecars_are_ignored(tmp_path: Path) -> None:
     path = write(tmp_path / "a.tif")
     (tmp_path / "a.tif.aux.xml").write_text(
         '<PAMDataset><PAMRasterBand band="1"><NoDataValue>0</NoDataValue></PAMRasterBand></PAMDataset>'
@@ -136,7 +136,9 @@ def test_sidecars_are_not_looked_at(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("driver", ["GTiff", "COG", "JP2OpenJPEG", "NITF"])
 @pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_image_is_told_when_it_is_opened(tmp_path: Path, driver: str, part: float) -> None:
+def test_a_truncated_image_is_refused_when_it_is_opened(
+    tmp_path: Path, driver: str, part: float
+) -> None:
     data = write(tmp_path / "whole", np.tile(PIXELS, (5, 5)), driver=driver).read_bytes()
     (tmp_path / "cut").write_bytes(data[: int(part * len(data))])
     with pytest.raises(FormatError, match="cut: "):
@@ -185,7 +187,7 @@ def test_a_copy_has_the_new_tags_and_the_same_pixels(tmp_path: Path, driver: str
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
-def test_what_is_written_is_read(tmp_path: Path, dtype: str) -> None:
+def test_a_written_raster_reads_back(tmp_path: Path, dtype: str) -> None:
     pixels = np.tile(PIXELS, (4, 4)).astype(dtype)
     write_raster(tmp_path / "a.tif", pixels, MODEL)
     image = open_raster(tmp_path / "a.tif")

@@ -1,4 +1,4 @@
-"""Real deliveries: every model is read, in the right pixels, and the images agree on the ground."""
+"""Real deliveries: all models are read in the right pixels, and the images agree on the ground."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +109,7 @@ def test_a_crop_in_its_own_pixels_is_a_whole_number_of_pixels_from_the_full_scen
 def test_the_rpc_agrees_with_the_physical_model(
     real_data: Path, image: str, product: str, first: tuple[float, float]
 ) -> None:
-    """The producer's grids locate pixels 4000, 4200 ... of the full scene, counted from zero."""
+    """The producer's grids locate pixels 4000, 4200 … of the full scene, counted from zero."""
     folder = real_data / "phr_ventoux_pair"
     crop = read_rpc(folder / f"{image}_image.tif").model
     with rasterio.open(folder / "loc_grids" / f"GRID_PHR1B_P_{product}.tif") as grid:
@@ -136,7 +136,7 @@ def test_the_full_scene_s_dimap_is_shifted_to_the_crop(real_data: Path) -> None:
 
 
 @pytest.mark.parametrize("view", ["1", "2"])
-def test_the_full_scene_s_model_and_the_crop_s_are_told_apart(
+def test_models_of_the_full_scene_and_of_the_crop_are_distinguished(
     real_data: Path, tmp_path: Path, view: str
 ) -> None:
     image = real_data / "phr_gizeh_pair" / f"img{view}.tif"
@@ -171,7 +171,7 @@ def test_an_image_without_a_model_is_refused(real_data: Path) -> None:
 
 
 def agreement(a: Scene, b: Scene, point: Array) -> tuple[float, float]:
-    """Best correlation of what two scenes show round a ground point, and how far apart, in pixels."""
+    """Best correlation of two scenes around a ground point, and its distance in pixels."""
     gsd_m = scene_gsd_m(a)
     chip, around = (
         render_chip(a.image, a.model, point, gsd_m, 61),
@@ -185,7 +185,7 @@ def agreement(a: Scene, b: Scene, point: Array) -> tuple[float, float]:
 
 
 def matched(a: Scene, b: Scene) -> tuple[Array, Array]:
-    """Positions in two images of details that look alike, wrong ones included."""
+    """Matched positions in two images, wrong matches included."""
     sift = cv2.SIFT_create()
     seen = []
     for scene in (a, b):
@@ -216,14 +216,14 @@ def matched(a: Scene, b: Scene) -> tuple[Array, Array]:
         ("phr_iceland_pair", ("img_01.tif", "img_02.tif"), 0.26, (1460.0, 1560.0)),
     ],
 )
-def test_the_two_images_of_a_pair_meet_on_sensible_ground(
+def test_the_rays_of_a_pair_intersect_at_plausible_heights(
     real_data: Path,
     folder: str,
     names: tuple[str, str],
     epipolar_error_px: float,
     heights_m: tuple[float, float],
 ) -> None:
-    """Rays of a detail pass at the distance known of the pair, at heights of the place."""
+    """The rays of a match pass at the known distance of the pair, at plausible heights."""
     a, b = (read_scene(real_data / folder / name) for name in names)
     in_a, in_b = matched(a, b)
     low, high = (

@@ -1,4 +1,4 @@
-"""A scene: its model found, placed and written back; its accuracy and acquisition told."""
+"""Scenes: the model is found, shifted to a crop and written back; accuracy and acquisition are read."""
 
 import math
 import shutil
@@ -87,7 +87,7 @@ def test_tags_come_before_sidecars_and_an_explicit_model_before_all(tmp_path: Pa
     assert read_rpc(path, tmp_path / "a_RPC.TXT").model.error_bias_m == 9.0
 
 
-def test_without_a_model_the_message_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_without_a_model_the_message_lists_the_files_searched_for(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a_R1C1.tif")
     with pytest.raises(
         FormatError,
@@ -103,7 +103,7 @@ def test_a_model_that_vanishes_is_refused_with_the_name_of_its_file(tmp_path: Pa
         read_scene(path)
 
 
-def test_a_model_of_another_place_is_refused(tmp_path: Path) -> None:
+def test_a_model_of_another_region_is_refused(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif")
     elsewhere = replace(CROP, image_offset=CROP.image_offset + 90_000.0)
     (tmp_path / "a_RPC.TXT").write_text(format_rpc_text(elsewhere))
@@ -122,7 +122,7 @@ def test_a_crop_is_read_right_whether_its_model_is_the_full_scene_s_or_its_own(
     assert "line 9000, sample 15000" in read.note
 
 
-def test_a_crop_whose_model_could_be_either_is_asked_about(tmp_path: Path) -> None:
+def test_a_crop_with_an_ambiguous_model_needs_its_origin(tmp_path: Path) -> None:
     half_way = replace(FULL, image_offset=FULL.image_offset - np.array(ORIGIN) / 2.0)
     path = write_image(tmp_path / "a.tif", tagged=half_way, placed=True)
     with pytest.raises(FormatError, match=r"give crop_origin=\(0, 0\) or crop_origin=\(9000, 15000\)"):
@@ -134,7 +134,7 @@ def test_a_crop_whose_model_could_be_either_is_asked_about(tmp_path: Path) -> No
     np.testing.assert_allclose(shifted.image_offset, half_way.image_offset - np.array(ORIGIN))
 
 
-def test_a_tile_of_an_image_in_several_files_has_to_say_where_it_lies(tmp_path: Path) -> None:
+def test_a_tile_of_an_image_in_several_files_needs_its_origin(tmp_path: Path) -> None:
     (tmp_path / "RPC_a.XML").write_text(V2)
     first = write_image(tmp_path / "IMG_a_R1C1.tif")
     second = write_image(tmp_path / "IMG_a_R2C1.tif")
@@ -154,7 +154,7 @@ def test_a_scene_sees_the_ground_its_model_says(tmp_path: Path) -> None:
     assert 0.4 < scene_gsd_m(scene) < 0.6
 
 
-def test_the_direction_of_view_is_that_which_leaves_the_image_still(tmp_path: Path) -> None:
+def test_ground_moved_along_the_viewing_direction_stays_in_the_image(tmp_path: Path) -> None:
     scene = read_scene(write_image(tmp_path / "a.tif", tagged=CROP))
     derivative = CROP.project_derivative(scene_centre(scene)[None, :])[0]
     east, north = np.linalg.solve(derivative[:, :2], -derivative[:, 2])
@@ -164,7 +164,7 @@ def test_the_direction_of_view_is_that_which_leaves_the_image_still(tmp_path: Pa
     assert scene.acquisition.azimuth_deg == pytest.approx(azimuth_deg, abs=a_hundredth_of_a_degree)
 
 
-def test_the_tags_of_the_image_tell_the_sensor_and_the_time(tmp_path: Path) -> None:
+def test_sensor_and_time_are_read_from_the_tags_of_the_image(tmp_path: Path) -> None:
     tags = {"MISSION": "PHR", "MISSION_INDEX": "1B"}
     tags |= {"IMAGING_DATE": "2013-02-08", "IMAGING_TIME": "08:36:09.1Z"}
     scene = read_scene(write_image(tmp_path / "a.tif", tagged=CROP, **tags))
@@ -172,7 +172,7 @@ def test_the_tags_of_the_image_tell_the_sensor_and_the_time(tmp_path: Path) -> N
     assert scene.acquisition.acquired_at == datetime(2013, 2, 8, 8, 36, 9, 100_000, tzinfo=UTC)
 
 
-def test_the_product_document_beside_the_rpc_tells_the_sensor(tmp_path: Path) -> None:
+def test_the_sensor_is_read_from_the_product_document_beside_the_rpc(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a.tif")
     (tmp_path / "RPC_a.XML").write_text(format_dimap_rpc(V2, CROP))
     assert read_scene(path).acquisition.sensor == "PHR"
@@ -193,7 +193,7 @@ def test_the_product_document_beside_the_rpc_tells_the_sensor(tmp_path: Path) ->
         ((math.nan, math.nan), "unheard of", 50.0),
     ],
 )
-def test_the_accuracy_is_what_is_stated_else_what_is_known_of_the_sensor(
+def test_the_accuracy_is_the_stated_one_else_that_of_the_sensor(
     stated: tuple[float, float], sensor: str, sigma_m: float
 ) -> None:
     model = replace(FULL, error_bias_m=stated[0], error_random_m=stated[1])
@@ -264,7 +264,7 @@ def test_refined_tags_are_written_to_a_copy_when_the_image_is_given(tmp_path: Pa
     assert misfit_px(read_rpc(path).model, CROP) < a_millionth_of_a_pixel
 
 
-def test_the_delivered_model_is_never_written_over(tmp_path: Path) -> None:
+def test_the_delivered_model_is_never_overwritten(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif")
     (tmp_path / "a.RPB").write_text(format_rpb(CROP))
     delivered = read_rpc(path)
@@ -272,7 +272,7 @@ def test_the_delivered_model_is_never_written_over(tmp_path: Path) -> None:
         write_model(delivered, refined(CROP), tmp_path)
 
 
-def test_a_latin_1_document_stays_one(tmp_path: Path) -> None:
+def test_a_latin_1_document_stays_latin_1(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a.tif")
     text = format_dimap_rpc(V2, CROP).replace("UTF-8", "ISO-8859-1").replace("invented", "invent\u00e9")
     (tmp_path / "RPC_a.XML").write_bytes(text.encode("latin-1"))

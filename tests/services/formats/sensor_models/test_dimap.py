@@ -1,4 +1,4 @@
-"""DIMAP: both versions read to the same model, and a refined model goes back without a contradiction."""
+"""DIMAP: both versions give the same model, and a refined document is free of contradictions."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -49,7 +49,7 @@ def misfit_px(a: RpcModel, b: RpcModel) -> float:
 
 
 def locate_by_direct_model(text: str, line_sample: Array, height_m: Array) -> Array:
-    """Longitudes and latitudes by the other model of a document, which the project does not read."""
+    """Longitudes and latitudes by the model to the ground, which the project does not read."""
     root = ElementTree.fromstring(text)
     places = root.findall(".//Direct_Model") + root.findall(".//ImagetoGround_Values")
     names = ("SAMP", "LINE") if places[0].tag == "Direct_Model" else ("LON", "LAT")
@@ -77,7 +77,7 @@ def locate_by_direct_model(text: str, line_sample: Array, height_m: Array) -> Ar
 
 
 def contradiction_px(text: str, over: RpcModel = MODEL) -> float:
-    """Distance in the image between a document's two models, over the range of one."""
+    """Distance in the image between the two models of a document, over the range of one."""
     model = parse_dimap_rpc(text)
     ground = ground_of(over)
     line_sample = model.project(ground)
@@ -93,13 +93,13 @@ def test_the_first_pixel_is_one_one_in_version_2_and_zero_zero_in_version_3(text
     assert misfit_px(model, MODEL) == 0.0
 
 
-def test_version_3_that_starts_at_one_is_believed() -> None:
+def test_version_3_may_start_at_one() -> None:
     text = V3.replace(">0</FIRST_", ">1</FIRST_")
     np.testing.assert_array_equal(parse_dimap_rpc(text).image_offset, MODEL.image_offset - 1.0)
 
 
 @both_versions
-def test_the_errors_of_the_fit_are_not_taken_for_the_accuracy_of_the_scene(text: str) -> None:
+def test_the_errors_of_the_fit_are_not_the_accuracy_of_the_scene(text: str) -> None:
     assert np.isnan(parse_dimap_rpc(text).error_bias_m)
 
 
@@ -129,7 +129,7 @@ def test_a_model_that_mixes_lines_and_samples_is_written_in_both_directions(text
 
 
 @both_versions
-def test_a_model_to_the_ground_that_would_contradict_is_removed(text: str, monkeypatch) -> None:
+def test_a_contradictory_model_to_the_ground_is_removed(text: str, monkeypatch) -> None:
     monkeypatch.setattr("services.formats.sensor_models.dimap.TO_GROUND_LIMIT_PX", 0.0)
     mixed = replace(MODEL, line_num=MODEL.line_num + 1e-3 * MODEL.sample_num)
     written = format_dimap_rpc(text, mixed)
@@ -140,7 +140,7 @@ def test_a_model_to_the_ground_that_would_contradict_is_removed(text: str, monke
 
 
 @both_versions
-def test_a_document_takes_the_model_of_another_place(text: str) -> None:
+def test_a_document_takes_the_model_of_another_region(text: str) -> None:
     elsewhere = replace(MODEL, ground_offset=MODEL.ground_offset + np.array([5.0, -3.0, 100.0]))
     read = parse_dimap_rpc(format_dimap_rpc(text, elsewhere))
     np.testing.assert_array_equal(read.ground_offset, elsewhere.ground_offset)
@@ -183,7 +183,7 @@ def test_a_garbled_document_gives_a_model_or_a_format_error(data, text: str) -> 
             continue
 
 
-def test_a_product_document_tells_sensor_time_and_sun_at_the_centre() -> None:
+def test_sensor_time_and_sun_are_read_from_a_product_document() -> None:
     text = (
         '<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.15"/>'
         "<METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE></Metadata_Identification><Strip_Source>"
@@ -195,20 +195,20 @@ def test_a_product_document_tells_sensor_time_and_sun_at_the_centre() -> None:
         "<Solar_Incidences><SUN_AZIMUTH>142.5</SUN_AZIMUTH><SUN_ELEVATION>52.25</SUN_ELEVATION>"
         "</Solar_Incidences></Located_Geometric_Values></Dimap_Document>"
     )
-    told = parse_dimap_acquisition(text, "image")
-    assert (told.image_id, told.sensor) == ("image", "PHR1A")
-    assert told.acquired_at == datetime(2021, 3, 4, 10, 36, 9, 100_000, tzinfo=UTC)
-    assert (told.sun_azimuth_deg, told.sun_elevation_deg) == (142.5, 52.25)
+    acquisition = parse_dimap_acquisition(text, "image")
+    assert (acquisition.image_id, acquisition.sensor) == ("image", "PHR1A")
+    assert acquisition.acquired_at == datetime(2021, 3, 4, 10, 36, 9, 100_000, tzinfo=UTC)
+    assert (acquisition.sun_azimuth_deg, acquisition.sun_elevation_deg) == (142.5, 52.25)
 
 
-def test_an_rpc_document_tells_the_family_of_the_sensor_only() -> None:
-    told = parse_dimap_acquisition(V3, "image")
-    assert (told.sensor, told.acquired_at) == ("PNEO", None)
+def test_an_rpc_document_gives_the_family_of_the_sensor_only() -> None:
+    acquisition = parse_dimap_acquisition(V3, "image")
+    assert (acquisition.sensor, acquisition.acquired_at) == ("PNEO", None)
 
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("folder", ["phr_rpc_only/calanques", "phr_rpc_only/toulouse"])
-def test_a_delivered_document_keeps_its_two_directions_together(real_data: Path, folder: str) -> None:
+def test_both_models_of_a_delivered_document_still_agree(real_data: Path, folder: str) -> None:
     path = sorted((real_data / folder).glob("RPC*.XML"))[0]
     text = path.read_text()
     own = parse_dimap_rpc(text)

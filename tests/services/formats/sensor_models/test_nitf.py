@@ -1,4 +1,4 @@
-"""RPC00B and RPC00A in NITF files, as bytes of the standard; GDAL reads the same pixels and places."""
+"""RPC00B and RPC00A in NITF files, made from the standard; GDAL reads the same pixels and positions."""
 
 import json
 from pathlib import Path
@@ -26,7 +26,7 @@ both_records = pytest.mark.parametrize("name", ["invented_rpc00b.ntf", "invented
 
 
 @both_records
-def test_a_record_is_read_as_the_standard_has_it(name: str) -> None:
+def test_a_record_is_read_as_in_the_standard(name: str) -> None:
     delivered = read_rpc(GOLDEN / name)
     model = delivered.model
     assert isinstance(model, RpcModel)
@@ -35,11 +35,11 @@ def test_a_record_is_read_as_the_standard_has_it(name: str) -> None:
     assert (delivered.convention, delivered.crop_origin) == ("tags", (0.0, 0.0))
 
 
-def test_gdal_counts_the_pixels_of_a_record_from_half_a_pixel_before() -> None:
+def test_gdal_agrees_with_its_pixels_counted_from_the_corner() -> None:
     with rasterio.open(GOLDEN / "invented_rpc00b.ntf") as file, RPCTransformer(file.rpcs) as gdal:
         line, sample = gdal.rowcol(*GROUND.T, op=np.asarray)
-    found = np.column_stack([line, sample]) - CORNER_OF_FIRST_PIXEL
-    np.testing.assert_allclose(found, LINE_SAMPLE, atol=a_millionth_of_a_pixel, rtol=0)
+    actual = np.column_stack([line, sample]) - CORNER_OF_FIRST_PIXEL
+    np.testing.assert_allclose(actual, LINE_SAMPLE, atol=a_millionth_of_a_pixel, rtol=0)
 
 
 @both_records

@@ -1,4 +1,4 @@
-"""What a registration leaves: its correction, an RPC only while it is true, layers a GIS opens."""
+"""Deliverables of a registration: correction, RPC where one fits, map grid and layers for a GIS."""
 
 import json
 from dataclasses import replace
@@ -33,14 +33,14 @@ def written(correction: ImageCorrection = CORRECTION) -> str:
     return format_correction(correction, "affine", np.diag([np.nan, 1, 2, 3, 4, 5]), "tags", "none")
 
 
-def test_a_correction_reads_back_as_it_was() -> None:
+def test_a_correction_survives_a_round_trip() -> None:
     again = parse_correction(written())
     for name in ("parameters", "centre", "half_size"):
         np.testing.assert_array_equal(getattr(again, name), getattr(CORRECTION, name))
     assert json.loads(written())["covariance_px2"][0][0] is None
 
 
-def test_the_formula_of_the_document_is_the_one_that_is_applied() -> None:
+def test_the_formula_in_the_document_is_the_one_applied() -> None:
     document = json.loads(written())
     place = np.array([100.0, 900.0])
     t = (place - np.array(document["centre_px"])) / np.array(document["half_size_px"])
@@ -70,7 +70,7 @@ def test_a_truncated_correction_is_a_format_error(size: int) -> None:
         parse_correction(written()[: min(size, len(written()) - 3)])
 
 
-def test_an_rpc_that_no_longer_follows_the_model_is_refused_with_its_error() -> None:
+def test_an_rpc_that_does_not_fit_the_model_is_refused_with_its_error() -> None:
     shape, heights_m = (40_000, 2000), (50.0, 850.0)
     target = np.array([5.4, 43.6, 300.0])
     smooth, shaking = (
@@ -99,18 +99,18 @@ def test_residual_vectors_open_in_a_gis_with_heights_and_reference_system(
     assert meta["crs"] == "EPSG:4979"
     fields = dict(zip(meta["fields"], values, strict=True))
     ends = shapely.get_coordinates(shapely.from_wkb(geometry), include_z=True).reshape(-1, 2, 3)
-    found = measures.matched
-    np.testing.assert_array_equal(ends[:, 0], measures.lon_lat_h[found])
-    np.testing.assert_array_equal(ends[:, 1, 2], measures.lon_lat_h[found, 2])
+    matched = measures.matched
+    np.testing.assert_array_equal(ends[:, 0], measures.lon_lat_h[matched])
+    np.testing.assert_array_equal(ends[:, 1, 2], measures.lon_lat_h[matched, 2])
     drawn_m = (ends[:, 1] - ends[:, 0])[:, :2] * metres_per_degree_at(ends[:, 0]) / exaggeration
-    np.testing.assert_allclose(drawn_m, measures.residual_m[found], atol=A_MICROMETRE)
+    np.testing.assert_allclose(drawn_m, measures.residual_m[matched], atol=A_MICROMETRE)
     assert set(fields["exaggeration"]) == {exaggeration}
     assert set(fields["status"]) <= {"active", "deactivated"}
     points = pyogrio.read_info(path, layer="control_points")
     assert (points["features"], points["geometry_type"]) == (len(measures.point_id), "Point Z")
 
 
-def test_a_scene_on_a_map_is_delivered_as_the_place_it_has(registered, tmp_path: Path) -> None:
+def test_the_refined_model_of_an_ortho_scene_is_its_map_grid(registered, tmp_path: Path) -> None:
     path = tmp_path / "map.tif"
     with rasterio.open(
         path, "w", "GTiff", 60, 50, 1, "EPSG:32631", Affine(10.0, 0.0, 5e5, 0.0, -10.0, 48e5), np.uint8

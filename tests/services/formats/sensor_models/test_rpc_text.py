@@ -1,4 +1,4 @@
-"""RPC text files: what is written is read back, and nothing but a FormatError comes out of a bad one."""
+"""RPC text files survive a round trip; a bad file raises a FormatError and nothing else."""
 
 import math
 from dataclasses import fields, replace
@@ -39,7 +39,7 @@ def assert_same(a: RpcModel, b: RpcModel) -> None:
         np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name))
 
 
-def test_the_invented_text_holds_the_numbers_its_maker_wrote() -> None:
+def test_the_numbers_of_the_golden_text_are_read() -> None:
     model = parse_rpc_text(TEXT)
     assert model.image_offset.tolist() == [12999.5, 13249.25]
     assert model.image_scale.tolist() == [13000.0, 13250.0]
@@ -67,7 +67,7 @@ def test_every_number_survives_the_rpb(model: RpcModel) -> None:
     assert rpb_satellite(text) == "GE01"
 
 
-def test_errors_nobody_knows_are_left_out_of_the_text() -> None:
+def test_unknown_errors_are_omitted_from_the_text() -> None:
     model = replace(parse_rpc_text(TEXT), error_bias_m=math.nan, error_random_m=math.nan)
     assert "ERR_" not in format_rpc_text(model)
 
