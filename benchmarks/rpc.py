@@ -1,16 +1,16 @@
-"""Ground to image and back by the RPC: Amers, rpcfast and GDAL (through rasterio) on the same points.
+"""RPC projection and its inverse: Amers, rpcfast and GDAL (through rasterio) on the same points.
 
-CPU time of one thread, medians of runs taken in turn. Beside the speed, the largest difference from
-Amers in pixels, and for `locate` from the position that was asked for. A ground position becomes pixels
-by projecting it. Amers and rpcfast take the centre of the first pixel for (0, 0), GDAL for (0.5, 0.5):
-half a pixel is taken off what GDAL projects and added to what it locates. Each locates to its own
-default tolerance (rpcfast 1e-8 px, Amers 1e-7 px, GDAL 0.1 px), and GDAL once more to 1e-6 px. GDAL is
-given fewer points. Run: python -m benchmarks.rpc
+The table shows the CPU time of one thread (median of interleaved runs) and the largest difference from
+Amers in pixels; for `locate` also the largest difference from the requested position. Ground positions
+are compared by their projections. The centre of the first pixel is (0, 0) in Amers and rpcfast and
+(0.5, 0.5) in GDAL: half a pixel is subtracted from GDAL's projections and added to the positions that it
+locates. Each implementation locates to its default tolerance (rpcfast 1e-8 px, Amers 1e-7 px, GDAL
+0.1 px), and GDAL also to 1e-6 px. GDAL gets fewer points. Run: python -m benchmarks.rpc
 """
 
 import os
 
-# Read by Numba when it is first imported.
+# Numba reads this when it is first imported.
 os.environ["NUMBA_NUM_THREADS"] = "1"
 
 import argparse
@@ -38,7 +38,7 @@ STRICT = {"RPC_PIXEL_ERROR_THRESHOLD": "1e-6", "RPC_MAX_ITERATIONS": "40"}
 
 @dataclass(frozen=True)
 class Outcome:
-    """One implementation, one direction."""
+    """The result of one implementation in one direction."""
 
     direction: str
     implementation: str
@@ -51,8 +51,14 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Way:
-    """An implementation's way in one direction: what is run, and what it gives as Amers would say it."""
+class Variant:
+    """One implementation in one direction.
+
+    Attributes:
+        points: number of points.
+        run: the function to time.
+        result: its result in the conventions of Amers.
+    """
 
     points: int
     run: Callable[[], object]
@@ -60,7 +66,7 @@ class Way:
 
 
 def main() -> None:
-    """Measure, print, keep."""
+    """Measure, print the table and store the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--gdal-points", type=int, default=200_000)
@@ -79,7 +85,7 @@ def main() -> None:
             "rpcfast": rpcfast_project(model, ground),
             "GDAL": gdal_project(gdal, few),
         }
-        outcomes = compared("project", projecting, arguments.repeats, lambda way: way.result())
+        outcomes = compared("project", projecting, arguments.repeats, lambda variant: variant.result())
         few_px = line_sample[: arguments.gdal_points]
         locating = {
             "Amers": amers_locate(model, line_sample, ground[:, 2]),
@@ -88,7 +94,11 @@ def main() -> None:
             "GDAL to 1e-6 px": gdal_locate(strict, few_px, few[:, 2]),
         }
         outcomes += compared(
-            "locate", locating, arguments.repeats, lambda way: model.project(way.result()), line_sample
+            "locate",
+            locating,
+            arguments.repeats,
+            lambda variant: model.project(variant.result()),
+            line_sample,
         )
     show(outcomes)
     keep("rpc", [asdict(outcome) for outcome in outcomes])
@@ -96,61 +106,70 @@ def main() -> None:
 
 def compared(
     direction: str,
-    ways: dict[str, Way],
+    variants: dict[str, Variant],
     repeats: int,
-    in_pixels: Callable[[Way], Array],
-    asked: Array | None = None,
+    in_pixels: Callable[[Variant], Array],
+    requested: Array | None = None,
 ) -> list[Outcome]:
-    """Times and largest differences of some ways; the first is the one the others are held against."""
-    taken_s = cpu_medians_s({name: way.run for name, way in ways.items()}, repeats)
-    pixels = {name: in_pixels(way) for name, way in ways.items()}
-    reference = next(iter(ways))
+    """Times and largest differences of some variants; the first one is the reference."""
+    taken_s = cpu_medians_s({name: variant.run for name, variant in variants.items()}, repeats)
+    pixels = {name: in_pixels(variant) for name, variant in variants.items()}
+    reference = next(iter(variants))
     outcomes = []
-    for name, way in ways.items():
-        speed = way.points / taken_s[name]
-        faster = ways[reference].points / taken_s[reference] / speed
-        difference_px = largest(pixels[name] - pixels[reference][: way.points])
-        round_trip_px = None if asked is None else largest(pixels[name] - asked[: way.points])
+    for name, variant in variants.items():
+        speed = variant.points / taken_s[name]
+        faster = variants[reference].points / taken_s[reference] / speed
+        difference_px = largest(pixels[name] - pixels[reference][: variant.points])
+        round_trip_px = (
+            None if requested is None else largest(pixels[name] - requested[: variant.points])
+        )
         outcomes.append(
             Outcome(
-                direction, name, way.points, taken_s[name], speed, faster, difference_px, round_trip_px
+                direction,
+                name,
+                variant.points,
+                taken_s[name],
+                speed,
+                faster,
+                difference_px,
+                round_trip_px,
             )
         )
     return outcomes
 
 
 def largest(difference: Array) -> float:
-    """Largest absolute value; a position that was not found counts as infinitely far."""
+    """Largest absolute value; an undefined position counts as infinitely far."""
     return float(np.nan_to_num(np.abs(difference), nan=np.inf).max())
 
 
-def amers_project(model: RpcModel, ground: Array) -> Way:
-    """The way of the service."""
-    return Way(len(ground), lambda: model.project(ground), lambda: model.project(ground))
+def amers_project(model: RpcModel, ground: Array) -> Variant:
+    """Amers."""
+    return Variant(len(ground), lambda: model.project(ground), lambda: model.project(ground))
 
 
-def amers_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Way:
-    """The way of the service."""
-    return Way(
+def amers_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Variant:
+    """Amers."""
+    return Variant(
         len(height_m),
         lambda: model.locate(line_sample, height_m),
         lambda: model.locate(line_sample, height_m),
     )
 
 
-def rpcfast_project(model: RpcModel, ground: Array) -> Way:
-    """Coordinates are given apart and contiguous, as rpcfast wants them."""
+def rpcfast_project(model: RpcModel, ground: Array) -> Variant:
+    """Rpcfast, which needs separate, contiguous coordinates."""
     other, coordinates = fast(model), [np.ascontiguousarray(column) for column in ground.T]
 
     def result() -> Array:
         sample, line = rpcfast.project(other, *coordinates)
         return np.column_stack([line, sample])
 
-    return Way(len(ground), lambda: rpcfast.project(other, *coordinates), result)
+    return Variant(len(ground), lambda: rpcfast.project(other, *coordinates), result)
 
 
-def rpcfast_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Way:
-    """Coordinates are given apart and contiguous, as rpcfast wants them."""
+def rpcfast_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Variant:
+    """Rpcfast, which needs separate, contiguous coordinates."""
     other = fast(model)
     sample_line_h = [np.ascontiguousarray(c) for c in (line_sample[:, 1], line_sample[:, 0], height_m)]
 
@@ -158,38 +177,38 @@ def rpcfast_locate(model: RpcModel, line_sample: Array, height_m: Array) -> Way:
         lon, lat, _ = rpcfast.localize(other, *sample_line_h)
         return np.column_stack([lon, lat, height_m])
 
-    return Way(len(height_m), lambda: rpcfast.localize(other, *sample_line_h), result)
+    return Variant(len(height_m), lambda: rpcfast.localize(other, *sample_line_h), result)
 
 
-def gdal_project(gdal: RPCTransformer, ground: Array) -> Way:
-    """Positions are not rounded to whole pixels."""
+def gdal_project(gdal: RPCTransformer, ground: Array) -> Variant:
+    """GDAL, without rounding to whole pixels."""
     coordinates = [np.ascontiguousarray(column) for column in ground.T]
 
     def run() -> tuple[Array, Array]:
-        line, sample = gdal.rowcol(*coordinates, op=as_it_is)
+        line, sample = gdal.rowcol(*coordinates, op=unrounded)
         return line, sample
 
-    return Way(len(ground), run, lambda: np.column_stack(run()) - GDAL_FIRST_PIXEL)
+    return Variant(len(ground), run, lambda: np.column_stack(run()) - GDAL_FIRST_PIXEL)
 
 
-def gdal_locate(gdal: RPCTransformer, line_sample: Array, height_m: Array) -> Way:
-    """Positions are counted from the corner of the first pixel ("ul"), as GDAL does."""
+def gdal_locate(gdal: RPCTransformer, line_sample: Array, height_m: Array) -> Variant:
+    """GDAL, with positions from the corner of the first pixel ("ul")."""
     line, sample = (np.ascontiguousarray(column) for column in line_sample.T + GDAL_FIRST_PIXEL)
 
     def run() -> tuple[Array, Array]:
         lon, lat = gdal.xy(line, sample, zs=height_m, offset="ul")
         return lon, lat
 
-    return Way(len(height_m), run, lambda: np.column_stack([*run(), height_m]))
+    return Variant(len(height_m), run, lambda: np.column_stack([*run(), height_m]))
 
 
-def as_it_is(position: Array) -> Array:
-    """What rasterio may do with a position before it gives it."""
+def unrounded(position: Array) -> Array:
+    """The position itself: the operation that rasterio applies to its results."""
     return position
 
 
 def fast(model: RpcModel) -> rpcfast.RPCModel:
-    """The model as rpcfast holds it."""
+    """The model in the structure of rpcfast."""
     rpc = gdal_rpc(model)
     names = [
         f"{axis}_{what}"
@@ -209,7 +228,7 @@ def show(outcomes: list[Outcome]) -> None:
         "M points/s",
         "Amers is faster",
         "from Amers",
-        "from what was asked",
+        "from the request",
         title="RPC, one thread; largest differences",
     )
     for o in outcomes:

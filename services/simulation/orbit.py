@@ -22,6 +22,9 @@ EARTH_ROTATION_RAD_S = 7.292115e-5
 INCLINATION_DEG = 98.2
 """Inclination of a sun-synchronous orbit at 700 km."""
 
+ORBIT_HEIGHT_M = 700e3
+"""Height of the orbit above the equatorial radius."""
+
 JITTER_HZ = 1.5
 _STEP_S = 0.05
 _MARGIN_STEPS = 6
@@ -34,7 +37,6 @@ def pushbroom_over(
     direction_deg: tuple[float, float],
     height_range_m: tuple[float, float],
     *,
-    orbit_height_m: float = 700e3,
     jitter_px: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> PushbroomModel:
@@ -49,7 +51,6 @@ def pushbroom_over(
         gsd_m: ground sampling distance at the target, along and across the track.
         direction_deg: incidence and azimuth, the direction from the target to the satellite.
         height_range_m: height range of the model.
-        orbit_height_m: height of the orbit above the equatorial radius.
         jitter_px: amplitude of an oscillation of the line of sight about each axis, at 1.5 Hz.
         rng: source of the phases of that oscillation; without it they are zero.
 
@@ -59,7 +60,7 @@ def pushbroom_over(
     incidence_deg, azimuth_deg = direction_deg
     ground_axes = ecef_from_east_north_up(target_lon_lat_h)
     target = ecef_from_lon_lat_h(target_lon_lat_h[None, :])[0]
-    satellite = _satellite(target, ground_axes, incidence_deg, azimuth_deg, orbit_height_m)
+    satellite = _satellite(target, ground_axes, incidence_deg, azimuth_deg)
     track = _Track(satellite)
     heading = track.velocity(np.zeros(1))[0]
     heading = heading - (heading @ ground_axes[:, 2]) * ground_axes[:, 2]
@@ -125,9 +126,7 @@ def sun_direction(lon_lat: Array, when: datetime) -> tuple[float, float]:
     return float(np.degrees(np.arcsin(up))), float(np.degrees(np.arctan2(east, north)) % 360.0)
 
 
-def _satellite(
-    target: Array, axes: Array, incidence_deg: float, azimuth_deg: float, orbit_height_m: float
-) -> Array:
+def _satellite(target: Array, axes: Array, incidence_deg: float, azimuth_deg: float) -> Array:
     """Intersection (3,) of the line of sight from a target with the sphere of the orbit, ECEF."""
     incidence, azimuth = np.radians([incidence_deg, azimuth_deg])
     direction = axes @ np.array(
@@ -137,13 +136,13 @@ def _satellite(
             np.cos(incidence),
         ]
     )
-    radius = WGS84_A + orbit_height_m
+    radius = WGS84_A + ORBIT_HEIGHT_M
     along = float(target @ direction)
     square = along * along + radius * radius - float(target @ target)
     if not 0.0 <= incidence_deg < 60.0 or square <= 0.0:
         raise InputError(
             f"incidence: {incidence_deg:g} degrees given, 0 to less than 60 degrees and visible from an "
-            f"orbit at {orbit_height_m / 1e3:g} km expected"
+            f"orbit at {ORBIT_HEIGHT_M / 1e3:g} km expected"
         )
     return np.asarray(target + (math.sqrt(square) - along) * direction)
 

@@ -44,7 +44,6 @@ class ViewPlan:
         gsd_m: ground sampling distance at the centre.
         incidence_deg, azimuth_deg: direction from the ground to the satellite.
         acquired_at: UTC; determines the sun and the state of the fields.
-        orbit_height_m: height of the orbit above the equatorial radius.
         jitter_px: amplitude of the oscillation of the line of sight.
         radiometry: pixel values of light.
     """
@@ -56,7 +55,6 @@ class ViewPlan:
     incidence_deg: float = 0.0
     azimuth_deg: float = 0.0
     acquired_at: datetime = datetime(2024, 6, 12, 10, 40, tzinfo=UTC)
-    orbit_height_m: float = 700e3
     jitter_px: float = 0.0
     radiometry: Radiometry = PLAIN_RADIOMETRY
 
@@ -134,7 +132,6 @@ def plan_geometry(
         plan.gsd_m,
         (plan.incidence_deg, plan.azimuth_deg),
         heights_m,
-        orbit_height_m=plan.orbit_height_m,
         jitter_px=plan.jitter_px,
         rng=rng,
     )
