@@ -167,7 +167,7 @@ def test_results_go_after_a_while_and_the_job_says_so(
     assert client.get(f"{old}/results/report.json", headers=me).status_code == 404
     assert client.get(f"{young}/results/report.json", headers=me).content == b"{}"
     with database.transaction() as connection:
-        changes = list_changes(connection, 1000, kind="job", subject=old.rsplit("/", 1)[1])
+        changes = list_changes(connection, 1000, None, "job", old.rsplit("/", 1)[1])
     assert (changes[0].actor_name, changes[0].action) == ("retention", "changed")
     assert client.get("/audit?kind=job", headers=admin).json()["changes"][0]["after"][
         "results_removed_at"

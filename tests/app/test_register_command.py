@@ -95,7 +95,7 @@ def test_the_command_registers_straight_from_a_block_folder(
     assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
 
 
-def test_points_held_out_are_told_in_the_report_and_can_take_a_good_verdict_away(
+def test_check_points_are_reported_and_can_take_a_good_verdict_away(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):
     def register(moved_px: float) -> dict:
