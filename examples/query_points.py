@@ -50,6 +50,8 @@ def draw(points: geopandas.GeoDataFrame, picture: str) -> None:
         figsize=(7.0, 6.0),
     )
     axes.set(xlabel="east, m", ylabel="north, m", title=f"{len(points)} control points")
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.tick_params(axis="x", rotation=45)
     axes.figure.savefig(picture, dpi=120, bbox_inches="tight")
     plt.close(axes.figure)
 

@@ -43,9 +43,8 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
     moved_px = registration.model.project(ground) - scene.model.project(ground)
     print(f"the model moved by {np.nanmedian(np.hypot(*moved_px.T)):.1f} px (median over the points)")
 
-    refined = write_refined(
-        image, None, registration.model, registration.adjustment, scene.image.shape, folder
-    )
+    model, adjustment = registration.model, registration.adjustment
+    refined = write_refined(image, None, model, adjustment, shape=scene.image.shape, folder=folder)
     print(f"{refined.note}: {', '.join(path.name for path in refined.files)}")
 
 
