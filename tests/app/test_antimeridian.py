@@ -137,7 +137,7 @@ def outlines_of(client: TestClient, headers: dict[str, str], how: str = "GET", *
     return client.request(how, path, headers=headers, **place).json()["features"]
 
 
-def test_an_outline_is_told_in_two_parts_counterclockwise(
+def test_an_outline_across_is_two_counterclockwise_parts(
     published: None, client: TestClient, bearer
 ) -> None:
     (block,) = outlines_of(client, bearer("read"))
@@ -177,7 +177,7 @@ BEYOND = [[-180.0 if lon < 180.0 else lon - 360.0, lat] for lon, lat in AROUND]
 
 
 @pytest.mark.parametrize("ring", [AROUND, TURNED, BEFORE, BEYOND], ids=["on", "turned", "west", "east"])
-def test_geometries_of_questions_meet_what_lies_on_either_side(
+def test_geometries_of_queries_intersect_features_on_either_side(
     made: Made, published: None, client: TestClient, bearer, ring: list[list[float]]
 ) -> None:
     lon = check_block(made.block).points.lon_lat_h[:, 0]

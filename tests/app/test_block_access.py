@@ -56,7 +56,9 @@ def test_a_block_is_uploaded_as_an_archive_and_ingested_by_a_job(
     assert feature["properties"]["n_points"] == 40
 
 
-def test_what_is_refused_of_a_block_is_listed_with_its_reasons(client, settings, bearer, tmp_path):
+def test_the_problems_of_a_refused_block_are_listed_with_their_reasons(
+    client, settings, bearer, tmp_path
+):
     made = make_block(tmp_path / "calanques_v1")
     with (made.folder / "chips/0000.npy").open("r+b") as chips:
         chips.seek(9_000)
@@ -165,7 +167,7 @@ def test_only_folders_below_the_allowed_one_are_ingested_by_request(tmp_path, pa
         lifecycle.folder_to_ingest(allowed, path)
 
 
-def test_a_server_without_an_allowed_folder_says_which_setting_is_missing(client, settings, bearer):
+def test_a_server_without_an_allowed_folder_names_the_missing_setting(client, settings, bearer):
     job = ingested_by_job(client, settings, bearer("admin"), {"path": "x"})
     assert job["status"] == "failed"
     assert "AMERS_INGEST_FOLDER" in job["message"]
@@ -201,7 +203,7 @@ def test_the_whole_life_runs_from_the_command_line(run, tmp_path):
     assert run("block", "withdraw", "calanques@2")["state"] == "withdrawn"
 
 
-def test_commands_speak_plainly_without_json(run, tmp_path):
+def test_commands_print_text_without_json(run, tmp_path):
     made = make_block(tmp_path / "block")
     runner = CliRunner()
     result = runner.invoke(commands, ["block", "ingest", str(made.folder)], catch_exceptions=False)

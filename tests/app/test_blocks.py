@@ -49,7 +49,7 @@ def test_publishing_and_withdrawing_flip_all_points_at_once(connection, ingested
     assert visible(connection) == 40
 
 
-def test_wrong_steps_are_conflicts_that_say_the_state(connection, ingested):
+def test_wrong_steps_are_conflicts_that_name_the_state(connection, ingested):
     with pytest.raises(Conflict, match="is staged: it cannot become withdrawn"):
         lifecycle.withdraw_block(connection, "calanques")
     lifecycle.publish_block(connection, "calanques")
@@ -141,7 +141,7 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
     chips.close()
 
 
-def test_points_are_asked_for_by_an_outline_and_thinned_evenly(connection, storage, tmp_path):
+def test_points_are_read_by_outline_and_thinned_evenly(connection, storage, tmp_path):
     made = make_block(tmp_path / "many", count=600)
     lifecycle.ingest_block(connection, storage, made.folder)
     lifecycle.publish_block(connection, "calanques")
@@ -194,7 +194,7 @@ def test_quality_figures_are_those_of_the_points(connection, ingested):
     assert repr(quality) == repr(result.quality)
 
 
-def test_files_no_row_names_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
+def test_files_without_rows_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
     orphan = make_block(tmp_path / "orphan", count=3, seed=9).folder / "chips/0000.npy"
     key = storage.put_chips(orphan).key
     assert remove_unnamed_chips(connection, storage) == [key]

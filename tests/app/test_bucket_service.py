@@ -72,7 +72,7 @@ def test_a_scene_is_registered_with_all_files_in_a_bucket(
     assert storage.keys(f"scenes/{scene}") == []
 
 
-def test_an_outage_of_the_bucket_is_told_and_passes(
+def test_an_outage_of_the_bucket_is_reported_and_ends(
     dsn: str, bearer: Bearer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     image, me = b"II*\0" + bytes(1000), bearer("register")

@@ -40,7 +40,7 @@ def arrays(reply):
         return dict(archive)
 
 
-def test_chips_of_many_points_are_those_of_each_with_all_that_is_known_of_them(made, get):
+def test_chips_of_many_points_are_those_of_each_with_their_metadata(made, get):
     ids = [FIRST + 31, FIRST + 2, FIRST + 3]
     chip_arrays = arrays(get(CHIPS, ids=",".join(map(str, ids))))
     assert_array_equal(chip_arrays["point_id"], np.repeat(sorted(ids), 6))
@@ -134,7 +134,7 @@ def test_an_archive_is_made_in_pieces_however_many_chips_it_has(made, get, monke
         ({"bbox": "5,43,6,44", "limit": "3"}, 400, "limit"),
     ],
 )
-def test_a_wrong_question_for_chips_is_refused(get, parameters, status, named):
+def test_a_wrong_request_for_chips_is_refused(get, parameters, status, named):
     reply = get(CHIPS, **parameters)
     assert reply.status_code == status
     assert named in reply.json()["detail"]

@@ -184,7 +184,7 @@ def test_a_client_that_follows_next_as_qgis_does_sees_every_point_once(served):
     assert seen == (2**26 + np.arange(60)).tolist()
 
 
-def test_clients_without_a_valid_token_are_told_so(served):
+def test_clients_without_a_valid_token_get_an_error(served):
     with pytest.raises(RuntimeError, match="401"):
         Features(served.url, headers={"Authorization": "Bearer wrong"}).feature_collections()
     with pytest.raises(pyogrio.errors.DataSourceError, match="401"):

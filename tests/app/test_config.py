@@ -20,7 +20,7 @@ def test_every_setting_has_a_default():
     assert not settings.public_points
 
 
-def test_a_variable_sets_what_its_name_says(monkeypatch):
+def test_a_variable_sets_the_setting_of_its_name(monkeypatch):
     monkeypatch.setenv("AMERS_PUBLIC_POINTS", "true")
     monkeypatch.setenv("AMERS_PORT", "8123")
     settings = read_settings()

@@ -128,7 +128,7 @@ def test_a_reader_of_a_page_in_pieces_who_is_gone_gives_the_only_connection_back
     anyio.run(read_on)
 
 
-def test_an_upload_too_many_is_told_to_come_again_and_nobody_else_notices(app: FastAPI, bearer) -> None:
+def test_an_upload_too_many_is_asked_to_retry_and_others_are_not_affected(app: FastAPI, bearer) -> None:
     async def crowded() -> None:
         arrived, go_on = anyio.Event(), anyio.Event()
 

@@ -152,7 +152,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
         assert remove_unnamed_chips(connection, storage) == []
 
 
-def test_a_database_whose_disk_is_full_says_so_and_loads_the_block_once_there_is_room(
+def test_a_full_disk_of_the_database_is_reported_and_the_block_loads_once_there_is_room(
     open_folder: Path, tmp_path: Path
 ):
     made = make_block(tmp_path / "block", count=2_000, n_images=2, gsds_m=(2.0,), dtype=np.uint8)

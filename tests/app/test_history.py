@@ -145,7 +145,7 @@ def test_every_point_and_view_that_was_tried_leaves_a_row(
     assert {row["registration_id"] for row in rows} == {rows[0]["registration_id"]}
 
 
-def test_what_is_kept_of_a_point_is_what_its_rows_add_up_to(
+def test_the_history_of_a_point_is_the_sum_of_its_rows(
     connection: Connection, stored: Registration
 ) -> None:
     for scene in ("a", "b", "c"):
@@ -169,7 +169,7 @@ def test_what_is_kept_of_a_point_is_what_its_rows_add_up_to(
     np.testing.assert_allclose([row["expected"] for row in kept], 3 * share, rtol=1e-12)
 
 
-def test_a_scene_speaks_once_however_often_it_is_registered(
+def test_a_scene_counts_once_however_often_it_is_registered(
     connection: Connection, stored: Registration
 ) -> None:
     remembered(connection, stored, "a")
@@ -180,7 +180,7 @@ def test_a_scene_speaks_once_however_often_it_is_registered(
     assert {tries for tries, _ in counters(connection).values()} == {2}
 
 
-def test_a_failed_registration_is_kept_and_says_nothing_of_its_points(
+def test_a_failed_registration_is_stored_and_does_not_count(
     connection: Connection, stored: Registration
 ) -> None:
     remembered(connection, failing(stored), "a")
@@ -216,7 +216,7 @@ def test_an_attempt_that_has_lost_its_job_counts_nothing(
     assert {tries for tries, _ in counters(connection).values()} == {1}
 
 
-def test_what_a_scene_does_not_show_is_no_fault_of_a_point(
+def test_ground_that_a_scene_does_not_show_is_no_failure_of_a_point(
     connection: Connection, stored: Registration
 ) -> None:
     reason = stored.measures.reason.copy()
@@ -226,7 +226,7 @@ def test_what_a_scene_does_not_show_is_no_fault_of_a_point(
     assert set(counters(connection)) == set(stored.measures.point_id[4:].tolist())
 
 
-def test_a_view_counts_only_where_it_is_known_what_it_should_have_shown(
+def test_a_view_counts_only_where_its_expected_position_is_known(
     connection: Connection, stored: Registration
 ) -> None:
     remembered(connection, stored, "a")
@@ -295,7 +295,7 @@ def test_the_next_registration_prefers_points_that_have_served(
     assert vanished_tried("after") < before
 
 
-def test_a_point_that_fails_where_others_serve_is_proposed_and_served_until_somebody_decides(
+def test_a_failing_point_is_proposed_for_suspension_and_served_until_the_decision(
     connection: Connection,
     client: TestClient,
     bearer: Callable[[str], dict[str, str]],

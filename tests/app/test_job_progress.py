@@ -55,7 +55,7 @@ def wait_of(connection: Connection, job: Job) -> timedelta:
     return end - moment
 
 
-def test_a_job_keeps_what_it_said_on_its_way(connection: Connection):
+def test_a_job_keeps_its_messages(connection: Connection):
     job = asked(connection)
     first = attempts.claim(connection, job.id, "w", LEASE_S)
     assert first is not None
@@ -129,7 +129,7 @@ def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Conn
     assert sorted(job.id for page in pages for job in page) == sorted(job.id for job in made)
 
 
-def test_results_go_after_a_while_and_the_job_says_so(
+def test_old_results_are_removed_and_the_job_reports_it(
     client: TestClient, bearer, database: Database, storage: Storage
 ):
     me, admin = bearer("register"), bearer("admin")

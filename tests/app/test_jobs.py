@@ -95,7 +95,7 @@ def test_work_needs_a_token_that_allows_it(client: TestClient, bearer: Bearer, s
     assert client.post(EXECUTE, json=body, headers=bearer("read")).status_code == 403
 
 
-def test_somebody_elses_scene_cannot_be_registered(client: TestClient, bearer: Bearer, scene: str):
+def test_a_scene_of_another_owner_cannot_be_registered(client: TestClient, bearer: Bearer, scene: str):
     reply = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=bearer("register"))
     assert reply.status_code == 404
     assert scene in reply.json()["detail"]
@@ -108,7 +108,7 @@ def test_a_removed_scene_cannot_be_registered(client: TestClient, me: dict[str, 
     assert "removed" in reply.json()["detail"]
 
 
-def test_the_same_request_with_the_same_key_asks_once(
+def test_the_same_request_with_the_same_key_creates_one_job(
     client: TestClient, me: dict[str, str], bearer: Bearer, scene: str
 ):
     body = {"inputs": {"scene": scene}}
@@ -122,7 +122,7 @@ def test_the_same_request_with_the_same_key_asks_once(
     assert stranger["jobID"] != first["jobID"], "keys are each owner's own"
 
 
-def test_requests_with_one_key_at_the_same_time_ask_once(
+def test_concurrent_requests_with_one_key_create_one_job(
     client: TestClient, me: dict[str, str], scene: str
 ):
     def ask(_: int) -> str:
@@ -172,7 +172,7 @@ def test_a_job_that_has_ended_cannot_be_dismissed(
     assert client.get(f"/jobs/{job['jobID']}", headers=me).json()["status"] == "successful"
 
 
-def test_a_failed_job_tells_why_with_its_numbers(
+def test_a_failed_job_reports_the_reason_with_its_numbers(
     client: TestClient, me: dict[str, str], scene: str, database: Database
 ):
     job = client.post(EXECUTE, json={"inputs": {"scene": scene}}, headers=me).json()
@@ -221,7 +221,7 @@ def test_jobs_are_listed_page_by_page_and_by_kind_and_state(
     assert client.get("/jobs?status=lost", headers=me).status_code == 400
 
 
-def test_a_waiting_job_says_its_place_in_the_queue_and_its_scene(
+def test_a_waiting_job_reports_its_queue_position_and_its_scene(
     client: TestClient, me: dict[str, str], scene: str, database: Database
 ):
     first, second = (

@@ -123,7 +123,7 @@ def test_an_identity_is_revoked_here_whatever_its_issuer_says(client, issuer, ds
     assert client.get("/tokens/self", headers=issuer.token()).status_code == 401
 
 
-def test_unknown_keys_do_not_make_us_ask_the_issuer_again_and_again(client, issuer):
+def test_unknown_keys_do_not_cause_repeated_requests_to_the_issuer(client, issuer):
     for number in range(5):
         client.get("/tokens/self", headers=issuer.token(kid=f"unknown-{number}"))
     assert issuer.asked.count("/keys") == 1

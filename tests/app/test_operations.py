@@ -70,7 +70,7 @@ def test_a_change_over_the_api_names_caller_and_request(client, connection, bear
     assert any(link["rel"] == "next" for link in listed["links"])
 
 
-def test_the_progress_of_a_job_is_no_change_and_its_states_are(connection):
+def test_the_states_of_a_job_are_recorded_and_its_progress_is_not(connection):
     job = jobs.create(connection, "register-scene", {})
     attempt = attempts.claim(connection, job.id, "w", 30.0)
     attempts.report(connection, job.id, attempt.attempt, 10, "on the way")
@@ -130,7 +130,7 @@ def test_an_administrator_makes_lists_and_revokes_tokens_over_the_api(client, be
         {"name": "x", "scopes": ["read"], "surprise": 1},
     ],
 )
-def test_a_token_that_makes_no_sense_is_not_made_over_the_api(client, bearer, body):
+def test_a_token_with_unusable_properties_is_refused_over_the_api(client, bearer, body):
     assert client.post("/tokens", json=body, headers=bearer("admin")).status_code == 422
 
 
@@ -160,7 +160,7 @@ def families(text: str) -> dict:
     return {family.name: family for family in text_string_to_metric_families(text)}
 
 
-def test_metrics_tell_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
+def test_metrics_report_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
     lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 7).folder)
     lifecycle.publish_block(connection, "calanques")
     jobs.create(connection, "register-scene", {})
@@ -241,6 +241,6 @@ def test_a_line_of_the_log_carries_request_job_and_caller():
     assert plain.endswith(f'done request_id=r-1 job_id={job_id} actor={actor} status=200 path="a b"')
 
 
-def test_what_somebody_sends_never_looks_like_a_line_of_the_log():
+def test_text_that_a_caller_sends_never_looks_like_a_line_of_the_log():
     line = logs.Lines("text").format(record("name\n2026-01-01 INFO forged"))
     assert "\n" not in line

@@ -71,7 +71,7 @@ def ortho(*words: object) -> dict:
     return printed
 
 
-def test_a_scene_is_laid_on_a_map_by_one_command(tmp_path: Path) -> None:
+def test_a_scene_is_orthorectified_by_one_command(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
     output = ortho(scene, "--dem", dem, "--vertical", "ellipsoid", "-o", tmp_path / "out" / "ortho.tif")
     assert output["error_px"] < 0.1
@@ -106,7 +106,7 @@ def test_the_ground_sampling_of_a_map_in_degrees_is_that_of_its_pixels_on_the_gr
     assert made["gsd_m"] == pytest.approx(pixel_m2**0.5, rel=a_thousandth)
 
 
-def test_heights_without_a_datum_and_files_written_over_are_refused(tmp_path: Path) -> None:
+def test_heights_without_a_datum_and_outputs_over_inputs_are_refused(tmp_path: Path) -> None:
     scene, dem = write_inputs(tmp_path)
     with pytest.raises(AmersError, match=r"dem\.tif.*does not state its vertical datum"):
         ortho(scene, "--dem", dem, "-o", tmp_path / "ortho.tif")

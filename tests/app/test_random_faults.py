@@ -13,7 +13,7 @@ KILL_EVERY_S = 2.0
 SEED = 7
 
 
-def test_whoever_is_killed_whenever_every_job_ends_once_and_nothing_is_half(open_folder: Path):
+def test_whatever_is_killed_every_job_ends_once_and_nothing_is_incomplete(open_folder: Path):
     folder = open_folder / "faults"
     folder.mkdir(mode=0o755)
     outcome = run(folder, REGISTRATIONS, INGESTIONS, SEED, KILL_EVERY_S)

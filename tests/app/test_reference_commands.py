@@ -98,7 +98,7 @@ def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
         (("land.tif", "--name", "x", "--dem", "../beside/land.tif"), "not a file below the folder"),
     ],
 )
-def test_what_can_be_no_reference_is_refused_in_one_line(
+def test_an_unusable_reference_is_refused_in_one_line(
     amers: Amers, words: tuple[str, ...], message: str
 ):
     result = amers("add", *words)

@@ -151,7 +151,7 @@ def test_a_reference_is_known_by_one_name_until_it_is_removed(
         remove_reference(connection, "land")
 
 
-def test_places_found_are_kept_and_searched_first_in_the_next_scene(
+def test_matched_places_are_recorded_and_searched_first_in_the_next_scene(
     database: Database,
     settings: Settings,
     connection: Connection,
@@ -205,7 +205,7 @@ def test_a_failed_registration_leaves_no_places(
     assert places(connection) == []
 
 
-def test_a_scene_beside_every_reference_says_so(
+def test_a_scene_outside_every_reference_is_refused_with_the_reason(
     database: Database, settings: Settings, folder: Path, tmp_path: Path
 ) -> None:
     files = SceneFiles(folder / "first.tif", sigma_m=SIGMA_M)

@@ -146,7 +146,7 @@ def test_check_points_of_another_image_are_refused_by_name(
     assert "checks.geojson: expected marks in tagged.tif, found marks in other.tif" in result.stderr
 
 
-def test_the_command_registers_with_the_store_and_remembers_the_measures(
+def test_the_command_registers_with_the_store_and_records_the_measures(
     amers: Amers, world: FlatWorld, published: None, tmp_path: Path, dsn: str
 ):
     folder = tmp_path / "out"
@@ -163,7 +163,7 @@ def test_the_command_registers_with_the_store_and_remembers_the_measures(
     assert rows == {"n": 40}
 
 
-def test_the_command_says_by_its_exit_code_what_went_wrong(
+def test_the_exit_code_of_the_command_shows_the_kind_of_error(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):
     def register(*arguments: object) -> tuple[int, str]:
@@ -226,7 +226,7 @@ def test_the_command_lets_a_service_register(
         (("--dem", "heights.tif"), "--dem: it has the heights of a reference"),
     ],
 )
-def test_what_a_service_has_of_its_own_is_not_sent_to_it(
+def test_a_service_uses_its_own_points_and_references(
     amers: Amers, world: FlatWorld, tmp_path: Path, words: tuple[str, str], message: str
 ):
     scene = ("scene", "register", world.tagged, "--server", "http://127.0.0.1:1", "-o", tmp_path / "out")

@@ -182,7 +182,7 @@ def test_a_token_to_read_does_not_upload(client: TestClient, bearer: Bearer):
     assert client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("read")).status_code == 403
 
 
-def test_a_scene_of_somebody_else_does_not_exist(client: TestClient, bearer: Bearer, storage: Storage):
+def test_a_scene_of_another_owner_is_not_found(client: TestClient, bearer: Bearer, storage: Storage):
     scene = client.post("/scenes?name=a.tif", content=TIFF, headers=bearer("register")).json()
     here = f"/scenes/{scene['id']}"
     stranger = bearer("register")
@@ -212,7 +212,7 @@ def test_a_removed_scene_keeps_its_record_and_loses_its_files(
     assert late.status_code == 409
 
 
-def test_a_path_from_a_stranger_is_only_a_name(client: TestClient, bearer: Bearer, storage: Storage):
+def test_folders_in_a_sent_file_name_are_dropped(client: TestClient, bearer: Bearer, storage: Storage):
     me = bearer("register")
     for name in ("../../../etc/passwd.tif", "/etc/cron.d/x.tif", "..\\..\\x.tif", ".hidden.tif"):
         reply = client.post("/scenes", params={"name": name}, content=TIFF, headers=me)

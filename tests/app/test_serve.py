@@ -41,7 +41,7 @@ def service(open_folder):
 
 
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
-def test_a_service_that_is_told_to_end_takes_its_worker_and_its_database_along(service, ending):
+def test_a_stopped_service_stops_its_worker_and_its_database(service, ending):
     workers = service.workers()
     service.process.send_signal(ending)
     service.process.wait(timeout=60)
@@ -49,14 +49,14 @@ def test_a_service_that_is_told_to_end_takes_its_worker_and_its_database_along(s
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
 
 
-def test_a_worker_that_is_killed_gets_a_successor(service):
+def test_a_killed_worker_is_replaced(service):
     (worker,) = service.workers()
     os.kill(worker, signal.SIGKILL)
     assert until(lambda: service.workers() not in ([], [worker]))
     assert service.is_ready()
 
 
-def test_a_database_that_is_killed_is_back_without_anybodys_help(service):
+def test_a_killed_database_is_restarted(service):
     os.kill(int((service.cluster.data / "postmaster.pid").read_text().splitlines()[0]), signal.SIGKILL)
     assert until(service.is_ready)
 
@@ -67,7 +67,7 @@ def test_a_service_that_is_killed_leaves_no_worker_behind(service):
     assert until(lambda: users_of(service.cluster.folder / "lease") == [])
 
 
-def test_requests_under_way_are_answered_when_the_service_is_told_to_end(service, tmp_path):
+def test_requests_under_way_are_answered_when_the_service_is_stopped(service, tmp_path):
     made = make_block(tmp_path / "block", count=POINTS, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
     storage = Storage(service.folder / "storage")
     with service.cluster.lease() as dsn, engine.connect(dsn) as connection:

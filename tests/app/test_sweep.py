@@ -75,7 +75,7 @@ def test_an_upload_outlives_a_clock_that_jumps(
     assert storage.path(f"scenes/{last.headers['amers-scene']}/a.tif").read_bytes() == TIFF
 
 
-def test_an_upload_nobody_goes_on_with_is_given_up_after_a_day_that_the_service_ran(
+def test_an_abandoned_upload_is_deleted_after_a_day_of_running_time(
     client: TestClient, me: dict[str, str], database: Database, storage: Storage
 ):
     idle, busy = begun(client, me), begun(client, me)
@@ -93,9 +93,7 @@ def test_an_upload_nobody_goes_on_with_is_given_up_after_a_day_that_the_service_
     assert client.get("/scenes", headers=me).json()["scenes"][0]["state"] == "uploading"
 
 
-def test_the_time_of_the_service_goes_on_by_a_little_at_a_jump_and_never_back(
-    database: Database, storage: Storage
-):
+def test_the_running_time_advances_little_at_a_jump_and_never_back(database: Database, storage: Storage):
     def elapsed_s() -> float:
         with database.transaction() as connection:
             row = run_sql(connection, "select uptime_s() as ran").fetchone()
@@ -125,7 +123,7 @@ def writing(storage: Storage) -> Iterator["subprocess.Popen[bytes]"]:
         yield process
 
 
-def test_what_is_being_written_is_not_swept_and_what_a_killed_writer_left_is(
+def test_files_being_written_are_not_swept_and_those_of_killed_writers_are(
     database: Database, storage: Storage
 ):
     with writing(storage) as writer:

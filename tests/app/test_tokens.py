@@ -59,7 +59,7 @@ def test_an_expired_token_is_refused(connection):
         authenticate(connection, new.secret)
 
 
-def test_a_token_is_revoked_by_name_only_when_the_name_says_which(connection):
+def test_a_token_is_revoked_by_name_only_when_the_name_is_unique(connection):
     first = create_token(connection, "survey office", ["read"]).token
     create_token(connection, "survey office", ["admin"])
     with pytest.raises(Conflict, match=str(first.id)):
@@ -81,13 +81,13 @@ def test_a_token_is_revoked_by_name_only_when_the_name_says_which(connection):
         ("x", ["read"], 0),
     ],
 )
-def test_a_token_that_makes_no_sense_is_not_made(connection, name, scopes, days):
+def test_a_token_with_unusable_properties_is_refused(connection, name, scopes, days):
     with pytest.raises(InputError):
         create_token(connection, name, scopes, days)
     assert list_tokens(connection) == []
 
 
-def test_nobody_is_let_in_without_a_token(connection):
+def test_a_request_without_a_token_is_refused(connection):
     with pytest.raises(NotAllowed) as refused:
         require(None, Scope.READ)
     assert not refused.value.authenticated

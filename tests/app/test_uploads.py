@@ -140,7 +140,7 @@ def probe(http: httpx.Client, url: str) -> int:
     return http.patch(url, content=b"", headers=PIECE | {"Upload-Offset": start}).status_code
 
 
-def test_the_service_says_what_of_tus_it_speaks(client: TestClient, me: dict[str, str]):
+def test_the_service_reports_the_tus_extensions_it_supports(client: TestClient, me: dict[str, str]):
     reply_headers = client.options("/uploads").headers
     assert reply_headers["tus-version"] == "1.0.0"
     assert set(reply_headers["tus-extension"].split(",")) == {
@@ -192,7 +192,7 @@ def test_a_piece_that_does_not_begin_where_the_file_ends_is_refused(
     assert client.head(url, headers=me).headers["upload-offset"] == "100"
 
 
-def test_a_piece_that_is_not_as_announced_is_thrown_away(client: TestClient, me: dict[str, str]):
+def test_a_piece_with_a_wrong_checksum_is_discarded(client: TestClient, me: dict[str, str]):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     for algorithm in ("sha1", "sha256"):
         start = int(client.head(url, headers=me).headers["upload-offset"])
@@ -228,7 +228,7 @@ def tar_with_a_broken_later_header() -> bytes:
         (tar_with_a_broken_later_header(), {"filename": "a.tar"}, "broken archive"),
     ],
 )
-def test_a_file_that_is_not_what_it_should_be_is_refused_and_forgotten(
+def test_an_unusable_file_is_refused_and_deleted(
     client: TestClient,
     me: dict[str, str],
     storage: Storage,
@@ -262,7 +262,7 @@ def test_a_file_that_is_not_what_it_should_be_is_refused_and_forgotten(
         (10, {"filename": "..."}, 422),
     ],
 )
-def test_an_upload_that_can_have_no_place_is_refused_before_it_begins(
+def test_an_unusable_upload_is_refused_before_it_begins(
     client: TestClient, me: dict[str, str], size: int, metadata: dict[str, str], status: int
 ):
     reply = begun(client, me, size, **metadata)
@@ -309,9 +309,7 @@ def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
     assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
 
 
-def test_an_upload_of_somebody_else_does_not_exist(
-    client: TestClient, me: dict[str, str], bearer: Bearer
-):
+def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: dict[str, str], bearer: Bearer):
     url = begun(client, me, len(TIFF), filename="a.tif").headers["location"]
     stranger = bearer("register") | TUS
     assert client.head(url, headers=stranger).status_code == 404
@@ -383,7 +381,7 @@ def test_a_block_that_has_arrived_is_there_to_be_ingested(
     assert storage.size(key) == 100
 
 
-def test_archives_lie_alike_and_are_swept_alike_whichever_way_they_came(
+def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
     client: TestClient, bearer: Bearer, storage: Storage, settings: Settings, dsn: str
 ):
     admin = bearer("admin")

@@ -155,7 +155,7 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
     assert results_of(dsn, job) == 0
 
 
-def test_a_worker_told_to_stop_gives_its_job_back_at_once(
+def test_a_stopped_worker_gives_its_job_back_at_once(
     client: TestClient,
     me: dict[str, str],
     ask: Callable[..., str],
@@ -255,7 +255,7 @@ def test_a_scene_without_points_fails_for_good_at_the_first_attempt(
     assert attempt_of(dsn, reply.headers["location"]) == 1
 
 
-def test_a_truncated_scene_fails_for_good_and_says_so(
+def test_a_truncated_scene_fails_for_good_with_the_reason(
     settings: Settings, bearer: Bearer, world: FlatWorld, log: Path
 ):
     me = bearer("register")

@@ -154,7 +154,7 @@ def rename(block: Path) -> None:
         (lose_coordinates, "points.parquet"),
     ],
 )
-def test_a_block_that_is_not_what_it_says_is_refused_whole(
+def test_a_block_that_contradicts_its_document_is_refused_completely(
     service, client, store, world, tmp_path, spoil, says
 ):
     block = shutil.copytree(world.block, tmp_path / "spoiled")

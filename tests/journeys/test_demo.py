@@ -43,7 +43,7 @@ def test_a_model_wrong_by_fifty_metres_comes_to_agree_with_the_block(demo):
     assert 20 <= demo["points active"] <= demo["points matched"] <= demo["points visible"]
 
 
-def test_what_the_block_itself_is_wrong_by_is_shown_beside(demo):
+def test_the_error_of_the_block_itself_is_shown_too(demo):
     frame_m = [
         float(part) for part in demo["error of the block's frame, east, north, up (m)"].split(",")
     ]
@@ -51,7 +51,7 @@ def test_what_the_block_itself_is_wrong_by_is_shown_beside(demo):
     assert demo["CE90 registered, on the Earth (m)"] > 0.0
 
 
-def test_the_report_is_where_it_says(demo):
+def test_the_report_is_at_the_printed_path(demo):
     report = Path(demo["report"])
     assert "<html" in report.read_text(encoding="utf-8")
     assert (report.parent / "refined_RPC.TXT").is_file()
@@ -72,7 +72,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
         (("--images", "one.tif", "--images", "two.tif", "--gsd-m", "20,2"), "finer first"),
     ],
 )
-def test_a_production_that_cannot_be_says_why_and_leaves_nothing(tmp_path, words, says):
+def test_an_impossible_production_states_the_reason_and_leaves_nothing(tmp_path, words, says):
     refused = amers("production", "run", *words, "-o", tmp_path / "block")
     assert refused.returncode == 2
     assert says in refused.stderr
