@@ -45,7 +45,7 @@ class FlatModel:
 
 @dataclass(frozen=True)
 class Registered:
-    """Measures of a scene, their adjustment, and the function that repeats it."""
+    """Measures of a scene, their adjustment, and a function that repeats the adjustment."""
 
     measures: Measures
     adjustment: SceneAdjustment
@@ -55,40 +55,42 @@ class Registered:
     gsd_m: float = GSD_M
 
     def adjusted(self, refit: Callable[[BoolArray], SceneAdjustment] | None = None) -> AdjustedScene:
-        """The scene after its adjustment, repeated by its own function or another."""
+        """The adjusted scene, with its own function that repeats the adjustment or another one."""
         return AdjustedScene(self.measures, self.adjustment, self.shape, self.gsd_m, refit or self.refit)
 
 
 def register(
     n: int = 60, noise_px: float = 0.2, lost: int = 8, wrong: int = 4, extent: float = 1.0, seed: int = 0
 ) -> Registered:
-    """Register a scene on n visible points.
+    """A simulated registration on n visible points.
 
     Args:
-        n: visible points, `lost` of them not matched and `wrong` of them matched elsewhere.
-        noise_px: of the measures.
-        extent: part of each side of the image where points are.
-        seed: of the random numbers.
+        n: number of visible points; `lost` of them are not matched, `wrong` of them are mismatched.
+        noise_px: noise of the measures.
+        extent: share of each side of the image that has points.
+        seed: seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     model, frame = FlatModel(), no_correction(SHAPE)
     truth = replace(frame, parameters=np.array([[12.0, 1.5, 0.0], [-7.0, 0.0, 0.0]]))
     predicted = rng.uniform(0.0, 1.0, (n, 2)) * (np.array(SHAPE) - 1.0) * extent
     lon_lat_h = model.locate(predicted, np.zeros(n))
-    seen = truth.apply(predicted) + rng.normal(0.0, noise_px, (n, 2))
-    seen[:lost] = np.nan
-    seen[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(6.0, 15.0, (wrong, 2))
+    observed = truth.apply(predicted) + rng.normal(0.0, noise_px, (n, 2))
+    observed[:lost] = np.nan
+    observed[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(
+        6.0, 15.0, (wrong, 2)
+    )
 
     def refit(usable: BoolArray) -> SceneAdjustment:
         observations = ControlObservations(
-            lon_lat_h, seen, np.full(n, noise_px), np.zeros((n, 3, 3)), usable
+            lon_lat_h, observed, np.full(n, noise_px), np.zeros((n, 3, 3)), usable
         )
         return adjust_scene(model, SHAPE, observations, AdjustmentOptions(order="drift"))
 
-    matched = np.isfinite(seen).all(axis=1)
+    matched = np.isfinite(observed).all(axis=1)
     adjustment = refit(matched)
     corrected = CorrectedModel(model, adjustment.correction)
-    residual_px = seen - corrected.project(lon_lat_h)
+    residual_px = observed - corrected.project(lon_lat_h)
     reason = np.where(adjustment.active, "", np.where(matched, "beyond 2.7 sigma", "score under 0.8"))
     reason = reason.astype("<U32")
     reason[: lost // 2] = np.where(matched[: lost // 2], reason[: lost // 2], "second peak too close")
@@ -96,7 +98,7 @@ def register(
         point_id=np.arange(n),
         lon_lat_h=lon_lat_h,
         predicted=predicted,
-        line_sample=seen,
+        line_sample=observed,
         sigma_px=np.where(matched, noise_px, np.nan),
         score=np.where(matched, rng.uniform(0.8, 0.98, n), rng.uniform(0.1, 0.7, n)),
         views=np.full(n, 3),
@@ -112,5 +114,5 @@ def register(
 
 @pytest.fixture
 def registered() -> Callable[..., Registered]:
-    """Makes a registration; see `register`."""
+    """A function that makes a registration; see `register`."""
     return register
