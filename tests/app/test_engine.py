@@ -1,0 +1,70 @@
+"""Engines: errors, full pools and connections that died while nobody used them."""
+
+from uuid import uuid4
+
+import psycopg
+import pytest
+from sqlalchemy import func, select, text
+
+from app.config import Settings
+from app.db import engine
+from app.db.engine import Database
+from app.db.schema import block, token
+from app.usecases.tokens import create_token
+from tests.statements import run_sql
+
+
+def test_errors_of_statements_are_those_of_the_driver(database: Database):
+    with pytest.raises(psycopg.errors.DivisionByZero), database.reading() as connection:
+        connection.execute(text("select 1 / 0"))
+    with pytest.raises(psycopg.errors.NotNullViolation), database.transaction() as connection:
+        connection.execute(token.insert().values(id=uuid4(), name="nobody"))
+
+
+def test_a_caller_gives_up_when_no_connection_is_free_in_time(
+    dsn: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(engine, "POOL_TIMEOUT_S", 0.1)
+    one = settings.model_copy(update={"pool_size": 1})
+    with (
+        engine.pooled(dsn, one) as database,
+        database.reading(),
+        pytest.raises(engine.PoolTimeout, match="no connection was free"),
+        database.reading(),
+    ):
+        pass
+
+
+def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, database: Database):
+    for context in (database.reading, database.transaction):
+        with context() as connection:
+            connection.execute(select(block.c.number))
+    with psycopg.connect(dsn, autocommit=True) as other:
+        other.execute(
+            "select pg_terminate_backend(pid, 10000) from pg_stat_activity"
+            " where datname = current_database() and pid <> pg_backend_pid()"
+        )
+    for context in (database.reading, database.transaction):
+        with context() as connection:
+            assert connection.scalar(select(func.count()).select_from(block)) == 0
+
+
+def test_statements_of_the_driver_and_expressions_share_one_transaction(dsn: str):
+    with engine.connect(dsn) as connection:
+        create_token(connection, "kept", ["read"])
+        connection.commit()
+        run_sql(connection, "update token set name = 'changed'")
+    with engine.connect(dsn) as connection:
+        assert connection.scalar(select(token.c.name)) == "changed"
+        run_sql(connection, "update token set name = 'forgotten'")
+        connection.rollback()
+    with engine.connect(dsn) as connection:
+        assert connection.scalar(select(token.c.name)) == "changed"
+
+
+def test_a_transaction_records_who_is_behind_it_until_it_ends(database: Database):
+    setting = select(func.current_setting("amers.actor_name", True))
+    with database.transaction() as connection:
+        assert connection.scalar(setting)
+    with database.reading() as connection:
+        assert not connection.scalar(setting)
