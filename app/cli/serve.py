@@ -1,13 +1,15 @@
 """`amers serve`: the API and one worker."""
 
+import gc
 import logging
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 import uvicorn
@@ -16,6 +18,9 @@ from app import logs
 from app.config import Settings, read_settings
 from app.db import engine
 from app.db.cluster import embedded
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 WORKER = """
 import ctypes, os, signal, sys
@@ -48,7 +53,7 @@ def serve(
         command = (sys.executable, "-c", WORKER, "worker", str(os.getpid()))
         with database_watched(settings), companion(command if worker else None):
             uvicorn.run(
-                "app.main:create_app",
+                _application(),
                 factory=True,
                 host=host or settings.host,
                 port=port or settings.port,
@@ -57,6 +62,15 @@ def serve(
                 server_header=False,
                 timeout_graceful_shutdown=DRAIN_SECONDS,
             )
+
+
+def _application() -> "Callable[[], FastAPI]":
+    """The factory of the application, imported without a search for garbage: what is imported stays."""
+    gc.disable()
+    create_app: Callable[[], FastAPI] = import_module("app.main").create_app
+    gc.freeze()
+    gc.enable()
+    return create_app
 
 
 @contextmanager

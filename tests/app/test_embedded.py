@@ -24,7 +24,7 @@ USER = """
 import itertools, sys
 from pathlib import Path
 import psycopg
-from app.db.embedded import Cluster
+from app.db.cluster.embedded import Cluster
 with Cluster(Path(sys.argv[1]), durable=False).lease() as dsn:
     for line in itertools.chain([""], sys.stdin):
         with psycopg.connect(dsn) as connection:
