@@ -1,4 +1,4 @@
-// Builds the page: one script, MapLibre's worker, one style sheet, the outline of the land; no address of elsewhere.
+// Builds the page: one script, the worker of MapLibre, one style sheet, the outline of the land; nothing from other sites.
 import { build } from "esbuild";
 import { mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
@@ -29,18 +29,18 @@ for (const name of readdirSync(built)) {
   writeFileSync(new URL(`${name}.gz`, built), gzipSync(readFileSync(new URL(name, built)), { level: 9 }));
 }
 
-/** A script without the comment that points to its source map, which is not shipped. */
+/** A script without the link to its source map, which is not part of the page. */
 function withoutMap(script) {
   return script.replace(/\n\/\/# sourceMappingURL=.*\s*$/, "\n");
 }
 
-/** Land and borders of Natural Earth as GeoJSON, to 0.01 degree, as fine as the data are. */
+/** Land and borders of Natural Earth as GeoJSON, rounded to 0.01 degree, the resolution of the data. */
 function land() {
   const world = JSON.parse(readFileSync("node_modules/world-atlas/countries-50m.json", "utf8"));
-  const lands = feature(world, world.objects.land).features.flatMap(({ geometry }) => geometry.coordinates);
+  const polygons = feature(world, world.objects.land).features.flatMap(({ geometry }) => geometry.coordinates);
   const borders = mesh(world, world.objects.countries, (one, other) => one !== other);
   const geometries = [
-    { type: "MultiPolygon", coordinates: lands.map((rings) => rings.map((ring) => closedAtThePole(unrolled(ring)))) },
+    { type: "MultiPolygon", coordinates: polygons.map((rings) => rings.map((ring) => closedAtPole(unrolled(ring)))) },
     { type: "MultiLineString", coordinates: borders.coordinates.map(unrolled) },
   ];
   const features = geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry }));
@@ -48,7 +48,7 @@ function land() {
   return JSON.stringify({ type: "FeatureCollection", features }, rounded);
 }
 
-/** A line without the jump at the antimeridian: it goes on beyond 180 degrees, where the map wraps it around. */
+/** A line without the jump at the antimeridian: longitudes continue beyond 180 degrees, where the map wraps. */
 function unrolled(line) {
   let turn = 0;
   return line.map(([lon, lat], at) => {
@@ -58,8 +58,8 @@ function unrolled(line) {
   });
 }
 
-/** A ring that has gone around the south pole, by way of the pole's edge of the map. */
-function closedAtThePole(ring) {
+/** A ring around the south pole, closed along the edge of the map. */
+function closedAtPole(ring) {
   const [first, last] = [ring[0], ring.at(-1)];
   return Math.abs(last[0] - first[0]) < 180 ? ring : [...ring, [last[0], -90], [first[0], -90], first];
 }

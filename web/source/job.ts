@@ -6,7 +6,7 @@ import type { ResultFile, StatusInfo } from "./api_types";
 import { badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
 import type { Criterion, Report } from "./report_types";
-import { type MeasureProperties, residualVectors } from "./residuals";
+import { type PointResultProperties, residualVectors } from "./residuals";
 
 const POLL_MS = 1000;
 
@@ -94,7 +94,7 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
   }
   const [report, points] = await Promise.all([
     get<Report>(reportFile.href, signal),
-    get<FeatureCollection<Point, MeasureProperties>>(pointsFile.href, signal),
+    get<FeatureCollection<Point, PointResultProperties>>(pointsFile.href, signal),
   ]);
   const ring = report.scene.footprint_lon_lat as Position[];
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };

@@ -2,7 +2,7 @@
 
 import type { Feature, FeatureCollection, Point } from "geojson";
 
-export interface MeasureProperties {
+export interface PointResultProperties {
   status: "active" | "deactivated" | "not matched";
   reason: string;
   residual_east_m: number | null;
@@ -18,7 +18,7 @@ const LONG_SHARE = 0.08;
  *
  * @returns the features, and the factor by which the vectors are longer than the residuals.
  */
-export function residualVectors(points: FeatureCollection<Point, MeasureProperties>): { features: Feature[]; exaggeration: number } {
+export function residualVectors(points: FeatureCollection<Point, PointResultProperties>): { features: Feature[]; exaggeration: number } {
   const withResiduals = points.features.filter(({ properties }) => properties.residual_east_m != null && properties.residual_north_m != null);
   const lengths = withResiduals
     .filter(({ properties }) => properties.status === "active")
