@@ -1,5 +1,5 @@
-# The API with its map page, and the worker: one image, two commands. Without AMERS_DATABASE_URL it would
-# need PostgreSQL's binaries, which it does not have: see docker-compose.yml.
+# One image for the API with its map page and for the worker. It has no PostgreSQL server for a private
+# cluster, so it needs AMERS_DATABASE_URL: see docker-compose.yml.
 FROM node:22-bookworm-slim AS page
 
 WORKDIR /build/web
