@@ -17,9 +17,7 @@ from app.usecases.blocks.export import ExportBlock, select_points, write_selecte
 from app.usecases.blocks.lifecycle import Published
 from services.quality.block import BlockQuality, Distribution, quality_document
 
-app = typer.Typer(
-    help="Blocks of control points: ingest, publish, withdraw, export.", no_args_is_help=True
-)
+app = typer.Typer(no_args_is_help=True)
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 

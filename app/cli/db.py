@@ -12,9 +12,7 @@ from app.db import engine
 from app.db.cluster import backup as archive
 from app.db.cluster import embedded
 
-app = typer.Typer(
-    help="The database and its schema: upgrade, status, backup, restore.", no_args_is_help=True
-)
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.command()

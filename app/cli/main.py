@@ -45,9 +45,8 @@ class Commands(UserDict[str, Any]):
     def __getitem__(self, name: str) -> Any:
         if self.data[name] is None:
             module = import_module(f"app.cli.{name}")
-            command = get_group(module.app) if hasattr(module, "app") else _single(module, name)
-            command.name, command.short_help = name, COMMANDS[name]
-            self.data[name] = command
+            self.data[name] = _group(module, name) if hasattr(module, "app") else _single(module, name)
+            self.data[name].name = name
         return self.data[name]
 
 
@@ -98,6 +97,13 @@ def main() -> None:
         sys.exit(EXIT_NOT_REGISTERED if isinstance(error, ComputationError) else EXIT_REFUSED)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
+
+
+def _group(module: Any, name: str) -> Any:
+    """The group of commands of a module, with the help from `COMMANDS`."""
+    group = get_group(module.app)
+    group.help = COMMANDS[name]
+    return group
 
 
 def _single(module: Any, name: str) -> Any:

@@ -15,9 +15,7 @@ from app.usecases import history
 from app.usecases.features import points
 from app.usecases.features.query import parse_bbox
 
-app = typer.Typer(
-    help="Control points of published blocks: query, suspend, reinstate.", no_args_is_help=True
-)
+app = typer.Typer(no_args_is_help=True)
 
 
 class PointFormat(StrEnum):

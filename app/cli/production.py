@@ -18,7 +18,7 @@ from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
-app = typer.Typer(help="Make new blocks of points from images.", no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True)
 
 _DEFAULT = ProductionOptions()
 

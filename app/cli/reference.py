@@ -11,9 +11,7 @@ from app.db.references import ReferenceRow
 from app.usecases import references
 from app.usecases.references import NewReference
 
-app = typer.Typer(
-    help="Reference images, for scenes on ground without control points.", no_args_is_help=True
-)
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.command()

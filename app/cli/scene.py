@@ -31,7 +31,7 @@ from services.orthorectification.rectify import OrthoOptions
 from services.reports.document import report_document
 from services.types import Progress
 
-app = typer.Typer(help="Register and orthorectify scenes.", no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True)
 
 Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
 """Registers one scene into a folder and returns its report; the last argument copies the image too."""

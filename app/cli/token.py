@@ -9,7 +9,7 @@ from app.cli.store import transaction
 from app.db.tokens import Token
 from app.usecases import tokens
 
-app = typer.Typer(help="Tokens of the callers of the API.", no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.command()
