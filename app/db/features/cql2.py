@@ -11,6 +11,7 @@ import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import (
@@ -31,13 +32,14 @@ from sqlalchemy import (
 
 from app.db.constants import integer_constant
 from app.db.features.collection import Collection, Property
-from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_instant
+from app.db.features.cql2_bounds import MOST_NODES, parse_geometry, parse_instant, parse_text
 from app.db.features.crs import CRS84, Crs
 from app.db.features.predicates import Condition, geometry_from_wkb, infinity, instant_of
 from app.db.schema.base import Double, Timestamp
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
+KEPT_FILTERS = 128
 DEEPEST_EXPRESSION = 32
 """Operators in each other. SQLAlchemy compiles them recursively, with a dozen calls for each."""
 
@@ -100,6 +102,19 @@ TEMPORAL: Mapping[str, Callable[[Expression, Expression, Expression, Expression]
     "t_startedby": lambda a, a_end, b, b_end: and_(a == b, a_end > b_end),
     "t_starts": lambda a, a_end, b, b_end: and_(a == b, a_end < b_end),
 }
+
+
+@lru_cache(KEPT_FILTERS)
+def translate_text(text: str, collection: Collection, crs: Crs) -> Condition:
+    """A filter in CQL2 text as a condition, kept for the next box or page with the same filter.
+
+    Args:
+        crs: of the coordinates in the filter.
+
+    Raises:
+        InvalidParameter: as `parse_text` and `translate`.
+    """
+    return translate(parse_text(text), collection, crs)
 
 
 def translate(expression: Any, collection: Collection, crs: Crs) -> Condition:

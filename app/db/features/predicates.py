@@ -53,16 +53,20 @@ class Condition:
     def __and__(self, other: "Condition") -> "Condition":
         if self.box is not None and other.box is not None:
             raise ValueError("both conditions have a box: intersect the boxes first")
-        predicates = [
-            predicate
-            for predicate in (self.non_bbox_predicate, other.non_bbox_predicate)
-            if predicate is not None
-        ]
         return Condition(
             self.box or other.box,
-            and_(*predicates) if predicates else None,
+            _both(self.non_bbox_predicate, other.non_bbox_predicate),
             self.has_spatial_predicate or other.has_spatial_predicate,
         )
+
+
+def _both(
+    one: ColumnElement[bool] | None, other: ColumnElement[bool] | None
+) -> ColumnElement[bool] | None:
+    """Two predicates as one; a single one stays the same object, by which its statements are kept."""
+    if one is None:
+        return other
+    return one if other is None else and_(one, other)
 
 
 ANYTHING = Condition()

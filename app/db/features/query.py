@@ -29,7 +29,7 @@ from app.db.features.crs import Crs
 from app.db.features.predicates import ANYTHING, BoxShape, Condition, box_parameters, box_predicate
 from app.db.opaque import opaque
 from app.db.schema.base import Double
-from app.db.statements import HotStatement, hot, hot_like
+from app.db.statements import HotStatement, hot_like
 
 KEPT_STATEMENTS = 512
 """Statements kept for each step: of the layouts and orders that users ask for."""
@@ -120,25 +120,20 @@ def page_select(selection: Selection, columns: Columns, after: Key | None) -> Se
 
     Returns:
         A statement with the bind parameters of `page_parameters`. It is kept for all selections of the
-        same layout but for the predicate of a user's filter, which is added to it.
+        same layout, and with a user's filter for the next request with the same one.
     """
     layout, condition = selection.layout, selection.condition
-    unknown_after = None if after is None else tuple(value is None for value in after)
     predicate = condition.non_bbox_predicate
     if layout.collection.full_scan and not selection.order and not condition.spatial:
-        if predicate is None:
-            return _kept_full_scan(layout, columns)
-        return layout.collection.full_scan(kept_columns(layout, columns), predicate)
+        return _kept_full_scan(layout, columns, predicate)
+    unknown_after = None if after is None else tuple(value is None for value in after)
     statement = _kept_select(layout, columns, selection.box_shape, unknown_after)
-    return statement if predicate is None else statement.where(predicate)
+    return statement if predicate is None else _kept_filtered(statement, predicate)
 
 
 def hot_page(selection: Selection, columns: Columns, after: Key | None) -> HotStatement:
     """`page_select` compiled, once for all requests of the same structure."""
-    statement = page_select(selection, columns, after)
-    if selection.condition.non_bbox_predicate is None:
-        return _kept_hot(statement)
-    return hot_like(statement)
+    return _kept_hot(page_select(selection, columns, after))
 
 
 def page_parameters(selection: Selection, after: Key | None, limit: int) -> dict[str, Any]:
@@ -187,14 +182,22 @@ def _kept_select(
 
 
 @lru_cache(KEPT_STATEMENTS)
-def _kept_full_scan(layout: Layout, columns: Columns) -> Select[Any]:
+def _kept_filtered(statement: Select[Any], predicate: ColumnElement[bool]) -> Select[Any]:
+    return statement.where(predicate)
+
+
+@lru_cache(KEPT_STATEMENTS)
+def _kept_full_scan(
+    layout: Layout, columns: Columns, predicate: ColumnElement[bool] | None
+) -> Select[Any]:
     assert layout.collection.full_scan is not None
-    return layout.collection.full_scan(kept_columns(layout, columns), true())
+    rows = kept_columns(layout, columns)
+    return layout.collection.full_scan(rows, true() if predicate is None else predicate)
 
 
 @lru_cache(KEPT_STATEMENTS)
 def _kept_hot(statement: Select[Any]) -> HotStatement:
-    return hot(statement)
+    return hot_like(statement)
 
 
 def _ordering(order: Order) -> ColumnElement[Any]:

@@ -17,8 +17,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 from app.db.features.bbox import Box
 from app.db.features.collection import Collection, Property, Viewer
 from app.db.features.counts import Count
-from app.db.features.cql2 import geometry_condition, translate
-from app.db.features.cql2_bounds import check_size, parse_instant, parse_json, parse_text
+from app.db.features.cql2 import geometry_condition, translate, translate_text
+from app.db.features.cql2_bounds import check_size, parse_instant, parse_json
 from app.db.features.crs import CRS84, EARTH_RADIUS_M, EVERY, Crs
 from app.db.features.predicates import ANYTHING, Condition, in_time, key_among
 from app.db.features.query import Key, Order, Selection
@@ -211,7 +211,7 @@ def _filter_conditions(collection: Collection, query: FeatureFilter) -> Iterator
         yield geometry_condition(collection, query.intersects, "intersects")
     if query.filter is not None:
         crs = crs_of("filter-crs", query.filter_crs, None) if query.filter_crs else CRS84
-        yield translate(_parsed_filter(query), collection, crs)
+        yield _cql2_condition(query, collection, crs)
 
 
 def _restriction_conditions(collection: Collection, restriction: Restriction) -> Iterator[Condition]:
@@ -223,17 +223,18 @@ def _restriction_conditions(collection: Collection, restriction: Restriction) ->
         yield key_among(collection, restriction.ids)
 
 
-def _parsed_filter(query: FeatureFilter) -> Any:
+def _cql2_condition(query: FeatureFilter, collection: Collection, crs: Crs) -> Condition:
     language = query.filter_lang or ("cql2-text" if isinstance(query.filter, str) else "cql2-json")
     if language not in FILTER_LANGUAGES:
         raise InvalidParameter(
             f"filter-lang: {language!r:.40} found, one of {', '.join(FILTER_LANGUAGES)} expected"
         )
     if language == "cql2-json":
-        return parse_json(query.filter if isinstance(query.filter, str) else json.dumps(query.filter))
+        text = query.filter if isinstance(query.filter, str) else json.dumps(query.filter)
+        return translate(parse_json(text), collection, crs)
     if not isinstance(query.filter, str):
         raise InvalidParameter(f"filter: an object found, text expected for filter-lang {language}")
-    return parse_text(query.filter)
+    return translate_text(query.filter, collection, crs)
 
 
 def _literal(item: Property, text: str) -> Any:
