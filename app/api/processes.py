@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response, status
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import DatabaseDep, Reader, SettingsDep
+from app.api.deps import InstallationDep, Reader
 from app.api.jobs import job_url, status_info
 from app.api.models.base import Link
 from app.api.models.jobs import (
@@ -115,8 +115,7 @@ def execute(
     body: Execute,
     request: Request,
     response: Response,
-    database: DatabaseDep,
-    settings: SettingsDep,
+    installation: InstallationDep,
     caller: Reader,
     idempotency_key: Annotated[str | None, Header()] = None,
     prefer: Annotated[str | None, Header()] = None,
@@ -129,9 +128,9 @@ def execute(
     outputs = None
     if body.outputs is not None:
         outputs = {name: output.transmission_mode for name, output in body.outputs.items()}
-    with database.transaction() as connection:
-        job_request = JobRequest(process_id, inputs, outputs, body.response)
-        job = jobs.execute(connection, settings, caller, job_request, idempotency_key)
+    job_request = JobRequest(process_id, inputs, outputs, body.response)
+    with installation.database.transaction() as connection:
+        job = jobs.execute(connection, installation.settings, caller, job_request, idempotency_key)
     response.headers["Location"] = job_url(request, job)
     if "respond-async" in (prefer or ""):
         response.headers["Preference-Applied"] = "respond-async"
