@@ -277,9 +277,9 @@ ARCHIVES: list[tuple[str, str, bytes]] = [
     ("zip that is a bomb", "unpacks to more", zipped(IMAGE, ("zeros", BOMB))),
     ("zip that lies about a size", "a.tif", lying(bytes(200_000))),
     ("zip of ten thousand files", "more than", zipped(*((f"{i}.txt", b"") for i in range(10_001)))),
-    ("zip in a zip", "one image", zipped(("b.zip", zipped(IMAGE)))),
-    ("zip of two images", "one image", zipped(IMAGE, ("b.tif", PIXELS))),
-    ("zip of a VRT", "one image", zipped(("a.vrt", b"<VRTDataset/>"))),
+    ("zip in a zip", "exactly one is expected", zipped(("b.zip", zipped(IMAGE)))),
+    ("zip of two images", "exactly one is expected", zipped(IMAGE, ("b.tif", PIXELS))),
+    ("zip of a VRT", "exactly one is expected", zipped(("a.vrt", b"<VRTDataset/>"))),
     ("zip of a VRT that calls itself TIFF", "neither TIFF", zipped(("a.tif", b"<VRTDataset/>"))),
     ("zip without its end", "broken archive", zipped(IMAGE)[:-30]),
     ("zip without its beginning", "broken archive", zipped(IMAGE)[:4] + zipped(IMAGE)[60:]),
@@ -297,7 +297,7 @@ ARCHIVES: list[tuple[str, str, bytes]] = [
     ("tar with a pipe", "device", tarred(IMAGE, ("x", b""), kind=tarfile.FIFOTYPE)),
     ("tar that is a bomb", "unpacks to more", gzip.compress(tarred(IMAGE, ("zeros", BOMB)), 9)),
     ("tar cut in its first file", "", tarred(("a.tif", bytes(100_000)))[:2_000]),
-    ("gzip of an empty tar", "one image", gzip.compress(bytes(100_000))),
+    ("gzip of an empty tar", "exactly one is expected", gzip.compress(bytes(100_000))),
     ("gzip cut", "broken archive", gzip.compress(tarred(IMAGE))[:60]),
 ]
 
