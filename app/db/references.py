@@ -1,6 +1,6 @@
 """Reference images of the installation, and the places on them that scenes were found by."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 
 import numpy as np
@@ -20,6 +20,19 @@ FEW_ATTEMPTS = 3
 
 PLACES_INSIDE = named("references.sql", "places_inside")
 COUNT_PLACES = named("references.sql", "count_places")
+
+
+@dataclass(frozen=True)
+class NewReferenceImage:
+    """The columns of a new reference image, as in `ReferenceRow`."""
+
+    name: str
+    image: str
+    dem: str | None
+    vertical: str | None
+    geoid: str | None
+    sigma_m: float | None
+    gsd_m: float
 
 
 @dataclass(frozen=True)
@@ -70,16 +83,7 @@ COLUMNS = columns_of(
 
 
 def insert_reference(
-    connection: Connection,
-    *,
-    name: str,
-    image: str,
-    dem: str | None,
-    vertical: str | None,
-    geoid: str | None,
-    sigma_m: float | None,
-    gsd_m: float,
-    outline: Array,
+    connection: Connection, new: NewReferenceImage, outline: Array
 ) -> ReferenceRow | None:
     """A new reference; None when there is one of that name.
 
@@ -88,16 +92,7 @@ def insert_reference(
     """
     statement = (
         postgresql.insert(reference_image)
-        .values(
-            name=name,
-            image=image,
-            dem=dem,
-            vertical=vertical,
-            geoid=geoid,
-            sigma_m=sigma_m,
-            gsd_m=gsd_m,
-            footprint=func.ST_GeomFromWKB(_wkb(outline), 4326),
-        )
+        .values(**asdict(new), footprint=func.ST_GeomFromWKB(_wkb(outline), 4326))
         .on_conflict_do_nothing(index_elements=[reference_image.c.name])
         .returning(*COLUMNS)
     )

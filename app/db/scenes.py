@@ -58,6 +58,7 @@ def begin_upload(
     owner: UUID | None,
     name: str,
     file_name: str,
+    *,
     sigma_m: float | None,
     announced_bytes: int | None = None,
 ) -> UUID:

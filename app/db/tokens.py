@@ -50,6 +50,7 @@ VALID_TOKEN = hot(
 
 def insert_token(
     connection: Connection,
+    *,
     name: str,
     secret_hash: bytes,
     scopes: tuple[str, ...],

@@ -1,6 +1,6 @@
 """The table `upload`: files that arrive in pieces, into the scratch folder of the storage."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from uuid import UUID, uuid4
 
@@ -17,19 +17,16 @@ IDLE = and_(upload.c.expires_at < now, upload.c.active_at_uptime_s < uptime_s - 
 
 
 @dataclass(frozen=True)
-class UploadRow:
-    """A file that arrives in pieces.
+class AnnouncedFile:
+    """What the sender of an upload announces.
 
     Attributes:
         scene_id: the scene of an image or model; None for a block.
         name, file_name: the sender's name, and that in the storage.
-        size_bytes, sha256: of the whole file as announced; None without a checksum.
+        size_bytes, sha256: of the whole file; None without a checksum.
         metadata: as sent; replies repeat it.
-        file_key: of a complete archive of a block in the storage.
-        expired: nobody continued the upload for too long.
     """
 
-    id: UUID
     owner: UUID | None
     purpose: UploadPurpose
     scene_id: UUID | None
@@ -38,6 +35,18 @@ class UploadRow:
     size_bytes: int
     sha256: str | None
     metadata: str
+
+
+@dataclass(frozen=True)
+class UploadRow(AnnouncedFile):
+    """A file that arrives in pieces.
+
+    Attributes:
+        file_key: of a complete archive of a block in the storage.
+        expired: nobody continued the upload for too long.
+    """
+
+    id: UUID
     file_key: str | None
     created_at: datetime
     expires_at: datetime
@@ -48,33 +57,11 @@ class UploadRow:
 COLUMNS = columns_of(UploadRow, upload, expired=and_(IDLE, upload.c.finished_at.is_(None)))
 
 
-def insert_upload(
-    connection: Connection,
-    *,
-    owner: UUID,
-    purpose: UploadPurpose,
-    scene_id: UUID | None,
-    name: str,
-    file_name: str,
-    size_bytes: int,
-    sha256: str | None,
-    metadata: str,
-) -> UploadRow:
+def insert_upload(connection: Connection, announced: AnnouncedFile) -> UploadRow:
     """A new upload of which no piece has arrived."""
     statement = (
         insert(upload)
-        .values(
-            id=uuid4(),
-            owner=owner,
-            purpose=purpose,
-            scene_id=scene_id,
-            name=name,
-            file_name=file_name,
-            size_bytes=size_bytes,
-            sha256=sha256,
-            metadata=metadata,
-            expires_at=now + hours(LIFE_HOURS),
-        )
+        .values(id=uuid4(), **asdict(announced), expires_at=now + hours(LIFE_HOURS))
         .returning(*COLUMNS)
     )
     return only(UploadRow, connection.execute(statement))

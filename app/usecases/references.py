@@ -64,8 +64,7 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
     reference = read_reference(_reference_files(settings, new))
     assert isinstance(reference.model, OrthoModel)
     scene = Scene(reference.image, reference.model, Acquisition(new.name), 0.0)
-    row = references.insert_reference(
-        connection,
+    image = references.NewReferenceImage(
         name=new.name.strip(),
         image=new.image,
         dem=new.dem,
@@ -73,8 +72,8 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
         geoid=new.geoid,
         sigma_m=new.sigma_m,
         gsd_m=reference.model.grid.gsd_m,
-        outline=scene_footprint(scene),
     )
+    row = references.insert_reference(connection, image, scene_footprint(scene))
     if row is None:
         raise Conflict(f"name: there is a reference {new.name!r} already; choose another name")
     return row

@@ -74,7 +74,12 @@ def upload_scene(
     with database.transaction() as connection:
         left = quotas.upload_allowance(connection, installation.settings, owner, sent.size_bytes)
         scene_id = scenes.begin_upload(
-            connection, owner.id, sent.name[-200:], file_name, sigma_m, sent.size_bytes
+            connection,
+            owner.id,
+            sent.name[-200:],
+            file_name,
+            sigma_m=sigma_m,
+            announced_bytes=sent.size_bytes,
         )
     key = f"{folder_of(scene_id)}/{file_name}"
     try:

@@ -16,7 +16,7 @@ from app.db import scenes, uploads
 from app.db.engine import Connection, Database
 from app.db.schema import UploadPurpose
 from app.db.tokens import Token
-from app.db.uploads import UploadRow
+from app.db.uploads import AnnouncedFile, UploadRow
 from app.errors import AmersError, Conflict, InputError, NotFound, TooLarge
 from app.storage import Storage
 from app.usecases import quotas
@@ -131,9 +131,10 @@ def create_upload(
     elif purpose == "image":
         if scene_id is not None:
             raise InputError("scene: not expected; the upload of an image creates a new scene")
-        scene_id = scenes.begin_upload(connection, caller.id, new.name[-200:], file_name, new.sigma_m)
-    upload = uploads.insert_upload(
-        connection,
+        scene_id = scenes.begin_upload(
+            connection, caller.id, new.name[-200:], file_name, sigma_m=new.sigma_m
+        )
+    announced = AnnouncedFile(
         owner=caller.id,
         purpose=purpose,
         scene_id=None if purpose == "block" else scene_id,
@@ -143,6 +144,7 @@ def create_upload(
         sha256=new.sha256,
         metadata=new.metadata,
     )
+    upload = uploads.insert_upload(connection, announced)
     _path(storage, upload.id).touch(mode=0o600, exist_ok=False)
     return upload
 

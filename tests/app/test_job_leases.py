@@ -39,7 +39,7 @@ def test_a_worker_back_from_the_dead_writes_nothing(database: Database):
     heir = claimed(database, job.id, "heir")
     assert (zombie.attempt, heir.attempt) == (1, 2)
     with database.transaction() as connection:
-        scene_id = scenes.begin_upload(connection, None, "a", "a.tif", None)
+        scene_id = scenes.begin_upload(connection, None, "a", "a.tif", sigma_m=None)
     writes: list[Callable[[Connection], None]] = [
         lambda c: attempts.renew(c, job.id, zombie.attempt, LEASE_S),
         lambda c: attempts.report(c, job.id, zombie.attempt, 50, "late"),

@@ -88,7 +88,7 @@ def test_work_of_a_job_is_recorded_with_the_owner_of_the_job(dsn, connection):
     job = jobs.create(connection, "ingest-block", {}, owner.id)
     connection.commit()
     with working_for(Origin(actor_name="worker 7", job_id=job.id)), engine.connect(dsn) as own:
-        scenes.begin_upload(own, owner.id, "a", "a.tif", None)
+        scenes.begin_upload(own, owner.id, "a", "a.tif", sigma_m=None)
     (change,) = changes(connection, kind="scene")
     assert (change.actor, change.actor_name, change.job_id) == (owner.id, "worker 7", job.id)
 
@@ -147,7 +147,7 @@ def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
 def test_a_token_uploads_no_more_bytes_than_its_quota(connection, settings):
     small = create_token(connection, "small", ["register"], upload_quota_bytes=1000).token
     assert quotas.upload_allowance(connection, settings, small, 1000) == 1000
-    scene_id = scenes.begin_upload(connection, small.id, "a", "a.tif", None)
+    scene_id = scenes.begin_upload(connection, small.id, "a", "a.tif", sigma_m=None)
     scenes.finish_upload(connection, scene_id, "scenes/a/a.tif", 900, "0" * 64)
     assert quotas.upload_allowance(connection, settings, small) == 100
     with pytest.raises(TooLarge, match="900 of 1000 bytes are used"):

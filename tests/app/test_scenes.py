@@ -238,8 +238,8 @@ def test_the_sweep_removes_what_uploads_cut_off_left_behind(client: TestClient, 
     app = client.app
     database, storage = app.state.database, app.state.storage  # type: ignore[attr-defined]
     with database.transaction() as connection:
-        arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", None)
-        cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", None)
+        arriving = scenes.begin_upload(connection, None, "b.tif", "b.tif", sigma_m=None)
+        cut_off = scenes.begin_upload(connection, None, "c.tif", "c.tif", sigma_m=None)
         run_sql(
             connection,
             "update scene set created_at = now() - interval '2 days', created_at_uptime_s = -2 * 86400"

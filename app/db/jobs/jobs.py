@@ -83,6 +83,7 @@ def create(
     kind: str,
     inputs: dict[str, Any],
     owner: UUID | None = None,
+    *,
     idempotency_key: str | None = None,
     outputs: dict[str, str] | None = None,
     response: JobResponse = "document",

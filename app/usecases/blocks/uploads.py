@@ -7,7 +7,7 @@ from app.auth import may_access
 from app.db import uploads
 from app.db.engine import Connection
 from app.db.tokens import Token
-from app.db.uploads import UploadRow
+from app.db.uploads import AnnouncedFile, UploadRow
 from app.errors import Conflict, InputError, NotFound, StorageOutage
 from app.storage import Storage
 from app.usecases import quotas
@@ -31,8 +31,7 @@ def receive_block(installation: Installation, caller: Token, sent: SentFile) -> 
         left = quotas.upload_allowance(connection, installation.settings, caller, sent.size_bytes)
         limit = min(left, installation.settings.upload_limit_bytes)
         # An archive of unknown size reserves all that is left of the quota until it has arrived.
-        upload = uploads.insert_upload(
-            connection,
+        announced = AnnouncedFile(
             owner=caller.id,
             purpose="block",
             scene_id=None,
@@ -42,6 +41,7 @@ def receive_block(installation: Installation, caller: Token, sent: SentFile) -> 
             sha256=None,
             metadata="",
         )
+        upload = uploads.insert_upload(connection, announced)
     try:
         stored = storage.put(block_key(upload), sent.chunks, limit)
         if stored.size_bytes == 0:
