@@ -117,7 +117,7 @@ def no_document(folder: Path) -> None:
         (misshapen_chips, r"chips/0000\.npy: shape \(240, 101, 99\)"),
         (path_out_of_the_folder, r"chip_file: '\.\./\.\./outside\.npy' found"),
         (link_out_of_the_folder, r"chips/0000\.npy: a link"),
-        (no_document, r"block\.json: not JSON"),
+        (no_document, r"block\.json: cannot be parsed as JSON"),
     ],
 )
 def test_a_broken_block_is_refused_by_name_changes_nothing_and_works_once_mended(
