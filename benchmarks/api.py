@@ -28,7 +28,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
@@ -112,7 +112,7 @@ def filled(count: int, console: Console) -> Iterator[Store]:
         folder = Path(name)
         folder.chmod(0o755)
         dsn = stack.enter_context(Cluster(folder / "postgres", durable=False).lease())
-        engine.upgrade(dsn)
+        revisions.upgrade(dsn)
         start = time.perf_counter()
         ground = fill(dsn, count)
         console.print(f"{count:,} points in {time.perf_counter() - start:.0f} s")

@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection
 from app.db.features.bbox import Box
@@ -63,7 +63,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
         Path(name).chmod(0o755)
         with Cluster(Path(name) / "postgres", durable=False).lease() as dsn:
-            engine.upgrade(dsn)
+            revisions.upgrade(dsn)
             ground = fill(dsn, arguments.points)
             with engine.connect(dsn) as connection:
                 sizes = (1_000, 2_000)

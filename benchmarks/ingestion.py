@@ -16,7 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block
@@ -46,7 +46,7 @@ def main() -> None:
             last[:] = [now, message]
 
         with Cluster(folder / "postgres", durable=True).lease() as dsn:
-            engine.upgrade(dsn)
+            revisions.upgrade(dsn)
             last[0] = start = time.perf_counter()
             with engine.connect(dsn) as connection:
                 ingest_block(connection, Storage(folder / "storage"), made.folder, note)

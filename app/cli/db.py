@@ -8,7 +8,7 @@ import typer
 
 from app.cli.output import AsJson, show_one
 from app.config import read_settings
-from app.db import engine
+from app.db import revisions
 from app.db.cluster import backup as archive
 from app.db.cluster import embedded
 
@@ -19,9 +19,9 @@ app = typer.Typer(no_args_is_help=True)
 def upgrade(as_json: AsJson = False) -> None:
     """Upgrade the schema of the database to the version that this Amers needs."""
     with embedded.database(read_settings()) as dsn:
-        before = engine.status(dsn)
-        engine.upgrade(dsn)
-        after = engine.status(dsn)
+        before = revisions.status(dsn)
+        revisions.upgrade(dsn)
+        after = revisions.status(dsn)
     show_one({"from": before.found, "to": after.found}, as_json=as_json)
 
 
@@ -30,7 +30,7 @@ def status(as_json: AsJson = False) -> None:
     """Show the schema version of the database and the one that this Amers needs."""
     settings = read_settings()
     with embedded.database(settings) as dsn:
-        schema = engine.status(dsn)
+        schema = revisions.status(dsn)
     record = {
         "database": "private cluster" if settings.database_url is None else "AMERS_DATABASE_URL",
         "data_folder": settings.data_folder,
@@ -66,6 +66,6 @@ def restore(
     """Restore an archive into an empty database, and upgrade its schema."""
     with embedded.database(read_settings()) as dsn:
         archive.restore(dsn, file)
-        engine.upgrade(dsn)
-        schema = engine.status(dsn)
+        revisions.upgrade(dsn)
+        schema = revisions.status(dsn)
     show_one({"archive": file, "revision": schema.found}, as_json=as_json)

@@ -16,7 +16,7 @@ import uvicorn
 
 from app import logs
 from app.config import Settings, read_settings
-from app.db import engine
+from app.db import revisions
 from app.db.cluster import embedded
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def serve(
     settings = read_settings()
     logs.configure(settings)
     with embedded.database(settings) as dsn:
-        engine.ensure_schema(dsn, upgradable=settings.database_url is None)
+        revisions.ensure_schema(dsn, upgradable=settings.database_url is None)
         command = (sys.executable, "-c", WORKER, "worker", str(os.getpid()))
         with database_watched(settings), companion(command if worker else None):
             uvicorn.run(

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from app.config import Settings, read_settings
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster import embedded
 from app.db.engine import Connection
 
@@ -18,6 +18,6 @@ def transaction(settings: Settings | None = None) -> Iterator[Connection]:
     """
     chosen = settings or read_settings()
     with embedded.database(chosen) as dsn:
-        engine.ensure_schema(dsn, upgradable=chosen.database_url is None)
+        revisions.ensure_schema(dsn, upgradable=chosen.database_url is None)
         with engine.connect(dsn) as connection:
             yield connection

@@ -1,4 +1,4 @@
-"""Connections to the database: engines with their pools, and the version of the schema.
+"""Connections to the database: engines with their pools.
 
 A request reads on a connection that can only read, each statement a transaction of its own; whatever
 writes has one transaction. Role, read-only mode and time limit belong to a connection from its start:
@@ -14,8 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
-from pathlib import Path
 from select import POLLIN, poll
 from typing import Any
 
@@ -38,10 +36,9 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 from app import request_context
 from app.config import Settings
 from app.db.cluster import embedded
-from app.errors import InputError
+from app.db.revisions import DriverConnection, driver_connection, ensure_schema, unreachable
 
 Connection = sqlalchemy.Connection
-DriverConnection = psycopg.Connection[tuple[Any, ...]]
 
 READER = "amers_reader"
 """Role of the connections that answer reading requests: it can do nothing but select."""
@@ -114,19 +111,6 @@ class Database:
             connection.commit()
 
 
-@dataclass(frozen=True)
-class SchemaStatus:
-    """The version of the schema: as found in a database (None: empty) and as this Amers needs it."""
-
-    found: str | None
-    needed: str
-
-    @property
-    def current(self) -> bool:
-        """Whether the database can be used as it is."""
-        return self.found == self.needed
-
-
 @contextmanager
 def opened(settings: Settings) -> Iterator[Database]:
     """The installation's database, ready for use: running, with the schema of this Amers, pools warm.
@@ -188,7 +172,7 @@ def connect(dsn: str) -> Iterator[Connection]:
     try:
         connection = _unpooled(dsn).connect()
     except psycopg.OperationalError as error:
-        raise _unreachable(error) from error
+        raise unreachable(error) from error
     with connection:
         set_origin(connection)
         yield connection
@@ -232,73 +216,8 @@ def limit_lock_wait(connection: Connection, seconds: float) -> None:
     connection.execute(select(func.set_config("lock_timeout", f"{seconds:g}s", True)))
 
 
-def status(dsn: str) -> SchemaStatus:
-    """The version of a database's schema beside the one this Amers needs."""
-    with _reachable(dsn) as connection:
-        found = None
-        if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
-            found = connection.execute("select version_num from alembic_version").fetchone()
-    return SchemaStatus(found=found[0] if found else None, needed=newest_revision())
-
-
-def ensure_schema(dsn: str, *, upgradable: bool) -> None:
-    """Bring the schema up to date, or say that it is not.
-
-    Raises:
-        InputError: the schema is another one and may not be upgraded here.
-    """
-    state = status(dsn)
-    if state.current:
-        return
-    if not upgradable:
-        raise InputError(
-            f"the schema of the database is at revision {state.found or 'none'}, "
-            f"this Amers needs {state.needed}: run `amers db upgrade`"
-        )
-    upgrade(dsn)
-
-
-def upgrade(dsn: str) -> None:
-    """Apply the migrations that the database lacks; safe when several commands do it at once.
-
-    Raises:
-        InputError: the database was upgraded by a newer Amers.
-    """
-    from alembic import command
-    from alembic.config import Config
-
-    state = status(dsn)
-    if state.found is not None and state.found > state.needed:
-        raise InputError(
-            f"the database is at revision {state.found}, newer than this Amers knows ({state.needed})"
-        )
-    config = Config()
-    config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
-    config.attributes["dsn"] = dsn
-    command.upgrade(config, "head")
-    _grant_reading(dsn)
-
-
-def migrations_folder() -> Path:
-    """Where the migrations are installed."""
-    return Path(str(resources.files("migrations")))
-
-
-def newest_revision() -> str:
-    """The revision this Amers needs; migrations are named `REVISION_what_it_does.py`, in order."""
-    return max(path.name.split("_")[0] for path in (migrations_folder() / "versions").glob("[0-9]*.py"))
-
-
-def _grant_reading(dsn: str) -> None:
-    """Let the reading role read all tables, those of later migrations too."""
-    from app.db.statements import sql_file
-
-    with _reachable(dsn) as connection:
-        connection.execute(sql_file("grants.sql").encode())
-
-
 def _may_read_as_reader(dsn: str) -> bool:
-    with _reachable(dsn) as connection:
+    with driver_connection(dsn) as connection:
         row = connection.execute(
             """select from pg_roles where rolname = %(role)s
                 and pg_has_role(current_user, oid, 'member')
@@ -384,17 +303,3 @@ def _raise_as_driver(context: ExceptionContext) -> None:
     """Let callers see the driver's error: its classes say what happened, and nothing wraps it."""
     if isinstance(context.original_exception, psycopg.Error):
         raise context.original_exception
-
-
-@contextmanager
-def _reachable(dsn: str) -> Iterator[DriverConnection]:
-    try:
-        connection = psycopg.connect(dsn, connect_timeout=10)
-    except psycopg.OperationalError as error:
-        raise _unreachable(error) from error
-    with connection:
-        yield connection
-
-
-def _unreachable(error: psycopg.OperationalError) -> InputError:
-    return InputError(f"the database cannot be reached: {str(error).strip()}")

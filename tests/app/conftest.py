@@ -12,7 +12,7 @@ from psycopg import sql
 from pydantic import SecretStr
 
 from app.config import Settings
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection, Database
 from app.main import create_app
@@ -29,7 +29,7 @@ def cluster(open_folder: Path) -> Iterator[Cluster]:
     with cluster.lease():
         with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
             connection.execute(sql.SQL("create database {}").format(sql.Identifier(TEMPLATE)))
-        engine.upgrade(cluster.dsn(TEMPLATE))
+        revisions.upgrade(cluster.dsn(TEMPLATE))
         yield cluster
 
 

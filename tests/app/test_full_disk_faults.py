@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from app.config import Settings
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.errors import is_no_room
 from app.storage import Storage
@@ -161,7 +161,7 @@ def test_a_full_disk_of_the_database_is_reported_and_the_block_loads_once_there_
     cluster = Cluster(disk.folder / "postgres", durable=False)
     try:
         with cluster.lease() as dsn:
-            engine.upgrade(dsn)
+            revisions.upgrade(dsn)
             with engine.connect(dsn) as connection:
                 # With a new segment of the log, it is the table that has no room.
                 run_sql(connection, "select pg_switch_wal()")

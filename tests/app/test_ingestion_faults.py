@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from app.db import binary_copy, engine
+from app.db import binary_copy, engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.db.metrics import read_gauges
 from app.storage import Storage
@@ -214,7 +214,7 @@ def test_postgresql_killed_in_the_middle_of_an_ingestion_leaves_nothing(
     killed = []
 
     with own.lease() as dsn:
-        engine.upgrade(dsn)
+        revisions.upgrade(dsn)
 
         def kill_halfway(fraction: float, message: str) -> None:
             started = message == f"loading rows of table {table}"
@@ -257,7 +257,7 @@ def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
             kill(own)
 
     with own.lease() as dsn:
-        engine.upgrade(dsn)
+        revisions.upgrade(dsn)
         with pytest.raises(psycopg.OperationalError):
             ingest_and_kill(dsn)
 

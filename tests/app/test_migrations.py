@@ -14,9 +14,9 @@ from alembic.script import ScriptDirectory
 from pydantic import SecretStr
 
 from app.config import Settings
-from app.db import engine
+from app.db import engine, revisions
 from app.db.cluster import backup
-from app.db.engine import SchemaStatus
+from app.db.revisions import SchemaStatus
 from app.errors import Conflict, InputError
 from app.usecases.tokens import create_token, list_tokens
 from tests.statements import run_sql
@@ -43,15 +43,15 @@ def tables(dsn: str) -> set[str]:
 
 def alembic(dsn: str) -> Config:
     config = Config()
-    config.set_main_option("script_location", str(engine.migrations_folder()))
+    config.set_main_option("script_location", str(revisions.migrations_folder()))
     config.attributes["dsn"] = dsn
     return config
 
 
 def test_an_empty_database_gets_the_tables_of_the_store_and_the_queue(empty_dsn):
-    assert engine.status(empty_dsn) == SchemaStatus(found=None, needed=engine.newest_revision())
-    engine.upgrade(empty_dsn)
-    assert engine.status(empty_dsn).current
+    assert revisions.status(empty_dsn) == SchemaStatus(found=None, needed=revisions.newest_revision())
+    revisions.upgrade(empty_dsn)
+    assert revisions.status(empty_dsn).current
     assert tables(empty_dsn) >= OURS | {"procrastinate_jobs", "spatial_ref_sys"}
 
 
@@ -74,21 +74,21 @@ def test_two_upgrades_at_once_do_the_work_of_one(empty_dsn):
             for env in [{**os.environ, "AMERS_DATABASE_URL": empty_dsn}] * 2
         ]
     assert [future.result().returncode for future in done] == [0, 0]
-    assert engine.status(empty_dsn).current
+    assert revisions.status(empty_dsn).current
 
 
 def test_every_migration_can_be_undone(empty_dsn):
-    engine.upgrade(empty_dsn)
+    revisions.upgrade(empty_dsn)
     command.downgrade(alembic(empty_dsn), "base")
     assert tables(empty_dsn) <= {"alembic_version", "spatial_ref_sys"}
-    engine.upgrade(empty_dsn)
-    assert engine.status(empty_dsn).current
+    revisions.upgrade(empty_dsn)
+    assert revisions.status(empty_dsn).current
 
 
 def test_the_names_of_the_files_give_the_order_that_alembic_keeps(empty_dsn):
     scripts = ScriptDirectory.from_config(alembic(empty_dsn))
-    assert scripts.get_current_head() == engine.newest_revision()
-    assert scripts.get_heads() == [engine.newest_revision()]
+    assert scripts.get_current_head() == revisions.newest_revision()
+    assert scripts.get_heads() == [revisions.newest_revision()]
 
 
 def test_a_database_of_your_own_is_not_upgraded_behind_your_back(empty_dsn, tmp_path):
@@ -102,12 +102,12 @@ def test_a_database_of_a_newer_amers_is_left_alone(dsn):
     with engine.connect(dsn) as connection:
         run_sql(connection, "update alembic_version set version_num = '9999'")
     with pytest.raises(InputError, match="newer than this Amers"):
-        engine.upgrade(dsn)
+        revisions.upgrade(dsn)
 
 
 def test_a_database_that_does_not_answer_is_an_error_of_one_line(tmp_path):
     with pytest.raises(InputError, match="cannot be reached"):
-        engine.status(f"host={tmp_path} dbname=amers connect_timeout=1")
+        revisions.status(f"host={tmp_path} dbname=amers connect_timeout=1")
 
 
 def test_reading_connections_can_neither_write_nor_take_too_long(dsn, tmp_path):
@@ -172,7 +172,7 @@ def test_a_backup_restores_into_an_empty_database(dsn, empty_dsn, tmp_path):
         create_token(connection, "kept", ["read"])
     backup.dump(dsn, tmp_path / "amers.dump")
     backup.restore(empty_dsn, tmp_path / "amers.dump")
-    assert engine.status(empty_dsn).current
+    assert revisions.status(empty_dsn).current
     with engine.connect(empty_dsn) as connection:
         assert [token.name for token in list_tokens(connection)] == ["kept"]
 

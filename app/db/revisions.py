@@ -1,0 +1,112 @@
+"""Revisions of the schema: the one of a database, the one this Amers needs, and the upgrade."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import psycopg
+
+from app.errors import InputError
+
+DriverConnection = psycopg.Connection[tuple[Any, ...]]
+
+
+@dataclass(frozen=True)
+class SchemaStatus:
+    """The version of the schema: as found in a database (None: empty) and as this Amers needs it."""
+
+    found: str | None
+    needed: str
+
+    @property
+    def current(self) -> bool:
+        """Whether the database can be used as it is."""
+        return self.found == self.needed
+
+
+def status(dsn: str) -> SchemaStatus:
+    """The version of a database's schema beside the one this Amers needs."""
+    with driver_connection(dsn) as connection:
+        found = None
+        if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
+            found = connection.execute("select version_num from alembic_version").fetchone()
+    return SchemaStatus(found=found[0] if found else None, needed=newest_revision())
+
+
+def ensure_schema(dsn: str, *, upgradable: bool) -> None:
+    """Bring the schema up to date, or say that it is not.
+
+    Raises:
+        InputError: the schema is another one and may not be upgraded here.
+    """
+    state = status(dsn)
+    if state.current:
+        return
+    if not upgradable:
+        raise InputError(
+            f"the schema of the database is at revision {state.found or 'none'}, "
+            f"this Amers needs {state.needed}: run `amers db upgrade`"
+        )
+    upgrade(dsn)
+
+
+def upgrade(dsn: str) -> None:
+    """Apply the migrations that the database lacks; safe when several commands do it at once.
+
+    Raises:
+        InputError: the database was upgraded by a newer Amers.
+    """
+    from alembic import command
+    from alembic.config import Config
+
+    state = status(dsn)
+    if state.found is not None and state.found > state.needed:
+        raise InputError(
+            f"the database is at revision {state.found}, newer than this Amers knows ({state.needed})"
+        )
+    config = Config()
+    config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
+    config.attributes["dsn"] = dsn
+    command.upgrade(config, "head")
+    _grant_reading(dsn)
+
+
+def migrations_folder() -> Path:
+    """Where the migrations are installed."""
+    return Path(str(resources.files("migrations")))
+
+
+def newest_revision() -> str:
+    """The revision this Amers needs; migrations are named `REVISION_what_it_does.py`, in order."""
+    return max(path.name.split("_")[0] for path in (migrations_folder() / "versions").glob("[0-9]*.py"))
+
+
+def _grant_reading(dsn: str) -> None:
+    """Let the reading role read all tables, those of later migrations too."""
+    from app.db.statements import sql_file
+
+    with driver_connection(dsn) as connection:
+        connection.execute(sql_file("grants.sql").encode())
+
+
+@contextmanager
+def driver_connection(dsn: str) -> Iterator[DriverConnection]:
+    """A connection of the driver without an engine: one transaction, committed at the end.
+
+    Raises:
+        InputError: the database cannot be reached.
+    """
+    try:
+        connection = psycopg.connect(dsn, connect_timeout=10)
+    except psycopg.OperationalError as error:
+        raise unreachable(error) from error
+    with connection:
+        yield connection
+
+
+def unreachable(error: psycopg.OperationalError) -> InputError:
+    """The error for the user when no connection can be made."""
+    return InputError(f"the database cannot be reached: {str(error).strip()}")
