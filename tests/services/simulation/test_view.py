@@ -205,8 +205,8 @@ def test_the_delivered_model_has_exactly_the_given_error(world: World) -> None:
     image = rng.uniform(0.0, 699.0, (500, 2))
     ground = geometry.true_model.locate(image, rng.uniform(*world.height_range_m, 500))
     wrong = CorrectedModel(geometry.true_model, geometry.error).project(ground)
-    error_px = np.linalg.norm(geometry.delivered.project(ground) - wrong, axis=1)
-    assert error_px.max() < 2.0 * a_hundredth_of_a_pixel
+    fit_error_px = np.linalg.norm(geometry.delivered.project(ground) - wrong, axis=1)
+    assert fit_error_px.max() < 2.0 * a_hundredth_of_a_pixel
     np.testing.assert_allclose(geometry.error.parameters[:, 1:], error_px[:, 1:])
     moved = np.hypot(*geometry.error.parameters[:, 0])
     assert moved == pytest.approx(50.0 / 0.5, rel=0.1)
