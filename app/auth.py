@@ -47,7 +47,7 @@ def authenticate(connection: Connection, secret: str) -> Token:
     """The token of a secret.
 
     Raises:
-        NotAllowed: the secret is unknown, expired or revoked; the message does not tell which.
+        NotAllowed: the secret is unknown, expired or revoked; the message is the same for all three.
     """
     token = find_valid_token(connection, secret_hash(secret))
     if token is None:
