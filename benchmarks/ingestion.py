@@ -21,7 +21,7 @@ from app.db.cluster.embedded import Cluster
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block
 from benchmarks._measuring import keep
-from services.formats.block.check import FILES_AT_ONCE
+from services.formats.block.check import CHECKSUM_THREADS
 from tests.factories import make_block
 
 IMAGES = 8
@@ -76,7 +76,7 @@ def plain_copy(files: list[Path], folder: Path) -> float:
             os.fsync(copied.fileno())
 
     start = time.perf_counter()
-    with ThreadPoolExecutor(FILES_AT_ONCE) as pool:
+    with ThreadPoolExecutor(CHECKSUM_THREADS) as pool:
         list(pool.map(copy, files))
     taken_s = time.perf_counter() - start
     shutil.rmtree(folder)
