@@ -129,10 +129,10 @@ def _inspect(folder: Path) -> Binaries | None:
         return None
     if not (_share_folder(folder) / "extension" / "postgis.control").is_file():
         return None
-    said = subprocess.run(
+    output = subprocess.run(
         [folder / "postgres", "--version"], capture_output=True, text=True, check=False
     ).stdout
-    version = re.search(r"\d+", said)
+    version = re.search(r"\d+", output)
     return Binaries(folder, int(version[0])) if version else None
 
 
@@ -140,8 +140,10 @@ def _share_folder(folder: Path) -> Path:
     pg_config = folder / "pg_config"
     if not pg_config.is_file():
         return folder.parent / "share"
-    said = subprocess.run([pg_config, "--sharedir"], capture_output=True, text=True, check=False).stdout
-    return Path(said.strip())
+    output = subprocess.run(
+        [pg_config, "--sharedir"], capture_output=True, text=True, check=False
+    ).stdout
+    return Path(output.strip())
 
 
 def _user(entry: pwd.struct_passwd) -> ServerUser:

@@ -269,10 +269,12 @@ class Cluster:
         command += ["--pgdata", str(self.data), "--log", str(log), "--timeout", str(int(START_SECONDS))]
         deadline = time.monotonic() + LEAVING_SECONDS
         while run_as(user, command, timeout_s=2 * START_SECONDS).returncode != 0:
-            said = " / ".join(log.read_text(errors="replace").splitlines()[-4:]) if log.exists() else ""
+            last_lines = (
+                " / ".join(log.read_text(errors="replace").splitlines()[-4:]) if log.exists() else ""
+            )
             # Processes of a killed server need a moment to notice and leave the shared memory.
-            if "shared memory" not in said or time.monotonic() > deadline:
-                raise ServerFailure(f"PostgreSQL did not start ({log}): {said}")
+            if "shared memory" not in last_lines or time.monotonic() > deadline:
+                raise ServerFailure(f"PostgreSQL did not start ({log}): {last_lines}")
             time.sleep(0.2)
 
     def _stop(self, user: ServerUser) -> None:
