@@ -21,7 +21,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 
 DIALECT: Dialect = postgresql.psycopg.dialect()  # type: ignore[no-untyped-call]
-KEPT_STRUCTURES = 512
+KEPT_STRUCTURES = 64
 """Compiled statements of users' filters that are kept."""
 NAME = re.compile(r"^-- name: (\w+)$", re.MULTILINE)
 

@@ -39,7 +39,7 @@ from app.db.schema.base import Double, Timestamp
 from app.errors import InvalidParameter
 
 GEOMETRY = ("geometry", "geom")
-KEPT_FILTERS = 128
+KEPT_FILTERS = 32
 DEEPEST_EXPRESSION = 32
 """Operators in each other. SQLAlchemy compiles them recursively, with a dozen calls for each."""
 

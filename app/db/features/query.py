@@ -33,6 +33,8 @@ from app.db.statements import HotStatement, hot_like
 
 KEPT_STATEMENTS = 512
 """Statements kept for each step: of the layouts and orders that users ask for."""
+KEPT_FILTERED = 32
+"""Statements kept with a user's filter: one of a thousand parts takes megabytes."""
 
 LIMIT = bindparam("limit", None, BigInteger())
 AFTER_KEY = bindparam("after_key", None, BigInteger())
@@ -181,12 +183,12 @@ def _kept_select(
     return rows.order_by(*orders).limit(LIMIT + integer_constant(1))
 
 
-@lru_cache(KEPT_STATEMENTS)
+@lru_cache(KEPT_FILTERED)
 def _kept_filtered(statement: Select[Any], predicate: ColumnElement[bool]) -> Select[Any]:
     return statement.where(predicate)
 
 
-@lru_cache(KEPT_STATEMENTS)
+@lru_cache(KEPT_FILTERED)
 def _kept_full_scan(
     layout: Layout, columns: Columns, predicate: ColumnElement[bool] | None
 ) -> Select[Any]:
@@ -195,7 +197,7 @@ def _kept_full_scan(
     return layout.collection.full_scan(rows, true() if predicate is None else predicate)
 
 
-@lru_cache(KEPT_STATEMENTS)
+@lru_cache(KEPT_FILTERED)
 def _kept_hot(statement: Select[Any]) -> HotStatement:
     return hot_like(statement)
 
