@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, show
-from app.cli.store import transaction
+from app.cli.transaction import transaction
 from app.usecases import operations
 
 

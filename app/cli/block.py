@@ -7,7 +7,7 @@ import typer
 
 from app.cli.output import AsJson, Row, print_json, show, show_one
 from app.cli.progress import shown_progress
-from app.cli.store import transaction
+from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db.blocks import Block
 from app.errors import InputError

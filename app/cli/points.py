@@ -10,7 +10,7 @@ from typing import Annotated, BinaryIO
 import typer
 
 from app.cli.output import AsJson, print_json, show, show_one
-from app.cli.store import transaction
+from app.cli.transaction import transaction
 from app.usecases import history
 from app.usecases.features import points
 from app.usecases.features.query import parse_bbox

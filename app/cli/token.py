@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, Row, show, show_one
-from app.cli.store import transaction
+from app.cli.transaction import transaction
 from app.db.tokens import Token
 from app.usecases import tokens
 
