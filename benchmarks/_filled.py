@@ -1,10 +1,12 @@
 """A store with millions of published points and no chips, filled in minutes.
 
-Blocks of a million points lie side by side along a parallel, one point for 2 km2 on average, each in
-Hilbert order, so that a footprint meets the same ground however many points there are.
+Blocks of a million points have the same extent in degrees, with one point for 2 km2 on average at the
+latitude of the first row, each in Hilbert order. Twenty of them lie side by side along a parallel;
+further rows follow to the south. A footprint meets the same ground however many points there are.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +25,11 @@ from tests.statements import run_sql
 
 WEST_DEG = -177.0
 CENTRE_LAT_DEG = 44.0
+"""Of the first row of blocks."""
 POINTS_PER_KM2 = 0.5
 BLOCK_POINTS = 1_000_000
+ROW_BLOCKS = 20
+"""Blocks along one parallel: with a million points each, from 177 degrees west to 175 degrees east."""
 TYPOLOGIES = ("crossroads", "building corner", None)
 
 
@@ -33,21 +38,32 @@ class Ground:
     """Where the points lie.
 
     Attributes:
-        west_south_deg: (2,) lon, lat of the corner.
-        side_deg: (2,) extent in longitude and latitude.
+        west_south_deg: (blocks, 2) lon, lat of the corner of each block.
+        side_deg: (2,) extent of a block in longitude and latitude.
         points: how many.
+        block_points: how many in each block but the last.
     """
 
     west_south_deg: Array
     side_deg: Array
     points: int
+    block_points: int
 
     def box(self, rng: np.random.Generator, count: int) -> tuple[float, float, float, float]:
-        """West, south, east, north of a square on the ground that holds about so many points."""
+        """West, south, east, north of a box in one of the blocks that holds about so many points."""
         part = side_m(count) / np.array(metres_per_degree(CENTRE_LAT_DEG, 0.0))
-        low = self.west_south_deg + rng.uniform(0.0, 1.0, 2) * (self.side_deg - part)
+        low = rng.choice(self.west_south_deg) + rng.uniform(0.0, 1.0, 2) * (self.side_deg - part)
         west, south, east, north = (float(value) for value in (*low, *(low + part)))
         return west, south, east, north
+
+    def point_id(self, rng: np.random.Generator) -> int:
+        """The id of one of the points."""
+        block, row = divmod(int(rng.integers(self.points)), self.block_points)
+        return ((block + 1) << ID_BITS) + row
+
+    def points_of(self, block: int) -> int:
+        """How many points a block has; the last one may have fewer."""
+        return min(self.block_points, self.points - block * self.block_points)
 
 
 def side_m(count: int) -> float:
@@ -55,19 +71,34 @@ def side_m(count: int) -> float:
     return math.sqrt(count / POINTS_PER_KM2) * 1000.0
 
 
-def fill(dsn: str, count: int, console: Console | None = None) -> Ground:
+def lay_out(count: int, block_points: int = BLOCK_POINTS) -> Ground:
+    """The ground of so many points.
+
+    Raises:
+        ValueError: the rows of blocks would leave the Earth.
+    """
+    block_points = min(count, block_points)
+    side_deg = side_m(block_points) / np.array(metres_per_degree(CENTRE_LAT_DEG, 0.0))
+    row, column = np.divmod(np.arange(-(-count // block_points)), ROW_BLOCKS)
+    low = np.column_stack([column, -row]) * side_deg + [WEST_DEG, CENTRE_LAT_DEG - side_deg[1] / 2.0]
+    if low[:, 1].min() < -90.0 or (low + side_deg).max() > 180.0:
+        raise ValueError(f"{count:,} points in blocks of {block_points:,} leave the Earth")
+    return Ground(low, side_deg, count, block_points)
+
+
+def fill(
+    dsn: str, count: int, console: Console | None = None, block_points: int = BLOCK_POINTS
+) -> Ground:
     """Fill an empty store of the newest schema with published points; indexes are built at the end."""
-    largest = min(count, BLOCK_POINTS)
-    side_deg = side_m(largest) / np.array(metres_per_degree(CENTRE_LAT_DEG, 0.0))
-    south_deg = CENTRE_LAT_DEG - side_deg[1] / 2.0
-    blocks = -(-count // largest)
+    ground = lay_out(count, block_points)
+    blocks = len(ground.west_south_deg)
     with engine.connect(dsn) as connection:
         # Rows made here need no check against the tables they point to, four fifths of the time.
         run_sql(connection, "set session_replication_role = replica")
         run_sql(connection, "drop index point_geom")
         for k in range(blocks):
-            low = np.array([WEST_DEG + k * side_deg[0], south_deg])
-            _fill_block(connection, k + 1, low, side_deg, min(largest, count - k * largest))
+            _insert_block(connection, ground, k)
+            binary.insert_rows(connection, point, _columns(ground, k))
             if console is not None:
                 console.print(f"block {k + 1} of {blocks} filled")
         run_sql(connection, "set session_replication_role = origin")
@@ -77,19 +108,17 @@ def fill(dsn: str, count: int, console: Console | None = None) -> Ground:
     with psycopg.connect(dsn, autocommit=True) as alone:
         alone.execute("vacuum analyze point")
         alone.execute("vacuum analyze block")
-    return Ground(np.array([WEST_DEG, south_deg]), side_deg * [blocks, 1], count)
+    return ground
 
 
-def _fill_block(connection: Connection, number: int, low: Array, side_deg: Array, count: int) -> None:
-    rng = np.random.default_rng(number)
-    lon_lat = low + rng.uniform(0.0, 1.0, (count, 2)) * side_deg
-    lon_lat_h = np.column_stack([lon_lat[hilbert_order(lon_lat)], rng.uniform(0.0, 2000.0, count)])
+def _insert_block(connection: Connection, ground: Ground, k: int) -> None:
+    low, number = ground.west_south_deg[k], k + 1
     run_sql(
         connection,
         """insert into block (number, id, version, state, extent, n_points, n_views, metadata, checksum)
            overriding system value
            values (%s, %s, '1', 'published', st_makeenvelope(%s, %s, %s, %s, 4326), %s, 0, '{}', '')""",
-        [number, f"bench-{number}", *low, *(low + side_deg), count],
+        [number, f"bench-{number}", *low, *(low + ground.side_deg), ground.points_of(k)],
     )
     run_sql(
         connection,
@@ -97,7 +126,14 @@ def _fill_block(connection: Connection, number: int, low: Array, side_deg: Array
            overriding system value values (%s, %s, 'chips/0000.npy', 'chips/0', 'uint8', 0)""",
         [number, number],
     )
-    columns = {
+
+
+def _columns(ground: Ground, k: int) -> Mapping[str, binary.Column]:
+    number, count = k + 1, ground.points_of(k)
+    rng = np.random.default_rng(number)
+    lon_lat = ground.west_south_deg[k] + rng.uniform(0.0, 1.0, (count, 2)) * ground.side_deg
+    lon_lat_h = np.column_stack([lon_lat[hilbert_order(lon_lat)], rng.uniform(0.0, 2000.0, count)])
+    return {
         "id": binary.numbers((number << ID_BITS) + np.arange(count), "i8"),
         "block_number": binary.numbers(np.full(count, number), "i4"),
         "geom": binary.points_z(lon_lat_h),
@@ -116,4 +152,3 @@ def _fill_block(connection: Connection, number: int, low: Array, side_deg: Array
         "chip_row": binary.numbers(np.arange(count) * 8, "i8"),
         "chip_count": binary.numbers(np.full(count, 8), "i2"),
     }
-    binary.insert_rows(connection, point, columns)

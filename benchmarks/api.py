@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ from app.db.cluster.embedded import Cluster
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks import _servers
-from benchmarks._filled import Ground, fill
+from benchmarks._filled import ROW_BLOCKS, Ground, fill
 from benchmarks._measuring import keep
 from benchmarks._servers import Server
 from tests.factories import make_block
@@ -114,13 +114,13 @@ def filled(count: int, console: Console) -> Iterator[Store]:
         dsn = stack.enter_context(Cluster(folder / "postgres", durable=False).lease())
         revisions.upgrade(dsn)
         start = time.perf_counter()
-        ground = fill(dsn, count)
+        ground = fill(dsn, count, console)
         console.print(f"{count:,} points in {time.perf_counter() - start:.0f} s")
         made = make_block(
             folder / "block",
             count=2 * CHIP_POINTS,
             name="chips",
-            box=(5.0, 10.0, 5.1, 10.08),
+            box=(5.0, 80.0, 5.4, 80.08),  # North of the points of `fill`.
             n_images=CHIP_VIEWS,
             gsds_m=(2.0,),
             dtype=np.uint8,
@@ -152,6 +152,8 @@ def peers(
 
 def kinds(ground: Ground) -> dict[str, Ask]:
     """The requests, by name; a path is empty where a service has no such resource."""
+    # Tiles further south cover more degrees, and so more points.
+    first_row = replace(ground, west_south_deg=ground.west_south_deg[:ROW_BLOCKS])
 
     def in_box(count: int) -> Ask:
         def ask(server: Server, rng: np.random.Generator) -> str:
@@ -161,11 +163,10 @@ def kinds(ground: Ground) -> dict[str, Ask]:
         return ask
 
     def point(server: Server, rng: np.random.Generator) -> str:
-        block, row = divmod(int(rng.integers(ground.points)), min(ground.points, 1_000_000))
-        return f"{server.items}/{((block + 1) << 26) + row}?f={server.page.partition('f=')[2]}"
+        return f"{server.items}/{ground.point_id(rng)}?f={server.page.partition('f=')[2]}"
 
     def tile(server: Server, rng: np.random.Generator) -> str:
-        west, south, _, _ = ground.box(rng, FOOTPRINT_POINTS)
+        west, south, _, _ = first_row.box(rng, FOOTPRINT_POINTS)
         side = 2**TILE_ZOOM
         x = int((west + 180.0) / 360.0 * side)
         y = int((1.0 - math.asinh(math.tan(math.radians(south))) / math.pi) / 2.0 * side)
