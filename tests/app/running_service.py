@@ -31,17 +31,27 @@ class Served:
         points: of the block; their ids in the service begin at 2^26.
         authorization: the header of a caller.
         folder: where its log and the caller's files may lie.
+        dsn: of its database.
+        pid: of its process.
     """
 
     url: str
     points: ControlPoints
     authorization: dict[str, str]
     folder: Path
+    dsn: str
+    pid: int
 
 
 @contextmanager
-def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator[Served]:
-    """A service without a worker and a token with one scope; the service is stopped at the end."""
+def service_with_a_block(
+    cluster: Cluster, folder: Path, scope: str, **environment: str
+) -> Iterator[Served]:
+    """A service without a worker and a token with one scope; the service is stopped at the end.
+
+    Args:
+        environment: its settings, such as `AMERS_POOL_SIZE="2"`.
+    """
     with fresh_database(cluster, TEMPLATE) as dsn:
         made = make_block(folder / "block", count=60)
         settings = Settings(database_url=dsn, data_folder=folder / "data")
@@ -54,6 +64,7 @@ def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator
             **os.environ,
             "AMERS_DATABASE_URL": dsn,
             "AMERS_DATA_FOLDER": str(settings.data_folder),
+            **environment,
         }
         log = folder / "log"
         with log.open("wb") as output:
@@ -66,7 +77,8 @@ def service_with_a_block(cluster: Cluster, folder: Path, scope: str) -> Iterator
         url = f"http://127.0.0.1:{port}"
         try:
             assert until(lambda: _answers(url)), log.read_text()
-            yield Served(url, made.points, {"Authorization": f"Bearer {secret}"}, folder)
+            authorization = {"Authorization": f"Bearer {secret}"}
+            yield Served(url, made.points, authorization, folder, dsn, process.pid)
         finally:
             process.terminate()
             process.wait()
