@@ -73,6 +73,10 @@ installation = Table(
     Column("single", Boolean, primary_key=True, server_default=text("true")),
     # Signs the keys of pages.
     Column("page_secret", LargeBinary, nullable=False),
+    # The storage of the files names it in its file `installation.json`.
+    Column("id", Uuid, nullable=False, server_default=text("gen_random_uuid()")),
+    # Advances here and in the storage while the service runs: an older backup is behind.
+    Column("storage_generation", BigInteger, nullable=False, server_default=text("0")),
     CheckConstraint("single", name="single"),
 )
 
