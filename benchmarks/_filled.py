@@ -77,9 +77,10 @@ def lay_out(count: int, block_points: int = BLOCK_POINTS) -> Ground:
     Raises:
         ValueError: the rows of blocks would leave the Earth.
     """
-    block_points = min(count, block_points)
+    blocks = -(-count // block_points)
+    block_points = -(-count // blocks)  # As many in each, so that density is the same everywhere.
     side_deg = side_m(block_points) / np.array(metres_per_degree(CENTRE_LAT_DEG, 0.0))
-    row, column = np.divmod(np.arange(-(-count // block_points)), ROW_BLOCKS)
+    row, column = np.divmod(np.arange(blocks), ROW_BLOCKS)
     low = np.column_stack([column, -row]) * side_deg + [WEST_DEG, CENTRE_LAT_DEG - side_deg[1] / 2.0]
     if low[:, 1].min() < -90.0 or (low + side_deg).max() > 180.0:
         raise ValueError(f"{count:,} points in blocks of {block_points:,} leave the Earth")
