@@ -1,6 +1,6 @@
 """Least-squares fit of a rational polynomial model to another sensor model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,12 +12,19 @@ from services.types import Array
 
 RIDGES = (1e-5, 1e-3, 1e-1)
 """Dampings of the coefficients relative to a misfit of one normalised unit, without which the 39
-coefficients of a smooth model are not determined. The damping with the best fit is used: where a model
-is not smooth, a weak damping lets the denominators vanish."""
+coefficients of a smooth model are not determined. Where a model is not smooth, a weak damping lets the
+denominators vanish, and a stronger one fits better."""
+
+CLOSE_ENOUGH_PX = 1e-3
+"""A fit within this error is used without a search for a better one: a tenth of what a refined RPC may
+differ from its model."""
 
 _ITERATIONS = 8
-_NODES = (16, 16, 8)
-"""Lines, samples and heights of the grid of points of a fit."""
+_CONVERGED = 1e-9
+"""Iterations end when no normalised coefficient changes by more than this."""
+_GRIDS = ((8, 8, 4), (16, 16, 8))
+"""Lines, samples and heights of the grids of points of a fit. The first one suffices for a smooth model;
+256 points determine 39 coefficients."""
 _MARGIN = 1.02
 """Extent of the grid of points, relative to the image."""
 _CHECK_NODES = (37, 37, 7)
@@ -46,7 +53,9 @@ def fit_rpc(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[fl
 
     Each coordinate is a ratio with its own denominator. The ratio is multiplied out and solved by
     linear least squares. Each iteration is weighted by the denominator of the previous one and damped
-    around its coefficients, so that the damping causes no bias.
+    around its coefficients, so that the damping causes no bias. The first fit within `CLOSE_ENOUGH_PX`
+    is returned: the grids of points and the dampings are tried in turn, the cheapest first. If none is
+    that close, the closest is returned.
 
     Source: Tao and Hu (2001), "A comprehensive study of the rational function model".
 
@@ -58,15 +67,18 @@ def fit_rpc(model: SensorModel, shape: tuple[int, int], height_range_m: tuple[fl
     Raises:
         CoverageError: the model cannot locate the whole image over the range of heights.
     """
-    image, ground = _grid(model, shape, height_range_m, _NODES, _MARGIN)
     check_image, check_ground = _grid(model, shape, height_range_m, _CHECK_NODES, _CHECK_MARGIN)
     fits = []
-    for ridge in RIDGES:
-        fitted = _fit(image, ground, shape, height_range_m, ridge)
-        error_px = np.linalg.norm(fitted.project(check_ground) - check_image, axis=1)
-        error_px[np.isnan(error_px)] = np.inf
-        rms_px = float(np.sqrt(np.mean(error_px**2)))
-        fits.append(RpcFit(fitted, float(error_px.max()), rms_px))
+    for nodes in _GRIDS:
+        image, ground = _grid(model, shape, height_range_m, nodes, _MARGIN)
+        for ridge in RIDGES:
+            fitted = _fit(image, ground, shape, height_range_m, ridge)
+            error_px = np.linalg.norm(fitted.project(check_ground) - check_image, axis=1)
+            error_px[np.isnan(error_px)] = np.inf
+            rms_px = float(np.sqrt(np.mean(error_px**2)))
+            fits.append(RpcFit(fitted, float(error_px.max()), rms_px))
+            if fits[-1].max_error_px < CLOSE_ENOUGH_PX:
+                return fits[-1]
     return min(fits, key=lambda fit: fit.max_error_px)
 
 
@@ -92,29 +104,38 @@ def fit_to_ground(model: RpcModel) -> GroundFit:
     """The rational polynomials from the image to the ground that invert an RPC over its whole range.
 
     A DIMAP file contains them beside the RPC. They are fitted by the method of `fit_rpc` and checked
-    between its nodes.
+    between its nodes, and the first one within `CLOSE_ENOUGH_PX` is returned.
 
     Args:
         model: the RPC, whose offsets and scales also normalise the inverse.
     """
-    positions, ground = _normalised_pairs(model, _NODES, _MARGIN)
     check, _ = _normalised_pairs(model, _CHECK_NODES, _CHECK_MARGIN)
-    expected_px = model.image_offset + check[:, [1, 0]] * model.image_scale
     fits = []
-    for ridge in RIDGES:
-        polynomials = [
-            part for k in range(2) for part in _fit_ratio(cubic_terms(positions), ground[:, k], ridge)
-        ]
-        lon_num, lon_den, lat_num, lat_den = polynomials
-        terms = cubic_terms(check)
-        located = np.column_stack(
-            [terms @ lon_num / (terms @ lon_den), terms @ lat_num / (terms @ lat_den), check[:, 2]]
-        )
-        projected_px = model.project(model.ground_offset + located * model.ground_scale)
-        error_px = np.linalg.norm(projected_px - expected_px, axis=1)
-        worst_px = float(np.nan_to_num(error_px, nan=np.inf).max(initial=0.0)) if len(check) else np.inf
-        fits.append(GroundFit(lon_num, lon_den, lat_num, lat_den, worst_px))
+    for nodes in _GRIDS:
+        positions, ground = _normalised_pairs(model, nodes, _MARGIN)
+        terms = cubic_terms(positions)
+        for ridge in RIDGES:
+            lon_num, lon_den = _fit_ratio(terms, ground[:, 0], ridge)
+            lat_num, lat_den = _fit_ratio(terms, ground[:, 1], ridge)
+            fit = GroundFit(lon_num, lon_den, lat_num, lat_den, np.inf)
+            fits.append(replace(fit, max_error_px=_inverse_error_px(model, fit, check)))
+            if fits[-1].max_error_px < CLOSE_ENOUGH_PX:
+                return fits[-1]
     return min(fits, key=lambda fit: fit.max_error_px)
+
+
+def _inverse_error_px(model: RpcModel, fit: GroundFit, check: Array) -> float:
+    """Largest distance of normalised positions (n, 3) from the projections of their ground."""
+    if not len(check):
+        return np.inf
+    terms = cubic_terms(check)
+    lon = terms @ fit.lon_num / (terms @ fit.lon_den)
+    lat = terms @ fit.lat_num / (terms @ fit.lat_den)
+    located = np.column_stack([lon, lat, check[:, 2]])
+    projected_px = model.project(model.ground_offset + located * model.ground_scale)
+    expected_px = model.image_offset + check[:, [1, 0]] * model.image_scale
+    error_px = np.linalg.norm(projected_px - expected_px, axis=1)
+    return float(np.nan_to_num(error_px, nan=np.inf).max())
 
 
 def _normalised_pairs(
@@ -206,4 +227,6 @@ def _fit_ratio(terms: Array, value: Array, ridge: float) -> tuple[Array, Array]:
         stacked = np.vstack([weight[:, None] * design, damping])
         step = np.linalg.lstsq(stacked, np.concatenate([misfit, np.zeros(39)]), rcond=None)[0]
         coefficients = coefficients + step
+        if np.abs(step).max() < _CONVERGED:
+            break
     return coefficients[:20], np.concatenate([[1.0], coefficients[20:]])

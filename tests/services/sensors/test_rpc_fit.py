@@ -1,5 +1,7 @@
 """An RPC fits a smooth model within a hundredth of a pixel, and its stated error is honest otherwise."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,37 @@ def test_a_full_affine_is_refitted_within_a_hundredth_of_a_pixel() -> None:
     assert error_px(corrected, fit.model, shape).max() < a_hundredth_of_a_pixel
 
 
+@dataclass
+class CountingModel:
+    """A sensor model that counts the positions it located for every grid."""
+
+    base: CorrectedModel
+    located: list[int] = field(default_factory=list)
+
+    def locate(self, line_sample: np.ndarray, height_m: np.ndarray) -> np.ndarray:
+        self.located.append(len(line_sample))
+        return self.base.locate(line_sample, height_m)
+
+
+def test_an_affine_is_refitted_on_few_points_and_a_jitter_on_more() -> None:
+    shape = (40_000, 2000)
+    affine = ImageCorrection(np.array([[9.0, 1.0, -2.0], [5.0, 1.5, 4.0]]), *_frame(shape))
+    points_of_fits = {}
+    for jitter_px in (0.0, 3.0):
+        rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
+        base = rpc if jitter_px == 0.0 else a_pushbroom(shape, jitter_px)
+        model = CountingModel(CorrectedModel(base, affine))
+        fit_rpc(model, shape, HEIGHTS_M)
+        check_points = max(model.located)
+        points_of_fits[jitter_px] = [n for n in model.located if n < check_points]
+    assert points_of_fits == {0.0: [256], 3.0: [256, 2048]}
+
+
+def _frame(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    plain = no_correction(shape)
+    return plain.centre, plain.half_size
+
+
 def test_a_refitted_drift_agrees_with_the_folded_one() -> None:
     shape = (3000, 3000)
     rpc = fit_rpc(a_pushbroom(shape), shape, HEIGHTS_M).model
@@ -83,7 +116,7 @@ def test_a_refitted_drift_agrees_with_the_folded_one() -> None:
 
 
 def test_a_model_that_does_not_cover_the_heights_is_refused_with_numbers() -> None:
-    with pytest.raises(CoverageError, match=r"only \d+ of 2048 positions"):
+    with pytest.raises(CoverageError, match=r"only \d+ of 9583 positions"):
         fit_rpc(a_pushbroom((300, 400)), (300, 400), (-6.4e6, 100.0))
 
 
