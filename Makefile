@@ -42,7 +42,7 @@ bench-load: postgis
 	$(BIN)/python -m benchmarks.load --clients 64 --seconds 60
 
 bench-faults: postgis
-	$(BIN)/python -m benchmarks.faults --registrations 50 --ingestions 20
+	$(BIN)/python -m benchmarks.faults
 
 bench-registration: $(READY)
 	$(BIN)/python -m benchmarks.stress

@@ -77,12 +77,14 @@ class KilledInstallation:
         kill_every_s: from the moment the service is ready again to the next kill, in the mean;
             exponentially distributed.
         killed: how often each kind of process was.
+        finished_backups: folders of the backups whose command reported success.
     """
 
     folder: Path
     rng: random.Random
     kill_every_s: float
     killed: "Counter[str]" = field(default_factory=Counter)
+    finished_backups: list[Path] = field(default_factory=list)
     _services: dict[str, Service] = field(default_factory=dict)
     _threads: list[threading.Thread] = field(default_factory=list)
     _stop: threading.Event = field(default_factory=threading.Event)
@@ -169,6 +171,32 @@ class KilledInstallation:
     def stop_killing(self) -> None:
         """Stop killing processes."""
         self._quiet.set()
+
+    @property
+    def backups(self) -> Path:
+        """Folder of the backups."""
+        return self.folder.with_name("backups")
+
+    def back_up(self, name: str, kill_after_s: float, is_killed: bool) -> None:
+        """Make a backup; one that is killed on the way must not look whole."""
+        self.backups.mkdir(exist_ok=True)
+        command = [sys.executable, "-m", "app.cli.main", "db", "backup", str(self.backups / name)]
+        with self.log.open("ab") as output:
+            process = subprocess.Popen(
+                command,
+                env=self._services["api"].environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+            )
+        try:
+            process.wait(kill_after_s if is_killed else PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            self.killed["backup"] += 1
+        if process.returncode == 0:
+            self.finished_backups.append(self.backups / name)
 
     @contextmanager
     def inside(self) -> Iterator[psycopg.Connection[dict[str, object]]]:
