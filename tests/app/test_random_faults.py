@@ -8,7 +8,7 @@ from benchmarks.faults import Work, run
 
 pytestmark = pytest.mark.long
 
-WORK = Work(registrations=5, ingestions=2, uploads=3, exports=2, backups=2)
+WORK = Work(registrations=4, ingestions=2, uploads=2, exports=1, backups=2)
 KILL_EVERY_S = 2.0
 SEED = 7
 
