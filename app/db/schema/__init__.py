@@ -20,6 +20,7 @@ from app.db.schema.base import (
     now,
     uptime_s,
 )
+from app.db.schema.integrity import damaged_file, result_file
 from app.db.schema.jobs import job, job_message, scene, upload
 from app.db.schema.points import block, chip_file, density_cell, image, point, view
 from app.db.schema.registrations import (
@@ -42,6 +43,7 @@ __all__ = [
     "block",
     "chip_file",
     "clock",
+    "damaged_file",
     "density_cell",
     "hours",
     "image",
@@ -56,6 +58,7 @@ __all__ = [
     "reference_image",
     "reference_point",
     "registration",
+    "result_file",
     "scene",
     "token",
     "upload",

@@ -11,6 +11,7 @@ from sqlalchemy import (
     Identity,
     Index,
     Integer,
+    LargeBinary,
     SmallInteger,
     Table,
     Text,
@@ -92,6 +93,8 @@ chip_file = Table(
     Column("storage_key", Text, nullable=False),
     Column("dtype", Text, nullable=False),
     Column("n_chips", BigInteger, nullable=False),
+    # Four bytes for each chip; null: ingested by an earlier version and not verified since.
+    Column("chip_checksums", LargeBinary),
     UniqueConstraint("block_number", "name"),
     one_of("dtype", Literal["uint8", "uint16"]),
     Index("chip_file_key", "storage_key"),

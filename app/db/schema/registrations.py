@@ -112,6 +112,8 @@ reference_image = Table(
     Column("gsd_m", Double, nullable=False),
     Column("footprint", Polygon, nullable=False),
     Column("created_at", Timestamp, nullable=False, server_default=now),
+    # Path to SHA-256 of each of its files; null: added by an earlier version and not verified since.
+    Column("checksums", Json),
     CheckConstraint("sigma_m > 0", name="sigma_m"),
     CheckConstraint("gsd_m > 0", name="gsd_m"),
 )
