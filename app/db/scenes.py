@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import JSON, cast, delete, exists, func, insert, literal, select, update
+from sqlalchemy import JSON, Text, cast, delete, exists, func, insert, literal, select, update
 from sqlalchemy.dialects.postgresql import JSONB
 
 from app.db.engine import Connection
@@ -107,6 +107,15 @@ def add_model(connection: Connection, scene_id: UUID, name: str, size_bytes: int
         .values(models=scene.c.models.concat(file))
     )
     return updated.rowcount == 1
+
+
+def drop_model(connection: Connection, scene_id: UUID, name: str) -> None:
+    """Delete the record of a file beside the image, if there is one."""
+    connection.execute(
+        update(scene)
+        .where(scene.c.id == scene_id, scene.c.models.has_key(name))
+        .values(models=scene.c.models.op("-")(cast(name, Text)))
+    )
 
 
 def finish_upload(

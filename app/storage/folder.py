@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkstemp
 from typing import BinaryIO, Protocol
+from uuid import uuid4
 
 from app.errors import InputError, NotFound, TooLarge
 
@@ -125,12 +126,26 @@ class Storage:
                 self._place(writing.finish(), key)
         return StoredFile(key, writing.size_bytes, writing.sha256)
 
-    def adopt(self, path: Path, key: str) -> None:
-        """Move a file of `scratch` to a key."""
+    def link(self, path: Path, key: str) -> None:
+        """Store a file of `scratch` under a key too; the file stays in `scratch`.
+
+        Both names share the bytes where the file system has hard links; elsewhere the bytes are copied.
+        """
         self._locate(key)
         with path.open("rb") as file:
             os.fsync(file.fileno())
-        self._place(path, key)
+        second_name = self.scratch() / f"link-{uuid4().hex}"
+        try:
+            try:
+                os.link(path, second_name)
+            except OSError:
+                shutil.copyfile(path, second_name)
+                with second_name.open("rb") as file:
+                    os.fsync(file.fileno())
+            self._place(second_name, key)
+        finally:
+            # A rename between two names of one file does nothing.
+            second_name.unlink(missing_ok=True)
 
     def scratch(self) -> Path:
         """A folder for unfinished files, on the file system of the storage if it is a folder.

@@ -3,7 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
@@ -15,7 +15,7 @@ from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge
-from app.storage import Storage, StoredFile
+from app.storage import Storage, StoredFile, Writing
 from app.usecases import quotas
 from app.usecases.installation import Installation
 from app.usecases.server_files import file_below
@@ -83,7 +83,8 @@ def upload_scene(
         )
     key = f"{folder_of(scene_id)}/{file_name}"
     try:
-        image = _receive(storage, key, sent, _images_only(sent.chunks), min(left, limit))
+        with _receiving(storage, key, sent, _images_only(sent.chunks), min(left, limit)) as image:
+            pass
         with database.transaction() as connection:
             row = scenes.finish_upload(connection, scene_id, key, image.size_bytes, image.sha256)
         if row is None:
@@ -94,9 +95,12 @@ def upload_scene(
     except BaseException:
         with database.transaction() as connection:
             scenes.give_up_upload(connection, scene_id)
-        # After an outage of the storage, garbage collection deletes what is left.
-        with suppress(StorageOutage):
-            storage.delete(key)
+            is_stored = scenes.find_scene(connection, scene_id) is not None
+        # A commit whose confirmation was lost has stored the scene: its image must stay. After an
+        # outage of the storage, garbage collection deletes what is left.
+        if not is_stored:
+            with suppress(StorageOutage):
+                storage.delete(key)
         raise
 
 
@@ -105,23 +109,38 @@ def upload_side_file(
 ) -> StoredFile:
     """Store a file beside the image of a scene; it replaces a file of the same name.
 
+    A row never describes other bytes than the storage has: the record of the former file is deleted
+    first. After a failure there is no such file, or the former one, until the request is repeated.
+
     Raises:
         NotFound: there is no such scene, or the caller may not see it.
         Conflict: the scene's files were removed, or lie on the server.
         InputError: files of this kind do not belong beside an image.
         TooLarge: the file exceeds the limit or the caller's quota.
     """
-    settings = installation.settings
-    with installation.database.transaction() as connection:
+    settings, database = installation.settings, installation.database
+    with database.transaction() as connection:
         file_name = side_file_name(visible_scene(connection, caller, scene_id), sent.name)
         limit = side_file_limit(settings, file_name)
         _refuse_too_large(sent, limit)
         left = quotas.upload_allowance(connection, settings, caller, sent.size_bytes)
     key = f"{folder_of(scene_id)}/{file_name}"
-    stored = _receive(installation.storage, key, sent, sent.chunks, min(limit, left))
-    with installation.database.transaction() as connection:
-        record_side_file(connection, scene_id, file_name, stored.size_bytes, stored.sha256)
-    return stored
+    with (
+        _receiving(installation.storage, key, sent, sent.chunks, min(limit, left)) as writing,
+        database.transaction() as connection,
+    ):
+        scenes.drop_model(connection, scene_id, file_name)
+    try:
+        with database.transaction() as connection:
+            record_side_file(connection, scene_id, file_name, writing.size_bytes, writing.sha256)
+    except BaseException:
+        with database.transaction() as connection:
+            scene = scenes.find_scene(connection, scene_id)
+        if scene is None or file_name not in scene.models:
+            with suppress(StorageOutage):
+                installation.storage.delete(key)
+        raise
+    return StoredFile(key, writing.size_bytes, writing.sha256)
 
 
 def side_file_limit(settings: Settings, file_name: str) -> int:
@@ -306,10 +325,11 @@ def _refuse_too_large(sent: SentFile, limit_bytes: int) -> None:
         raise TooLarge(f"{sent.size_bytes} bytes announced, at most {limit_bytes} accepted")
 
 
-def _receive(
+@contextmanager
+def _receiving(
     storage: Storage, key: str, sent: SentFile, chunks: Iterable[bytes], limit_bytes: int
-) -> StoredFile:
-    """Store a file if its size and checksum are as announced, else nothing."""
+) -> Iterator[Writing]:
+    """Receive a file and check size and checksum; it gets its key at the end of the context."""
     with storage.writing(key, limit_bytes) as writing:
         for chunk in chunks:
             writing.write(chunk)
@@ -317,7 +337,7 @@ def _receive(
             raise InputError(f"{sent.size_bytes} bytes announced, {writing.size_bytes} received")
         if sent.sha256 not in (None, writing.sha256):
             raise InputError(f"sha256 {sent.sha256} announced, {writing.sha256} received")
-    return StoredFile(key, writing.size_bytes, writing.sha256)
+        yield writing
 
 
 def _images_only(chunks: Iterable[bytes]) -> Iterator[bytes]:

@@ -177,9 +177,11 @@ def received_bytes(storage: Storage, upload: UploadRow) -> int:
 
 
 def append_piece(installation: Installation, upload: UploadRow, piece: Piece) -> int:
-    """Append a piece to an upload; the last piece completes it and moves the file to its place.
+    """Append a piece to an upload; the last piece completes it and stores the file.
 
-    When the connection breaks, the bytes that arrived stay, unless the piece has a checksum.
+    When the connection breaks, the bytes that arrived stay, unless the piece has a checksum. The bytes
+    stay too until the transaction that completes the upload is committed: after a failure, an empty
+    piece at the end of the file completes it again.
 
     Returns:
         The number of bytes of the file that have arrived.
@@ -291,7 +293,10 @@ def _append(file: IO[bytes], piece: Piece, size_bytes: int) -> None:
 
 
 def _complete(installation: Installation, upload: UploadRow, path: Path) -> None:
-    """Move a complete file to its place in the storage, or delete it and raise the reason."""
+    """Store a complete file and delete it from the scratch folder; delete it too if it cannot be used.
+
+    The file in the scratch folder is deleted after the commit. Until then every step can be repeated.
+    """
     database, storage = installation.database, installation.storage
     try:
         with path.open("rb") as file:
@@ -302,7 +307,9 @@ def _complete(installation: Installation, upload: UploadRow, path: Path) -> None
             _complete_image(installation, upload, path, sha256)
         elif upload.purpose == "model":
             assert upload.scene_id is not None
-            storage.adopt(path, f"{folder_of(upload.scene_id)}/{upload.file_name}")
+            with database.transaction() as connection:
+                scenes.drop_model(connection, upload.scene_id, upload.file_name)
+            storage.link(path, f"{folder_of(upload.scene_id)}/{upload.file_name}")
             with database.transaction() as connection:
                 record_side_file(
                     connection, upload.scene_id, upload.file_name, upload.size_bytes, sha256
@@ -310,7 +317,7 @@ def _complete(installation: Installation, upload: UploadRow, path: Path) -> None
                 uploads.finish(connection, upload.id)
         else:
             key = block_key(upload)
-            storage.adopt(path, key)
+            storage.link(path, key)
             with database.transaction() as connection:
                 uploads.finish(connection, upload.id, key)
     except AmersError:
@@ -318,6 +325,7 @@ def _complete(installation: Installation, upload: UploadRow, path: Path) -> None
             _delete_row(connection, upload)
         path.unlink(missing_ok=True)
         raise
+    path.unlink(missing_ok=True)
 
 
 def _delete_row(connection: Connection, upload: UploadRow) -> None:
@@ -328,7 +336,7 @@ def _delete_row(connection: Connection, upload: UploadRow) -> None:
 
 
 def _complete_image(installation: Installation, upload: UploadRow, path: Path, sha256: str) -> None:
-    """Move an image, or the image and the models of an archive, into the folder of the scene."""
+    """Store an image, or the image and the models of an archive, in the folder of the scene."""
     assert upload.scene_id is not None
     storage = installation.storage
     with path.open("rb") as file:
@@ -351,7 +359,7 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
         ]
         for source in [*models, image]:
             file_name = name if source == path else source.name
-            storage.adopt(source, f"{folder_of(upload.scene_id)}/{file_name}")
+            storage.link(source, f"{folder_of(upload.scene_id)}/{file_name}")
     key = f"{folder_of(upload.scene_id)}/{name}"
     with installation.database.transaction() as connection:
         if scenes.finish_upload(connection, upload.scene_id, key, size_bytes, sha256) is None:
@@ -359,7 +367,6 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
         for model in model_files:
             record_side_file(connection, upload.scene_id, *model)
         uploads.finish(connection, upload.id)
-    path.unlink(missing_ok=True)
 
 
 def _unpack(archive: Path, folder: Path, settings: Settings) -> tuple[Path, list[Path]]:

@@ -81,12 +81,12 @@ def test_a_file_that_is_not_in_the_bucket_is_not_found(storage: Storage, tmp_pat
         storage.put("../up", [b"x"])
 
 
-def test_a_file_of_the_scratch_folder_is_taken_over(storage: Storage):
+def test_a_file_of_the_scratch_folder_is_stored_and_stays_there(storage: Storage):
     path = storage.scratch() / "arrived"
     path.write_bytes(b"II*")
-    storage.adopt(path, "scenes/c/a.tif")
+    storage.link(path, "scenes/c/a.tif")
     assert storage.size("scenes/c/a.tif") == 3
-    assert unfinished(storage) == []
+    assert unfinished(storage) == [path]
 
 
 def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path):
