@@ -46,6 +46,7 @@ class Settings(BaseSettings):
         ingest_folder: block folders below it can be ingested through the API; None allows none.
         quota_upload_bytes: largest total size of the uploads of one token in the storage.
         quota_jobs: largest number of open jobs of one token.
+        jobs_running_per_owner: largest number of running jobs of one token; None: no limit.
         public_metrics: whether metrics can be read without a token.
         cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*` for all.
         oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
@@ -78,6 +79,7 @@ class Settings(BaseSettings):
     ingest_folder: Path | None = None
     quota_upload_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
     quota_jobs: int = Field(default=100, ge=0)
+    jobs_running_per_owner: int | None = Field(default=None, ge=1)
     public_metrics: bool = False
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
     oidc_issuer: str | None = None

@@ -86,8 +86,8 @@ def show_job(*, job_id: JobId, request: Request, database: DatabaseDep, caller: 
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
         status = status_info(request, job)
-        status.queue_position = jobs.queue_position(connection, job)
-        status.estimated_end = jobs.expected_end(connection, job)
+        outlook = jobs.outlook(connection, job)
+        status.queue_position, status.estimated_end = outlook.position, outlook.expected_end
     return status
 
 
@@ -143,5 +143,6 @@ def status_info(request: Request, job: Job) -> StatusInfo:
         finished=job.finished_at,
         updated=job.updated_at,
         error=JobError.model_validate(job.error) if job.error else None,
+        priority=job.priority or None,
         links=links,
     )

@@ -33,6 +33,7 @@ CONFORMS_TO = tuple(
 EXECUTE = "http://www.opengis.net/def/rel/ogc/1.0/execute"
 QUALIFIED_VALUE = {"value", "mediaType", "encoding", "schema", "format"}
 """Members of an input that gives its value together with a description of it."""
+HIGHEST_PRIORITY = 100
 SCENES = ("scenes/", "collections/scenes/items/")
 
 
@@ -48,7 +49,7 @@ class RequestedOutput(BaseModel):
 class Execute(BaseModel):
     """The body of an execution."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     inputs: dict[str, Any] = Field(default_factory=dict, description="Inputs of the process, by name.")
     outputs: dict[str, RequestedOutput] | None = Field(
@@ -58,6 +59,13 @@ class Execute(BaseModel):
     )
     response: Literal["document", "raw"] = Field(
         default="document", description="Whether the results are one document or the outputs themselves."
+    )
+    priority: int = Field(
+        default=0,
+        alias="amers:priority",
+        ge=-HIGHEST_PRIORITY,
+        le=HIGHEST_PRIORITY,
+        description="Jobs of a higher priority come first; only administrators may give another than 0.",
     )
 
 
@@ -128,7 +136,7 @@ def execute(
     outputs = None
     if body.outputs is not None:
         outputs = {name: output.transmission_mode for name, output in body.outputs.items()}
-    job_request = JobRequest(process_id, inputs, outputs, body.response)
+    job_request = JobRequest(process_id, inputs, outputs, body.response, body.priority)
     with installation.database.transaction() as connection:
         job = jobs.execute(connection, installation.settings, caller, job_request, idempotency_key)
     response.headers["Location"] = job_url(request, job)

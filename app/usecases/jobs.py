@@ -5,21 +5,20 @@ import re
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
 
 from psycopg import OperationalError
 
-from app.auth import may_access, owner_filter, require
+from app.auth import Scope, may_access, owner_filter, require
 from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
 from app.db.jobs import progress as job_progress
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job, JobFilter
-from app.db.jobs.progress import JobMessage
+from app.db.jobs.progress import JobMessage, Outlook
 from app.db.schema import JobResponse
 from app.db.tokens import Token
 from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
@@ -50,12 +49,14 @@ class JobRequest:
         inputs: as sent, not yet checked.
         outputs: name of each requested output, to `value` or `reference`; None requests all of them.
         response: how the results are sent: in a document, or as they are.
+        priority: of the job in the queue; only administrators may give another one than 0.
     """
 
     process_id: str
     inputs: dict[str, Any]
     outputs: Mapping[str, str] | None = None
     response: JobResponse = "document"
+    priority: int = 0
 
 
 def find_process(process_id: str) -> Process:
@@ -81,7 +82,7 @@ def execute(
 
     Raises:
         NotFound: no such process, or an input that does not exist for this caller.
-        NotAllowed: the caller's token lacks the scope.
+        NotAllowed: the caller's token lacks the scope of the process, or of a priority.
         TooMany: the caller has as many open jobs as the quota allows.
         InputError: unusable inputs or outputs, or the key was used with another request.
     """
@@ -91,10 +92,13 @@ def execute(
         raise InputError(
             f"idempotency key: {len(idempotency_key)} characters found, 1 to {LONGEST_KEY} expected"
         )
+    if request.priority:
+        require(caller, Scope.ADMIN)
     parsed = process.parse_inputs(request.inputs)
     process.check_outputs(request.outputs or {})
     outputs = None if request.outputs is None else dict(request.outputs)
-    checked = JobRequest(process.id, process.format_inputs(parsed), outputs, request.response)
+    inputs = process.format_inputs(parsed)
+    checked = JobRequest(process.id, inputs, outputs, request.response, request.priority)
     if idempotency_key is not None:
         earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
         if earlier is not None:
@@ -109,6 +113,7 @@ def execute(
         idempotency_key=idempotency_key,
         outputs=outputs,
         response=checked.response,
+        priority=checked.priority,
     )
     if job is not None:
         return job
@@ -121,7 +126,7 @@ def execute(
 
 def _same_request(job: Job, request: JobRequest) -> Job:
     """The job of an idempotency key, if it was created by the same request."""
-    if JobRequest(job.kind, job.inputs, job.outputs, job.response) != request:
+    if JobRequest(job.kind, job.inputs, job.outputs, job.response, job.priority) != request:
         raise InputError(
             f"idempotency key: job {job.id} was created with this key by a different request; "
             "send a new key"
@@ -154,14 +159,9 @@ def list_jobs(
     return jobs.newest(connection, owner_filter(caller), wanted, limit, after)
 
 
-def queue_position(connection: Connection, job: Job) -> int | None:
-    """The position of a waiting job in the queue, 1 for the next one; None when it does not wait."""
-    return job_progress.position(connection, job) if job.state == "accepted" else None
-
-
-def expected_end(connection: Connection, job: Job) -> datetime | None:
-    """The expected end of an open job, from the durations of earlier jobs; None when unknown."""
-    return job_progress.expected_end(connection, job)
+def outlook(connection: Connection, job: Job) -> Outlook:
+    """The place of a job in the queue, and its expected end."""
+    return job_progress.outlook(connection, job.id)
 
 
 def read_messages(connection: Connection, caller: Token, job_id: UUID) -> list[JobMessage]:

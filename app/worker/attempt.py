@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from uuid import UUID
 
 from psycopg import OperationalError
 
@@ -73,17 +72,21 @@ class Attempts:
     worker: str
     should_stop: Callable[[], bool]
 
-    def do_job(self, job_id: UUID) -> None:
-        """Claim a job and do one attempt at it; does nothing when the job cannot be claimed."""
-        with working_for(Origin(actor_name=f"worker {self.worker}", job_id=job_id)):
-            self._do_job(job_id)
-
-    def _do_job(self, job_id: UUID) -> None:
+    def do_next_job(self) -> None:
+        """Claim the next job and do one attempt at it; does nothing when no job may be claimed."""
         with self.database.transaction() as connection:
-            job = attempts.claim(connection, job_id, self.worker, self.settings.lease_seconds)
+            job = attempts.claim_next(
+                connection,
+                self.worker,
+                self.settings.lease_seconds,
+                self.settings.jobs_running_per_owner,
+            )
         if job is None:
-            log.info("job %s cannot be claimed: it has ended, or another worker has it", job_id)
             return
+        with working_for(Origin(actor_name=f"worker {self.worker}", job_id=job.id)):
+            self._do_job(job)
+
+    def _do_job(self, job: Job) -> None:
         log.info("job %s: attempt %d at %s", job.id, job.attempt, job.kind)
         try:
             self._supervise(job)

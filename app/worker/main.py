@@ -1,4 +1,4 @@
-"""A worker: takes job ids from the queue and does these jobs, one after the other, until a signal."""
+"""A worker: does the next job for each ticket that it takes from the queue, until a signal."""
 
 import asyncio
 import logging
@@ -9,7 +9,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from uuid import UUID
 
 import procrastinate
 import psycopg
@@ -24,7 +23,7 @@ from app.worker.sweep import Sweeper
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0
-"""Longest time until a delayed entry of the queue is found; new entries notify the workers."""
+"""Longest time until a delayed ticket is found; new tickets notify the workers."""
 PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
 
@@ -93,8 +92,8 @@ class _Worker:
         attempts = Attempts(self.database, self.settings, self.name, self.stop.is_set)
 
         @app.task(name=queue.TASK, queue=queue.QUEUE)
-        def do_job(job_id: str) -> None:
-            attempts.do_job(UUID(job_id))
+        def do_next_job() -> None:
+            attempts.do_next_job()
 
         async with app.open_async():
             log.info("worker %s waits for jobs", self.name)

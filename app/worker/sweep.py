@@ -53,7 +53,9 @@ class Sweeper:
         next_files_at = time.monotonic()
         while not self.stop.wait(self.settings.lease_seconds / 3.0):
             try:
-                sweep_jobs(self.database, self.settings.lease_seconds)
+                sweep_jobs(
+                    self.database, self.settings.lease_seconds, self.settings.jobs_running_per_owner
+                )
                 if time.monotonic() > next_files_at:
                     next_files_at += FILES_EVERY_S
                     sweep_results(self.database, self.settings.result_days)
@@ -64,16 +66,16 @@ class Sweeper:
                 log.exception("the sweep failed and is repeated")
 
 
-def sweep_jobs(database: Database, lease_s: float) -> None:
-    """Take the jobs of dead workers back, and put jobs that the queue has lost into it again."""
+def sweep_jobs(database: Database, lease_s: float, running_limit: int | None = None) -> None:
+    """Take the jobs of dead workers back, and issue tickets for jobs that wait without one."""
     with database.transaction() as connection:
         if not queue.may_sweep(connection):
             return
         for job_id in attempts.take_back(connection, FAILURES_ALLOWED):
             log.warning("job %s: taken back from a worker whose lease expired", job_id)
-        for job_id in queue.enqueue_forgotten(connection, lease_s):
-            log.warning("job %s: was missing in the queue and is queued again", job_id)
         queue.forget_dead_entries(connection, SILENT_WORKER_S)
+        if issued := queue.replace_lost_tickets(connection, lease_s, running_limit):
+            log.warning("%d tickets of the queue were lost and are issued again", issued)
 
 
 def sweep_results(database: Database, result_days: float | None) -> None:

@@ -15,13 +15,13 @@ from fastapi.testclient import TestClient
 from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
-from app.db.jobs import attempts
 from app.main import create_app
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.jobs import do_attempt
 from app.usecases.tokens import create_token
 from tests.app.flat_world import SIGMA_M, FlatWorld
+from tests.app.job_queue import claim
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -103,7 +103,7 @@ class Installation:
         """The job that a reply names, after one attempt at it by the code of the worker process."""
         job_id = UUID(reply.json()["jobID"])
         with self.database.transaction() as connection:
-            job = attempts.claim(connection, job_id, "a worker", 60.0)
+            job = claim(connection, job_id, "a worker", 60.0)
         assert job is not None
         do_attempt(self.database, self.settings, job_id, job.attempt)
         job_reply = self.client.get(f"/jobs/{job_id}", headers=self.headers["admin"])

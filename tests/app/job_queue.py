@@ -18,10 +18,22 @@ def new_job(database: Database) -> Job:
     return job
 
 
+def claim(
+    connection: Connection, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S
+) -> Job | None:
+    """The job, claimed by a worker before all others; None when no job waits."""
+    run_sql(
+        connection, "update job set priority = 100 where id = %s and state = 'accepted'", [str(job_id)]
+    )
+    job = attempts.claim_next(connection, worker, lease_s)
+    assert job is None or job.id == job_id
+    return job
+
+
 def claimed(database: Database, job_id: UUID, worker: str = "w", lease_s: float = LEASE_S) -> Job:
     """The job, claimed by a worker."""
     with database.transaction() as connection:
-        job = attempts.claim(connection, job_id, worker, lease_s)
+        job = claim(connection, job_id, worker, lease_s)
     assert job is not None
     return job
 
@@ -44,12 +56,10 @@ def let_lease_lapse(database: Database, job_id: UUID) -> None:
         )
 
 
-def queue_entries(connection: Connection, job_id: UUID) -> int:
-    """The number of waiting queue entries of a job."""
+def tickets(connection: Connection) -> int:
+    """The number of tickets that workers may take, now or later."""
     row = run_sql(
-        connection,
-        "select count(*) as n from procrastinate_jobs where status = 'todo' and args ->> 'job_id' = %s",
-        [str(job_id)],
+        connection, "select count(*) as n from procrastinate_jobs where status = 'todo'"
     ).fetchone()
     assert row is not None
     return int(row["n"])

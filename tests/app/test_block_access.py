@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from app.cli.main import app as commands
 from app.db import engine
-from app.db.jobs import attempts
 from app.errors import InputError
 from app.main import create_app
 from app.usecases.blocks import lifecycle
 from app.usecases.jobs import do_attempt
+from tests.app.job_queue import claim
 from tests.factories import BOX, make_block
 
 
@@ -30,7 +30,7 @@ def ingested_by_job(client, settings, admin, body: dict) -> dict:
     ingesting = settings.model_copy(update={"ingest_folder": client.app.state.settings.ingest_folder})
     with engine.opened(ingesting) as database:
         with database.transaction() as connection:
-            job = attempts.claim(connection, job_id, "a worker", 30.0)
+            job = claim(connection, job_id, "a worker", 30.0)
         do_attempt(database, ingesting, job_id, job.attempt)
     return client.get(f"/jobs/{job_id}", headers=admin).json()
 

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 
 from app.db import engine
 from app.db import points as point_store
-from app.db.jobs import attempts
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
@@ -20,7 +19,7 @@ from app.usecases.processes import Work
 from services.formats.block.check import check_block
 from services.formats.block.document import rectangle
 from services.types import point_chips
-from tests.app.job_queue import new_job
+from tests.app.job_queue import claim, new_job
 from tests.factories import BOX, make_block
 from tests.statements import run_sql
 
@@ -158,7 +157,7 @@ def test_a_block_is_exported_by_a_job_as_an_archive(
     job_id = UUID(response.json()["jobID"])
     with engine.opened(settings) as database:
         with database.transaction() as own:
-            job = attempts.claim(own, job_id, "a worker", 30.0)
+            job = claim(own, job_id, "a worker", 30.0)
         do_attempt(database, settings, job_id, job.attempt)
     reply = client.get(f"/jobs/{job_id}/results/block.zip", headers=reader)
     assert reply.status_code == 200, reply.text

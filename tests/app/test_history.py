@@ -33,6 +33,7 @@ from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.types import health
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world
+from tests.app.job_queue import claim
 from tests.statements import run_sql
 
 VANISHED = 5
@@ -197,7 +198,7 @@ def test_an_attempt_that_has_lost_its_job_counts_nothing(
     job = jobs.create(connection, "register-scene", {})
     assert job is not None
     for attempt in (1, 2):
-        assert attempts.claim(connection, job.id, "a worker", 30.0)
+        assert claim(connection, job.id, "a worker", 30.0)
         if attempt == 1:
             attempts.try_again(connection, job.id, 1, 0.0)
     connection.commit()

@@ -15,17 +15,17 @@ from app.db.jobs.jobs import Job
 from app.storage import Storage
 from app.worker.attempt import FAILURES_ALLOWED
 from app.worker.sweep import sweep_files, sweep_jobs
-from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, queue_entries, state_of
+from tests.app.job_queue import LEASE_S, claimed, let_lease_lapse, new_job, state_of, tickets
 from tests.statements import run_sql
 
 
 def test_a_job_is_claimed_by_one_worker_only(database: Database):
-    job = new_job(database)
+    new_job(database)
     with ThreadPoolExecutor(6) as threads:
 
         def try_it(worker: int) -> Job | None:
             with database.transaction() as connection:
-                return attempts.claim(connection, job.id, f"w{worker}", LEASE_S)
+                return attempts.claim_next(connection, f"w{worker}", LEASE_S)
 
         got = [one for one in threads.map(try_it, range(6)) if one is not None]
     assert [one.attempt for one in got] == [1]
@@ -106,18 +106,22 @@ def test_a_lease_that_is_renewed_is_not_taken_back(database: Database):
     assert state_of(database, job.id).state == "running"
 
 
-def test_a_job_that_the_queue_has_lost_is_put_back_into_it(database: Database):
-    lost, queued = new_job(database), new_job(database)
+def test_a_ticket_that_the_queue_has_lost_is_issued_again_once(database: Database):
+    for _ in range(2):
+        new_job(database)
     with database.transaction() as connection:
         run_sql(
-            connection, "delete from procrastinate_jobs where args ->> 'job_id' = %s", [str(lost.id)]
+            connection,
+            "delete from procrastinate_jobs where id in (select min(id) from procrastinate_jobs)",
         )
-        run_sql(connection, "update job set updated_at = now() - interval '1 hour'")
-    sweep_jobs(database, LEASE_S)
     sweep_jobs(database, LEASE_S)
     with database.transaction() as connection:
-        assert queue_entries(connection, lost.id) == 1
-        assert queue_entries(connection, queued.id) == 1
+        assert tickets(connection) == 1, "the worker that has just taken it may be about to claim"
+        run_sql(connection, "update job set updated_at = now() - interval '1 hour'")
+    for _ in range(2):
+        sweep_jobs(database, LEASE_S)
+    with database.transaction() as connection:
+        assert tickets(connection) == 2
 
 
 def test_entries_of_the_queue_that_died_with_their_worker_are_forgotten(database: Database):

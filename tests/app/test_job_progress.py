@@ -1,6 +1,5 @@
 """Progress of jobs: messages, the expected end, and the removal of old results."""
 
-from dataclasses import replace
 from datetime import datetime, timedelta
 from uuid import UUID, uuid4
 
@@ -10,8 +9,10 @@ from app.db.audit import list_changes
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs, progress
 from app.db.jobs.jobs import Job, JobFilter
+from app.db.jobs.progress import Outlook
 from app.storage import Storage
 from app.worker.sweep import sweep_files, sweep_results
+from tests.app.job_queue import claim
 from tests.statements import run_sql
 
 LEASE_S = 30.0
@@ -28,7 +29,7 @@ def asked(connection: Connection, kind: str = "register-scene") -> Job:
 
 
 def begun(connection: Connection, kind: str = "register-scene") -> Job:
-    job = attempts.claim(connection, asked(connection, kind).id, "w", LEASE_S)
+    job = claim(connection, asked(connection, kind).id, "w", LEASE_S)
     assert job is not None
     return job
 
@@ -47,7 +48,7 @@ def done_in(connection: Connection, seconds: float, kind: str = "register-scene"
 
 def wait_of(connection: Connection, job: Job) -> timedelta:
     """Time from now to the expected end of a job."""
-    end = progress.expected_end(connection, job)
+    end = progress.outlook(connection, job.id).expected_end
     now = run_sql(connection, "select clock_timestamp() as now").fetchone()
     assert end is not None
     assert now is not None
@@ -57,12 +58,12 @@ def wait_of(connection: Connection, job: Job) -> timedelta:
 
 def test_a_job_keeps_its_messages(connection: Connection):
     job = asked(connection)
-    first = attempts.claim(connection, job.id, "w", LEASE_S)
+    first = claim(connection, job.id, "w", LEASE_S)
     assert first is not None
     attempts.report(connection, job.id, 1, 10, "looking for points")
     attempts.report(connection, job.id, 1, 20, "looking for points")
     attempts.try_again(connection, job.id, 1, 0.0)
-    attempts.claim(connection, job.id, "w", LEASE_S)
+    claim(connection, job.id, "w", LEASE_S)
     attempts.fail(connection, job.id, 2, {"title": "Not enough points", "detail": "3 found"})
     messages = progress.read_messages(connection, job.id, 100)
     assert [(entry.attempt, entry.progress, entry.message) for entry in messages] == [
@@ -79,7 +80,7 @@ def test_a_job_keeps_its_messages(connection: Connection):
 
 def test_the_expected_end_is_the_median_of_past_jobs_of_its_process(connection: Connection):
     running = begun(connection)
-    assert progress.expected_end(connection, running) is None, "nothing like it was ever done"
+    assert progress.outlook(connection, running.id).expected_end is None, "nothing like it was ever done"
     for seconds in (10, 100, 1000):
         done_in(connection, seconds)
     done_in(connection, 5, kind="ingest-block")
@@ -110,19 +111,16 @@ def test_a_waiting_job_is_expected_after_those_before_it_shared_by_the_workers(c
     assert abs(wait_of(connection, waiting) - timedelta(seconds=(100 + 20) / 2 + 100)) < a_slow_machine
     ended = jobs.find(connection, done_in(connection, 1))
     assert ended is not None
-    assert progress.expected_end(connection, ended) is None
+    assert progress.outlook(connection, ended.id) == Outlook(None, None)
 
 
 def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Connection):
     made = [asked(connection) for _ in range(6)]
-    queued = run_sql(
-        connection, "select args ->> 'job_id' as job from procrastinate_jobs order by id"
-    ).fetchall()
-    assert [row["job"] for row in queued] == [str(job.id) for job in made]
-    assert [progress.position(connection, job) for job in made] == [1, 2, 3, 4, 5, 6]
+    positions = [progress.outlook(connection, job.id).position for job in made]
+    assert positions == [1, 2, 3, 4, 5, 6]
     run_sql(connection, "update job set created_at = %s", [made[0].created_at])
-    alike = [replace(job, created_at=made[0].created_at) for job in made]
-    assert sorted(progress.position(connection, job) for job in alike) == [1, 2, 3, 4, 5, 6]
+    alike = [progress.outlook(connection, job.id).position for job in made]
+    assert sorted(alike) == [1, 2, 3, 4, 5, 6]
     pages = [jobs.newest(connection, None, JobFilter(), 2)]
     while len(pages[-1]) == 2:
         pages.append(jobs.newest(connection, None, JobFilter(), 2, after=pages[-1][-1].id))
@@ -140,7 +138,7 @@ def test_old_results_are_removed_and_the_job_reports_it(
         for age_days in (3.0, 1.0):
             reply = client.post("/processes/register-scene/execution", json=body, headers=me)
             url = reply.headers["location"]
-            job = attempts.claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
+            job = claim(connection, UUID(url.rsplit("/", 1)[1]), "w", LEASE_S)
             assert job is not None
             key = storage.put(f"results/{job.id}/1/report.json", [b"{}"]).key
             attempts.succeed(connection, job.id, 1, {"verdict": "good", "files": {"report.json": key}})

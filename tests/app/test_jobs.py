@@ -13,7 +13,7 @@ from app.db import engine
 from app.db.engine import Database
 from app.db.jobs import attempts, jobs
 from app.main import create_app
-from tests.app.job_queue import LEASE_S, claimed, queue_entries
+from tests.app.job_queue import LEASE_S, claimed, tickets
 
 Bearer = Callable[[str], dict[str, str]]
 EXECUTE = "/processes/register-scene/execution"
@@ -58,7 +58,7 @@ def test_a_request_for_work_becomes_a_job_in_the_queue(
     document = client.get(reply.headers["location"], headers=me).json()
     assert document == {**job, "amers:queuePosition": 1}
     with engine.connect(dsn) as connection:
-        assert queue_entries(connection, UUID(job["jobID"])) == 1
+        assert tickets(connection) == 1
         stored = jobs.find(connection, UUID(job["jobID"]))
     assert stored is not None
     assert stored.inputs["options"]["max_points"] == 100
@@ -157,7 +157,7 @@ def test_a_dismissed_job_stays_dismissed_and_is_never_claimed(
     assert client.delete(here, headers=me).json()["status"] == "dismissed"
     assert client.delete(here, headers=me).json()["status"] == "dismissed"
     with database.transaction() as connection:
-        assert attempts.claim(connection, UUID(job["jobID"]), "w", LEASE_S) is None
+        assert attempts.claim_next(connection, "w", LEASE_S) is None
     assert client.get(f"{here}/results", headers=me).status_code == 404
 
 

@@ -19,6 +19,7 @@ from app.request_context import Origin, working_for
 from app.usecases import quotas
 from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
+from tests.app.job_queue import claim
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -72,7 +73,7 @@ def test_a_change_over_the_api_names_caller_and_request(client, connection, bear
 
 def test_the_states_of_a_job_are_recorded_and_its_progress_is_not(connection):
     job = jobs.create(connection, "register-scene", {})
-    attempt = attempts.claim(connection, job.id, "w", 30.0)
+    attempt = claim(connection, job.id, "w", 30.0)
     attempts.report(connection, job.id, attempt.attempt, 10, "on the way")
     attempts.succeed(connection, job.id, attempt.attempt, {})
     recorded = changes(connection, kind="job")

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from app.cli.main import app
 from app.config import Settings
 from app.db import engine, registrations
-from app.db.jobs import attempts, jobs
+from app.db.jobs import jobs
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases.jobs import do_attempt
@@ -27,6 +27,7 @@ from services.formats.images.raster import write_raster
 from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from services.geodesy import metres_per_degree
 from services.sensors.rpc import RpcModel
+from tests.app.job_queue import claim
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
 a_pixel = 1.0
@@ -137,7 +138,7 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
         job_id = reply.json()["jobID"]
         with engine.pooled(dsn, settings) as database:
             with database.transaction() as connection:
-                assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
+                assert claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
         job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
         if job["status"] == "failed":

@@ -15,7 +15,6 @@ from rasterio.transform import Affine
 from app.config import Settings
 from app.db import engine, references
 from app.db.engine import Connection, Database
-from app.db.jobs import attempts
 from app.errors import Conflict, InputError, NotFound
 from app.main import create_app
 from app.storage import open_storage
@@ -38,6 +37,7 @@ from services.imagery.source import ArrayImage, sample_image
 from services.map_grid import MapGrid, xy_of_lon_lat
 from services.registration.options import RegistrationOptions
 from services.types import FloatImage
+from tests.app.job_queue import claim
 from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import ended, running_worker
 from tests.statements import run_sql
@@ -244,7 +244,7 @@ def test_a_service_registers_on_a_reference_where_it_has_no_points_or_when_asked
             assert reply.status_code == 201, reply.text
             job_id = reply.json()["jobID"]
             with database.transaction() as connection:
-                assert attempts.claim(connection, UUID(job_id), "a worker", 30.0)
+                assert claim(connection, UUID(job_id), "a worker", 30.0)
             do_attempt(database, settings, UUID(job_id), 1)
             job: dict = client.get(f"/jobs/{job_id}", headers=me).json()
             if job["status"] == "successful":

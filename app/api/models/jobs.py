@@ -75,7 +75,8 @@ class StatusInfo(Reply):
     """The state of a job.
 
     `amers:queuePosition` is the place in the queue of a job that waits. `amers:estimatedEnd` is
-    estimated from the durations of earlier jobs.
+    estimated from the durations of earlier jobs. `amers:priority` is that of a job to which an
+    administrator gave one.
     """
 
     job_id: UUID = Field(serialization_alias="jobID")
@@ -93,6 +94,7 @@ class StatusInfo(Reply):
     links: list[Link]
     queue_position: int | None = missing("amers:queuePosition")
     estimated_end: datetime | None = missing("amers:estimatedEnd")
+    priority: int | None = missing("amers:priority")
 
 
 class Jobs(Reply):

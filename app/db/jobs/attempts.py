@@ -9,13 +9,16 @@ from typing import Any
 from uuid import UUID
 
 from sqlalchemy import func, select, update
+from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
 from app.db.jobs.jobs import COLUMNS, Job
-from app.db.jobs.queue import enqueue
-from app.db.rows import among, every, first
-from app.db.schema import clock, job
+from app.db.jobs.queue import issue_ticket, lock_claims, replace_spent_ticket
+from app.db.rows import among, every, only
+from app.db.schema import clock, job, job_turn
+from app.db.statements import named
 
+NEXT_JOB = named("jobs.sql", "next_job")
 LOST_WORKER = {"type": "lost-worker", "title": "The worker was lost"}
 
 
@@ -23,16 +26,31 @@ class LostJob(Exception):
     """The job went on without this attempt: it was dismissed, or another worker took it over."""
 
 
-def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> Job | None:
-    """Start the next attempt at an accepted job; None when the job cannot be claimed."""
+def claim_next(
+    connection: Connection, worker: str, lease_s: float, running_limit: int | None = None
+) -> Job | None:
+    """The next job, claimed for an attempt; None when no job may be claimed.
+
+    The next job is one of the highest priority; among these, of the owner with the fewest running jobs;
+    then of the owner whose last job was claimed longest ago; then the oldest.
+    Claims wait for each other.
+
+    Args:
+        running_limit: most running jobs of one owner; None: no limit.
+    """
+    lock_claims(connection)
+    job_id = connection.scalar(NEXT_JOB, {"running_limit": running_limit})
+    if job_id is None:
+        return None
     claimed = connection.execute(
         update(job)
-        .where(job.c.id == job_id, job.c.state == "accepted")
+        .where(job.c.id == job_id)
         .values(
             state="running",
             attempt=job.c.attempt + 1,
             worker=worker,
             lease_until=clock + timedelta(seconds=lease_s),
+            not_before=None,
             progress=0,
             message="started",
             claimed_at=clock,
@@ -41,7 +59,14 @@ def claim(connection: Connection, job_id: UUID, worker: str, lease_s: float) -> 
         )
         .returning(*COLUMNS)
     )
-    return first(Job, claimed)
+    next_job = only(Job, claimed)
+    turn = insert(job_turn).values(owner=next_job.owner, claimed_at=next_job.claimed_at)
+    connection.execute(
+        turn.on_conflict_do_update(
+            index_elements=[job_turn.c.owner], set_={"claimed_at": turn.excluded.claimed_at}
+        )
+    )
+    return next_job
 
 
 def renew(connection: Connection, job_id: UUID, attempt: int, lease_s: float) -> None:
@@ -80,6 +105,7 @@ def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[st
         lease_until=None,
         finished_at=clock,
     )
+    replace_spent_ticket(connection)
 
 
 def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, Any]) -> None:
@@ -98,6 +124,7 @@ def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, An
         lease_until=None,
         finished_at=clock,
     )
+    replace_spent_ticket(connection)
 
 
 def give_back(connection: Connection, job_id: UUID, attempt: int) -> None:
@@ -115,7 +142,7 @@ def give_back(connection: Connection, job_id: UUID, attempt: int) -> None:
         lease_until=None,
         worker=None,
     )
-    enqueue(connection, job_id)
+    issue_ticket(connection)
 
 
 def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float) -> None:
@@ -131,10 +158,12 @@ def try_again(connection: Connection, job_id: UUID, attempt: int, delay_s: float
         state="accepted",
         failures=job.c.failures + 1,
         lease_until=None,
+        not_before=clock + timedelta(seconds=delay_s),
         worker=None,
         message="broke off, waiting for the next attempt",
     )
-    enqueue(connection, job_id, delay_s)
+    issue_ticket(connection, connection.scalar(select(job.c.not_before).where(job.c.id == job_id)))
+    replace_spent_ticket(connection)
 
 
 def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
@@ -165,7 +194,7 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
     )
     for lost in lapsed:
         if lost.failures < failures_allowed:
-            enqueue(connection, lost.id)
+            issue_ticket(connection)
             continue
         detail = f"the worker died {lost.failures} times while it did this job"
         error = {**LOST_WORKER, "detail": detail, "failures": lost.failures}
@@ -174,6 +203,7 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
             .where(job.c.id == lost.id)
             .values(state="failed", message=detail, error=error, finished_at=clock)
         )
+        replace_spent_ticket(connection)
     return [lost.id for lost in lapsed]
 
 

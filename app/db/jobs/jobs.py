@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, extract, func, select, tuple_, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
-from app.db.jobs.queue import enqueue
+from app.db.jobs.queue import issue_ticket, replace_spent_ticket
 from app.db.rows import columns_of, every, first
 from app.db.schema import JobResponse, JobState, clock, job
 
@@ -34,6 +34,7 @@ class Job:
         error: problem details of a failure.
         results: what a successful job made.
         results_removed_at: when the files of the results were removed.
+        priority: jobs of a higher one come first; 0 unless an administrator set it.
     """
 
     id: UUID
@@ -55,6 +56,7 @@ class Job:
     error: dict[str, Any] | None
     results: dict[str, Any] | None
     results_removed_at: datetime | None
+    priority: int
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ def create(
     idempotency_key: str | None = None,
     outputs: dict[str, str] | None = None,
     response: JobResponse = "document",
+    priority: int = 0,
 ) -> Job | None:
     """A new accepted job, in the queue once the transaction is committed.
 
@@ -106,13 +109,14 @@ def create(
             response=response,
             owner=owner,
             idempotency_key=idempotency_key,
+            priority=priority,
         )
         .on_conflict_do_nothing(index_elements=[job.c.owner, job.c.idempotency_key])
         .returning(*COLUMNS)
     )
     created = first(Job, connection.execute(statement))
     if created is not None:
-        enqueue(connection, created.id)
+        issue_ticket(connection)
     return created
 
 
@@ -170,6 +174,8 @@ def dismiss(connection: Connection, job_id: UUID) -> bool:
             updated_at=clock,
         )
     )
+    if dismissed.rowcount == 1:
+        replace_spent_ticket(connection)
     return dismissed.rowcount == 1
 
 

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import func, select, tuple_
+from sqlalchemy import select
 
 from app.db.engine import Connection
-from app.db.jobs.jobs import OPEN, Job
-from app.db.rows import columns_of, every
-from app.db.schema import job, job_message
+from app.db.rows import columns_of, every, first
+from app.db.schema import job_message
 from app.db.statements import named
 
 PAST_JOBS = 20
@@ -17,7 +16,7 @@ PAST_JOBS = 20
 BEATING_S = 30
 """A worker of the queue gives a sign of life every ten seconds; one silent for longer does not count."""
 
-EXPECTED_END = named("jobs.sql", "expected_end")
+OUTLOOK = named("jobs.sql", "outlook")
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,20 @@ class JobMessage:
     message: str
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """What the owner of an open job waits for.
+
+    Attributes:
+        position: of a waiting job, 1 for the next one, as if all owners had as many running jobs.
+        expected_end: from the median durations of past jobs, shared by the workers that are alive; None
+            when no job of this process has succeeded yet, or the job has ended.
+    """
+
+    position: int | None
+    expected_end: datetime | None
+
+
 MESSAGE_COLUMNS = columns_of(JobMessage, job_message, at=job_message.c.written_at)
 
 
@@ -49,36 +62,7 @@ def read_messages(connection: Connection, job_id: UUID, limit: int) -> list[JobM
     return every(JobMessage, connection.execute(newest_first))[::-1]
 
 
-def position(connection: Connection, waiting: Job) -> int:
-    """How many waiting jobs are as old as a job or older, itself included."""
-    count = connection.scalar(
-        select(func.count())
-        .select_from(job)
-        .where(
-            job.c.state == "accepted",
-            tuple_(job.c.created_at, job.c.id) <= tuple_(waiting.created_at, waiting.id),
-        )
-    )
-    return max(int(count or 0), 1)
-
-
-def expected_end(connection: Connection, open_job: Job) -> datetime | None:
-    """When an open job may end: past jobs' median durations, shared by the workers that are alive.
-
-    Returns:
-        None when no job of its process has succeeded yet, or the job has ended.
-    """
-    if open_job.state not in OPEN:
-        return None
-    end: datetime | None = connection.scalar(
-        EXPECTED_END,
-        {
-            "past": PAST_JOBS,
-            "kind": open_job.kind,
-            "created_at": open_job.created_at,
-            "id": open_job.id,
-            "beating_s": BEATING_S,
-            "claimed_at": open_job.claimed_at if open_job.state == "running" else None,
-        },
-    )
-    return end
+def outlook(connection: Connection, job_id: UUID) -> Outlook:
+    """The place of a job in the queue and its expected end."""
+    values = {"id": job_id, "past": PAST_JOBS, "beating_s": BEATING_S, "nobody": UUID(int=0)}
+    return first(Outlook, connection.execute(OUTLOOK, values)) or Outlook(None, None)

@@ -1,13 +1,18 @@
-"""The queue that workers take jobs from; a second entry of the same job does no harm."""
+"""The queue: its entries are tickets. A ticket calls a worker, who then claims the job that is next.
 
+There is a ticket for each waiting job, but no ticket belongs to a job: the order of jobs is that of
+`attempts.claim_next`. A ticket whose claim finds nothing is spent: all waiting jobs may belong to owners
+who have as many running jobs as they may. The end of a job therefore issues a ticket if there are fewer
+tickets than waiting jobs.
+"""
+
+from datetime import datetime
 from functools import cache
 from typing import TYPE_CHECKING
-from uuid import UUID
 
-from sqlalchemy import func, select, update
+from sqlalchemy import func, select
 
 from app.db.engine import Connection, driver
-from app.db.schema import clock, job
 from app.db.statements import named
 
 if TYPE_CHECKING:
@@ -18,28 +23,53 @@ TASK = "amers:job"
 SWEEP_LOCK = 0x414D4552
 """Advisory lock that keeps two workers from sweeping at once."""
 
-FORGOTTEN_JOBS = named("jobs.sql", "forgotten_jobs")
+CLAIM_LOCK = 0x414D4558
+"""Advisory lock of claims, and of whoever counts tickets: a claim sees all jobs that ended before it."""
+TICKETS_PER_SWEEP = 16
+"""Most tickets that one sweep replaces: the first jobs that end replace the others."""
+
+MISSING_TICKETS = named("jobs.sql", "missing_tickets")
 PRUNE_SILENT_WORKERS = named("jobs.sql", "prune_silent_workers")
 DELETE_DEAD_ENTRIES = named("jobs.sql", "delete_dead_entries")
 
 
-def enqueue(connection: Connection, job_id: UUID, delay_s: float = 0.0) -> None:
-    """Put a job into the queue, in the transaction of its row; a job with two entries is done once."""
+def issue_ticket(connection: Connection, not_before: datetime | None = None) -> None:
+    """Call a worker for one job, in the transaction that makes the job wait.
+
+    Args:
+        not_before: of the job, by the clock of the database; None for now.
+    """
     _queue().configure_task(
-        TASK,
-        queue=QUEUE,
-        schedule_in={"milliseconds": int(1000 * delay_s)} if delay_s else None,
-        connection=driver(connection),
-    ).defer(job_id=str(job_id))
+        TASK, queue=QUEUE, schedule_at=not_before, connection=driver(connection)
+    ).defer()
 
 
-def enqueue_forgotten(connection: Connection, after_s: float) -> list[UUID]:
-    """Put accepted jobs into the queue that it does not have any more, for instance after a restore."""
-    forgotten = list(connection.scalars(FORGOTTEN_JOBS, {"after_s": after_s, "task": TASK}))
-    for job_id in forgotten:
-        connection.execute(update(job).where(job.c.id == job_id).values(updated_at=clock))
-        enqueue(connection, job_id)
-    return forgotten
+def lock_claims(connection: Connection) -> None:
+    """Let other claims, and other counts of tickets, wait until the end of the transaction."""
+    connection.execute(select(func.pg_advisory_xact_lock(CLAIM_LOCK)))
+
+
+def replace_spent_ticket(connection: Connection) -> None:
+    """Issue a ticket if there are fewer than waiting jobs; the last step of whatever ends a job.
+
+    The owner of the job may now have another one claimed, whose ticket may have been spent.
+    """
+    lock_claims(connection)
+    if _missing_tickets(connection, 0.0, None):
+        issue_ticket(connection)
+
+
+def replace_lost_tickets(connection: Connection, after_s: float, running_limit: int | None) -> int:
+    """The number of tickets issued for jobs that wait without one, for instance after a restore.
+
+    Args:
+        after_s: time since the last change of the jobs to count.
+        running_limit: most running jobs of one owner; None: no limit.
+    """
+    missing = min(_missing_tickets(connection, after_s, running_limit), TICKETS_PER_SWEEP)
+    for _ in range(missing):
+        issue_ticket(connection)
+    return missing
 
 
 def forget_dead_entries(connection: Connection, silent_s: float) -> None:
@@ -51,6 +81,11 @@ def forget_dead_entries(connection: Connection, silent_s: float) -> None:
 def may_sweep(connection: Connection) -> bool:
     """Whether nobody else sweeps; true until the end of the transaction."""
     return bool(connection.scalar(select(func.pg_try_advisory_xact_lock(SWEEP_LOCK))))
+
+
+def _missing_tickets(connection: Connection, after_s: float, running_limit: int | None) -> int:
+    values = {"after_s": after_s, "running_limit": running_limit, "task": TASK}
+    return int(connection.scalar(MISSING_TICKETS, values) or 0)
 
 
 @cache

@@ -21,7 +21,7 @@ from app.db.schema.base import (
     uptime_s,
 )
 from app.db.schema.integrity import damaged_file, result_file
-from app.db.schema.jobs import job, job_message, scene, upload
+from app.db.schema.jobs import job, job_message, job_turn, scene, upload
 from app.db.schema.points import block, chip_file, density_cell, image, point, view
 from app.db.schema.registrations import (
     measure,
@@ -50,6 +50,7 @@ __all__ = [
     "installation",
     "job",
     "job_message",
+    "job_turn",
     "measure",
     "metadata",
     "now",

@@ -137,10 +137,15 @@ job = Table(
     Column("claimed_at", Timestamp),
     # When the files of the results were removed.
     Column("results_removed_at", Timestamp),
+    # Jobs of a higher priority come first; only administrators set it.
+    Column("priority", SmallInteger, nullable=False, server_default=text("0")),
+    # The delay of a repeated attempt; null: the job may be claimed at once.
+    Column("not_before", Timestamp),
     UniqueConstraint("owner", "idempotency_key"),
     one_of("state", JobState),
     one_of("response", JobResponse),
     CheckConstraint("progress between 0 and 100", name="progress"),
+    CheckConstraint("priority between -100 and 100", name="priority"),
     Index("job_owner", "owner", "created_at"),
     Index("job_lease", "lease_until", postgresql_where=text("state in ('accepted', 'running')")),
     Index("job_finished", "kind", "finished_at", postgresql_where=text("state = 'successful'")),
@@ -149,6 +154,27 @@ job = Table(
         "finished_at",
         postgresql_where=text("state = 'successful' and results_removed_at is null"),
     ),
+    # The next jobs of every owner, and how many of his jobs run.
+    Index(
+        "job_waiting",
+        "owner",
+        text("priority desc"),
+        "created_at",
+        "id",
+        postgresql_where=text("state = 'accepted'"),
+    ),
+    Index("job_running", "owner", postgresql_where=text("state = 'running'")),
+)
+
+# When a job of each owner was last claimed: the owner who waits longest is next. Jobs may be deleted
+# later, so this time is kept beside them.
+job_turn = Table(
+    "job_turn",
+    metadata,
+    # Null: the command line.
+    Column("owner", ForeignKey("token.id", ondelete="CASCADE")),
+    Column("claimed_at", Timestamp, nullable=False),
+    UniqueConstraint("owner", postgresql_nulls_not_distinct=True),
 )
 
 # Messages of a job in their order; the trigger `job_messages` writes them.

@@ -1,12 +1,41 @@
 -- Statements on jobs and on the tables of the queue.
 
--- name: forgotten_jobs
--- Accepted jobs that the queue does not have any more.
-select id from job
-where state = 'accepted' and updated_at < clock_timestamp() - make_interval(secs => :after_s)
-    and not exists (select from procrastinate_jobs
-                    where task_name = :task and status = 'todo' and args ->> 'job_id' = job.id::text)
-for update skip locked
+-- name: next_job
+-- The job to claim: of the highest priority; then of the owner with the fewest running jobs; then of the
+-- owner whose last job was claimed longest ago; then the oldest. A row that is being written is passed over.
+with heads as (
+    select distinct on (owner) id, owner, priority, created_at from job
+    where state = 'accepted' and (not_before is null or not_before <= statement_timestamp())
+    order by owner, priority desc, created_at, id
+), running as (
+    select owner, count(*) as n from job where state = 'running' group by owner
+)
+select job.id
+from heads join job using (id)
+    left join running on running.owner is not distinct from heads.owner
+    left join job_turn on job_turn.owner is not distinct from heads.owner
+where coalesce(running.n, 0) < coalesce(cast(:running_limit as bigint), coalesce(running.n, 0) + 1)
+order by heads.priority desc, coalesce(running.n, 0), job_turn.claimed_at nulls first,
+    heads.created_at, heads.id
+limit 1
+for update of job skip locked
+
+-- name: missing_tickets
+-- How many jobs may be claimed beyond the tickets that are left for them.
+with owners as (
+    select owner,
+        count(*) filter (where state = 'running') as running,
+        count(*) filter (where state = 'accepted'
+            and updated_at <= statement_timestamp() - make_interval(secs => :after_s)
+            and (not_before is null or not_before <= statement_timestamp())) as waiting
+    from job where state in ('accepted', 'running') group by owner
+)
+select greatest(0, cast(coalesce(sum(least(waiting,
+        greatest(coalesce(cast(:running_limit as bigint), running + waiting) - running, 0))), 0) as bigint)
+    - (select count(*) from procrastinate_jobs
+       where task_name = :task and status = 'todo'
+           and (scheduled_at is null or scheduled_at <= statement_timestamp())))
+from owners
 
 -- name: prune_silent_workers
 select worker_id from procrastinate_prune_stalled_workers_v1(:silent_s)
@@ -15,31 +44,41 @@ select worker_id from procrastinate_prune_stalled_workers_v1(:silent_s)
 -- Entries whose worker was pruned.
 delete from procrastinate_jobs where task_name = :task and status = 'doing' and worker_id is null
 
--- name: expected_end
--- When a job may end: the median durations of past jobs, shared by the workers that give signs of life.
--- A job that has not started waits for the rest of those that run and for all that are older.
-with typical as (
+-- name: outlook
+-- The place of a waiting job in the queue, and when an open job may end: after those before it, the median
+-- durations of past jobs shared by the workers that give signs of life. The order is that of `next_job`
+-- when every owner has as many running jobs: one job of each owner in turn.
+with waiting as (
+    select job.id, kind, (-priority, row_number() over in_turn, coalesce(job_turn.claimed_at, '-infinity'),
+                          created_at, job.id) as place
+    from job left join job_turn on coalesce(job_turn.owner, :nobody) = coalesce(job.owner, :nobody)
+    where state = 'accepted'
+    window in_turn as (partition by job.owner, priority order by created_at, job.id)
+), before as (
+    select kind from waiting where place < (select place from waiting where id = :id)
+), typical as (
     select kind, (select percentile_cont(0.5) within group (order by seconds)
                   from (select extract(epoch from finished_at - claimed_at) as seconds
                         from job p where p.kind = k.kind and state = 'successful'
                         order by finished_at desc limit :past) past) as seconds
     from (select distinct kind from job where state in ('accepted', 'running')) k
 ), own as (
-    select seconds from typical where kind = :kind
-), before as (
-    select sum(case state when 'accepted' then t.seconds
-        else greatest(t.seconds - extract(epoch from clock_timestamp() - claimed_at), 0)
-        end) as seconds
-    from job join typical t using (kind)
-    where state = 'running' or (state = 'accepted' and (created_at, id) < (:created_at, :id))
+    select job.state, claimed_at, seconds
+    from job left join typical using (kind) where id = :id and state in ('accepted', 'running')
+), queued as (
+    select coalesce(sum(seconds), 0) as seconds from before join typical using (kind)
+), under_way as (
+    select coalesce(sum(greatest(
+        seconds - extract(epoch from clock_timestamp() - claimed_at), 0)), 0) as seconds
+    from job join typical using (kind) where state = 'running'
 ), workers as (
     select greatest(count(*), 1) as n from procrastinate_workers
     where last_heartbeat > clock_timestamp() - make_interval(secs => :beating_s)
 )
-select case when cast(:claimed_at as timestamptz) is null
-    then clock_timestamp() + make_interval(
-        secs => coalesce(before.seconds, 0) / workers.n + own.seconds)
-    else greatest(clock_timestamp(),
-                  cast(:claimed_at as timestamptz) + make_interval(secs => own.seconds))
-    end
-from own, before, workers where own.seconds is not null
+select case own.state when 'accepted' then (select count(*) + 1 from before) end as position,
+    case when own.seconds is null then null
+        when own.state = 'accepted' then clock_timestamp() + make_interval(
+            secs => (queued.seconds + under_way.seconds) / workers.n + own.seconds)
+        else greatest(clock_timestamp(), claimed_at + make_interval(secs => own.seconds))
+    end as expected_end
+from own, queued, under_way, workers

@@ -18,6 +18,7 @@ from app.storage import Storage
 from app.usecases import results
 from app.usecases.jobs import PROCESSES, error_details
 from services.errors import NotEnoughPoints
+from tests.app.job_queue import claim
 from tests.statements import run_sql
 
 EXCEPTIONS = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
@@ -111,7 +112,7 @@ def done(ask: Callable[..., Any], dsn: str, storage: Storage) -> Callable[..., s
 def begun(dsn: str, job_id: str) -> Job:
     """The job after a worker has claimed it."""
     with engine.connect(dsn) as connection:
-        job = attempts.claim(connection, UUID(job_id), "a worker", 30.0)
+        job = claim(connection, UUID(job_id), "a worker", 30.0)
     assert job is not None
     return job
 
