@@ -543,6 +543,7 @@ export interface StatusInfo {
   links: Link[];
   "amers:queuePosition"?: number;
   "amers:estimatedEnd"?: string;
+  "amers:priority"?: number;
 }
 
 export interface StoredFile {

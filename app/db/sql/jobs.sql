@@ -3,10 +3,25 @@
 -- name: next_job
 -- The job to claim: of the highest priority; then of the owner with the fewest running jobs; then of the
 -- owner whose last job was claimed longest ago; then the oldest. A row that is being written is passed over.
-with heads as (
-    select distinct on (owner) id, owner, priority, created_at from job
-    where state = 'accepted' and (not_before is null or not_before <= statement_timestamp())
-    order by owner, priority desc, created_at, id
+-- The first job of one owner after that of another is one step in the index, however many jobs he has.
+with recursive head_of_tokens as (
+    (select id, owner, priority, created_at from job
+        where state = 'accepted' and owner is not null
+            and (not_before is null or not_before <= statement_timestamp())
+        order by owner, priority desc, created_at, id limit 1)
+    union all
+    select next.* from head_of_tokens last, lateral (
+        select id, owner, priority, created_at from job
+        where state = 'accepted' and owner > last.owner
+            and (not_before is null or not_before <= statement_timestamp())
+        order by owner, priority desc, created_at, id limit 1) next
+), heads as (
+    select * from head_of_tokens
+    union all
+    (select id, owner, priority, created_at from job
+        where state = 'accepted' and owner is null
+            and (not_before is null or not_before <= statement_timestamp())
+        order by owner, priority desc, created_at, id limit 1)
 ), running as (
     select owner, count(*) as n from job where state = 'running' group by owner
 )
@@ -52,7 +67,7 @@ with waiting as (
     select job.id, kind, (-priority, row_number() over in_turn, coalesce(job_turn.claimed_at, '-infinity'),
                           created_at, job.id) as place
     from job left join job_turn on coalesce(job_turn.owner, :nobody) = coalesce(job.owner, :nobody)
-    where state = 'accepted'
+    where state = 'accepted' and (select state from job where id = :id) = 'accepted'
     window in_turn as (partition by job.owner, priority order by created_at, job.id)
 ), before as (
     select kind from waiting where place < (select place from waiting where id = :id)
