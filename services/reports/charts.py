@@ -1,54 +1,67 @@
 """The charts of a report: points by stage and reason, residuals against position and height."""
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from services.quality.accuracy import statistics
 from services.reports.drawing import (
     ACTIVE,
     DEACTIVATED,
-    INK,
-    MANY_POINTS,
     MATCHED,
     NOT_MATCHED,
-    QUIET,
-    TEXT_PT,
-    WIDTH_IN,
-    plain_axes,
     shortened,
-    style,
 )
 from services.reports.numbers import number
+from services.reports.plot import (
+    INK,
+    QUIET,
+    SMALL_TEXT,
+    TEXT,
+    WIDTH,
+    Figure,
+    Panel,
+    data_range,
+    left_margin,
+    widened,
+)
 from services.reports.report import RegistrationReport
 from services.types import Array
+
+_GAP = 14.0
+"""Width between panels, points."""
+_BAR = 19.0
+"""Height of a bar with the gap to the next one, points."""
+_BAR_LABELS = 130.0
+"""Width of the labels of bars, points."""
 
 
 def residual_histograms(report: RegistrationReport) -> Figure:
     """Distribution of the residuals of the active points in x, y and xy."""
-    figure = Figure(figsize=(WIDTH_IN, 2.3), layout="constrained")
-    panels = figure.subplots(1, 3, sharey=True)
+    figure = Figure(166.0)
     measures = report.figure_data.measures
     line, sample = measures.residual_px[measures.active].T
-    for axes, name, values in zip(
-        panels, ("x (sample)", "y (line)", "xy"), (sample, line, np.hypot(line, sample)), strict=True
-    ):
-        style(axes)
-        axes.set_xlabel(f"{name}, px")
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=4, prune="both"))
+    histograms = []
+    for name, values in (("x (sample)", sample), ("y (line)", line), ("xy", np.hypot(line, sample))):
         finite = values[np.isfinite(values)]
-        if not len(finite):
-            continue
-        reach = max(float(np.abs(finite).max()), 0.01)
-        bins = np.linspace(0.0 if name == "xy" else -reach, reach, 17)
-        axes.hist(finite, bins=bins, color=ACTIVE, alpha=0.85)
-        moments = statistics(finite)
-        axes.axvline(moments.mean, color=INK, linewidth=1.0)
-        axes.set_title(
-            f"{number(moments.mean, 3)} ± {number(moments.std, 3)}", color=INK, fontsize=TEXT_PT
-        )
-    panels[0].set_ylabel("points")
-    panels[0].yaxis.get_major_locator().set_params(integer=True)
+        reach = max(float(np.abs(finite).max(initial=0.0)), 0.01)
+        counts, edges = np.histogram(finite, np.linspace(0.0 if name == "xy" else -reach, reach, 17))
+        histograms.append((name, finite, counts, edges))
+    highest = max(1, *(int(counts.max()) for _, _, counts, _ in histograms))
+    y_range = (0.0, 1.05 * highest)
+    left = left_margin(y_range, 4)
+    width = (WIDTH - left - 2.0 * _GAP - 4.0) / 3.0
+    for k, (name, finite, counts, edges) in enumerate(histograms):
+        x_range = widened(float(edges[0]), float(edges[-1]))
+        panel = Panel(figure, left + k * (width + _GAP), 20.0, width, 112.0, x_range, y_range)
+        panel.x_axis(f"{name}, px", count=3)
+        panel.y_axis("points" if k == 0 else "", count=4, numbers=k == 0)
+        tops, bottoms = panel.places(edges[:-1], counts), panel.places(edges[1:], 0.0 * counts)
+        for top, bottom in zip(tops, bottoms, strict=True):
+            figure.box((top[0], top[1]), tuple(bottom - top), ACTIVE, opacity=0.85)
+        if len(finite):
+            moments = statistics(finite)
+            figure.line(panel.places(np.full(2, moments.mean), np.array(y_range)), INK, 1.0)
+            title = f"{number(moments.mean, 3)} ± {number(moments.std, 3)}"
+            figure.text(panel.left + width / 2.0, 12.0, title, anchor="middle")
     return figure
 
 
@@ -65,59 +78,53 @@ def funnel(report: RegistrationReport) -> Figure:
             remaining -= reason.count
             bars.append((shortened(reason.label), remaining, reason.count, NOT_MATCHED))
         bars.append(("matched" if stage == "not matched" else "active", 0, total, colour))
-    figure, axes = plain_axes(height_in=0.5 + 0.26 * len(bars))
-    for row, (_, start, width, colour) in enumerate(bars):
-        axes.barh(row, width, left=start, height=0.62, color=colour)
-        axes.annotate(
-            str(width),
-            (start + width, row),
-            (4, 0),
-            textcoords="offset points",
-            va="center",
-            color=INK,
-            fontsize=TEXT_PT,
+    height = _BAR * len(bars)
+    figure = Figure(height + 36.0)
+    x_range = (0.0, max(counts.visible, 1) * 1.12)
+    panel = Panel(
+        figure, _BAR_LABELS, 4.0, WIDTH - _BAR_LABELS - 4.0, height, x_range, (float(len(bars)), 0.0)
+    )
+    panel.x_axis("points", count=5)
+    figure.line(panel.places(np.zeros(2), np.array([0.0, len(bars)])), QUIET, 0.6)
+    for row, (name, start, n_points, colour) in enumerate(bars):
+        corner, end = panel.places(
+            np.array([start, start + n_points]), np.array([row + 0.19, row + 0.81])
         )
-    axes.set_yticks(range(len(bars)), [name for name, *_ in bars])
-    axes.invert_yaxis()
-    axes.set_xlim(0, max(counts.visible, 1) * 1.12)
-    axes.set_xlabel("points")
+        figure.box(tuple(corner), tuple(end - corner), colour, title=f"{name}: {n_points}")
+        middle = float(corner[1] + end[1]) / 2.0 + 3.5
+        figure.text(_BAR_LABELS - 6.0, middle, name, anchor="end", size=SMALL_TEXT)
+        figure.text(float(end[0]) + 4.0, middle, str(n_points))
     return figure
 
 
 def residuals_along(report: RegistrationReport) -> Figure:
     """Residuals of the active points against line and sample: drift and jitter show here."""
-    figure = Figure(figsize=(WIDTH_IN, 3.8), layout="constrained")
-    panels = figure.subplots(2, 2, sharex="col", sharey="row")
+    figure = Figure(274.0)
     measures = report.figure_data.measures
     residual, place = measures.residual_px[measures.active], measures.line_sample[measures.active]
+    y_ranges = [data_range(residual[:, k]) for k in range(2)]
+    left = max(map(left_margin, y_ranges))
+    width = (WIDTH - left - _GAP - 8.0) / 2.0
     for k, residual_name in enumerate(("y (line)", "x (sample)")):
         for j, place_name in enumerate(("line", "sample")):
-            axes = panels[k, j]
-            style(axes)
-            axes.axhline(0.0, color=QUIET, linewidth=0.7)
-            axes.scatter(
-                place[:, j],
-                residual[:, k],
-                s=7,
-                color=ACTIVE,
-                alpha=0.7,
-                linewidths=0,
-                rasterized=len(place) > MANY_POINTS,
+            panel = Panel(
+                figure,
+                left + j * (width + _GAP),
+                6.0 + k * 118.0,
+                width,
+                108.0,
+                (0.0, float(report.scene.shape[j])),
+                y_ranges[k],
             )
-            axes.plot(*_running_median(place[:, j], residual[:, k]), color=DEACTIVATED, linewidth=1.4)
-            axes.set_xlim(0, report.scene.shape[j])
-            axes.locator_params(axis="x", nbins=4)
-            if k == 1:
-                axes.set_xlabel(place_name)
-            if j == 0:
-                axes.set_ylabel(f"{residual_name}, px")
+            panel.x_axis(place_name if k == 1 else "", count=5, numbers=k == 1)
+            panel.y_axis(f"{residual_name}, px" if j == 0 else "", numbers=j == 0)
+            _draw_residuals(panel, place[:, j], residual[:, k])
     return figure
 
 
 def residuals_by_height(report: RegistrationReport) -> Figure:
     """Residuals of the active points on the ground against their height, along and across the view."""
-    figure = Figure(figsize=(WIDTH_IN, 2.6), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
+    figure = Figure(188.0)
     measures = report.figure_data.measures
     azimuth = np.radians(report.scene.acquisition.azimuth_deg)
     names = ("along the view", "across the view") if np.isfinite(azimuth) else ("north", "east")
@@ -127,25 +134,28 @@ def residuals_by_height(report: RegistrationReport) -> Figure:
         away = -away
     across = np.array([-away[1], away[0]]) if np.isfinite(azimuth) else np.array([1.0, 0.0])
     height_m = measures.lon_lat_h[measures.active, 2]
-    for axes, name, direction in zip(panels, names, (away, across), strict=True):
-        residual_m = measures.residual_m[measures.active] @ direction
-        style(axes)
-        axes.axhline(0.0, color=QUIET, linewidth=0.7)
-        axes.scatter(
-            height_m,
-            residual_m,
-            s=7,
-            color=ACTIVE,
-            alpha=0.7,
-            linewidths=0,
-            rasterized=len(height_m) > MANY_POINTS,
-        )
-        axes.plot(*_running_median(height_m, residual_m), color=DEACTIVATED, linewidth=1.4)
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=4, prune="both"))
-        axes.set_xlabel("height, m")
-        axes.set_title(name, color=INK, fontsize=TEXT_PT, loc="left")
-    panels[0].set_ylabel("residual, m")
+    residual_m = measures.residual_m[measures.active] @ np.column_stack([away, across])
+    y_range = data_range(residual_m)
+    x_range = widened(float(height_m.min(initial=np.inf)), float(height_m.max(initial=-np.inf)))
+    if not np.isfinite(x_range).all():
+        x_range = (0.0, 1.0)
+    left = left_margin(y_range)
+    width = (WIDTH - left - _GAP - 8.0) / 2.0
+    for k, name in enumerate(names):
+        panel = Panel(figure, left + k * (width + _GAP), 18.0, width, 136.0, x_range, y_range)
+        panel.x_axis("height, m")
+        panel.y_axis("residual, m" if k == 0 else "", numbers=k == 0)
+        figure.text(panel.left, 11.0, name, size=TEXT)
+        _draw_residuals(panel, height_m, residual_m[:, k])
     return figure
+
+
+def _draw_residuals(panel: Panel, position: Array, residual: Array) -> None:
+    """Draw residuals against a position, with the zero line and a running median."""
+    figure = panel.figure
+    figure.line(panel.places(np.array(panel.x_range), np.zeros(2)), QUIET, 0.7)
+    figure.discs(panel.places(position, residual), 3.0, ACTIVE, 0.7)
+    figure.line(panel.places(*_running_median(position, residual)), DEACTIVATED, 1.4)
 
 
 def _running_median(position: Array, value: Array) -> tuple[Array, Array]:

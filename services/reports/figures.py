@@ -1,9 +1,13 @@
 """All figures of a report."""
 
+from collections.abc import Callable
+
 from services.reports.charts import funnel, residual_histograms, residuals_along, residuals_by_height
 from services.reports.maps import coverage_map, ground_overview, predicted_map, residual_map
+from services.reports.plot import Figure
+from services.reports.report import RegistrationReport
 
-FIGURES = (
+FIGURES: tuple[Callable[[RegistrationReport], Figure], ...] = (
     ground_overview,
     residual_map,
     coverage_map,
@@ -14,3 +18,8 @@ FIGURES = (
     predicted_map,
 )
 """Each draws one figure of a report; the page refers to them by their names."""
+
+
+def figure_markup(draw: Callable[[RegistrationReport], Figure], report: RegistrationReport) -> str:
+    """One of the figures as SVG markup, in the colours and fonts of the page."""
+    return draw(report).markup((draw.__doc__ or draw.__name__).splitlines()[0])

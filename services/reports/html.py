@@ -3,15 +3,17 @@
 import base64
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from services.quality.criteria import Criterion
 from services.reports.figure_data import ChipPair
+from services.reports.figures import FIGURES, figure_markup
 from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
 from services.reports.published import published_tables
 from services.reports.report import RegistrationReport
@@ -35,14 +37,10 @@ class GalleryGroup:
 
 def format_html(report: RegistrationReport) -> str:
     """The report as a self-contained page for screen, phone and paper."""
-    from services.reports.drawing import svg  # matplotlib: half a second that only a page needs
-    from services.reports.figures import FIGURES
-
-    page = _environment().get_template("registration.html")
-    return page.render(
+    return page_template().render(
         report=report,
         unmet=unmet_criteria(report),
-        figures={draw.__name__: Markup(svg(draw, report)) for draw in FIGURES},
+        figures={draw.__name__: Markup(figure_markup(draw, report)) for draw in FIGURES},
         gallery=choose_pairs(report.figure_data.gallery),
         published=published_tables(report),
         options=list(flat_options(report.run.options)),
@@ -50,8 +48,9 @@ def format_html(report: RegistrationReport) -> str:
     )
 
 
-def _environment() -> Environment:
-    """Templates that escape all values and raise an error for unknown names."""
+@cache
+def page_template() -> Template:
+    """The compiled template of the page; it escapes all values and raises an error for unknown names."""
     environment = Environment(
         loader=PackageLoader("services.reports", "."),
         autoescape=True,
@@ -70,7 +69,7 @@ def _environment() -> Environment:
         chip=chip_uri,
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
     )
-    return environment
+    return environment.get_template("registration.html")
 
 
 def unmet_criteria(report: RegistrationReport) -> list[Criterion]:

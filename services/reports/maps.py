@@ -1,205 +1,187 @@
 """The maps of a report: points, residuals and predicted accuracy, on the ground or on the image."""
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from services.geodesy import metres_per_degree
 from services.reports.drawing import (
     ACTIVE,
     ARROW,
     DEACTIVATED,
-    INK,
-    MANY_POINTS,
     NOT_MATCHED,
-    QUIET,
-    TEXT_PT,
     crowding,
-    image_axes,
-    image_height_in,
-    plain_axes,
+    image_panel,
     round_number,
     shortened,
+)
+from services.reports.plot import (
+    MARKS,
+    SMALL_TEXT,
+    WIDTH,
+    Figure,
+    Panel,
+    left_margin,
+    widened,
 )
 from services.reports.reasons import NO_REASON
 from services.reports.report import RegistrationReport
 from services.sensors.correction import ImageCorrection
 from services.types import Array, BoolArray
 
-_REASON_MARKERS = ("x", "+", "^", "s", "d")
+_ON_IMAGE = "#c9ced4"
+"""Colour of points that are not matched, on the dark quicklook."""
+_LEGEND_ROW = 14.0
+_PALE, _DEEP = np.array([247.0, 251.0, 255.0]), np.array([0.0, 92.0, 190.0])
+"""Ends of the colours of the predicted accuracy, red, green and blue."""
 
 
 def ground_overview(report: RegistrationReport) -> Figure:
     """The footprint of the scene and its points, kilometres east and north of its middle."""
-    figure, axes = plain_axes(height_in=3.6)
+    figure = Figure(272.0)
     outline, measures = report.scene.footprint_lon_lat, report.figure_data.measures
     places = outline if len(outline) else measures.lon_lat_h[:, :2]
     centre = places.mean(axis=0) if len(places) else np.zeros(2)
     km = np.array(metres_per_degree(float(centre[1]), 0.0)) / 1000.0
-    if len(outline):
-        ring = (np.concatenate([outline, outline[:1]]) - centre) * km
-        axes.fill(*ring.T, facecolor=ACTIVE, alpha=0.10, edgecolor="none")
-        axes.plot(*ring.T, color=ACTIVE, linewidth=1.0)
     offset = measures.lon_lat_h[:, :2] - centre
     offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
-    _scatter_by_status(axes, offset[:, ::-1] * km[::-1], measures.matched, measures.active)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("km east")
-    axes.set_ylabel("km north")
-    axes.grid(color=QUIET, alpha=0.25, linewidth=0.5)
+    points_km, outline_km = offset * km, (outline - centre) * km
+    panel = _equal_panel(figure, np.concatenate([points_km, outline_km]))
+    panel.x_axis("km east", count=8, grid=True)
+    panel.y_axis("km north", grid=True)
+    if len(outline):
+        ring = panel.places(*np.concatenate([outline_km, outline_km[:1]]).T)
+        figure.area(ring, ACTIVE, 0.10)
+        figure.line(ring, ACTIVE, 1.0)
+    for shown, colour, diameter in (
+        (~measures.matched, NOT_MATCHED, 2.6),
+        (measures.matched & ~measures.active, DEACTIVATED, 3.2),
+        (measures.active, ACTIVE, 3.2),
+    ):
+        figure.discs(panel.places(*points_km[shown].T), diameter, colour)
     return figure
+
+
+def _equal_panel(figure: Figure, shown: Array) -> Panel:
+    """A panel that shows places (n, 2) with the same scale on both axes."""
+    if not len(shown):
+        shown = np.zeros((1, 2))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    ranges = np.array([widened(*pair) for pair in zip(low.tolist(), high.tolist(), strict=True)])
+    left = left_margin((ranges[1, 0], ranges[1, 1]))
+    size = np.array([WIDTH - left - 8.0, figure.height - 38.0])
+    middle = ranges.mean(axis=1)
+    half = size / 2.0 * float((np.ptp(ranges, axis=1) / size).max())
+    (west, south), (east, north) = (middle - half).tolist(), (middle + half).tolist()
+    return Panel(figure, left, 4.0, float(size[0]), float(size[1]), (west, east), (south, north))
 
 
 def residual_map(report: RegistrationReport) -> Figure:
     """Residual vectors of the active points on the image, enlarged, with an arrow for the scale."""
-    figure, axes = image_axes(report, darkness=0.45)
-    measures = report.figure_data.measures
+    panel = image_panel(report, darkness=0.45, above=20.0, below=2.0)
+    figure, measures = panel.figure, report.figure_data.measures
     drawn = measures.active & np.isfinite(measures.residual_px).all(axis=1)
     residual, place = measures.residual_px[drawn], measures.line_sample[drawn]
-    axes.set_title(" " if len(residual) else "no active points", color=INK, fontsize=TEXT_PT, pad=10)
     if not len(residual):
+        figure.text(WIDTH / 2.0, 12.0, "no active points", anchor="middle")
         return figure
     length_px = np.hypot(*residual.T)
     key_px = round_number(float(np.quantile(length_px, 0.9)))
     crowd = crowding(len(residual))
     enlarged = 0.06 * crowd * float(np.hypot(*report.scene.shape)) / key_px
-    arrows = axes.quiver(
-        place[:, 1],
-        place[:, 0],
-        residual[:, 1] * enlarged,
-        residual[:, 0] * enlarged,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        color=ARROW if report.figure_data.quicklook is not None else ACTIVE,
-        width=0.0035 * crowd,
-    )
-    axes.quiverkey(
-        arrows,
-        X=0.06,
-        Y=1.04,
-        U=key_px * enlarged,
-        angle=0.0,
-        label=f"{key_px:g} px = {key_px * report.scene.gsd_m:.2g} m",
-        labelpos="E",
-        color=ACTIVE,
-        labelcolor=INK,
-        fontproperties={"size": TEXT_PT},
-    )
+    tips = place + enlarged * residual
+    width = 1.3 * crowd
+    colour = ARROW if report.figure_data.quicklook is not None else ACTIVE
+    tails, heads = panel.places(place[:, 1], place[:, 0]), panel.places(tips[:, 1], tips[:, 0])
+    with panel.clipped():
+        figure.arrows(tails, heads, colour, width)
+    key = key_px * enlarged * panel.width / report.scene.samples
+    figure.arrows(np.array([[2.0, 9.0]]), np.array([[2.0 + key, 9.0]]), ACTIVE, 1.3)
+    words = f"{key_px:g} px = {key_px * report.scene.gsd_m:.2g} m"
+    figure.text(8.0 + key, 12.5, words)
     return figure
 
 
 def coverage_map(report: RegistrationReport) -> Figure:
     """The points on the image by status and reason, and the cells without an active point."""
-    figure, axes = image_axes(report, darkness=0.6)
-    cells = report.coverage.cells
-    line_edges, sample_edges = (
-        np.linspace(-0.5, size - 0.5, len(cells) + 1) for size in report.scene.shape
-    )
-    for row, column in np.argwhere(cells == 0):
-        corner = sample_edges[column], line_edges[row]
-        size = sample_edges[1] - sample_edges[0], line_edges[1] - line_edges[0]
-        axes.add_patch(Rectangle(corner, *size, facecolor=DEACTIVATED, alpha=0.2, edgecolor="none"))
-    axes.vlines(sample_edges[1:-1], line_edges[0], line_edges[-1], color=NOT_MATCHED, linewidth=0.5)
-    axes.hlines(line_edges[1:-1], sample_edges[0], sample_edges[-1], color=NOT_MATCHED, linewidth=0.5)
-    _scatter_reasons(axes, report)
-    handles, _ = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(
-            loc="upper left",
-            bbox_to_anchor=(-0.02, -0.02),
-            ncols=2,
-            frameon=False,
-            fontsize=TEXT_PT - 1,
-            labelcolor=INK,
-            handletextpad=0.3,
-            markerscale=crowding(len(report.figure_data.measures.point_id)) ** -0.5,
-        )
+    groups = _groups(report)
+    below = 8.0 + _LEGEND_ROW * ((len(groups) + 1) // 2)
+    panel = image_panel(report, darkness=0.6, above=2.0, below=below)
+    figure, cells = panel.figure, report.coverage.cells
+    width, height = panel.width / cells.shape[1], panel.height / cells.shape[0]
+    for row, column in np.argwhere(cells == 0).tolist():
+        corner = panel.left + column * width, panel.top + row * height
+        figure.box(corner, (width, height), DEACTIVATED, opacity=0.2)
+    for k in range(1, cells.shape[1]):
+        x = panel.left + k * width
+        figure.line(np.array([(x, panel.top), (x, panel.top + panel.height)]), NOT_MATCHED, 0.5)
+    for k in range(1, cells.shape[0]):
+        y = panel.top + k * height
+        figure.line(np.array([(panel.left, y), (panel.left + panel.width, y)]), NOT_MATCHED, 0.5)
+    crowd = crowding(len(report.figure_data.measures.point_id))
+    rows = (len(groups) + 1) // 2
+    for k, (label, place, shape, colour) in enumerate(groups):
+        _draw_group(figure, panel.places(place[:, 1], place[:, 0]), shape, colour, crowd)
+        x = 8.0 + (k // rows) * WIDTH / 2.0
+        y = panel.top + panel.height + 12.0 + (k % rows) * _LEGEND_ROW
+        shown_colour = NOT_MATCHED if colour == _ON_IMAGE else colour
+        _draw_group(figure, np.array([[x, y - 3.0]]), shape, shown_colour, 1.0)
+        figure.text(x + 8.0, y, label, size=SMALL_TEXT)
     return figure
+
+
+def _groups(report: RegistrationReport) -> list[tuple[str, Array, str, str]]:
+    """Label, places (n, 2), shape and colour of the points by status and reason, active points last.
+
+    The places are the projections by the refined model.
+    """
+    measures, record = report.figure_data.measures, report.correction
+    correction = ImageCorrection(record.parameters_px, record.centre_px, record.half_size_px)
+    place = correction.apply(measures.predicted)
+    codes = np.where(measures.reason == "", NO_REASON, measures.reason)
+    on_image = report.figure_data.quicklook is not None
+    kinds: list[tuple[BoolArray, str, str]] = [
+        (~measures.matched, _ON_IMAGE if on_image else NOT_MATCHED, "not matched"),
+        (measures.matched & ~measures.active, DEACTIVATED, "deactivated"),
+    ]
+    groups = []
+    for rows, colour, stage in kinds:
+        for k, reason in enumerate(r for r in report.reasons if r.stage == stage):
+            label = f"{shortened(reason.label)} ({reason.count})"
+            shape = MARKS[min(k, len(MARKS) - 1)]
+            groups.append((label, place[rows & (codes == reason.reason)], shape, colour))
+    if measures.active.any():
+        label = f"active ({int(measures.active.sum())})"
+        groups.append((label, place[measures.active], "disc", ACTIVE))
+    return groups
+
+
+def _draw_group(figure: Figure, places: Array, shape: str, colour: str, crowd: float) -> None:
+    """Draw marks of one shape; discs get a white rim."""
+    if shape == "disc":
+        figure.discs(places, 4.8 * crowd, "white")
+        figure.discs(places, 4.0 * crowd, colour)
+    else:
+        figure.marks(places, shape, 4.2 * crowd**0.5, colour)
 
 
 def predicted_map(report: RegistrationReport) -> Figure:
     """CE90 that the covariance of the correction predicts over the image."""
-    figure, axes = plain_axes(height_in=image_height_in(report.scene.shape))
+    lines, samples = (float(size) for size in report.scene.shape)
+    left = left_margin((lines, 0.0))
+    scale = min((WIDTH - left - 10.0) / samples, 540.0 / lines)
+    width, height = samples * scale, lines * scale
+    figure = Figure(height + 38.0)
+    panel = Panel(figure, left, 6.0, width, height, (0.0, samples), (lines, 0.0))
     ce90_px = report.predicted.ce90_px
-    edges = [np.linspace(0.0, size, len(ce90_px) + 1) for size in report.scene.shape]
     finite = ce90_px[np.isfinite(ce90_px)]
     top = float(finite.max()) if len(finite) and finite.max() > 0.0 else 1.0
-    axes.pcolormesh(edges[1], edges[0], ce90_px, cmap="Blues", vmin=0.0, vmax=1.6 * top)
-    middles = [(edge[1:] + edge[:-1]) / 2.0 for edge in edges]
-    for row, column in np.argwhere(np.isfinite(ce90_px)):
-        axes.text(
-            middles[1][column],
-            middles[0][row],
-            f"{ce90_px[row, column]:.2f}",
-            ha="center",
-            va="center",
-            color="#10243a",
-            fontsize=TEXT_PT - 1.5,
-        )
-    axes.set_aspect("equal")
-    axes.set_xlim(0, report.scene.samples)
-    axes.set_ylim(report.scene.lines, 0)
-    axes.set_xlabel("sample")
-    axes.set_ylabel("line")
-    axes.locator_params(nbins=5)
+    cell = width / ce90_px.shape[1], height / ce90_px.shape[0]
+    for row, column in np.argwhere(np.isfinite(ce90_px)).tolist():
+        x, y = panel.left + column * cell[0], panel.top + row * cell[1]
+        red, green, blue = _PALE + (_DEEP - _PALE) * (ce90_px[row, column] / (1.6 * top))
+        colour = f"rgb({red:.0f} {green:.0f} {blue:.0f})"
+        figure.box((x, y), (cell[0] + 0.3, cell[1] + 0.3), colour)
+        words, middle = f"{ce90_px[row, column]:.2f}", y + cell[1] / 2.0 + 3.0
+        figure.text(x + cell[0] / 2.0, middle, words, anchor="middle", size=8.5, colour="#10243a")
+    panel.x_axis("sample", count=5)
+    panel.y_axis("line")
     return figure
-
-
-def _scatter_by_status(axes: Axes, north_east: Array, matched: BoolArray, active: BoolArray) -> None:
-    """Draw points (n, 2) in the colour of their status."""
-    for shown, colour, size in (
-        (~matched, NOT_MATCHED, 6),
-        (matched & ~active, DEACTIVATED, 9),
-        (active, ACTIVE, 9),
-    ):
-        axes.scatter(
-            north_east[shown, 1],
-            north_east[shown, 0],
-            s=size,
-            color=colour,
-            linewidths=0,
-            rasterized=len(north_east) > MANY_POINTS,
-        )
-
-
-def _scatter_reasons(axes: Axes, report: RegistrationReport) -> None:
-    """Draw points where the refined model projects them: active points as discs, others by reason."""
-    measures, record = report.figure_data.measures, report.correction
-    correction = ImageCorrection(record.parameters_px, record.centre_px, record.half_size_px)
-    place = correction.apply(measures.predicted)
-    many, crowd = len(place) > MANY_POINTS, crowding(len(place))
-    kinds = [
-        (~measures.matched, NOT_MATCHED, "not matched"),
-        (measures.matched & ~measures.active, DEACTIVATED, "deactivated"),
-    ]
-    codes = np.where(measures.reason == "", NO_REASON, measures.reason)
-    for rows, colour, stage in kinds:
-        reasons = [r for r in report.reasons if r.stage == stage]
-        for k, reason in enumerate(reasons):
-            shown = rows & (codes == reason.reason)
-            axes.scatter(
-                place[shown, 1],
-                place[shown, 0],
-                s=18 * crowd,
-                marker=_REASON_MARKERS[min(k, len(_REASON_MARKERS) - 1)],
-                color="#c9ced4"
-                if colour == NOT_MATCHED and report.figure_data.quicklook is not None
-                else colour,
-                linewidths=1.0,
-                label=f"{shortened(reason.label)} ({reason.count})",
-                rasterized=many,
-            )
-    active = measures.active
-    if active.any():
-        axes.scatter(
-            place[active, 1],
-            place[active, 0],
-            s=16 * crowd,
-            color=ACTIVE,
-            edgecolors="white",
-            linewidths=0.4,
-            label=f"active ({int(active.sum())})",
-            rasterized=many,
-        )

@@ -10,11 +10,12 @@ import pytest
 from services.quality.criteria import Criterion
 from services.registration.options import RegistrationOptions
 from services.reports.charts import funnel
-from services.reports.drawing import round_number, svg
+from services.reports.drawing import round_number
 from services.reports.figure_data import Quicklook
-from services.reports.figures import FIGURES
+from services.reports.figures import FIGURES, figure_markup
 from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
-from services.reports.maps import residual_map
+from services.reports.maps import coverage_map, residual_map
+from services.reports.plot import tick_words, ticks
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -155,11 +156,12 @@ def test_a_page_of_thousands_of_points_stays_light(material):
 
 
 def test_the_same_registration_gives_the_same_figure(material):
-    assert svg(residual_map, material().report()) == svg(residual_map, material().report())
+    first, second = (figure_markup(residual_map, material().report()) for _ in range(2))
+    assert first == second
 
 
 def test_figures_on_one_page_share_no_identifier(report):
-    seen = [set(re.findall(r' id="([^"]+)"', svg(draw, report))) for draw in FIGURES]
+    seen = [set(re.findall(r' id="([^"]+)"', figure_markup(draw, report))) for draw in FIGURES]
     assert sum(map(len, seen)) == len(set.union(*seen))
 
 
@@ -168,21 +170,53 @@ def test_the_residual_arrows_point_where_the_residuals_do(material):
     made = material()
     residual = np.tile([1.0, 2.0], (60, 1))
     measures = replace(made.measures, residual_px=residual)
-    axes = residual_map(made.with_measures(measures).report()).axes[0]
-    arrows = axes.collections[0]
-    assert axes.yaxis_inverted()
-    assert (arrows.U > 0).all()
-    np.testing.assert_allclose(arrows.U, 2.0 * arrows.V)
+    drawn = figure_markup(residual_map, made.with_measures(measures).report())
+    on_image = drawn[drawn.index("<svg x=") :]
+    shafts = re.findall(r"M[\d.]+ [\d.]+l(-?[\d.]+) (-?[\d.]+)", on_image[: on_image.index("stroke")])
+    right, down = np.array(shafts, dtype=float).T
+    a_printed_digit = 0.1
+    assert len(shafts) == made.measures.active.sum()
+    assert (down > 0).all()
+    np.testing.assert_allclose(right, 2.0 * down, atol=a_printed_digit)
 
 
 def test_the_funnel_ends_at_the_point_counts(report):
-    axes = funnel(report).axes[0]
-    widths = dict(zip([label.get_text() for label in axes.get_yticklabels()], axes.patches, strict=True))
+    drawn = figure_markup(funnel, report)
+    bar = r'<rect x="([\d.]+)" [^>]*width="([\d.]+)"[^>]*><title>([^<]+): (\d+)</title>'
+    bars = {name: (float(x), float(w), int(n)) for x, w, name, n in re.findall(bar, drawn)}
     counts = report.point_counts
-    assert widths["visible"].get_width() == counts.visible
-    assert widths["matched"].get_width() == counts.matched
-    assert widths["active"].get_width() == counts.active
-    assert widths["beyond 2.7 sigma"].get_x() == counts.active
+    left, width, _ = bars["visible"]
+    assert bars["visible"][2] == counts.visible
+    assert bars["matched"][2] == counts.matched
+    assert bars["active"][2] == counts.active
+    for name in ("matched", "active"):
+        assert bars[name][1] == pytest.approx(width * bars[name][2] / counts.visible, abs=0.02)
+    lost_from = (bars["beyond 2.7 sigma"][0] - left) / width * counts.visible
+    assert lost_from == pytest.approx(counts.active, abs=0.02 * counts.visible / width)
+
+
+def test_what_a_figure_draws_of_hostile_labels_is_text(material):
+    made = material()
+    reason = np.where(made.measures.active, "", HOSTILE)
+    report = made.with_measures(replace(made.measures, reason=reason)).report()
+    for draw in (funnel, coverage_map):
+        parsed = Page(figure_markup(draw, report))
+        assert parsed.tags <= {"svg", "path", "rect", "text", "title", "image"}
+        assert any("<script>" in text for text in parsed.texts)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "count", "words"),
+    [
+        (0.0, 2200.0, 5, "0 500 1000 1500 2000"),
+        (2200.0, 0.0, 5, "0 500 1000 1500 2000"),
+        (-0.13, 0.21, 4, "\N{MINUS SIGN}0.1 0.0 0.1 0.2"),
+        (210.0, 310.0, 4, "220 240 260 280 300"),
+        (1e-7, 4e-7, 3, "0.0000001 0.0000002 0.0000003 0.0000004"),
+    ],
+)
+def test_ticks_are_round_numbers_within_the_range(first, last, count, words):
+    assert " ".join(tick_words(ticks(first, last, count))) == words
 
 
 def test_the_gallery_shows_best_middle_and_worst_and_no_pair_twice(material):
