@@ -14,6 +14,8 @@ from app.errors import InputError
 
 GIBIBYTE = 1 << 30
 MEBIBYTE = 1 << 20
+RENAMED = {"AMERS_QUOTA_UPLOAD_BYTES": "AMERS_QUOTA_STORAGE_BYTES"}
+"""Former names of settings: a limit that somebody has set must not be ignored."""
 
 
 def default_data_folder() -> Path:
@@ -44,9 +46,11 @@ class Settings(BaseSettings):
         scene_folder: scenes below it can be registered without an upload; None allows none.
         reference_folder: reference images and terrains below it can be added; None allows none.
         ingest_folder: block folders below it can be ingested through the API; None allows none.
-        quota_upload_bytes: largest total size of the uploads of one token in the storage.
+        quota_storage_bytes: largest total size of all that one token has in the storage.
+        quota_open_uploads: largest number of resumable uploads of one token that are not complete.
         quota_jobs: largest number of open jobs of one token.
         jobs_running_per_owner: largest number of running jobs of one token; None: no limit.
+        quota_kept_jobs: largest number of jobs of one token, those that have ended included.
         public_metrics: whether metrics can be read without a token.
         cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*` for all.
         oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
@@ -77,9 +81,11 @@ class Settings(BaseSettings):
     scene_folder: Path | None = None
     reference_folder: Path | None = None
     ingest_folder: Path | None = None
-    quota_upload_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
+    quota_storage_bytes: int = Field(default=1024 * GIBIBYTE, ge=0)
+    quota_open_uploads: int = Field(default=100, ge=0)
     quota_jobs: int = Field(default=100, ge=0)
     jobs_running_per_owner: int | None = Field(default=None, ge=1)
+    quota_kept_jobs: int = Field(default=10_000, ge=0)
     public_metrics: bool = False
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
     oidc_issuer: str | None = None
@@ -116,8 +122,11 @@ def read_settings() -> Settings:
     """The settings of this process.
 
     Raises:
-        InputError: variables have unusable values; the message names them.
+        InputError: variables have unusable values or former names; the message names them.
     """
+    for former, present in RENAMED.items():
+        if former in os.environ:
+            raise InputError(f"environment: {former} is now {present}; set it under this name")
     try:
         return Settings()
     except ValidationError as error:

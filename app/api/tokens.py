@@ -19,9 +19,9 @@ class TokenToMake(BaseModel):
     name: str = Field(description="Name of the token, for people.")
     scopes: list[Scope] = Field(description="What the token allows.")
     days: int | None = Field(default=None, description="Days until it expires; null: never.")
-    upload_quota_bytes: int | None = Field(
+    storage_quota_bytes: int | None = Field(
         default=None,
-        description="Bytes its scenes may take in the storage; null: as the settings have it.",
+        description="Bytes that all its files may take in the storage; null: as the settings have it.",
     )
     job_quota: int | None = Field(
         default=None, description="Jobs that may wait or run at once; null: as the settings have it."
@@ -39,7 +39,7 @@ def create(
             body.name,
             body.scopes,
             body.days,
-            upload_quota_bytes=body.upload_quota_bytes,
+            storage_quota_bytes=body.storage_quota_bytes,
             job_quota=body.job_quota,
         )
     response.headers["Location"] = f"{request.base_url}tokens/{new.token.id}"

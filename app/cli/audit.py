@@ -14,7 +14,7 @@ def audit(
     limit: Annotated[int, typer.Option(help="Largest number of changes to show, 1 to 1000.")] = 50,
     kind: Annotated[
         str | None,
-        typer.Option(help="Only this kind: token, block, scene, job, point or reference_image."),
+        typer.Option(help="Only this kind: token, block, scene, job, point, reference_image or audit."),
     ] = None,
     subject: Annotated[
         str | None, typer.Option(help="Only the thing with this id; ID@VERSION for a block.")

@@ -22,9 +22,9 @@ def create(
     days: Annotated[
         int | None, typer.Option(help="Days until the token expires; by default it does not.")
     ] = None,
-    upload_quota_bytes: Annotated[
+    storage_quota_bytes: Annotated[
         int | None,
-        typer.Option(help="Bytes that its scenes may take; by default that of the settings."),
+        typer.Option(help="Bytes that all its files may take; by default that of the settings."),
     ] = None,
     job_quota: Annotated[
         int | None, typer.Option(help="Jobs that may be open at once; by default that of the settings.")
@@ -38,7 +38,7 @@ def create(
             name,
             scope,
             days,
-            upload_quota_bytes=upload_quota_bytes,
+            storage_quota_bytes=storage_quota_bytes,
             job_quota=job_quota,
         )
     record = {**_record(new.token), "secret": new.secret}
@@ -77,6 +77,6 @@ def _record(token: Token) -> Row:
         "expires_at": token.expires_at,
         "revoked_at": token.revoked_at,
         "subject": token.subject,
-        "upload_quota_bytes": token.upload_quota_bytes,
+        "storage_quota_bytes": token.storage_quota_bytes,
         "job_quota": token.job_quota,
     }

@@ -1,17 +1,20 @@
-"""The table `audit`: changes of tokens, blocks, scenes, jobs and points, written by the database."""
+"""The table `audit`: changes of tokens, blocks, scenes, jobs and points, written by the database.
+
+The kind `audit` is the removal of its oldest rows.
+"""
 
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 from uuid import UUID
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from app.db.engine import Connection
 from app.db.rows import columns_of, every
-from app.db.schema import audit, job
+from app.db.schema import audit
 
-KINDS = ("token", "block", "scene", "job", "point", "reference_image")
+KINDS = ("token", "block", "scene", "job", "point", "reference_image", "audit")
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Change:
     after: dict[str, Any] | None
 
 
-COLUMNS = columns_of(Change, audit, actor=func.coalesce(audit.c.actor, job.c.owner))
+COLUMNS = columns_of(Change, audit)
 
 
 def list_changes(
@@ -52,12 +55,7 @@ def list_changes(
         before: changes with smaller ids only.
         kind, subject: None for all.
     """
-    statement = (
-        select(*COLUMNS)
-        .select_from(audit.outerjoin(job, job.c.id == audit.c.job_id))
-        .order_by(audit.c.id.desc())
-        .limit(limit)
-    )
+    statement = select(*COLUMNS).order_by(audit.c.id.desc()).limit(limit)
     if before is not None:
         statement = statement.where(audit.c.id < before)
     if kind is not None:

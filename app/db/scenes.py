@@ -6,7 +6,20 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import JSON, Text, cast, delete, exists, func, insert, literal, select, update
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    ColumnElement,
+    Text,
+    cast,
+    delete,
+    exists,
+    func,
+    insert,
+    literal,
+    select,
+    update,
+)
 from sqlalchemy.dialects.postgresql import JSONB
 
 from app.db.engine import Connection
@@ -62,7 +75,12 @@ def begin_upload(
     sigma_m: float | None,
     announced_bytes: int | None = None,
 ) -> UUID:
-    """Insert a scene whose image will be uploaded; returns its id."""
+    """Insert a scene whose image will be uploaded; returns its id.
+
+    Args:
+        announced_bytes: size of the image, or the most that may arrive; None where a row of `upload` has
+            it.
+    """
     scene_id = uuid4()
     connection.execute(
         insert(scene).values(
@@ -104,7 +122,10 @@ def add_model(connection: Connection, scene_id: UUID, name: str, size_bytes: int
     updated = connection.execute(
         update(scene)
         .where(scene.c.id == scene_id, scene.c.state != "removed")
-        .values(models=scene.c.models.concat(file))
+        .values(
+            models=scene.c.models.concat(file),
+            side_file_bytes=scene.c.side_file_bytes + size_bytes - _recorded_bytes(name),
+        )
     )
     return updated.rowcount == 1
 
@@ -114,7 +135,19 @@ def drop_model(connection: Connection, scene_id: UUID, name: str) -> None:
     connection.execute(
         update(scene)
         .where(scene.c.id == scene_id, scene.c.models.has_key(name))
-        .values(models=scene.c.models.op("-")(cast(name, Text)))
+        .values(
+            models=scene.c.models.op("-")(cast(name, Text)),
+            side_file_bytes=scene.c.side_file_bytes - _recorded_bytes(name),
+        )
+    )
+
+
+def reserve(connection: Connection, scene_id: UUID, size_bytes: int) -> None:
+    """Record the bytes that a scene will take beyond the size of its upload."""
+    connection.execute(
+        update(scene)
+        .where(scene.c.id == scene_id, scene.c.state == "uploading")
+        .values(size_bytes=size_bytes)
     )
 
 
@@ -230,3 +263,8 @@ def with_files(connection: Connection, scene_ids: list[UUID]) -> set[UUID]:
 
 def _finite(angle_deg: float | None) -> float | None:
     return None if angle_deg is None or math.isnan(angle_deg) else angle_deg
+
+
+def _recorded_bytes(name: str) -> ColumnElement[int]:
+    """The recorded size of a file beside the image of a scene, 0 without such a file."""
+    return func.coalesce(cast(scene.c.models[name]["size_bytes"].astext, BigInteger), 0)

@@ -10,9 +10,7 @@ from sqlalchemy.dialects.postgresql import insert
 from app.db.engine import Connection, driver
 from app.db.rows import columns_of, every, first, only
 from app.db.schema import job, now, token
-from app.db.statements import hot, named
-
-UPLOADED_BYTES = named("tokens.sql", "uploaded_bytes")
+from app.db.statements import hot
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,7 @@ class Token:
         scopes: some of `read`, `register`, `monitor`, `admin`.
         expires_at, revoked_at: None: never, not.
         subject: the identity at the issuer; None for a token with a secret.
-        upload_quota_bytes, job_quota: None: those of the settings.
+        storage_quota_bytes, job_quota: None: those of the settings.
     """
 
     id: UUID
@@ -33,7 +31,7 @@ class Token:
     expires_at: datetime | None
     revoked_at: datetime | None
     subject: str | None = None
-    upload_quota_bytes: int | None = None
+    storage_quota_bytes: int | None = None
     job_quota: int | None = None
 
 
@@ -55,7 +53,7 @@ def insert_token(
     secret_hash: bytes,
     scopes: tuple[str, ...],
     days: int | None,
-    upload_quota_bytes: int | None = None,
+    storage_quota_bytes: int | None = None,
     job_quota: int | None = None,
 ) -> Token:
     """Store a new token that expires after so many days, or never."""
@@ -67,7 +65,7 @@ def insert_token(
             secret_hash=secret_hash,
             scopes=scopes,
             expires_at=None if days is None else now + func.make_interval(0, 0, 0, days),
-            upload_quota_bytes=upload_quota_bytes,
+            storage_quota_bytes=storage_quota_bytes,
             job_quota=job_quota,
         )
         .returning(*COLUMNS)
@@ -133,14 +131,10 @@ def revoke_token(connection: Connection, token_id: UUID) -> Token:
     return only(Token, connection.execute(statement))
 
 
-def lock_token(connection: Connection, token_id: UUID) -> None:
-    """Make others who count what this token uses wait until the end of the transaction."""
-    connection.execute(select(token.c.id).where(token.c.id == token_id).with_for_update(key_share=True))
-
-
-def uploaded_bytes(connection: Connection, token_id: UUID) -> int:
-    """Bytes in the storage that the scenes of a token use and its unfinished uploads will use."""
-    return int(connection.execute(UPLOADED_BYTES, {"owner": token_id}).scalar_one())
+def lock_token(connection: Connection, token_id: UUID) -> Token:
+    """The token; others who count what it uses wait until the end of the transaction."""
+    statement = select(*COLUMNS).where(token.c.id == token_id).with_for_update(key_share=True)
+    return only(Token, connection.execute(statement))
 
 
 def open_jobs(connection: Connection, token_id: UUID) -> int:

@@ -83,7 +83,8 @@ def execute(
     Raises:
         NotFound: no such process, or an input that does not exist for this caller.
         NotAllowed: the caller's token lacks the scope of the process, or of a priority.
-        TooMany: the caller has as many open jobs as the quota allows.
+        TooMany: the caller has as many jobs as the quotas allow.
+        TooLarge: the process makes files, and the caller's storage quota is used up.
         InputError: unusable inputs or outputs, or the key was used with another request.
     """
     process = find_process(request.process_id)
@@ -105,6 +106,8 @@ def execute(
             return _same_request(earlier, checked)
     process.check(connection, caller, parsed)
     quotas.require_free_job(connection, settings, caller)
+    if process.outputs:
+        quotas.require_room(connection, settings, caller.id, f"a job that does {process.id}")
     job = jobs.create(
         connection,
         kind=checked.process_id,

@@ -43,7 +43,8 @@ def list_changes(
     Args:
         limit: at most this many changes, 1 to 1,000.
         before: only changes with an id below this one: the next page.
-        kind: only changes of this kind: `token`, `block`, `scene`, `job`, `point` or `reference_image`.
+        kind: only changes of this kind: `token`, `block`, `scene`, `job`, `point`, `reference_image` or
+            `audit`.
         subject: only changes of the thing with this id; ID@VERSION for a block.
 
     Raises:

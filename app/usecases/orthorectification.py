@@ -15,6 +15,7 @@ from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError
 from app.usecases.processes import Commit, Process, Work
+from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
 from app.usecases.terrain_file import TerrainFile, read_terrain
@@ -240,7 +241,7 @@ def _run(work: Work) -> Commit:
             options=inputs.options,
             progress=work.progress,
         )
-        key = work.storage.put_file(f"{work.attempt_folder}/{ORTHO_NAME}", ortho.path).key
+        keys = store_results(work, {ORTHO_NAME: ortho.path})
 
     def commit(connection: Connection) -> dict[str, Any]:
         return {
@@ -248,7 +249,7 @@ def _run(work: Work) -> Commit:
             "samples": ortho.samples,
             "seen": ortho.seen,
             "error_px": ortho.error_px,
-            "files": {ORTHO_NAME: key},
+            "files": keys,
         }
 
     return commit

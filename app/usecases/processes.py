@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
+from uuid import UUID
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -42,7 +43,12 @@ class Work:
     @property
     def attempt_folder(self) -> str:
         """Key prefix of the files of this attempt in the storage; no other attempt uses it."""
-        return f"results/{self.job.id}/{self.job.attempt}"
+        return f"{results_folder(self.job.id)}/{self.job.attempt}"
+
+
+def results_folder(job_id: UUID) -> str:
+    """Key prefix of the files of all attempts at a job in the storage."""
+    return f"results/{job_id}"
 
 
 @dataclass(frozen=True)

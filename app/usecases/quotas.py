@@ -1,48 +1,81 @@
-"""Quotas of one token: bytes of uploads in the storage, and open jobs."""
+"""Quotas of one token: bytes in the storage, open uploads, and jobs.
+
+Everything that a token makes counts: scenes with the files beside them, uploads under way, archives of
+blocks, and results of jobs. Each function locks the token until the end of the transaction, in which the
+caller records what it reserves: concurrent requests of one token wait for each other here.
+"""
+
+from uuid import UUID
 
 from app.config import Settings
-from app.db import tokens
+from app.db import tokens, usage
 from app.db.engine import Connection
+from app.db.jobs import attempts
+from app.db.jobs.jobs import Job
 from app.db.tokens import Token
 from app.errors import TooLarge, TooMany
 
+FREE_ROOM = (
+    "delete scenes, uploads or jobs that are no longer needed, or ask the administrator for a larger "
+    "quota"
+)
 
-def upload_allowance(
-    connection: Connection, settings: Settings, caller: Token, announced_bytes: int | None = None
+
+def storage_quota(settings: Settings, token: Token) -> int:
+    """The storage quota of a token, bytes."""
+    quota = token.storage_quota_bytes
+    return settings.quota_storage_bytes if quota is None else quota
+
+
+def require_room(
+    connection: Connection,
+    settings: Settings,
+    owner: UUID,
+    what: str,
+    size_bytes: int | None = None,
 ) -> int:
-    """The bytes that a token may still upload; locks the token until the end of the transaction.
-
-    Call it in the transaction that records the announced size: concurrent uploads of one token then
-    wait for each other here.
+    """The bytes that a token may still store, at least 1; locks the token.
 
     Args:
-        announced_bytes: size of the upload; None when the sender does not announce it.
+        what: is to be stored, for the message.
+        size_bytes: of it; None when the size is not known.
 
     Raises:
-        TooLarge: the quota is used up, or the announced upload exceeds what is left of it.
+        TooLarge: the quota is used up, or the size exceeds what is left of it.
     """
-    quota = caller.upload_quota_bytes
-    allowed = settings.quota_upload_bytes if quota is None else quota
-    tokens.lock_token(connection, caller.id)
-    used = tokens.uploaded_bytes(connection, caller.id)
-    left = allowed - used
-    if left <= 0 or (announced_bytes is not None and announced_bytes > left):
-        upload = "an upload" if announced_bytes is None else f"an upload of {announced_bytes} bytes"
+    token = tokens.lock_token(connection, owner)
+    quota = storage_quota(settings, token)
+    used = usage.read_usage(connection, owner).total_bytes
+    left = quota - used
+    if left <= 0 or (size_bytes is not None and size_bytes > left):
+        size = "" if size_bytes is None else f" of {size_bytes} bytes"
         raise TooLarge(
-            f"{upload} exceeds the quota of token {caller.name}: {used} of {allowed} bytes are used; "
-            "remove scenes that are no longer needed, or ask the administrator for a larger quota"
+            f"{what}{size} exceeds the storage quota of token {token.name}: {used} of {quota} bytes are "
+            f"used; {FREE_ROOM}"
         )
     return left
 
 
-def require_free_job(connection: Connection, settings: Settings, caller: Token) -> None:
-    """Refuse a new job to a token whose open jobs reach its quota; locks the token.
-
-    Call it in the transaction that creates the job: concurrent requests of one token then wait for each
-    other here.
+def require_free_upload(connection: Connection, settings: Settings, owner: UUID) -> None:
+    """Refuse another resumable upload to a token that has as many open ones as allowed; locks the token.
 
     Raises:
-        TooMany: the token has as many open jobs as its quota allows.
+        TooMany: as many uploads are open as are allowed.
+    """
+    token = tokens.lock_token(connection, owner)
+    open_uploads = usage.read_usage(connection, owner).open_uploads
+    if open_uploads >= settings.quota_open_uploads:
+        raise TooMany(
+            f"token {token.name} has {open_uploads} open uploads of {settings.quota_open_uploads} "
+            "allowed; complete one, or delete one that is no longer needed"
+        )
+
+
+def require_free_job(connection: Connection, settings: Settings, caller: Token) -> None:
+    """Refuse a new job to a token whose open jobs or kept jobs reach their quota; locks the token.
+
+    Raises:
+        TooMany: the token has as many open jobs, or as many jobs in all, as its quota allows.
     """
     quota = caller.job_quota
     allowed = settings.quota_jobs if quota is None else quota
@@ -53,3 +86,21 @@ def require_free_job(connection: Connection, settings: Settings, caller: Token) 
             f"token {caller.name} has {open_jobs} open jobs of {allowed} allowed; "
             "wait until one has ended, or dismiss one"
         )
+    kept_jobs = usage.read_usage(connection, caller.id).jobs
+    if kept_jobs >= settings.quota_kept_jobs:
+        raise TooMany(
+            f"token {caller.name} has {kept_jobs} jobs of {settings.quota_kept_jobs} that are kept; "
+            "delete ended jobs that are no longer needed (DELETE /jobs/ID)"
+        )
+
+
+def reserve_results(connection: Connection, settings: Settings, job: Job, size_bytes: int) -> None:
+    """Record the size of the files that an attempt is about to store; locks the token of its owner.
+
+    Raises:
+        TooLarge: the files exceed what is left of the owner's quota.
+        LostJob: the attempt is over.
+    """
+    if job.owner is not None:
+        require_room(connection, settings, job.owner, "the result of the job", size_bytes)
+    attempts.reserve_results(connection, job.id, job.attempt, size_bytes)

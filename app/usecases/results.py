@@ -1,14 +1,20 @@
-"""Results of a job, sent as its request asked: values, and files by value or by reference."""
+"""Results of a job: stored within the owner's quota, sent as its request asked, and removed."""
 
 import base64
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from uuid import UUID
 
+from app.db.engine import Database
+from app.db.jobs import attempts
 from app.db.jobs.jobs import Job
 from app.errors import NotFound
 from app.storage import Storage
+from app.usecases import quotas
+from app.usecases.processes import Work, results_folder
 from app.usecases.registration.deliverables import media_type
 
 Transmission = Literal["value", "reference"]
@@ -34,6 +40,43 @@ class ResultFile:
     def media_type(self) -> str:
         """The media type, by the suffix of the name."""
         return media_type(self.name)
+
+
+def store_results(work: Work, files: Mapping[str, Path]) -> dict[str, str]:
+    """Put the files of an attempt into the storage; returns their keys by name.
+
+    Their size is reserved from the owner's quota first.
+
+    Raises:
+        TooLarge: the files exceed what is left of the quota; nothing is stored.
+        LostJob: the attempt is over.
+    """
+    size_bytes = sum(path.stat().st_size for path in files.values())
+    with work.database.transaction() as connection:
+        quotas.reserve_results(connection, work.settings, work.job, size_bytes)
+    return {
+        name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
+        for name, path in files.items()
+    }
+
+
+def discard_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int) -> None:
+    """Delete the files of an attempt that is over without success, and give back their room.
+
+    Does nothing for an attempt that runs or has succeeded.
+    """
+    with database.transaction() as connection:
+        if attempts.counting_attempts(connection, [job_id]).get(job_id) == attempt:
+            return
+    delete_files(storage, f"{results_folder(job_id)}/{attempt}")
+    with database.transaction() as connection:
+        attempts.release_results(connection, job_id, attempt)
+
+
+def delete_files(storage: Storage, folder: str) -> None:
+    """Delete the files below a folder of the storage."""
+    for key in storage.keys(folder):
+        storage.delete(key)
 
 
 def requested_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[ResultFile]]:

@@ -10,11 +10,12 @@ from uuid import UUID
 
 from app.auth import may_access, owner_filter
 from app.config import Settings
-from app.db import scenes
+from app.db import scenes, uploads
 from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
-from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge
+from app.db.uploads import AnnouncedFile
+from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge, TooMany
 from app.storage import Storage, StoredFile, Writing
 from app.usecases import quotas
 from app.usecases.installation import Installation
@@ -31,6 +32,8 @@ RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
 SIDE_FILE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES
 SIDE_FILE_LIMIT_BYTES = 16 << 20
 """Largest file with a model or with check points."""
+MOST_SIDE_FILES = 100
+"""Largest number of files beside one image."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +75,22 @@ def upload_scene(
     file_name = clean_name(sent.name)
     _refuse_too_large(sent, limit)
     with database.transaction() as connection:
-        left = quotas.upload_allowance(connection, installation.settings, owner, sent.size_bytes)
+        left = quotas.require_room(
+            connection, installation.settings, owner.id, "the image", sent.size_bytes
+        )
+        # An image of unknown size reserves the most that it may have until it has arrived.
+        limit = min(left, limit)
         scene_id = scenes.begin_upload(
             connection,
             owner.id,
             sent.name[-200:],
             file_name,
             sigma_m=sigma_m,
-            announced_bytes=sent.size_bytes,
+            announced_bytes=limit if sent.size_bytes is None else sent.size_bytes,
         )
     key = f"{folder_of(scene_id)}/{file_name}"
     try:
-        with _receiving(storage, key, sent, _images_only(sent.chunks), min(left, limit)) as image:
+        with _receiving(storage, key, sent, _images_only(sent.chunks), limit) as image:
             pass
         with database.transaction() as connection:
             row = scenes.finish_upload(connection, scene_id, key, image.size_bytes, image.sha256)
@@ -116,30 +123,50 @@ def upload_side_file(
         NotFound: there is no such scene, or the caller may not see it.
         Conflict: the scene's files were removed, or lie on the server.
         InputError: files of this kind do not belong beside an image.
-        TooLarge: the file exceeds the limit or the caller's quota.
+        TooLarge: the file exceeds the limit or the quota of the scene's owner.
+        TooMany: the scene has as many files as are allowed.
     """
-    settings, database = installation.settings, installation.database
+    database, settings = installation.database, installation.settings
     with database.transaction() as connection:
-        file_name = side_file_name(visible_scene(connection, caller, scene_id), sent.name)
+        scene = visible_scene(connection, caller, scene_id)
+        file_name = side_file_name(scene, sent.name)
         limit = side_file_limit(settings, file_name)
         _refuse_too_large(sent, limit)
-        left = quotas.upload_allowance(connection, settings, caller, sent.size_bytes)
+        owner = scene.owner or caller.id
+        left = quotas.require_room(connection, settings, owner, file_name, sent.size_bytes)
+        # A file of unknown size reserves the most that it may have until it has arrived.
+        limit = min(left, limit)
+        reserved = AnnouncedFile(
+            owner=owner,
+            purpose="model",
+            scene_id=scene_id,
+            name=sent.name[-200:],
+            file_name=file_name,
+            size_bytes=sent.size_bytes or limit,
+            sha256=None,
+            metadata="",
+        )
+        upload = uploads.insert_upload(connection, reserved)
     key = f"{folder_of(scene_id)}/{file_name}"
-    with (
-        _receiving(installation.storage, key, sent, sent.chunks, min(limit, left)) as writing,
-        database.transaction() as connection,
-    ):
-        scenes.drop_model(connection, scene_id, file_name)
     try:
+        with (
+            _receiving(installation.storage, key, sent, sent.chunks, limit) as writing,
+            database.transaction() as connection,
+        ):
+            scenes.drop_model(connection, scene_id, file_name)
+        try:
+            with database.transaction() as connection:
+                record_side_file(connection, scene_id, file_name, writing.size_bytes, writing.sha256)
+        except BaseException:
+            with database.transaction() as connection:
+                present = scenes.find_scene(connection, scene_id)
+            if present is None or file_name not in present.models:
+                with suppress(StorageOutage):
+                    installation.storage.delete(key)
+            raise
+    finally:
         with database.transaction() as connection:
-            record_side_file(connection, scene_id, file_name, writing.size_bytes, writing.sha256)
-    except BaseException:
-        with database.transaction() as connection:
-            scene = scenes.find_scene(connection, scene_id)
-        if scene is None or file_name not in scene.models:
-            with suppress(StorageOutage):
-                installation.storage.delete(key)
-        raise
+            uploads.delete_upload(connection, upload.id)
     return StoredFile(key, writing.size_bytes, writing.sha256)
 
 
@@ -155,6 +182,7 @@ def side_file_name(scene: SceneRow, name: str) -> str:
     Raises:
         Conflict: the scene's files were removed or lie on the server, or the name is that of the image.
         InputError: files of this kind do not belong beside an image.
+        TooMany: the scene has as many files as are allowed.
     """
     file_name = clean_name(name)
     if scene.state == "removed":
@@ -168,6 +196,11 @@ def side_file_name(scene: SceneRow, name: str) -> str:
         )
     if file_name == scene.file_name:
         raise Conflict(f"{file_name} is the image of the scene; choose another name")
+    if len(scene.models) >= MOST_SIDE_FILES and file_name not in scene.models:
+        raise TooMany(
+            f"{file_name}: scene {scene.id} has {len(scene.models)} files beside its image, the most "
+            "that are allowed; send it under the name of a file that it replaces"
+        )
     return file_name
 
 

@@ -11,7 +11,7 @@ from app.errors import Conflict, InputError, NotFound
 
 LONGEST_DAYS = 36_500
 LONGEST_NAME = 200
-LARGEST_QUOTA = {"upload_quota_bytes": 2**62, "job_quota": 1_000_000}
+LARGEST_QUOTA = {"storage_quota_bytes": 2**62, "job_quota": 1_000_000}
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def create_token(
     scopes: Iterable[str],
     days: int | None = None,
     *,
-    upload_quota_bytes: int | None = None,
+    storage_quota_bytes: int | None = None,
     job_quota: int | None = None,
 ) -> NewToken:
     """Create a token.
@@ -37,7 +37,7 @@ def create_token(
         name: for people; several tokens may have the same name.
         scopes: one or more of `read`, `register`, `monitor`, `admin`.
         days: how long the token is valid; None without end.
-        upload_quota_bytes, job_quota: the token's quotas; None for those of the settings.
+        storage_quota_bytes, job_quota: the token's quotas; None for those of the settings.
 
     Raises:
         InputError: no name, an unknown scope or none, or a number out of range.
@@ -46,7 +46,7 @@ def create_token(
         raise InputError(f"name: {len(name.strip())} characters found, 1 to {LONGEST_NAME} expected")
     if days is not None and not 1 <= days <= LONGEST_DAYS:
         raise InputError(f"days: {days} found, 1 to {LONGEST_DAYS} expected")
-    for field, quota in (("upload_quota_bytes", upload_quota_bytes), ("job_quota", job_quota)):
+    for field, quota in (("storage_quota_bytes", storage_quota_bytes), ("job_quota", job_quota)):
         if quota is not None and not 0 <= quota <= LARGEST_QUOTA[field]:
             raise InputError(f"{field}: {quota} found, 0 to {LARGEST_QUOTA[field]} expected")
     secret = new_secret()
@@ -56,7 +56,7 @@ def create_token(
         secret_hash=secret_hash(secret),
         scopes=_checked_scopes(scopes),
         days=days,
-        upload_quota_bytes=upload_quota_bytes,
+        storage_quota_bytes=storage_quota_bytes,
         job_quota=job_quota,
     )
     return NewToken(token, secret)

@@ -113,29 +113,31 @@ def create_upload(
 
     Raises:
         NotAllowed: the caller's token lacks the scope.
-        TooLarge: the announced size exceeds the limit or the caller's quota.
+        TooLarge: the announced size exceeds the limit or the quota of the owner.
+        TooMany: the owner has as many open uploads, or the scene as many files, as are allowed.
         InputError, NotFound, Conflict: name, purpose or scene cannot be used.
     """
     purpose: UploadPurpose = new.purpose or ("image" if new.scene is None else "model")
     require(caller, Scope.ADMIN if purpose == "block" else Scope.REGISTER)
-    is_side_file = purpose == "model"
-    limit = side_file_limit(settings, new.name) if is_side_file else settings.upload_limit_bytes
+    limit = side_file_limit(settings, new.name) if purpose == "model" else settings.upload_limit_bytes
     if new.size_bytes > limit:
         raise TooLarge(f"{new.name[-200:]}: {new.size_bytes} bytes announced, at most {limit} accepted")
-    quotas.upload_allowance(connection, settings, caller, new.size_bytes)
-    file_name, scene_id = clean_name(new.name), new.scene
-    if is_side_file:
+    file_name, scene_id, owner = clean_name(new.name), new.scene, caller.id
+    if purpose == "model":
         if scene_id is None:
             raise InputError("scene: missing; a model needs the id of the scene it belongs to")
-        file_name = side_file_name(visible_scene(connection, caller, scene_id), new.name)
-    elif purpose == "image":
-        if scene_id is not None:
-            raise InputError("scene: not expected; the upload of an image creates a new scene")
+        scene = visible_scene(connection, caller, scene_id)
+        file_name, owner = side_file_name(scene, new.name), scene.owner or caller.id
+    elif purpose == "image" and scene_id is not None:
+        raise InputError("scene: not expected; the upload of an image creates a new scene")
+    quotas.require_free_upload(connection, settings, owner)
+    quotas.require_room(connection, settings, owner, file_name, new.size_bytes)
+    if purpose == "image":
         scene_id = scenes.begin_upload(
             connection, caller.id, new.name[-200:], file_name, sigma_m=new.sigma_m
         )
     announced = AnnouncedFile(
-        owner=caller.id,
+        owner=owner,
         purpose=purpose,
         scene_id=None if purpose == "block" else scene_id,
         name=new.name[-200:],
@@ -345,7 +347,7 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
         models: list[Path] = []
         image, name = path, upload.file_name
         if is_archive(head):
-            image, models = _unpack(path, folder, installation.settings)
+            image, models = _unpack(installation, upload, path, folder)
             name = image.name
             with image.open("rb") as file:
                 head = file.read(HEAD_BYTES)
@@ -369,13 +371,19 @@ def _complete_image(installation: Installation, upload: UploadRow, path: Path, s
         uploads.finish(connection, upload.id)
 
 
-def _unpack(archive: Path, folder: Path, settings: Settings) -> tuple[Path, list[Path]]:
+def _unpack(
+    installation: Installation, upload: UploadRow, archive: Path, folder: Path
+) -> tuple[Path, list[Path]]:
     """Unpack the one image of an archive and the models beside it into a folder; returns their paths.
+
+    What the archive declares to unpack to is reserved from the owner's quota first.
 
     Raises:
         FormatError: the archive is damaged or contains what is not allowed.
         InputError: it does not contain exactly one image, or two files would get the same name.
+        TooLarge: the files exceed what is left of the owner's quota.
     """
+    settings = installation.settings
     limits = ArchiveLimits(settings.upload_limit_bytes)
     members = check_archive(archive, limits)
     images = [member.path for member in members if member.path.suffix.lower() in IMAGE_SUFFIXES]
@@ -396,5 +404,13 @@ def _unpack(archive: Path, folder: Path, settings: Settings) -> tuple[Path, list
         raise InputError(
             "two files of the archive get the same name once unusual letters are replaced; rename one"
         )
-    unpack_archive(archive, targets, limits)
+    unpacked_bytes = sum(member.size_bytes for member in members if member.path in targets)
+    # The row of the upload counts as many bytes as the archive has, and ends with it.
+    more_bytes = max(unpacked_bytes - upload.size_bytes, 0)
+    if upload.owner is not None and upload.scene_id is not None and more_bytes > 0:
+        with installation.database.transaction() as connection:
+            what = f"{upload.file_name}, unpacked to {unpacked_bytes} bytes"
+            quotas.require_room(connection, settings, upload.owner, what, more_bytes)
+            scenes.reserve(connection, upload.scene_id, more_bytes)
+    unpack_archive(archive, targets, ArchiveLimits(max(unpacked_bytes, 1)))
     return targets[images[0]], [targets[path] for path in models]

@@ -376,7 +376,7 @@ TOKENS = [
         "POST",
         "/tokens",
         "quota",
-        json={"name": "x", "scopes": ["read"], "upload_quota_bytes": 10**30},
+        json={"name": "x", "scopes": ["read"], "storage_quota_bytes": 10**30},
     ),
     Bad("token whose name is NUL", "POST", "/tokens", "NUL", json={"name": "a\0b", "scopes": ["read"]}),
     Bad(

@@ -127,7 +127,7 @@ def test_an_administrator_makes_lists_and_revokes_tokens_over_the_api(client, be
         {"name": "x", "scopes": []},
         {"name": "x", "scopes": ["read"], "days": 0},
         {"name": "x", "scopes": ["read"], "job_quota": -1},
-        {"name": "x", "scopes": ["read"], "upload_quota_bytes": 2**63},
+        {"name": "x", "scopes": ["read"], "storage_quota_bytes": 2**63},
         {"name": "x", "scopes": ["read"], "surprise": 1},
     ],
 )
@@ -146,15 +146,15 @@ def test_a_token_has_no_more_open_jobs_than_its_quota(connection, settings):
 
 
 def test_a_token_uploads_no_more_bytes_than_its_quota(connection, settings):
-    small = create_token(connection, "small", ["register"], upload_quota_bytes=1000).token
-    assert quotas.upload_allowance(connection, settings, small, 1000) == 1000
+    small = create_token(connection, "small", ["register"], storage_quota_bytes=1000).token
+    assert quotas.require_room(connection, settings, small.id, "an image", 1000) == 1000
     scene_id = scenes.begin_upload(connection, small.id, "a", "a.tif", sigma_m=None)
     scenes.finish_upload(connection, scene_id, "scenes/a/a.tif", 900, "0" * 64)
-    assert quotas.upload_allowance(connection, settings, small) == 100
+    assert quotas.require_room(connection, settings, small.id, "an image") == 100
     with pytest.raises(TooLarge, match="900 of 1000 bytes are used"):
-        quotas.upload_allowance(connection, settings, small, 101)
+        quotas.require_room(connection, settings, small.id, "an image", 101)
     scenes.remove_scene(connection, scene_id)
-    assert quotas.upload_allowance(connection, settings, small) == 1000
+    assert quotas.require_room(connection, settings, small.id, "an image") == 1000
 
 
 def families(text: str) -> dict:

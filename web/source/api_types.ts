@@ -234,7 +234,7 @@ export interface NewTokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  upload_quota_bytes: number | null;
+  storage_quota_bytes: number | null;
   job_quota: number | null;
   secret: string;
 }
@@ -614,7 +614,7 @@ export interface TokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  upload_quota_bytes: number | null;
+  storage_quota_bytes: number | null;
   job_quota: number | null;
 }
 

@@ -19,7 +19,7 @@ class TokenRecord(Reply):
     expires_at: datetime | None
     revoked_at: datetime | None
     subject: str | None
-    upload_quota_bytes: int | None
+    storage_quota_bytes: int | None
     job_quota: int | None
 
 

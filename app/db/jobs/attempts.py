@@ -53,6 +53,7 @@ def claim_next(
             not_before=None,
             progress=0,
             message="started",
+            results_bytes=0,
             claimed_at=clock,
             started_at=func.coalesce(job.c.started_at, clock),
             updated_at=clock,
@@ -85,6 +86,29 @@ def report(connection: Connection, job_id: UUID, attempt: int, percent: int, mes
         LostJob: the attempt is over.
     """
     _write(connection, job_id, attempt, progress=percent, message=message)
+
+
+def reserve_results(connection: Connection, job_id: UUID, attempt: int, size_bytes: int) -> None:
+    """Record the size of the files that an attempt is about to store.
+
+    Raises:
+        LostJob: the attempt is over.
+    """
+    _write(connection, job_id, attempt, results_bytes=size_bytes)
+
+
+def release_results(connection: Connection, job_id: UUID, attempt: int) -> None:
+    """Give back the room for the files of an attempt that is over without success."""
+    connection.execute(
+        update(job)
+        .where(
+            job.c.id == job_id,
+            job.c.attempt == attempt,
+            job.c.state.not_in(("running", "successful")),
+            job.c.results_bytes > 0,
+        )
+        .values(results_bytes=0)
+    )
 
 
 def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[str, Any]) -> None:

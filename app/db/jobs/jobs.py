@@ -189,7 +189,7 @@ def remove_old_results(connection: Connection, older_than_s: float) -> list[UUID
             job.c.results.has_key("files"),
             job.c.finished_at < clock - timedelta(seconds=older_than_s),
         )
-        .values(results_removed_at=clock)
+        .values(results_removed_at=clock, results_bytes=0)
         .returning(job.c.id)
     )
     return list(removed.scalars())

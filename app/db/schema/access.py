@@ -18,7 +18,7 @@ from sqlalchemy import (
     text,
 )
 
-from app.db.schema.base import Double, Json, Timestamp, clock, metadata, now, one_of
+from app.db.schema.base import Double, Json, Timestamp, clock, metadata, now, one_of, uptime_s
 
 token = Table(
     "token",
@@ -34,18 +34,18 @@ token = Table(
     # Identity at an OpenID Connect issuer; null for a token with a secret.
     Column("subject", Text, unique=True),
     # Null: the quotas of the settings.
-    Column("upload_quota_bytes", BigInteger),
+    Column("storage_quota_bytes", BigInteger),
     Column("job_quota", Integer),
     CheckConstraint(
         "scopes <@ array['read', 'register', 'monitor', 'admin'] and scopes <> '{}'", name="scopes"
     ),
     CheckConstraint("(secret_hash is null) <> (subject is null)", name="secret_or_subject"),
-    CheckConstraint("upload_quota_bytes >= 0", name="upload_quota_bytes"),
+    CheckConstraint("storage_quota_bytes >= 0", name="storage_quota_bytes"),
     CheckConstraint("job_quota >= 0", name="job_quota"),
 )
 
-# Changes of tokens, blocks, scenes, jobs, points and reference images; triggers write it and refuse
-# any change of it.
+# Changes of tokens, blocks, scenes, jobs, points and reference images; triggers write it, and refuse any
+# change of it but the removal of its oldest rows, which leaves a row itself.
 audit = Table(
     "audit",
     metadata,
@@ -62,6 +62,7 @@ audit = Table(
     Column("action", Text, nullable=False),
     Column("before", Json),
     Column("after", Json),
+    Column("at_uptime_s", Double, nullable=False, server_default=uptime_s),
     one_of("action", Literal["created", "changed", "deleted"]),
     Index("audit_subject", "kind", "subject", "id"),
 )

@@ -68,10 +68,18 @@ scene = Table(
     Column("samples", Integer),
     Column("created_at_uptime_s", Double, nullable=False, server_default=uptime_s),
     Column("footprint_on_map", MapOutline, on_map("footprint")),
+    # Sum of the sizes in `models`.
+    Column("side_file_bytes", BigInteger, nullable=False, server_default=text("0")),
     one_of("state", SceneState),
     CheckConstraint("sigma_m > 0", name="sigma_m"),
     Index("scene_owner", "owner", "created_at"),
     Index("scene_footprint_on_map", "footprint_on_map", postgresql_using="gist"),
+    Index(
+        "scene_usage",
+        "owner",
+        postgresql_include=["size_bytes", "side_file_bytes"],
+        postgresql_where=text("state <> 'removed'"),
+    ),
 )
 
 # Files that arrive in pieces.
@@ -101,6 +109,12 @@ upload = Table(
     CheckConstraint("size_bytes > 0", name="size_bytes"),
     CheckConstraint("purpose = 'block' or scene_id is not null", name="scene_id"),
     Index("upload_expiry", "expires_at", postgresql_where=text("finished_at is null")),
+    Index(
+        "upload_usage",
+        "owner",
+        postgresql_include=["size_bytes", "finished_at"],
+        postgresql_where=text("finished_at is null or file_key is not null"),
+    ),
 )
 
 job = Table(
@@ -141,6 +155,10 @@ job = Table(
     Column("priority", SmallInteger, nullable=False, server_default=text("0")),
     # The delay of a repeated attempt; null: the job may be claimed at once.
     Column("not_before", Timestamp),
+    # Of the files of the results, reserved before they are stored; null: an earlier version did not
+    # record it, and the sweep measures the files.
+    Column("results_bytes", BigInteger, server_default=text("0")),
+    Column("created_at_uptime_s", Double, nullable=False, server_default=uptime_s),
     UniqueConstraint("owner", "idempotency_key"),
     one_of("state", JobState),
     one_of("response", JobResponse),
@@ -164,6 +182,12 @@ job = Table(
         postgresql_where=text("state = 'accepted'"),
     ),
     Index("job_running", "owner", postgresql_where=text("state = 'running'")),
+    Index(
+        "job_usage",
+        "owner",
+        postgresql_include=["results_bytes"],
+        postgresql_where=text("results_bytes > 0"),
+    ),
 )
 
 # When a job of each owner was last claimed: the owner who waits longest is next. Jobs may be deleted

@@ -22,7 +22,7 @@ registration = Table(
     "registration",
     metadata,
     Column("id", Uuid, primary_key=True),
-    Column("job_id", ForeignKey("job.id"), unique=True),
+    Column("job_id", ForeignKey("job.id", ondelete="SET NULL"), unique=True),
     Column("scene_id", ForeignKey("scene.id")),
     # Id and version of each block whose points were used.
     Column("block_versions", Json, nullable=False),

@@ -74,8 +74,24 @@ create function count_unserved_cells() returns void language sql as $$
     update density_cell d set n_unserved = changed.n from changed where d.id = changed.id
 $$;
 
+-- Add a row to `audit`. Settings of the transaction name who makes the change and why
+-- (`app/db/engine.py`); the change of a job is a change of the owner of the job.
+create function add_audit_row(kind text, subject text, action text, before jsonb, after jsonb)
+returns void language sql as $$
+    with origin as (
+        select nullif(current_setting('amers.actor', true), '')::uuid as actor,
+            nullif(current_setting('amers.job_id', true), '')::uuid as job_id
+    )
+    insert into audit (actor, actor_name, request_id, job_id, kind, subject, action, before, after)
+    select coalesce(actor, (select owner from job where id = origin.job_id)),
+        coalesce(
+            nullif(current_setting('amers.actor_name', true), ''), 'database role ' || session_user),
+        nullif(current_setting('amers.request_id', true), ''),
+        job_id, kind, subject, action, before, after
+    from origin
+$$;
+
 -- Trigger with column names as arguments: a row in `audit` when one of these columns changes.
--- Settings of the transaction name who changes it and why (`app/db/engine.py`).
 create function record_change() returns trigger language plpgsql as $$
 declare
     full_before jsonb;
@@ -92,14 +108,7 @@ begin
         from jsonb_each(full_after) where key = any(tg_argv);
     if before is not distinct from after then return null; end if;
     named := coalesce(full_after, full_before);
-    insert into audit
-        (actor, actor_name, request_id, job_id, kind, subject, action, before, after)
-    values (
-        nullif(current_setting('amers.actor', true), '')::uuid,
-        coalesce(
-            nullif(current_setting('amers.actor_name', true), ''), 'database role ' || session_user),
-        nullif(current_setting('amers.request_id', true), ''),
-        nullif(current_setting('amers.job_id', true), '')::uuid,
+    perform add_audit_row(
         tg_table_name,
         case tg_table_name when 'block' then (named->>'id') || '@' || (named->>'version')
                            else named->>'id' end,
@@ -112,6 +121,26 @@ end $$;
 create function refuse_change() returns trigger language plpgsql as $$
 begin
     raise exception 'table % only grows', tg_table_name using errcode = 'insufficient_privilege';
+end $$;
+
+-- Trigger of `audit` after a deletion: accept the oldest rows without a gap, if the service has run for 30
+-- days since the last of them, and leave a row that says which rows were removed. Refuse anything else.
+create function record_audit_removal() returns trigger language plpgsql as $$
+declare
+    gone record;
+begin
+    select count(*) as rows, min(id) as first, max(id) as last, min(at) as since, max(at) as until,
+        max(at_uptime_s) as until_uptime_s into gone from removed;
+    if gone.rows = 0 then return null; end if;
+    if gone.until > now() - interval '30 days' or gone.until_uptime_s > uptime_s() - 30 * 86400
+        or exists (select from audit where id < gone.last)
+    then
+        raise exception 'table audit only grows: only its oldest rows can be removed, 30 days after them'
+            using errcode = 'insufficient_privilege';
+    end if;
+    perform add_audit_row('audit', gone.first || '-' || gone.last, 'deleted',
+        jsonb_build_object('rows', gone.rows, 'since', gone.since, 'until', gone.until), null);
+    return null;
 end $$;
 
 -- Trigger of `job`: each new message, and each new attempt, leaves a row in `job_message`.

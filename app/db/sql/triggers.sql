@@ -1,11 +1,13 @@
 -- Triggers of the store; they come after the tables.
 
 -- The audit: columns whose changes are recorded. A progress or a lease is none of them.
-create trigger audit_only_grows before update or delete or truncate on audit
+create trigger audit_only_grows before update or truncate on audit
     for each statement execute function refuse_change();
+create trigger audit_removal after delete on audit referencing old table as removed
+    for each statement execute function record_audit_removal();
 create trigger token_changes after insert or update or delete on token
     for each row execute function record_change(
-        'name', 'scopes', 'subject', 'expires_at', 'revoked_at', 'upload_quota_bytes', 'job_quota');
+        'name', 'scopes', 'subject', 'expires_at', 'revoked_at', 'storage_quota_bytes', 'job_quota');
 create trigger block_changes after insert or update or delete on block
     for each row execute function record_change(
         'number', 'state', 'priority', 'checksum', 'n_points', 'n_views');

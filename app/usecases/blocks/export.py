@@ -18,6 +18,7 @@ from app.db.tokens import Token
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.processes import Commit, Process, Work
+from app.usecases.results import store_results
 from services.formats.block.document import (
     NAME_PATTERN,
     AccuracyFigure,
@@ -238,13 +239,12 @@ def _run(work: Work) -> Commit:
             with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as packed:
                 for path in sorted(folder.rglob("*")):
                     packed.write(path, path.relative_to(folder.parent))
-            key = f"{work.attempt_folder}/{ARCHIVE}"
-            work.storage.put_file(key, archive)
+            keys = store_results(work, {ARCHIVE: archive})
     finally:
         chips.close()
 
     def commit(connection: Connection) -> dict[str, Any]:
-        return {"points": n_points, "files": {ARCHIVE: key}}
+        return {"points": n_points, "files": keys}
 
     return commit
 

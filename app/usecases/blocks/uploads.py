@@ -28,7 +28,9 @@ def receive_block(installation: Installation, caller: Token, sent: SentFile) -> 
     database, storage = installation.database, installation.storage
     file_name = clean_name(sent.name)
     with database.transaction() as connection:
-        left = quotas.upload_allowance(connection, installation.settings, caller, sent.size_bytes)
+        left = quotas.require_room(
+            connection, installation.settings, caller.id, "the archive", sent.size_bytes
+        )
         limit = min(left, installation.settings.upload_limit_bytes)
         # An archive of unknown size reserves all that is left of the quota until it has arrived.
         announced = AnnouncedFile(

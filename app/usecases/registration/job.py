@@ -20,6 +20,7 @@ from app.usecases.registration.register import (
     record_registration,
     run_registration,
 )
+from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image
 from services.formats.images.bands import parse_bands
@@ -82,10 +83,7 @@ def _run(work: Work) -> Commit:
             progress=work.progress,
         )
         gsd_m = scene_gsd_m(registered.scene)
-        keys = {
-            name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
-            for name, path in registered.files.items()
-        }
+        keys = store_results(work, registered.files)
 
     def commit(connection: Connection) -> dict[str, Any]:
         scene_key = scene.sha256 or f"scene {scene.id}"
