@@ -16,6 +16,7 @@ GIBIBYTE = 1 << 30
 MEBIBYTE = 1 << 20
 RENAMED = {"AMERS_QUOTA_UPLOAD_BYTES": "AMERS_QUOTA_STORAGE_BYTES"}
 """Former names of settings: a limit that somebody has set must not be ignored."""
+TRASH_DAYS = 7.0
 
 
 def default_data_folder() -> Path:
@@ -41,6 +42,7 @@ class Settings(BaseSettings):
         read_timeout_seconds: time limit of the database for one statement of a reading request.
         job_memory_bytes, job_seconds: limits of one job on memory and time.
         result_days: days until the result files of a job are removed; None keeps them.
+        trash_days: days until files that the sweep removed are deleted; 0 deletes them at once.
         lease_seconds: time after which another worker takes over the job of a silent worker.
         storage_url: S3-compatible bucket for the files, `s3://BUCKET/PREFIX`; None for the data folder.
         scene_folder: scenes below it can be registered without an upload; None allows none.
@@ -76,6 +78,7 @@ class Settings(BaseSettings):
     job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
     result_days: float | None = Field(default=None, gt=0)
+    trash_days: float = Field(default=TRASH_DAYS, ge=0)
     lease_seconds: float = Field(default=30.0, gt=0)
     storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")
     scene_folder: Path | None = None

@@ -37,6 +37,7 @@ from app.config import Settings, read_settings
 from app.db import engine
 from app.oidc import Issuer
 from app.storage import StoredChips, open_storage
+from app.usecases import storage_identity
 from app.web import page
 
 DESCRIPTION = (
@@ -105,6 +106,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.state.database = await run_in_threadpool(opening.__enter__)
         app.state.storage = open_storage(settings)
         app.state.chips = StoredChips(app.state.storage)
+        await run_in_threadpool(
+            storage_identity.announce, app.state.database.transaction, app.state.storage
+        )
         try:
             yield
         finally:

@@ -1,5 +1,6 @@
 """`amers block`: blocks of points, from a folder to the publication."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from app.config import read_settings
 from app.db.blocks import Block
 from app.errors import InputError
 from app.storage import StoredChips, open_storage
+from app.usecases import storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.blocks.lifecycle import Published
@@ -36,6 +38,7 @@ def ingest(
     settings = read_settings()
     storage = open_storage(settings)
     with transaction(settings) as connection:
+        storage_identity.announce(partial(transaction, settings), storage)
         with shown_progress() as progress:
             ingested = lifecycle.ingest_block(connection, storage, path, progress, priority)
         block = ingested.block

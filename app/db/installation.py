@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from uuid import UUID
 
-from sqlalchemy import Select, func, select, update
+from sqlalchemy import Select, exists, func, or_, select, update
 
 from app.db.engine import Connection
 from app.db.rows import columns_of, only
-from app.db.schema import installation
+from app.db.schema import chip_file, installation, scene
 
 
 @dataclass(frozen=True)
@@ -40,3 +40,9 @@ def advance(connection: Connection, beyond: int = 0) -> None:
     """Advance the generation of the storage by one, and beyond a given one."""
     generation = func.greatest(installation.c.storage_generation, beyond) + 1
     connection.execute(update(installation).values(storage_generation=generation))
+
+
+def names_files(connection: Connection) -> bool:
+    """Whether a row names a file in the storage."""
+    image = exists(scene.c.id).where(scene.c.file_key.is_not(None))
+    return bool(connection.scalar(select(or_(exists(chip_file.c.id), image))))

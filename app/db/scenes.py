@@ -255,10 +255,10 @@ def remove_scene(connection: Connection, scene_id: UUID) -> None:
     )
 
 
-def with_files(connection: Connection, scene_ids: list[UUID]) -> set[UUID]:
-    """Those of some scenes that are not removed."""
-    statement = select(scene.c.id).where(among(scene.c.id, scene_ids), scene.c.state != "removed")
-    return set(connection.scalars(statement))
+def keeping_files(connection: Connection, scene_ids: list[UUID]) -> dict[UUID, bool]:
+    """Those of some scenes that exist, with whether they keep their files: they are not removed."""
+    statement = select(scene.c.id, scene.c.state).where(among(scene.c.id, scene_ids))
+    return {row.id: row.state != "removed" for row in connection.execute(statement)}
 
 
 def _finite(angle_deg: float | None) -> float | None:

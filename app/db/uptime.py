@@ -3,10 +3,12 @@
 Ages that decide over files are counted in it: `uptime_s()` in SQL.
 """
 
-from sqlalchemy import extract, func, update
+from datetime import date
+
+from sqlalchemy import extract, func, select, update
 
 from app.db.engine import Connection
-from app.db.schema import clock, uptime
+from app.db.schema import clock, uptime, uptime_s
 
 
 def advance(connection: Connection, most_s: float) -> None:
@@ -23,3 +25,9 @@ def advance(connection: Connection, most_s: float) -> None:
             elapsed_s=uptime.c.elapsed_s + func.least(func.greatest(step_s, 0.0), most_s),
         )
     )
+
+
+def today(connection: Connection) -> tuple[date, float]:
+    """The date by the clock of the database, and the seconds that the service has run."""
+    row = connection.execute(select(func.current_date().label("day"), uptime_s.label("uptime_s"))).one()
+    return row.day, float(row.uptime_s)

@@ -11,10 +11,13 @@ from app.storage.folder import (
     Writing,
     chips_key,
 )
+from app.storage.marker import MARKER, Marker, read_marker, write_marker
 
 __all__ = [
     "KEY",
+    "MARKER",
     "UNFINISHED",
+    "Marker",
     "RangeReader",
     "Storage",
     "StoredChips",
@@ -22,6 +25,8 @@ __all__ = [
     "Writing",
     "chips_key",
     "open_storage",
+    "read_marker",
+    "write_marker",
 ]
 
 

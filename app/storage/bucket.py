@@ -19,6 +19,10 @@ from app.storage.folder import COPY_BYTES, RangeReader, Storage, checked_key
 RETRIES = 3
 RETRY_TIMEOUT = timedelta(seconds=20)
 """A failing request is repeated for this time; then it raises `StorageOutage`."""
+COPY_LIMIT_BYTES = 5 << 30
+"""Largest file that S3 copies in one request."""
+PART_BYTES = 16 << 20
+"""Size of the parts of a larger file: 10,000 of them, the most that S3 accepts, are 156 GiB."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,11 @@ class BucketStorage(Storage):
         except Exception as error:
             raise InputError(f"AMERS_STORAGE_URL: {self.url!r} cannot be used: {error}") from error
         object.__setattr__(self, "store", store)
+
+    @property
+    def place(self) -> str:
+        """The address of the bucket."""
+        return self.url
 
     def local(self, key: str) -> Path | None:
         """None: the files of a bucket do not lie on this machine."""
@@ -98,6 +107,24 @@ class BucketStorage(Storage):
         """Delete a file, if it exists."""
         with _storage_errors(key):
             obstore.delete(self.store, checked_key(key))
+
+    def move(self, key: str, new_key: str) -> None:
+        """Give a file another key; does nothing if there is no such file.
+
+        The storage service copies the file, unless it is too large for one request.
+        """
+        if not self.exists(key):
+            return
+        with _storage_errors(key):
+            if self.size(key) <= COPY_LIMIT_BYTES:
+                obstore.copy(self.store, checked_key(key), checked_key(new_key))
+            else:
+                parts = obstore.get(self.store, key).stream(min_chunk_size=PART_BYTES)
+                # An iterator: of the stream itself, obstore expects asynchronous parts.
+                obstore.put(
+                    self.store, checked_key(new_key), (part for part in parts), chunk_size=PART_BYTES
+                )
+        self.delete(key)
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a prefix, sorted."""

@@ -147,6 +147,11 @@ class Storage:
             # A rename between two names of one file does nothing.
             second_name.unlink(missing_ok=True)
 
+    @property
+    def place(self) -> str:
+        """The folder or the address of the storage, for messages to operators."""
+        return str(self.folder)
+
     def scratch(self) -> Path:
         """A folder for unfinished files, on the file system of the storage if it is a folder.
 
@@ -222,6 +227,13 @@ class Storage:
         with suppress(OSError):
             while (path := path.parent) != self.folder:
                 path.rmdir()
+
+    def move(self, key: str, new_key: str) -> None:
+        """Give a file another key; does nothing if there is no such file."""
+        path = self._locate(key)
+        if path.is_file():
+            self._place(path, new_key)
+            self.delete(key)
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""

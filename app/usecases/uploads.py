@@ -232,14 +232,19 @@ def remove_abandoned_uploads(database: Database, storage: Storage) -> list[str]:
     """
     with database.transaction() as connection:
         uploads.delete_expired(connection)
-    paths = storage.scratch().glob(f"{UPLOAD_PREFIX}*")
-    files = {UUID(path.name.removeprefix(UPLOAD_PREFIX)): path for path in paths}
+    files = arriving_files(storage)
     with database.transaction() as connection:
         arriving = uploads.arriving(connection, list(files))
     abandoned = [path for upload_id, path in files.items() if upload_id not in arriving]
     for path in abandoned:
         path.unlink(missing_ok=True)
     return [path.name for path in abandoned]
+
+
+def arriving_files(storage: Storage) -> dict[UUID, Path]:
+    """The files of incomplete uploads on this machine, by the ids of their uploads."""
+    paths = storage.scratch().glob(f"{UPLOAD_PREFIX}*")
+    return {UUID(path.name.removeprefix(UPLOAD_PREFIX)): path for path in paths}
 
 
 def _path(storage: Storage, upload_id: UUID) -> Path:

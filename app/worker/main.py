@@ -17,7 +17,8 @@ from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
 from app.db.jobs import queue
-from app.storage import open_storage
+from app.storage import Storage, open_storage
+from app.usecases import storage_identity
 from app.worker.attempt import Attempts
 from app.worker.sweep import Sweeper
 
@@ -26,6 +27,8 @@ LONGEST_POLL_S = 5.0
 """Longest time until a delayed ticket is found; new tickets notify the workers."""
 PAUSE_S = 2.0
 """Pause before the queue is read again after an outage of the database."""
+STORAGE_RETRY_S = 20.0
+"""Pause before a worker without jobs looks again whether the storage belongs to the database."""
 
 log = logging.getLogger(__name__)
 
@@ -39,15 +42,19 @@ def run_worker(settings: Settings) -> None:
     stop = threading.Event()
     for number in ENDING:
         signal.signal(number, lambda *_: stop.set())
-    with engine.opened(settings) as database, _sweeping(database, settings, stop):
+    storage = open_storage(settings)
+    with engine.opened(settings) as database, _sweeping(database, storage, settings, stop):
+        while not stop.is_set() and not storage_identity.announce(database.transaction, storage):
+            stop.wait(STORAGE_RETRY_S)
         loop = asyncio.new_event_loop()
         # Not asyncio.run: it waits for ever when a task of the queue swallows its cancellation.
         loop.run_until_complete(_Worker(database, settings, stop).run())
 
 
 @contextmanager
-def _sweeping(database: Database, settings: Settings, stop: threading.Event) -> Iterator[None]:
-    storage = open_storage(settings)
+def _sweeping(
+    database: Database, storage: Storage, settings: Settings, stop: threading.Event
+) -> Iterator[None]:
     sweeper = threading.Thread(target=Sweeper(database, storage, settings, stop).run, name="sweeper")
     sweeper.start()
     try:

@@ -11,20 +11,25 @@ from dataclasses import dataclass
 
 import psycopg
 
-from app.config import Settings
+from app.config import TRASH_DAYS, Settings
 from app.db import scenes, uptime
 from app.db.engine import Database, limit_lock_wait
 from app.db.jobs import attempts, jobs, queue
 from app.request_context import Origin, working_for
-from app.storage import Storage
+from app.storage import Storage, trash
+from app.usecases import garbage_collection, storage_identity
 from app.usecases.blocks.uploads import remove_expired_archives
-from app.usecases.garbage_collection import remove_unnamed_chips, remove_unnamed_files
+from app.usecases.garbage_collection import Bin, remove_unnamed_chips, remove_unnamed_files
 from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
 from app.worker.attempt import FAILURES_ALLOWED
 
 SILENT_WORKER_S = 60.0
 """A worker of the queue sends a heartbeat every ten seconds; without one for this long it is dead."""
+FIRST_FILES_S = 900.0
+"""Files are swept first this long after the start of a worker: time to notice a wrong configuration."""
 FILES_EVERY_S = 3600.0
+GENERATION_EVERY_S = 60.0
+"""A backup of the database that is this much older than the newest files is recognised as older."""
 MOST_BETWEEN_S = 2 * FILES_EVERY_S
 """Longest credible time between two sweeps of files; a clock that shows more has jumped."""
 LONGEST_UPLOAD_S = 3600.0 * scenes.LONGEST_UPLOAD_HOURS
@@ -50,16 +55,25 @@ class Sweeper:
 
     def run(self) -> None:
         """Sweep jobs three times per lease, and files every hour."""
-        next_files_at = time.monotonic()
+        next_files_at = time.monotonic() + FIRST_FILES_S
+        next_generation_at = time.monotonic()
         while not self.stop.wait(self.settings.lease_seconds / 3.0):
             try:
                 sweep_jobs(
                     self.database, self.settings.lease_seconds, self.settings.jobs_running_per_owner
                 )
+                if time.monotonic() > next_generation_at:
+                    next_generation_at += GENERATION_EVERY_S
+                    storage_identity.prepare(self.database.transaction, self.storage)
                 if time.monotonic() > next_files_at:
                     next_files_at += FILES_EVERY_S
                     sweep_results(self.database, self.settings.result_days)
-                    sweep_files(self.database, self.storage, self.settings.job_seconds)
+                    sweep_files(
+                        self.database,
+                        self.storage,
+                        self.settings.job_seconds,
+                        self.settings.trash_days,
+                    )
             except psycopg.OperationalError as outage:
                 log.warning("the sweep failed and is repeated: %s", outage)
             except Exception:
@@ -87,22 +101,33 @@ def sweep_results(database: Database, result_days: float | None) -> None:
             log.info("job %s: removed its results, which are older than %g days", job_id, result_days)
 
 
-def sweep_files(database: Database, storage: Storage, longest_job_s: float) -> None:
-    """Remove the files of abandoned uploads, attempts and ingestions.
+def sweep_files(
+    database: Database, storage: Storage, longest_job_s: float, trash_days: float = TRASH_DAYS
+) -> None:
+    """Remove the files of abandoned uploads, attempts and ingestions, and old files of the trash.
+
+    Nothing is removed from a storage that does not belong to the database.
 
     Raises:
         psycopg.errors.LockNotAvailable: an ingestion is under way; the next sweep removes the rest.
     """
+    if not storage_identity.announce(database.transaction, storage):
+        return
     with database.transaction() as connection:
         uptime.advance(connection, MOST_BETWEEN_S)
+        moment = garbage_collection.moment(connection)
+    rubbish = Bin(storage, moment if trash_days > 0 else None)
     removed = remove_abandoned_uploads(database, storage)
     with database.transaction() as connection:
         scenes.give_up_old_uploads(connection)
-    removed += remove_unnamed_files(database, storage)
+    removed += remove_unnamed_files(database, rubbish)
     removed += storage.sweep_unfinished(LONGEST_UPLOAD_S + longest_job_s, UPLOAD_PREFIX)
     with database.transaction() as connection:
         limit_lock_wait(connection, LONGEST_WAIT_S)
-        removed += remove_unnamed_chips(connection, storage)
-        removed += remove_expired_archives(connection, storage)
+        removed += remove_unnamed_chips(connection, rubbish)
+        removed += remove_expired_archives(connection, rubbish)
     for name in removed:
         log.info("removed the file %s, which no row refers to", name)
+    n_deleted = trash.delete_old(storage, moment, trash_days)
+    if n_deleted:
+        log.info("deleted %d files that were in the trash for %g days", n_deleted, trash_days)

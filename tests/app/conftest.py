@@ -16,7 +16,7 @@ from app.db import engine, revisions
 from app.db.cluster.embedded import Cluster
 from app.db.engine import Connection, Database
 from app.main import create_app
-from app.storage import Storage
+from app.storage import MARKER, Storage
 from app.usecases.tokens import create_token
 
 TEMPLATE = "amers_template"
@@ -71,6 +71,12 @@ def settings(dsn: str, tmp_path: Path) -> Settings:
 def storage(settings: Settings) -> Storage:
     """The storage that the client of the same test uses."""
     return Storage(settings.data_folder / "storage")
+
+
+def stored_files(storage: Storage) -> list[Path]:
+    """All files of a storage but the one that names its installation."""
+    marker = storage.folder / MARKER
+    return [path for path in storage.folder.rglob("*") if path.is_file() and path != marker]
 
 
 @pytest.fixture

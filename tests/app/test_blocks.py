@@ -10,7 +10,7 @@ from app.db import points as point_store
 from app.errors import Conflict, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import remove_unnamed_chips
+from app.usecases.garbage_collection import Bin, remove_unnamed_chips
 from services.formats.block.document import rectangle
 from services.types import point_chips
 from tests.factories import BOX, make_block
@@ -197,6 +197,6 @@ def test_quality_figures_are_those_of_the_points(connection, ingested):
 def test_files_without_rows_are_swept_and_others_stay(connection, storage, tmp_path, ingested):
     orphan = make_block(tmp_path / "orphan", count=3, seed=9).folder / "chips/0000.npy"
     key = storage.put_chips(orphan).key
-    assert remove_unnamed_chips(connection, storage) == [key]
+    assert remove_unnamed_chips(connection, Bin(storage)) == [key]
     assert not storage.exists(key)
     assert len(storage.keys("chips")) == 1

@@ -17,7 +17,8 @@ from app.db.cluster.embedded import Cluster
 from app.errors import is_no_room
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import remove_unnamed_chips
+from app.usecases.garbage_collection import Bin, remove_unnamed_chips
+from tests.app.conftest import stored_files
 from tests.app.worker_processes import ended, running_worker
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -79,9 +80,7 @@ def settings(dsn: str, disk: Disk, tmp_path: Path) -> Settings:
 
 def files(storage: Storage) -> list[str]:
     """All files in the storage, finished or not."""
-    return [
-        str(path.relative_to(storage.folder)) for path in storage.folder.rglob("*") if path.is_file()
-    ]
+    return [str(path.relative_to(storage.folder)) for path in stored_files(storage)]
 
 
 def test_an_upload_that_fills_the_disk_is_507_and_leaves_nothing(
@@ -140,7 +139,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
         assert "full" in str(failed["message"])
         with engine.connect(dsn) as connection:
             assert lifecycle.list_blocks(connection) == []
-            remove_unnamed_chips(connection, storage)
+            remove_unnamed_chips(connection, Bin(storage))
         assert files(storage) == []
 
         disk.grow(20 * ROOM)
@@ -149,7 +148,7 @@ def test_an_ingestion_that_fills_the_disk_fails_with_the_reason_and_works_once_t
     with engine.connect(dsn) as connection:
         (block,) = lifecycle.list_blocks(connection)
         assert block.n_points == len(made.points)
-        assert remove_unnamed_chips(connection, storage) == []
+        assert remove_unnamed_chips(connection, Bin(storage)) == []
 
 
 def test_a_full_disk_of_the_database_is_reported_and_the_block_loads_once_there_is_room(

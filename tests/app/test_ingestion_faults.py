@@ -20,7 +20,7 @@ from app.db.cluster.embedded import Cluster
 from app.db.metrics import read_gauges
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from app.usecases.garbage_collection import remove_unnamed_chips
+from app.usecases.garbage_collection import Bin, remove_unnamed_chips
 from services.errors import FormatError
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -244,7 +244,7 @@ def test_postgresql_killed_in_the_middle_of_an_ingestion_leaves_nothing(
                 "view": 4000,
             }
             assert read_gauges(connection).points == 2000
-            assert remove_unnamed_chips(connection, storage) == []
+            assert remove_unnamed_chips(connection, Bin(storage)) == []
 
 
 def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
@@ -264,4 +264,4 @@ def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
     with own.lease() as dsn, engine.connect(dsn) as connection:
         assert rows(connection) == dict.fromkeys(TABLES, 0)
         assert len(storage.keys("chips")) == 1
-        assert len(remove_unnamed_chips(connection, storage)) == 1
+        assert len(remove_unnamed_chips(connection, Bin(storage))) == 1

@@ -19,6 +19,7 @@ from app.main import create_app
 from app.storage import KEY, Storage
 from app.usecases.scenes import clean_name, folder_of
 from app.worker.sweep import sweep_files
+from tests.app.conftest import stored_files
 from tests.app.running_service import running_service
 from tests.app.worker_processes import wait_until
 from tests.statements import run_sql
@@ -33,11 +34,6 @@ Bearer = Callable[[str], dict[str, str]]
 def settings(dsn: str, tmp_path: Path) -> Settings:
     """An installation with a small limit of uploads."""
     return Settings(database_url=dsn, data_folder=tmp_path / "data", upload_limit_bytes=LIMIT_BYTES)
-
-
-def stored_files(storage: Storage) -> list[Path]:
-    """All files in the storage, finished or not."""
-    return [path for path in storage.folder.rglob("*") if path.is_file()]
 
 
 def chunks(data: bytes) -> Iterator[bytes]:
@@ -290,4 +286,4 @@ def test_an_upload_cut_off_by_its_sender_leaves_nothing(
             return row == {"n": 0}
 
         wait_until(forgotten, "the scene is forgotten", 20.0)
-        assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
+        assert stored_files(storage) == []

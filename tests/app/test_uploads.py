@@ -28,6 +28,7 @@ from app.storage import Storage
 from app.usecases.blocks.uploads import find_uploaded_block
 from app.usecases.uploads import remove_abandoned_uploads
 from app.worker.sweep import sweep_files
+from tests.app.conftest import stored_files
 from tests.app.point_history import let_pass
 
 TIFF = b"II*\0" + np.random.default_rng(1).bytes(300_000)
@@ -242,7 +243,7 @@ def test_an_unusable_file_is_refused_and_deleted(
     assert message in refused.json()["detail"]
     assert client.head(reply.headers["location"], headers=me).status_code == 404
     assert client.get("/scenes", headers=me).json() == {"scenes": []}
-    assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
+    assert stored_files(storage) == []
 
 
 @pytest.mark.parametrize(
@@ -306,7 +307,7 @@ def test_an_archive_that_could_do_harm_or_is_no_scene_is_refused(
     reply = whole(client, me, zipped(files), filename="delivery.zip")
     assert reply.status_code == 422
     assert message in reply.json()["detail"]
-    assert [path for path in storage.folder.rglob("*") if path.is_file()] == []
+    assert stored_files(storage) == []
 
 
 def test_an_upload_of_another_owner_is_not_found(client: TestClient, me: dict[str, str], bearer: Bearer):

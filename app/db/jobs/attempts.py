@@ -8,7 +8,7 @@ from datetime import timedelta
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import func, select, update
+from sqlalchemy import case, func, select, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
@@ -231,12 +231,11 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
     return [lost.id for lost in lapsed]
 
 
-def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int]:
-    """The attempt of each of some jobs that runs or succeeded, if its results are kept."""
-    statement = select(job.c.id, job.c.attempt).where(
-        among(job.c.id, job_ids),
-        job.c.results_removed_at.is_(None),
-        job.c.state.in_(("running", "successful")),
+def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int | None]:
+    """Of some jobs those that exist, with the attempt that runs or succeeded if its results are kept."""
+    counts = job.c.results_removed_at.is_(None) & job.c.state.in_(("running", "successful"))
+    statement = select(job.c.id, case((counts, job.c.attempt)).label("attempt")).where(
+        among(job.c.id, job_ids)
     )
     return {row.id: row.attempt for row in connection.execute(statement)}
 

@@ -9,8 +9,8 @@ from app.db.engine import Connection
 from app.db.tokens import Token
 from app.db.uploads import AnnouncedFile, UploadRow
 from app.errors import Conflict, InputError, NotFound, StorageOutage
-from app.storage import Storage
 from app.usecases import quotas
+from app.usecases.garbage_collection import Bin
 from app.usecases.installation import Installation
 from app.usecases.scenes import SentFile, clean_name
 
@@ -84,9 +84,6 @@ def find_uploaded_block(connection: Connection, caller: Token, upload_id: UUID) 
     return upload.file_key
 
 
-def remove_expired_archives(connection: Connection, storage: Storage) -> list[str]:
-    """Delete the archives that were not ingested in time; returns their keys."""
-    keys = uploads.delete_unwanted_blocks(connection)
-    for key in keys:
-        storage.delete(key)
-    return keys
+def remove_expired_archives(connection: Connection, rubbish: Bin) -> list[str]:
+    """Remove the archives that were not ingested in time; returns their keys."""
+    return rubbish.remove(uploads.delete_unwanted_blocks(connection))

@@ -1,0 +1,140 @@
+"""The storage belongs to its database: each names the other, and only then files are removed.
+
+The storage names its installation in the file `installation.json`. A number in it, the generation,
+advances in database and storage while the service runs. A database whose generation is behind was
+restored from an older backup: it does not know the newest files.
+"""
+
+import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+from app.db import installation, uploads
+from app.db.engine import Connection, Database
+from app.db.installation import InstallationRow
+from app.errors import Conflict, InputError, StorageOutage
+from app.storage import Marker, Storage, read_marker, write_marker
+from app.usecases import garbage_collection
+from app.usecases.uploads import arriving_files
+
+log = logging.getLogger(__name__)
+
+Begin = Callable[[], AbstractContextManager[Connection]]
+"""Begins a transaction."""
+KNOWN_SHARE = 0.95
+"""A storage of an earlier version is adopted if rows of the database name this share of its files."""
+ADVICE = (
+    "Nothing is removed from the storage, and workers do no jobs. Check AMERS_DATABASE_URL, "
+    "AMERS_DATA_FOLDER and AMERS_STORAGE_URL; if this database and this storage belong together, run "
+    "`amers store adopt`"
+)
+
+
+def mismatch(connection: Connection, storage: Storage) -> str | None:
+    """Why the storage does not belong to the database, with what to do; None if it belongs to it."""
+    return _mismatch(connection, storage, installation.read(connection))
+
+
+def require_match(database: Database, storage: Storage) -> None:
+    """Check that the storage belongs to the database.
+
+    Raises:
+        Conflict: it does not.
+    """
+    with database.reading() as connection:
+        reason = mismatch(connection, storage)
+    if reason is not None:
+        raise Conflict(reason)
+
+
+def prepare(begin: Begin, storage: Storage) -> str | None:
+    """Bind a new storage to its database, and advance the generation of both.
+
+    Returns:
+        Why the storage does not belong to the database, with what to do; None if it belongs to it.
+    """
+    with begin() as connection:
+        row = installation.lock(connection)
+        reason = _mismatch(connection, storage, row)
+        if reason is not None:
+            return reason
+        if row.storage_generation == 0:
+            write_marker(storage, Marker(row.id, 0))
+        installation.advance(connection)
+    _write_marker(begin, storage)
+    return None
+
+
+def announce(begin: Begin, storage: Storage) -> bool:
+    """Prepare the storage and log what stands against it; returns whether it belongs to the database."""
+    try:
+        reason = prepare(begin, storage)
+    except (StorageOutage, OSError) as outage:
+        reason = f"the storage could not be checked: {outage}"
+    if reason is not None:
+        log.error("%s: %s", storage.place, reason)
+    return reason is None
+
+
+def adopt(begin: Begin, storage: Storage) -> InstallationRow:
+    """Bind a storage to the database, whatever it belonged to; returns their identity."""
+    with begin() as connection:
+        installation.lock(connection)
+        try:
+            marker = read_marker(storage)
+        except InputError:
+            marker = None
+        installation.advance(connection, beyond=marker.generation if marker else 0)
+    return _write_marker(begin, storage)
+
+
+def _write_marker(begin: Begin, storage: Storage) -> InstallationRow:
+    """Write what is committed: a crash leaves the storage a generation behind, never ahead."""
+    with begin() as connection:
+        row = installation.lock(connection)
+        write_marker(storage, Marker(row.id, row.storage_generation))
+    return row
+
+
+def _mismatch(connection: Connection, storage: Storage, row: InstallationRow) -> str | None:
+    try:
+        marker = read_marker(storage)
+    except InputError as error:
+        return f"{error}. {ADVICE}"
+    if marker is None:
+        reason = _without_marker(connection, storage, row)
+    elif marker.installation != row.id:
+        reason = (
+            f"the storage belongs to installation {marker.installation}, the database to {row.id}: "
+            "it is empty, or that of another installation"
+        )
+    elif marker.generation > row.storage_generation:
+        reason = (
+            f"the database is older than the storage (generation {row.storage_generation}, the storage "
+            f"has {marker.generation}): it is an older backup and does not know the newest files"
+        )
+    else:
+        return None
+    return None if reason is None else f"{reason}. {ADVICE}"
+
+
+def _without_marker(connection: Connection, storage: Storage, row: InstallationRow) -> str | None:
+    """Why a storage that names no installation does not belong to the database."""
+    if row.storage_generation > 0:
+        return (
+            "the storage names no installation, but the database was used with a storage before: "
+            "the folder is not mounted, or the bucket is another one"
+        )
+    families = garbage_collection.compare_files(connection, storage)
+    arriving = arriving_files(storage)
+    n_files = sum(family.n_files for family in families) + len(arriving)
+    n_unknown = sum(len(family.unknown) for family in families)
+    n_known = n_files - n_unknown - len(arriving.keys() - uploads.present(connection, list(arriving)))
+    if n_files == 0 and installation.names_files(connection):
+        return "the storage is empty, but the database names files: the folder is not mounted"
+    if n_known < KNOWN_SHARE * n_files:
+        return (
+            f"the storage names no installation, and the database knows {n_known} of its {n_files} "
+            "files: the database is empty, an older one, or that of another installation"
+        )
+    return None

@@ -1,0 +1,294 @@
+"""The storage belongs to its database: another, an older or an empty database removes nothing."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine
+from app.db.cluster.embedded import Cluster
+from app.main import create_app
+from app.storage import MARKER, Storage, open_storage, trash
+from app.storage.trash import TRASH, Moment
+from app.usecases import garbage_collection, storage_identity
+from app.usecases.blocks.lifecycle import ingest_block
+from app.usecases.tokens import create_token
+from app.worker import sweep
+from app.worker.sweep import Sweeper, sweep_files
+from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.s3_server import running_bucket
+from tests.factories import make_block
+from tests.statements import run_sql
+
+TIFF = b"II*\0" + bytes(1000)
+JOB_S = 3600.0
+LEASE_S = 0.3
+LONGEST_WAIT_S = 5.0
+FAMILIES = ("chips", "scenes", "results", "uploads")
+
+
+@dataclass(frozen=True)
+class Full:
+    """An installation with files of every family.
+
+    Attributes:
+        dsn: of its database, which nobody is connected to.
+        settings: with its storage.
+        files: key to content.
+    """
+
+    dsn: str
+    settings: Settings
+    files: dict[str, bytes]
+
+
+def contents(storage: Storage) -> dict[str, bytes]:
+    """All files of a storage but its marker, and its uploads that are still arriving."""
+    files = {}
+    for key in (key for family in FAMILIES for key in storage.keys(family)):
+        with storage.open(key) as file:
+            files[key] = file.read()
+    arriving = storage.scratch().glob("upload-*")
+    return files | {path.name: path.read_bytes() for path in arriving}
+
+
+def use(settings: Settings, folder: Path, seed: int) -> None:
+    """Run a service for a moment: it gets a block, a scene, an archive, a result, a begun upload."""
+    storage = open_storage(settings)
+    dsn = settings.database_url.get_secret_value() if settings.database_url else ""
+    with TestClient(create_app(settings)) as client:
+        with engine.connect(dsn) as connection:
+            made = make_block(folder / f"block-{seed}", count=5, seed=seed, version=f"1.{seed}")
+            ingest_block(connection, storage, made.folder)
+            secret = create_token(connection, "a user", ["admin"]).secret
+            job = run_sql(
+                connection,
+                "insert into job (id, kind, state, attempt, inputs, finished_at)"
+                " values (gen_random_uuid(), 'register-scene', 'successful', 1, '{}', now())"
+                " returning id",
+            ).fetchone()["id"]
+        client.headers["Authorization"] = f"Bearer {secret}"
+        client.post("/scenes?name=a.tif", content=TIFF).raise_for_status()
+        client.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10).raise_for_status()
+        storage.put(f"results/{job}/1/report.json", [b"{}"])
+        announced = {
+            "Upload-Length": "20",
+            "Upload-Metadata": "filename YS50aWY=",
+            "Tus-Resumable": "1.0.0",
+        }
+        client.post("/uploads", headers=announced).raise_for_status()
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def full(
+    request: pytest.FixtureRequest, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Full]:
+    """An installation whose storage is full."""
+    with running_bucket(monkeypatch) as url:
+        settings = Settings(
+            database_url=dsn,
+            data_folder=tmp_path / "data",
+            storage_url=url if request.param == "bucket" else None,
+        )
+        use(settings, tmp_path, 1)
+        yield Full(dsn, settings, contents(open_storage(settings)))
+
+
+@contextmanager
+def another(cluster: Cluster, dsn: str | None = None) -> Iterator[str]:
+    """A database of an installation of its own; or a copy of a database, as a restored backup is."""
+    with fresh_database(
+        cluster, TEMPLATE if dsn is None else dsn.split("dbname=")[1].split()[0]
+    ) as copy:
+        if dsn is None:
+            with engine.connect(copy) as connection:
+                run_sql(connection, "update installation set id = gen_random_uuid()")
+        yield copy
+
+
+def swept(settings: Settings, monkeypatch: pytest.MonkeyPatch, until: Callable[[], bool]) -> None:
+    """Let the sweeper of a worker sweep jobs and files every tick, until a condition or for seconds."""
+    monkeypatch.setattr(sweep, "FIRST_FILES_S", 0.0, raising=False)
+    stop = threading.Event()
+    brisk = settings.model_copy(update={"lease_seconds": LEASE_S})
+    with engine.opened(settings) as database:
+        sweeper = Sweeper(database, open_storage(settings), brisk, stop)
+        thread = threading.Thread(target=sweeper.run)
+        thread.start()
+        deadline = time.monotonic() + LONGEST_WAIT_S
+        while time.monotonic() < deadline and not until():
+            time.sleep(0.05)
+        stop.set()
+        thread.join()
+
+
+def assert_untouched(
+    full: Full, dsn: str, reason: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A worker on a database removes nothing from the full storage, and says why and what to do."""
+    storage = open_storage(full.settings)
+    before = contents(storage)
+    marker = storage.open(MARKER).read() if storage.exists(MARKER) else None
+    settings = full.settings.model_copy(update={"database_url": Settings(database_url=dsn).database_url})
+    swept(settings, monkeypatch, lambda: "amers store adopt" in caplog.text)
+    assert contents(storage) == before
+    assert (storage.open(MARKER).read() if storage.exists(MARKER) else None) == marker
+    assert storage.keys(TRASH) == []
+    assert reason in caplog.text
+    assert "amers store adopt" in caplog.text
+
+
+def test_an_empty_database_beside_a_full_storage_removes_nothing(
+    full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    assert {key.split("/")[0].split("-")[0] for key in full.files} == {*FAMILIES, "upload"}
+    with another(cluster) as empty:
+        assert_untouched(full, empty, "that of another installation", monkeypatch, caplog)
+
+
+def test_an_empty_database_beside_a_storage_of_an_earlier_version_removes_nothing(
+    full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    open_storage(full.settings).delete(MARKER)
+    with another(cluster) as empty:
+        assert_untouched(full, empty, f"knows 0 of its {len(full.files)} files", monkeypatch, caplog)
+
+
+def test_a_database_of_another_installation_removes_nothing(
+    full: Full,
+    cluster: Cluster,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+):
+    with another(cluster) as other:
+        elsewhere = Settings(database_url=other, data_folder=tmp_path / "elsewhere")
+        use(elsewhere, tmp_path, 2)
+        assert_untouched(full, other, "that of another installation", monkeypatch, caplog)
+
+
+def test_an_older_backup_of_the_database_removes_nothing(
+    full: Full,
+    cluster: Cluster,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+):
+    with another(cluster, full.dsn) as backup:
+        use(full.settings, tmp_path, 3)
+        assert len(contents(open_storage(full.settings))) == 2 * len(full.files)
+        assert_untouched(full, backup, "the database is older than the storage", monkeypatch, caplog)
+
+
+def test_a_storage_that_is_not_mounted_gets_no_files_of_its_own(
+    full: Full, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    unmounted = full.settings.model_copy(update={"data_folder": tmp_path / "x", "storage_url": None})
+    with engine.opened(unmounted) as database:
+        assert not storage_identity.announce(database.transaction, open_storage(unmounted))
+    assert "not mounted" in caplog.text
+    assert not open_storage(unmounted).exists(MARKER)
+
+
+def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Full):
+    storage = open_storage(full.settings)
+    storage.delete(MARKER)
+    with engine.connect(full.dsn) as connection:
+        run_sql(connection, "update installation set storage_generation = 0")
+    with engine.opened(full.settings) as database:
+        assert storage_identity.announce(database.transaction, storage)
+        sweep_files(database, storage, JOB_S)
+    assert contents(storage) == full.files
+
+
+def test_an_adopted_storage_is_swept_by_its_new_database_and_not_by_the_former_one(
+    full: Full, cluster: Cluster
+):
+    storage = open_storage(full.settings)
+    with another(cluster) as dsn, engine.pooled(dsn, full.settings) as database:
+        assert storage_identity.prepare(database.transaction, storage) is not None
+        storage_identity.adopt(database.transaction, storage)
+        assert storage_identity.prepare(database.transaction, storage) is None
+        sweep_files(database, storage, JOB_S)
+    assert [key for family in FAMILIES for key in storage.keys(family)] == []
+    ((batch, keys),) = trash.batches(storage).items()
+    with engine.pooled(full.dsn, full.settings) as database:
+        reason = storage_identity.prepare(database.transaction, storage)
+        assert reason is not None
+        assert "another installation" in reason
+        trash.put_back(storage, batch, keys)
+        storage_identity.adopt(database.transaction, storage)
+        sweep_files(database, storage, JOB_S)
+    before = {key: content for key, content in full.files.items() if "/" in key}
+    assert contents(storage) == before, "but for the upload that was arriving"
+
+
+def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptime(full: Full):
+    storage, key = open_storage(full.settings), f"scenes/{uuid4()}/left.tif"
+    storage.put(key, [b"left by a killed process"])
+    with engine.opened(full.settings) as database:
+        sweep_files(database, storage, JOB_S)
+        with database.transaction() as connection:
+            now = garbage_collection.moment(connection)
+        assert contents(storage) == full.files
+        assert trash.batches(storage) == {now.batch: [key]}
+        # A year of the calendar, as a clock that jumped shows it, without any uptime.
+        storage.move(f"{TRASH}/{now.batch}/{key}", f"{TRASH}/2020-01-01_{now.uptime_h}h/{key}")
+        sweep_files(database, storage, JOB_S)
+        assert trash.batches(storage) == {f"2020-01-01_{now.uptime_h}h": [key]}
+    for later, is_left in (
+        (Moment(date(2030, 1, 1), now.uptime_h + 7 * 24 - 1), True),
+        (Moment(date(2020, 1, 7), now.uptime_h + 1000), True),
+        (Moment(date(2020, 1, 8), now.uptime_h + 7 * 24), False),
+    ):
+        trash.delete_old(storage, later, 7.0)
+        assert bool(storage.keys(TRASH)) == is_left, later
+
+
+def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
+    full: Full, caplog: pytest.LogCaptureFixture
+):
+    storage = open_storage(full.settings)
+    stray = [f"scenes/{uuid4()}/a.tif" for _ in range(garbage_collection.FILES_AT_ONCE + 1)]
+    for key in stray:
+        storage.put(key, [b"x"])
+    with engine.opened(full.settings) as database:
+        sweep_files(database, storage, JOB_S)
+        assert set(storage.keys("scenes")) >= set(stray)
+        assert "amers store sweep" in caplog.text
+        assert set(garbage_collection.remove_all_unnamed(database, storage)) == set(stray)
+    assert contents(storage) == full.files
+    assert len(storage.keys(TRASH)) == len(stray)
+
+
+def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
+    storage, stop = open_storage(full.settings), threading.Event()
+    storage.put(f"scenes/{uuid4()}/left.tif", [b"left by a killed process"])
+    before = contents(storage)
+    brisk = full.settings.model_copy(update={"lease_seconds": LEASE_S})
+    with engine.opened(full.settings) as database:
+        thread = threading.Thread(target=Sweeper(database, storage, brisk, stop).run)
+        thread.start()
+        time.sleep(5 * LEASE_S)
+        stop.set()
+        thread.join()
+    assert contents(storage) == before
+
+
+def test_a_file_too_large_to_be_copied_by_the_bucket_goes_to_the_trash_in_parts(
+    full: Full, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("app.storage.bucket.COPY_LIMIT_BYTES", 10)
+    storage, content = open_storage(full.settings), bytes(range(256)) * 100
+    storage.put("scenes/large", [content])
+    storage.move("scenes/large", "trash/large")
+    assert not storage.exists("scenes/large")
+    assert storage.open("trash/large").read() == content
