@@ -55,6 +55,7 @@ class Settings(BaseSettings):
         quota_kept_jobs: largest number of jobs of one token, those that have ended included.
         public_metrics: whether metrics can be read without a token.
         cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*` for all.
+        trusted_hosts: further names in the header `Host` that the API answers to; `*` for all.
         oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
         oidc_audience: required audience of such a token.
         oidc_keys_url: address of the issuer's keys; None takes it from the discovery document.
@@ -91,6 +92,7 @@ class Settings(BaseSettings):
     quota_kept_jobs: int = Field(default=10_000, ge=0)
     public_metrics: bool = False
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
+    trusted_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     oidc_issuer: str | None = None
     oidc_audience: str = "amers"
     oidc_keys_url: str | None = None
@@ -106,7 +108,7 @@ class Settings(BaseSettings):
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
-    @field_validator("cors_origins", mode="before")
+    @field_validator("cors_origins", "trusted_hosts", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return (

@@ -32,7 +32,10 @@ from app.api import (
     uploads,
 )
 from app.api.body import BodyLimit
+from app.api.hosts import TrustedHosts
+from app.api.reply_headers import ReplyHeaders
 from app.api.request_log import RequestLog, RequestMetrics
+from app.api.tus import TusRequests
 from app.config import Settings, read_settings
 from app.db import engine
 from app.oidc import Issuer
@@ -77,6 +80,7 @@ CORS_HEADERS = (
     "Upload-Metadata",
     "Upload-Offset",
     "X-Checksum",
+    "X-HTTP-Method-Override",
     "X-Request-ID",
 )
 CORS_EXPOSED = (
@@ -135,10 +139,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         allow_headers=CORS_HEADERS,
         expose_headers=CORS_EXPOSED,
     )
+    app.add_middleware(TusRequests)
+    app.add_middleware(TrustedHosts, settings=settings)
     app.state.metrics = RequestMetrics()
     app.state.upload_turns = CapacityLimiter(deps.UPLOADS_AT_ONCE)
     app.state.issuer = None if settings.oidc_issuer is None else Issuer(settings)
     app.add_middleware(RequestLog, metrics=app.state.metrics)
+    app.add_middleware(ReplyHeaders)
     error_responses.install(app)
     openapi.install(app)
     for router in ROUTERS:

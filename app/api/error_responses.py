@@ -160,5 +160,8 @@ def _storage_unavailable(request: Request, error: Exception) -> JSONResponse:
 def _unexpected(request: Request, error: Exception) -> JSONResponse:
     """The reply to a bug or an outage: no details, which the log has with their trace."""
     request_id = getattr(request.state, "request_id", None)
-    headers = None if request_id is None else {"X-Request-ID": request_id}
+    # This reply is made outside of all middleware.
+    headers = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+    if request_id is not None:
+        headers["X-Request-ID"] = request_id
     return problem(500, "an unexpected error; the service has logged it", headers=headers)

@@ -22,12 +22,12 @@ from app.api.deps import (
 )
 from app.api.error_responses import problem
 from app.api.models.scenes import Upload
+from app.api.tus import VERSION
 from app.db.uploads import UploadRow
 from app.errors import InputError
 from app.usecases import uploads
 from app.usecases.uploads import Busy, Checksum, NewUpload, Piece, WrongChecksum
 
-VERSION = "1.0.0"
 PIECE = "application/offset+octet-stream"
 ALGORITHMS = ("sha1", "sha256")
 EXTENSIONS = "creation,termination,checksum,expiration"

@@ -24,7 +24,7 @@ from tests.service_process import Service, until
 pytestmark = pytest.mark.long
 
 ENDED = ("successful", "failed", "dismissed")
-SAME_HOST = {"Host": "amers.example"}
+SAME_HOST = {"Host": "localhost"}
 PATHS = (
     "/collections",
     "/collections/points/items?limit=1000",

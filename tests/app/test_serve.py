@@ -73,7 +73,7 @@ def test_requests_under_way_are_answered_when_the_service_is_stopped(service, tm
     with service.cluster.lease() as dsn, engine.connect(dsn) as connection:
         publish_block(connection, str(ingest_block(connection, storage, made.folder).block.number))
         secret = create_token(connection, "slow", ["register"]).secret
-    headers = f"Host: amers\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
+    headers = f"Host: localhost\r\nAuthorization: Bearer {secret}\r\nConnection: close\r\n"
     with slow_line(service.port) as reading, slow_line(service.port) as sending:
         # A streamed reply with a slow reader, and an upload whose second half is missing.
         reading.sendall(

@@ -1,0 +1,36 @@
+"""Headers of all replies: whether they may be stored, and that browsers must not guess their type."""
+
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+NO_STORE = "no-store"
+FIRST_ERROR = 400
+
+
+class ReplyHeaders:
+    """Middleware that adds `X-Content-Type-Options: nosniff` and `Cache-Control: no-store`.
+
+    A successful reply that states its own `Cache-Control` keeps it: tiles, chips and the map page.
+
+    Attributes:
+        app: the application that gets the requests.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers["X-Content-Type-Options"] = "nosniff"
+                if message["status"] >= FIRST_ERROR or "Cache-Control" not in headers:
+                    headers["Cache-Control"] = NO_STORE
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)

@@ -1,0 +1,179 @@
+"""Headers of replies, names of the service in `Host`, and what tus demands of every reply."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.main import create_app
+
+TIFF = b"II*\0" + bytes(100)
+TUS = {"Tus-Resumable": "1.0.0"}
+PIECE = {"Content-Type": "application/offset+octet-stream"}
+
+Bearer = Callable[[str], dict[str, str]]
+
+
+def operations(client: TestClient) -> Iterator[tuple[str, str]]:
+    """Method and path of every operation of the API description, parameters replaced by a number."""
+    for path, methods in client.get("/api").json()["paths"].items():
+        for method in methods:
+            if method in ("get", "head", "post", "put", "patch", "delete", "options"):
+                filled = "/".join("1" if part.startswith("{") else part for part in path.split("/"))
+                yield method.upper(), filled
+
+
+def test_every_reply_forbids_guesses_of_its_type_and_storing(client: TestClient, bearer: Bearer):
+    number = 0
+    for headers in ({}, bearer("admin")):
+        for method, path in operations(client):
+            reply = client.request(method, path, headers=headers)
+            number += 1
+            assert reply.headers["x-content-type-options"] == "nosniff", (method, path)
+            caching = reply.headers["cache-control"]
+            assert caching == "no-store" or (reply.is_success and "public" not in caching), (
+                method,
+                path,
+            )
+    assert number > 100
+    for path in ("/nothing", "/map/nothing"):
+        assert client.get(path).headers["cache-control"] == "no-store"
+
+
+def test_files_are_not_stored_and_not_guessed(client: TestClient, bearer: Bearer):
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    reply = client.get(f"/scenes/{scene}/files/a.tif", headers=me)
+    assert reply.content == TIFF
+    assert reply.headers["cache-control"] == "no-store"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_the_reply_to_an_unexpected_error_has_the_headers_too(settings: Settings):
+    app = create_app(settings)
+
+    @app.get("/broken")
+    def broken() -> None:
+        raise RuntimeError
+
+    with TestClient(app, raise_server_exceptions=False) as client:
+        reply = client.get("/broken")
+    assert reply.status_code == 500
+    assert reply.headers["cache-control"] == "no-store"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+def test_tiles_and_the_map_keep_their_own_caching(client: TestClient, bearer: Bearer):
+    tile = client.get("/collections/points/tiles/WebMercatorQuad/0/0/0", headers=bearer("read"))
+    assert (tile.status_code, tile.headers["cache-control"]) == (200, "private, no-cache")
+    headers = bearer("read") | {"If-None-Match": tile.headers["etag"]}
+    again = client.get("/collections/points/tiles/WebMercatorQuad/0/0/0", headers=headers)
+    assert again.status_code == 304
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "evil.example:8000", "localhost.evil.example", "169.254.169.254", "[::2]", ""],
+)
+def test_a_host_that_is_no_name_of_the_service_is_refused(client: TestClient, host: str):
+    reply = client.get("/", headers={"Host": host})
+    assert reply.status_code == 400
+    assert reply.headers["content-type"] == "application/problem+json"
+    assert "AMERS_TRUSTED_HOSTS" in reply.json()["detail"]
+    assert reply.headers["cache-control"] == "no-store"
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "LOCALHOST:80", "127.0.0.1:8000", "[::1]:8000", "testserver"]
+)
+def test_the_own_names_of_a_service_are_accepted(client: TestClient, host: str):
+    """`testserver` is the address at which the client of the tests arrives."""
+    assert client.get("/", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("trusted", "host", "status"),
+    [
+        ("gcp.example.org", "gcp.example.org", 200),
+        ("gcp.example.org", "www.gcp.example.org", 400),
+        ("*.example.org, other.example", "gcp.example.org:443", 200),
+        ("*.example.org, other.example", "other.example", 200),
+        ("*.example.org", "example.org", 400),
+        ("*.example.org", "badexample.org", 400),
+        ("*", "anything.example", 200),
+    ],
+)
+def test_a_public_name_is_accepted_where_the_settings_name_it(
+    dsn: str, tmp_path: Path, trusted: str, host: str, status: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("AMERS_TRUSTED_HOSTS", trusted)
+    settings = Settings(database_url=dsn, data_folder=tmp_path / "data")
+    with TestClient(create_app(settings)) as client:
+        reply = client.get("/", headers={"Host": host})
+    assert reply.status_code == status
+    if status == 200:
+        assert f"http://{host}/" in reply.text, "links have the name that the caller uses"
+
+
+def begun(client: TestClient, me: dict[str, str]) -> str:
+    reply = client.post(
+        "/uploads",
+        headers=me | TUS | {"Upload-Length": str(len(TIFF)), "Upload-Metadata": "filename YS50aWY="},
+    )
+    assert reply.status_code == 201, reply.text
+    return reply.headers["location"]
+
+
+def test_replies_to_uploads_name_the_version_of_tus_whatever_they_say(
+    client: TestClient, bearer: Bearer
+):
+    me = bearer("register")
+    url = begun(client, me)
+    offset = {"Upload-Offset": "5"}
+    nobody = "/uploads/00000000-0000-0000-0000-000000000001"
+    replies = {
+        400: client.patch(
+            url, headers=me | TUS | PIECE | {"Upload-Offset": "0", "Upload-Checksum": "md5 x"}
+        ),
+        401: client.head(url, headers=TUS),
+        404: client.head(nobody, headers=me | TUS),
+        405: client.put(url, headers=me | TUS),
+        409: client.patch(url, content=b"x", headers=me | TUS | PIECE | offset),
+        412: client.head(url, headers=me),
+        413: client.patch(url, content=TIFF * 2, headers=me | TUS | PIECE | {"Upload-Offset": "0"}),
+        415: client.patch(url, content=b"x", headers=me | TUS | offset),
+        422: client.head("/uploads/no-id", headers=me | TUS),
+    }
+    for status, reply in replies.items():
+        assert (reply.status_code, reply.headers.get("tus-resumable")) == (status, "1.0.0"), reply.text
+
+
+def test_a_post_stands_for_the_method_that_its_header_names(client: TestClient, bearer: Bearer):
+    me = bearer("register") | TUS
+    url = begun(client, me)
+
+    def override(method: str, **more: str) -> dict[str, str]:
+        return me | {"X-HTTP-Method-Override": method} | more
+
+    half = client.post(
+        url, content=TIFF[:50], headers=override("PATCH", **{"Upload-Offset": "0"}) | PIECE
+    )
+    assert (half.status_code, half.headers["upload-offset"]) == (204, "50")
+    assert client.post(url, headers=override("HEAD")).headers["upload-offset"] == "50"
+    assert client.post(url, headers=override("DELETE")).status_code == 204
+    assert client.head(url, headers=me).status_code == 404
+    wrong = client.post(url, headers=override("PUT"))
+    assert (wrong.status_code, wrong.headers["tus-resumable"]) == (400, "1.0.0")
+    assert "PATCH" in wrong.json()["detail"]
+
+
+def test_no_other_path_and_no_other_method_is_overridden(client: TestClient, bearer: Bearer):
+    me = bearer("register") | {"X-HTTP-Method-Override": "DELETE"}
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    url = begun(client, {"Authorization": me["Authorization"]})
+    assert client.post(f"/scenes/{scene}", headers=me).status_code == 405
+    assert client.get(url, headers=me).json()["state"] == "arriving"
+    assert client.get(url, headers=me).status_code == 200
+    assert client.get(f"/scenes/{scene}", headers=me).status_code == 200
