@@ -177,9 +177,7 @@ class _Translator:
 
     def boolean(self, node: Any) -> Predicate:
         """A condition of the filter as a predicate."""
-        self.nodes += 1
-        if self.nodes > MOST_NODES:
-            raise InvalidParameter(f"filter: more than {MOST_NODES} conditions")
+        self._add_nodes(1)
         if isinstance(node, bool):
             return literal(node, Boolean())
         if not isinstance(node, dict) or not isinstance(node.get("op"), str):
@@ -194,6 +192,13 @@ class _Translator:
                 self.depth -= 1
                 return predicate
         raise InvalidParameter(f"filter: no operator or function {node['op']!r:.60} here")
+
+    def _add_nodes(self, count: int) -> None:
+        self.nodes += count
+        if self.nodes > MOST_NODES:
+            raise InvalidParameter(
+                f"filter: more than {MOST_NODES} conditions, functions and values of lists: split it"
+            )
 
     def _enter(self) -> None:
         self.depth += 1
@@ -233,6 +238,7 @@ class _Translator:
         _count(op, args, 2)
         if not isinstance(args[1], list) or not args[1]:
             raise InvalidParameter("filter: in: a list of values expected")
+        self._add_nodes(len(args[1]))
         return or_(*(operator.eq(*self._pair(args[0], value)) for value in args[1]))
 
     def _like(self, op: str, args: list[Any]) -> Predicate:
@@ -306,7 +312,7 @@ class _Translator:
         op, args = node.get("op"), node.get("args")
         if not isinstance(op, str) or not isinstance(args, list):
             raise InvalidParameter(f"filter: a value expected, {json.dumps(node)!s:.60} found")
-        self.nodes += 1
+        self._add_nodes(1)
         if op.lower() == "casei":
             _count(op, args, 1)
             inner = self._scalar(args[0])

@@ -1,29 +1,27 @@
-"""Parsing of filters within limits of size: CQL2 by its library, geometries, times.
+"""Parsing of filters within limits of size: CQL2 in both languages, geometries, times.
 
 Sources: OGC 21-065r2, Common Query Language (CQL2); RFC 7946, RFC 3339.
 """
 
 import json
-import re
-from collections.abc import Callable
 from datetime import UTC, date, datetime
 from typing import Any
 
-import cql2
 import shapely
 
 from app.db.features.antimeridian import on_the_map
+from app.db.features.cql2_process import parse
+from app.db.features.cql2_tokens import check_text
 from app.db.features.crs import Crs, lon_lat_from_mercator
 from app.errors import InvalidParameter
 
-LONGEST_TEXT = 4_000
-"""Characters of a filter in text; the parser is recursive."""
-DEEPEST_TEXT = 10
-"""Levels of parentheses in text: each doubles the time of the parser on a wrong filter, 10 ms here."""
+LONGEST_JSON = 2_000_000
+"""Characters of a filter in JSON."""
 DEEPEST_JSON = 32
+DEEPEST_PARSED = 100
+"""Levels of a filter in text as JSON, two for each operator."""
 MOST_NODES = 1_000
 MOST_VERTICES = 10_000
-QUOTED = re.compile(r"'(?:[^'\\]|\\.|'')*'|\"[^\"]*\"")
 
 
 def parse_text(text: str) -> Any:
@@ -32,45 +30,71 @@ def parse_text(text: str) -> Any:
     Raises:
         InvalidParameter: the text is not CQL2, too long or too deep.
     """
-    if len(text) > LONGEST_TEXT:
-        raise InvalidParameter(
-            f"filter: {len(text)} characters, {LONGEST_TEXT} at most; send it by POST as cql2-json"
-        )
-    depth = deepest = 0
-    for character in QUOTED.sub("", text):
-        depth += (character == "(") - (character == ")")
-        deepest = max(deepest, depth)
-        if depth < 0:
-            break
-    if depth != 0:
-        raise InvalidParameter("filter: parentheses do not match")
-    if deepest > DEEPEST_TEXT:
-        raise InvalidParameter(f"filter: parentheses {deepest} deep, {DEEPEST_TEXT} at most in text")
-    return _parsed(cql2.parse_text, text)
+    _check_unicode(text)
+    check_text(text)
+    document = parse("text", text)
+    check_size(document, "filter", DEEPEST_PARSED)
+    return document
 
 
-def parse_json(text: str) -> Any:
-    """The parsed document of a filter in CQL2 JSON, checked by the library.
+def parse_json(document: Any) -> Any:
+    """A filter in CQL2 JSON, checked by the library.
+
+    Args:
+        document: parsed, or its text.
 
     Raises:
-        InvalidParameter: the text is not CQL2, too large or too deep.
+        InvalidParameter: the document is not CQL2, too large or too deep, or has a number that is not
+            finite, a member twice or half a character.
     """
+    if isinstance(document, str):
+        document = _loaded(document)
+    check_size(document, "filter")
     try:
-        document = json.loads(text)
+        text = json.dumps(document, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        raise InvalidParameter("filter: NaN or an infinity found, a finite number expected") from None
+    _check_unicode(text)
+    if len(text) > LONGEST_JSON:
+        raise InvalidParameter(f"filter: {len(text)} characters of JSON, {LONGEST_JSON} at most")
+    return parse("json", text)
+
+
+def _loaded(text: str) -> Any:
+    try:
+        return json.loads(text, object_pairs_hook=_members, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InvalidParameter(f"filter: not JSON: {error!s:.200}") from None
-    check_size(document, "filter")
-    return _parsed(cql2.parse_json, text)
 
 
-def check_size(document: Any, where: str) -> None:
+def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError("an object has a member twice")
+    return members
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} found, a finite number expected")
+
+
+def _check_unicode(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise InvalidParameter(
+            f"filter: half a character (a lone surrogate) at character {error.start + 1}"
+        ) from None
+
+
+def check_size(document: Any, where: str, deepest: int = DEEPEST_JSON) -> None:
     """Raise an error for a document that is too deep or has too many parts; the check does not recurse.
 
     Raises:
         InvalidParameter: the document exceeds a limit; the message names it and `where` it stood.
     """
     level, vertices, nodes = [document], 0, 0
-    for _ in range(DEEPEST_JSON):
+    for _ in range(deepest):
         below: list[Any] = []
         for part in level:
             inside = list(part.values()) if isinstance(part, dict) else part
@@ -86,7 +110,7 @@ def check_size(document: Any, where: str) -> None:
             )
         if not level:
             return
-    raise InvalidParameter(f"{where}: deeper than {DEEPEST_JSON} levels")
+    raise InvalidParameter(f"{where}: deeper than {deepest} levels")
 
 
 def parse_instant(text: Any, where: str) -> datetime:
@@ -152,12 +176,3 @@ def _box(values: Any) -> Any:
         return shapely.box(west, south, east, north)
     sides = [shapely.box(west, south, 180.0, north), shapely.box(-180.0, south, east, north)]
     return shapely.multipolygons(sides)
-
-
-def _parsed(parse: Callable[[str], Any], text: str) -> Any:
-    try:
-        return parse(text).to_json()
-    except (cql2.ParseError, cql2.ValidationError, ValueError, OverflowError) as error:
-        lines = [line.strip() for line in str(error).splitlines()]
-        reason = " ".join(line for line in lines if line and line not in ("|", "^---"))
-        raise InvalidParameter(f"filter: not CQL2: {reason:.300}") from None

@@ -230,8 +230,7 @@ def _cql2_condition(query: FeatureFilter, collection: Collection, crs: Crs) -> C
             f"filter-lang: {language!r:.40} found, one of {', '.join(FILTER_LANGUAGES)} expected"
         )
     if language == "cql2-json":
-        text = query.filter if isinstance(query.filter, str) else json.dumps(query.filter)
-        return translate(parse_json(text), collection, crs)
+        return translate(parse_json(query.filter), collection, crs)
     if not isinstance(query.filter, str):
         raise InvalidParameter(f"filter: an object found, text expected for filter-lang {language}")
     return translate_text(query.filter, collection, crs)
