@@ -4,6 +4,7 @@ No other module reads the environment.
 """
 
 import os
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -37,6 +38,14 @@ class Settings(BaseSettings):
         host, port: that the API listens on.
         upload_limit_bytes: largest upload of an image or a block.
         body_limit_bytes: largest body of all other requests.
+        head_seconds: longest time in which the head of a request arrives.
+        body_seconds: longest time in which such a body arrives.
+        rate_seconds, least_rate_bytes: an upload or a reply that moves fewer bytes per second, on the
+            average over so many seconds, is given up.
+        connections, connections_per_address: largest number of open connections of one API process, in
+            all and from one address.
+        trusted_proxies: addresses and networks of proxies that state the caller's address in
+            `X-Forwarded-For`.
         public_points: whether points and chips can be read without a token.
         pool_size: largest number of connections of one API process, for reading and again for writing.
         read_timeout_seconds: time limit of the database for one statement of a reading request.
@@ -73,6 +82,13 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=1, le=65535)
     upload_limit_bytes: int = Field(default=32 * GIBIBYTE, ge=1)
     body_limit_bytes: int = Field(default=MEBIBYTE, ge=1)
+    head_seconds: float = Field(default=10.0, gt=0)
+    body_seconds: float = Field(default=30.0, gt=0)
+    rate_seconds: float = Field(default=30.0, gt=0)
+    least_rate_bytes: int = Field(default=4096, ge=1)
+    connections: int = Field(default=1000, ge=1)
+    connections_per_address: int = Field(default=100, ge=1)
+    trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
     public_points: bool = False
     pool_size: int = Field(default=8, ge=1, le=100)
     read_timeout_seconds: float = Field(default=10.0, gt=0)
@@ -108,7 +124,7 @@ class Settings(BaseSettings):
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 
-    @field_validator("cors_origins", "trusted_hosts", mode="before")
+    @field_validator("cors_origins", "trusted_hosts", "trusted_proxies", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return (
@@ -116,6 +132,11 @@ class Settings(BaseSettings):
             if isinstance(value, str)
             else value
         )
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(str(ip_network(proxy)) for proxy in proxies)
 
     @field_validator("data_folder")
     @classmethod

@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
 
-from anyio import CapacityLimiter, to_thread
+from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.cors import CORSMiddleware
@@ -31,10 +31,11 @@ from app.api import (
     tokens,
     uploads,
 )
-from app.api.body import BodyLimit
+from app.api.body import BoundedBodies
 from app.api.hosts import TrustedHosts
 from app.api.reply_headers import ReplyHeaders
 from app.api.request_log import RequestLog, RequestMetrics
+from app.api.routes import CallerRoute
 from app.api.tus import TusRequests
 from app.config import Settings, read_settings
 from app.db import engine
@@ -129,9 +130,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
     )
-    app.add_middleware(
-        BodyLimit, limit_bytes=settings.body_limit_bytes, upload_limit_bytes=settings.upload_limit_bytes
-    )
+    app.router.route_class = CallerRoute
+    app.add_middleware(BoundedBodies, settings=settings)
     app.add_middleware(
         CORSMiddleware,
         allow_origins=settings.cors_origins,
@@ -142,7 +142,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(TusRequests)
     app.add_middleware(TrustedHosts, settings=settings)
     app.state.metrics = RequestMetrics()
-    app.state.upload_turns = CapacityLimiter(deps.UPLOADS_AT_ONCE)
+    app.state.uploads = deps.upload_turns()
+    app.state.turns = deps.turns_for(settings)
     app.state.issuer = None if settings.oidc_issuer is None else Issuer(settings)
     app.add_middleware(RequestLog, metrics=app.state.metrics)
     app.add_middleware(ReplyHeaders)

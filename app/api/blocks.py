@@ -18,6 +18,7 @@ from app.api.models.blocks import (
     UploadedBlock,
 )
 from app.api.models.jobs import StatusInfo
+from app.api.routes import CallerRoute
 from app.auth import is_administrator
 from app.db.blocks import Block
 from app.db.engine import Connection
@@ -30,7 +31,7 @@ from app.usecases.jobs import JobRequest
 from app.usecases.scenes import SentFile
 from services.quality.block import quality_document
 
-router = APIRouter(tags=["blocks"])
+router = APIRouter(tags=["blocks"], route_class=CallerRoute)
 
 
 class BlockToIngest(BaseModel):

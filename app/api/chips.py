@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import parameter_names
 from app.api.negotiation import NPZ, TIFF, refuse_unknown
+from app.api.routes import CallerRoute
 from app.errors import InvalidParameter
 from app.storage import StoredChips
 from app.usecases.features import points
@@ -17,7 +18,7 @@ from app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
 from app.usecases.features.query import FeatureFilter
 from services.types import ControlPoints
 
-router = APIRouter(tags=["points"])
+router = APIRouter(tags=["points"], route_class=CallerRoute)
 
 MEDIA_TYPES: dict[StackFormat, str] = {"npz": NPZ, "tif": TIFF}
 LIMIT_TEXT = f"A reply has the chips of at most {MOST_POINTS_WITH_CHIPS:,} points."

@@ -31,6 +31,7 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Cell, Page, document_page, drawn
+from app.api.routes import CallerRoute
 from app.db.engine import Connection
 from app.db.features.collection import Collection, Viewer
 from app.db.features.crs import CRS84
@@ -38,7 +39,7 @@ from app.errors import NotAllowed
 from app.usecases.features import items
 from app.usecases.features.tiles import TILED
 
-router = APIRouter(tags=["collections"])
+router = APIRouter(tags=["collections"], route_class=CallerRoute)
 
 REL = "http://www.opengis.net/def/rel/ogc/1.0"
 WORLD = (-180.0, -90.0, 180.0, 90.0)

@@ -5,15 +5,14 @@ endpoint takes a database connection in its own thread and for as long as it nee
 held a connection and waited for a thread could wait for a thread that waits for a connection.
 """
 
-from collections.abc import AsyncIterator
 from typing import Annotated
 
-from anyio import CapacityLimiter, WouldBlock
-from fastapi import Depends, Header, Request
+from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
-from starlette.exceptions import HTTPException
 
 from app import request_context
+from app.api.body import body_of
+from app.api.turns import Turns
 from app.auth import Scope, authenticate, authenticate_identity, require
 from app.config import Settings
 from app.db.engine import Database
@@ -24,11 +23,29 @@ from app.storage import Storage, StoredChips
 from app.usecases.installation import Installation
 
 UPLOADS_AT_ONCE = 32
+UPLOADS_PER_CALLER = 8
+TURN_PATIENCE_S = 10.0
+CALLER = "amers.caller"
 
 
 def threads_for(settings: Settings) -> int:
     """Number of threads for endpoints: one for each upload at once and for each database connection."""
     return UPLOADS_AT_ONCE + 2 * settings.pool_size
+
+
+def turns_for(settings: Settings) -> Turns:
+    """Turns of requests that read the database, so that one caller leaves half of its connections.
+
+    A quarter of the connections for reading is for authentication and health checks, which take no turn.
+    """
+    connections = settings.pool_size
+    most = max(1, connections - connections // 4)
+    return Turns("requests", most, max(1, connections // 2), TURN_PATIENCE_S)
+
+
+def upload_turns() -> Turns:
+    """Turns of uploads: each occupies a thread until all of its bytes have arrived."""
+    return Turns("uploads", UPLOADS_AT_ONCE, UPLOADS_PER_CALLER, patience_s=0.0)
 
 
 async def _settings(request: Request) -> Settings:
@@ -66,18 +83,23 @@ async def _installation(
 InstallationDep = Annotated[Installation, Depends(_installation)]
 
 
-async def _caller(
-    request: Request, database: DatabaseDep, authorization: Annotated[str | None, Header()] = None
-) -> Token | None:
-    """The caller's token, None if the request has none; an invalid token is refused."""
-    if authorization is None:
-        return None
-    kind, _, secret = authorization.partition(" ")
-    if kind.lower() != "bearer" or not secret.strip():
-        raise NotAllowed("the Authorization header must read `Bearer TOKEN`", authenticated=False)
-    caller = await run_in_threadpool(_token, request.app.state.issuer, database, secret.strip())
-    here = request_context.current()
-    here.actor, here.actor_name = caller.id, caller.name
+async def identify(request: Request) -> Token | None:
+    """The caller's token, None if the request has none; later dependencies get it from `caller_of`.
+
+    Raises:
+        NotAllowed: the token is invalid.
+    """
+    caller = None
+    authorization = request.headers.get("authorization")
+    if authorization is not None:
+        kind, _, secret = authorization.partition(" ")
+        if kind.lower() != "bearer" or not secret.strip():
+            raise NotAllowed("the Authorization header must read `Bearer TOKEN`", authenticated=False)
+        state = request.app.state
+        caller = await run_in_threadpool(_token, state.issuer, state.database, secret.strip())
+        here = request_context.current()
+        here.actor, here.actor_name = caller.id, caller.name
+    request.scope[CALLER] = caller
     return caller
 
 
@@ -88,30 +110,21 @@ def _token(issuer: Issuer | None, database: Database, secret: str) -> Token:
         return authenticate(connection, secret)
 
 
-CallerDep = Annotated[Token | None, Depends(_caller)]
+async def caller_of(request: Request) -> Token | None:
+    """The caller's token, None if the request has none; its route has authenticated it."""
+    caller: Token | None = request.scope[CALLER]
+    return caller
 
 
-async def _turn(request: Request, caller: CallerDep) -> AsyncIterator[None]:
-    """Count an upload in progress: each occupies a thread until all of its bytes have arrived.
-
-    Raises:
-        HTTPException: as many uploads as are allowed are in progress.
-    """
-    turns: CapacityLimiter = request.app.state.upload_turns
-    try:
-        turns.acquire_on_behalf_of_nowait(request)
-    except WouldBlock:
-        detail = (
-            f"{UPLOADS_AT_ONCE} uploads are in progress, the most that are allowed at once: try again"
-        )
-        raise HTTPException(503, detail, {"Retry-After": "5"}) from None
-    try:
-        yield
-    finally:
-        turns.release_on_behalf_of(request)
+CallerDep = Annotated[Token | None, Depends(caller_of)]
 
 
-UploadTurn = Depends(_turn, scope="function")
+async def takes_upload(request: Request, caller: CallerDep) -> None:
+    """Accept a body as large as an upload; the route gives the request a turn among the uploads."""
+    body_of(request).accept_upload()
+
+
+UploadTurn = Depends(takes_upload)
 
 
 async def _reader(caller: CallerDep) -> Token:

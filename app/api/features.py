@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import Page, count_text, features_page
+from app.api.routes import CallerRoute
 from app.api.streams import Streamed
 from app.auth import Scope, is_administrator, require
 from app.db.engine import Database
@@ -28,7 +29,7 @@ from services.formats.vector.feature_files import (
     format_parquet,
 )
 
-router = APIRouter(tags=["features"])
+router = APIRouter(tags=["features"], route_class=CallerRoute)
 
 
 async def _collection(collection: str) -> Collection:

@@ -5,9 +5,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Admin, DatabaseDep
 from app.api.models.features import PointHistoryRecord
+from app.api.routes import CallerRoute
 from app.usecases import history
 
-router = APIRouter(prefix="/points", tags=["points"])
+router = APIRouter(prefix="/points", tags=["points"], route_class=CallerRoute)
 
 
 class Suspension(BaseModel):

@@ -10,13 +10,14 @@ from app.api.deps import DatabaseDep, Reader
 from app.api.models.base import Link
 from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
 from app.api.negotiation import JSON
+from app.api.routes import CallerRoute
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.schema import JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs
 from app.usecases.features.query import parse_interval
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 
 MOST_LISTED = 1000
 RESULTS = "http://www.opengis.net/def/rel/ogc/1.0/results"

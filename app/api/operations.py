@@ -13,10 +13,11 @@ from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
 from app.api.models.administration import ChangeRecord, ChangeRecords
 from app.api.models.base import Link
 from app.api.negotiation import JSON
+from app.api.routes import CallerRoute
 from app.usecases import operations
 from app.usecases.operations import InstallationFigures
 
-router = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"], route_class=CallerRoute)
 
 
 @router.get("/metrics", response_class=Response)

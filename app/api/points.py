@@ -21,6 +21,7 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Page, features_page
+from app.api.routes import CallerRoute
 from app.db.features.collection import Viewer
 from app.db.point_detail import PointDetail, PointView
 from app.db.points import POINTS
@@ -33,7 +34,7 @@ from services.formats.chips.images import (
     format_sheet_png,
 )
 
-router = APIRouter(prefix="/collections/points/items", tags=["points"])
+router = APIRouter(prefix="/collections/points/items", tags=["points"], route_class=CallerRoute)
 
 PNG = "image/png"
 CHIPS_NEVER_CHANGE = {"Cache-Control": "private, max-age=86400"}

@@ -17,13 +17,14 @@ from app.api.models.jobs import (
     StatusInfo,
 )
 from app.api.negotiation import JSON
+from app.api.routes import CallerRoute
 from app.errors import InputError
 from app.usecases import jobs
 from app.usecases.jobs import JobRequest
 from app.usecases.processes import Process
 from app.usecases.registration.deliverables import media_type
 
-router = APIRouter(tags=["processes"])
+router = APIRouter(tags=["processes"], route_class=CallerRoute)
 
 VERSION = "1.0.0"
 OGC = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf/"

@@ -4,10 +4,11 @@ from fastapi import APIRouter
 
 from app.api.deps import Admin, DatabaseDep, Registrar, SettingsDep
 from app.api.models.administration import Reference, References
+from app.api.routes import CallerRoute
 from app.usecases import references
 from app.usecases.references import NewReference
 
-router = APIRouter(prefix="/references", tags=["references"])
+router = APIRouter(prefix="/references", tags=["references"], route_class=CallerRoute)
 
 
 @router.get("")

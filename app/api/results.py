@@ -16,6 +16,7 @@ from app.api.files import file_reply
 from app.api.jobs import JobId, job_url
 from app.api.models.jobs import ResultFile
 from app.api.negotiation import JSON, SCHEMA_JSON
+from app.api.routes import CallerRoute
 from app.db.jobs.jobs import Job
 from app.errors import AmersError
 from app.storage import Storage
@@ -24,7 +25,7 @@ from app.usecases.registration.deliverables import media_type
 from services import errors as errors_of_science
 from services.reports import document
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 
 Part = tuple[str, dict[str, str], bytes]
 """Name, headers and content of a part of a multipart reply."""

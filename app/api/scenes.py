@@ -13,13 +13,14 @@ from app.api.body import BINARY_BODY, announced_length, body_chunks
 from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
 from app.api.files import file_reply
 from app.api.models.scenes import Scene, Scenes, StoredFile
+from app.api.routes import CallerRoute
 from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
 from app.usecases.features.stac import scene_media_type
 from app.usecases.scenes import SentFile
 
-router = APIRouter(tags=["scenes"])
+router = APIRouter(tags=["scenes"], route_class=CallerRoute)
 
 MOST_LISTED = 1000
 

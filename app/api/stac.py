@@ -43,6 +43,7 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.processes import inlined
+from app.api.routes import CallerRoute
 from app.db.engine import Database
 from app.db.features.collection import Viewer
 from app.db.features.outlines import SCENES
@@ -51,7 +52,7 @@ from app.usecases.features import items as all_features
 from app.usecases.features import stac
 from app.usecases.features.query import FeatureQuery, ResolvedQuery, Restriction, resolve
 
-router = APIRouter(tags=["stac"])
+router = APIRouter(tags=["stac"], route_class=CallerRoute)
 
 API = "https://api.stacspec.org/v1.0.0/"
 CONFORMS_TO = (

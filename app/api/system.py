@@ -21,9 +21,10 @@ from app.api.negotiation import (
     refuse_unknown,
 )
 from app.api.pages import Cell, Page, document_page
+from app.api.routes import CallerRoute
 from app.db.engine import check_postgis
 
-router = APIRouter(tags=["system"])
+router = APIRouter(tags=["system"], route_class=CallerRoute)
 
 COMMON = "http://www.opengis.net/spec/ogcapi-common-1/1.0/conf/"
 FEATURES = "http://www.opengis.net/spec/ogcapi-features-"

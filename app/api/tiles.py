@@ -17,12 +17,13 @@ from app.api.models.documents import (
     TileSets,
 )
 from app.api.negotiation import JSON, MVT
+from app.api.routes import CallerRoute
 from app.db.features.collection import Collection
 from app.errors import NotFound
 from app.usecases.features import tiles
 from app.usecases.features.tiles import MATRIX_SET
 
-router = APIRouter(tags=["tiles"])
+router = APIRouter(tags=["tiles"], route_class=CallerRoute)
 
 MATRIX_SET_URI = "http://www.opengis.net/def/tilematrixset/OGC/1.0/WebMercatorQuad"
 MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"

@@ -5,10 +5,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.api.deps import Admin, CallerDep, DatabaseDep
 from app.api.models.administration import NewTokenRecord, TokenRecord, TokenRecords
+from app.api.routes import CallerRoute
 from app.auth import Scope, require_token
 from app.usecases import tokens
 
-router = APIRouter(prefix="/tokens", tags=["tokens"])
+router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=CallerRoute)
 
 
 class TokenToMake(BaseModel):

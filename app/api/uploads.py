@@ -22,6 +22,7 @@ from app.api.deps import (
 )
 from app.api.error_responses import problem
 from app.api.models.scenes import Upload
+from app.api.routes import CallerRoute
 from app.api.tus import VERSION
 from app.db.uploads import UploadRow
 from app.errors import InputError
@@ -45,7 +46,7 @@ async def _version(tus_resumable: Annotated[str | None, Header()] = None) -> Non
 
 
 Version = Depends(_version)
-router = APIRouter(prefix="/uploads", tags=["uploads"])
+router = APIRouter(prefix="/uploads", tags=["uploads"], route_class=CallerRoute)
 
 
 @router.options("", status_code=204)

@@ -15,6 +15,7 @@ import typer
 import uvicorn
 
 from app import logs
+from app.api import connections
 from app.config import Settings, read_settings
 from app.db import revisions
 from app.db.cluster import embedded
@@ -60,6 +61,7 @@ def serve(
                 log_config=None,
                 access_log=False,
                 server_header=False,
+                **connections.server_options(settings),
                 timeout_graceful_shutdown=DRAIN_SECONDS,
             )
 

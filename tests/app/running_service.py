@@ -25,7 +25,7 @@ from tests.service_process import free_port, until
 
 @dataclass(frozen=True)
 class Served:
-    """A running service with one published block of 60 points.
+    """A running service with one published block.
 
     Attributes:
         points: of the block; their ids in the service begin at 2^26.
@@ -45,15 +45,16 @@ class Served:
 
 @contextmanager
 def service_with_a_block(
-    cluster: Cluster, folder: Path, scope: str, **environment: str
+    cluster: Cluster, folder: Path, scope: str, count: int = 60, **environment: str
 ) -> Iterator[Served]:
     """A service without a worker and a token with one scope; the service is stopped at the end.
 
     Args:
+        count: number of points of the block.
         environment: its settings, such as `AMERS_POOL_SIZE="2"`.
     """
     with fresh_database(cluster, TEMPLATE) as dsn:
-        made = make_block(folder / "block", count=60)
+        made = make_block(folder / "block", count=count)
         settings = Settings(database_url=dsn, data_folder=folder / "data")
         with engine.connect(dsn) as connection:
             lifecycle.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)

@@ -33,10 +33,6 @@ def app(settings):
     def echo(body: dict) -> dict:
         return body
 
-    @app.post("/scenes/echo")
-    def upload(body: dict) -> dict:
-        return body
-
     @app.post("/token/{name}")
     def keep(name: str, database: DatabaseDep) -> str:
         with database.transaction() as connection:
@@ -156,17 +152,6 @@ def test_an_unknown_path_is_a_problem_too(client):
 
 def test_a_body_that_is_not_json_is_refused(client):
     refused(client.post("/echo", content=b"{", headers={"Content-Type": "application/json"}), 422)
-
-
-def test_a_body_over_the_limit_is_refused_announced_or_not(client, settings):
-    body = b'{"x": "' + b"x" * settings.body_limit_bytes + b'"}'
-    json = {"Content-Type": "application/json"}
-    assert (
-        str(settings.body_limit_bytes)
-        in refused(client.post("/echo", content=body, headers=json), 413)["detail"]
-    )
-    refused(client.post("/echo", content=iter([body[:1000], body[1000:]]), headers=json), 413)
-    assert client.post("/scenes/echo", content=body, headers=json).status_code == 200
 
 
 def test_the_reply_to_an_unexpected_error_reveals_nothing(client):

@@ -14,6 +14,7 @@ from fastapi import FastAPI
 from starlette.requests import ClientDisconnect
 
 from app.api import deps, streams
+from app.api.turns import Turns
 from app.config import Settings
 from app.db import engine
 from app.db.features import pages as features
@@ -138,7 +139,7 @@ def test_an_upload_too_many_is_asked_to_retry_and_others_are_not_affected(app: F
             await go_on.wait()
 
         async with app.router.lifespan_context(app), anyio.create_task_group() as tasks:
-            app.state.upload_turns.total_tokens = 1
+            app.state.uploads = Turns("uploads", most=1, most_per_caller=2, patience_s=0.0)
             client = client_of(app, bearer("register"))
 
             async def send() -> None:
@@ -151,7 +152,7 @@ def test_an_upload_too_many_is_asked_to_retry_and_others_are_not_affected(app: F
             assert refused.headers["retry-after"]
             assert (await client.get(f"{ITEMS}/{FIRST_ID}")).status_code == 200
             go_on.set()
-            while app.state.upload_turns.borrowed_tokens:
+            while not app.state.uploads.free:
                 await anyio.sleep(0.01)
             assert (await client.post(SCENES, content=IMAGE)).status_code == 201
 
