@@ -8,6 +8,7 @@ __all__ = [
     "AmersError",
     "ComputationError",
     "Conflict",
+    "DamagedFile",
     "InputError",
     "InvalidParameter",
     "NoSuchJob",
@@ -45,6 +46,24 @@ class StorageOutage(Exception):
 
 class Conflict(AmersError):
     """The present state of the thing does not allow the request."""
+
+
+class DamagedFile(AmersError):
+    """A file that a row of the store names is missing, or does not have the content it had.
+
+    The installation is at fault, not the caller: the reply is a 500, and the operator is alarmed.
+
+    Attributes:
+        key: of the file in the storage.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, key: str, reason: str) -> None:
+        super().__init__(
+            f"{key} is damaged: {reason}. The operator repairs it with `amers store verify`"
+        )
+        self.key = key
+        self.reason = reason
 
 
 class TooLarge(AmersError):

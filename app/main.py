@@ -40,8 +40,9 @@ from app.api.tus import TusRequests
 from app.config import Settings, read_settings
 from app.db import engine
 from app.oidc import Issuer
-from app.storage import StoredChips, open_storage
+from app.storage import open_storage
 from app.usecases import storage_identity
+from app.usecases.damage import open_chips
 from app.web import page
 
 DESCRIPTION = (
@@ -110,10 +111,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.state.settings = settings
         app.state.database = await run_in_threadpool(opening.__enter__)
         app.state.storage = open_storage(settings)
-        app.state.chips = StoredChips(app.state.storage)
         await run_in_threadpool(
             storage_identity.announce, app.state.database.transaction, app.state.storage
         )
+        app.state.chips = open_chips(app.state.database, app.state.storage)
         try:
             yield
         finally:

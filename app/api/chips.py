@@ -1,5 +1,6 @@
 """The chips of many points at once, for clients that match by themselves."""
 
+from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated, Any
 
@@ -11,8 +12,9 @@ from app.api.deps import ChipsDep, DatabaseDep, PointsReader
 from app.api.features import parameter_names
 from app.api.negotiation import NPZ, TIFF, refuse_unknown
 from app.api.routes import CallerRoute
-from app.errors import InvalidParameter
+from app.errors import DamagedFile, InvalidParameter
 from app.storage import StoredChips
+from app.usecases.damage import report_damage
 from app.usecases.features import points
 from app.usecases.features.points import MOST_POINTS_WITH_CHIPS, StackFormat
 from app.usecases.features.query import FeatureFilter
@@ -98,12 +100,23 @@ def search_chips(
 
 def _archive_reply(database: DatabaseDep, stored: StoredChips, query: ChipsQuery) -> StreamingResponse:
     """The archive; the first piece is read before the reply begins: missing chips are then an error."""
-    pieces = points.stream_chips(_points(database, query), stored, query.f)
+    pieces = _reporting(database, points.stream_chips(_points(database, query), stored, query.f))
     first = next(pieces)
     disposition = {"Content-Disposition": f'attachment; filename="chips.{query.f}"'}
     return StreamingResponse(
         chain((first,), pieces), media_type=MEDIA_TYPES[query.f], headers=disposition
     )
+
+
+def _reporting(database: DatabaseDep, pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """The same pieces; damage found once the reply has begun breaks it off and is reported too."""
+    first = next(pieces)
+    yield first
+    try:
+        yield from pieces
+    except DamagedFile as damage:
+        report_damage(database, damage)
+        raise
 
 
 def _points(database: DatabaseDep, query: ChipsQuery) -> ControlPoints:

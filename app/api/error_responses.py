@@ -15,6 +15,7 @@ from app.errors import (
     AmersError,
     ComputationError,
     Conflict,
+    DamagedFile,
     InputError,
     InvalidParameter,
     NoSuchJob,
@@ -26,6 +27,7 @@ from app.errors import (
     TooMany,
     is_no_room,
 )
+from app.usecases.damage import report_damage
 
 PROBLEM_JSON = "application/problem+json"
 HTTP_STATUS: dict[type[Exception], int] = {
@@ -54,6 +56,7 @@ log = logging.getLogger(__name__)
 def install(app: FastAPI) -> None:
     """Reply to every error of an application with problem details."""
     app.add_exception_handler(AmersError, _refused)
+    app.add_exception_handler(DamagedFile, _damaged)
     app.add_exception_handler(RequestValidationError, _malformed)
     app.add_exception_handler(HTTPException, _not_routed)
     app.add_exception_handler(psycopg.OperationalError, _unavailable)
@@ -101,6 +104,14 @@ def _refused(request: Request, error: Exception) -> JSONResponse:
     headers = HEADERS.get(status)
     kind = {"type": PROBLEM_TYPES[type(error)]} if type(error) in PROBLEM_TYPES else {}
     return problem(status, str(error), headers=headers, error=type(error).__name__, **kind)
+
+
+def _damaged(request: Request, error: Exception) -> JSONResponse:
+    """The reply to damage in the storage, which the operator has to repair."""
+    assert isinstance(error, DamagedFile)
+    if not report_damage(request.app.state.database, error):
+        return problem(404, f"{error.key} was removed meanwhile", error=NotFound.__name__)
+    return problem(500, str(error), error=DamagedFile.__name__)
 
 
 def _malformed(request: Request, error: Exception) -> JSONResponse:

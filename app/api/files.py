@@ -6,6 +6,7 @@ from fastapi import Response
 from fastapi.responses import FileResponse, StreamingResponse
 
 from app.storage import Storage
+from app.usecases.damage import named_by_row
 
 PIECE_BYTES = 1 << 20
 PAGE_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
@@ -14,15 +15,16 @@ HEADERS = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": PAGE_
 
 
 def file_reply(storage: Storage, key: str, media_type: str) -> Response:
-    """A file of the storage, streamed; requests for ranges work if it lies on this machine.
+    """A file that a row names, streamed; requests for ranges work if it lies on this machine.
 
     Raises:
-        NotFound: there is no such file.
+        DamagedFile: there is no such file.
     """
-    path = storage.local(key)
-    if path is not None:
-        return FileResponse(path, media_type=media_type, headers=HEADERS)
-    length = {"Content-Length": str(storage.size(key))}
+    with named_by_row(key):
+        path = storage.local(key)
+        if path is not None:
+            return FileResponse(path, media_type=media_type, headers=HEADERS)
+        length = {"Content-Length": str(storage.size(key))}
     return StreamingResponse(_pieces(storage, key), media_type=media_type, headers=HEADERS | length)
 
 

@@ -85,6 +85,11 @@ class _InstallationCollector(Collector):
                 store.oldest_waiting_s,
             ),
             ("amers_points_published", "Points that are served.", store.points),
+            (
+                "amers_damaged_files",
+                "Stored files found damaged or missing, and not repaired since.",
+                store.damaged_files,
+            ),
             ("amers_database_bytes", "Size of the database, bytes.", store.database_bytes),
             (
                 "amers_disk_free_bytes",

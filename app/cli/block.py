@@ -11,12 +11,14 @@ from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db.blocks import Block
+from app.db.engine import opened
 from app.errors import InputError
-from app.storage import StoredChips, open_storage
+from app.storage import open_storage
 from app.usecases import storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.blocks.lifecycle import Published
+from app.usecases.damage import open_chips
 from services.quality.block import BlockQuality, Distribution, quality_document
 
 app = typer.Typer(no_args_is_help=True)
@@ -129,14 +131,15 @@ def export(
         raise InputError(f"--bbox: {bbox!r:.100} found, four numbers W,S,E,N expected") from None
     settings = read_settings()
     inputs = ExportBlock((west, south, east, north), name, version, title)
-    with transaction(settings) as connection:
-        selected = select_points(connection, inputs)
-    chips = StoredChips(open_storage(settings))
-    try:
-        with shown_progress() as progress:
-            n_points = write_selected(selected, chips, output, progress)
-    finally:
-        chips.close()
+    with opened(settings) as database:
+        with database.snapshot() as connection:
+            selected = select_points(connection, inputs)
+        chips = open_chips(database, open_storage(settings))
+        try:
+            with shown_progress() as progress:
+                n_points = write_selected(selected, chips, output, progress)
+        finally:
+            chips.close()
     show_one({"block": output, "points": n_points}, as_json=as_json)
 
 

@@ -23,12 +23,14 @@ class StoredChipFile:
     Attributes:
         name: path in the block.
         storage_key: where the storage has it.
+        chip_checksums: as in `services.formats.chips.checksums`.
     """
 
     name: str
     storage_key: str
     dtype: str
     n_chips: int
+    chip_checksums: bytes
 
 
 def load_contents(

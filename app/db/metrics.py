@@ -21,6 +21,7 @@ class Gauges:
         queue: entries of the queue that no worker has taken.
         blocks: state to number.
         points: that are served.
+        damaged_files: files of the storage that were found damaged or missing, and not repaired since.
         database_bytes: size of the database.
     """
 
@@ -29,6 +30,7 @@ class Gauges:
     queue: int
     blocks: dict[str, int]
     points: int
+    damaged_files: int
     database_bytes: int
 
 

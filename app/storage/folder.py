@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,15 +112,27 @@ class Storage:
         with path.open("rb") as file:
             return self.put(key, iter(lambda: file.read(COPY_BYTES), b""))
 
-    def put_chips(self, path: Path, expected_sha256: str | None = None) -> StoredFile:
+    def put_chips(
+        self,
+        path: Path,
+        expected_sha256: str | None = None,
+        observe: Callable[[bytes], None] | None = None,
+    ) -> StoredFile:
         """Store a copy of a block's chip file under its checksum, unless the storage has it already.
 
         A file with another checksum than expected is not stored; the result has its actual checksum.
+
+        Args:
+            path: of the file.
+            expected_sha256: in hexadecimal; None accepts any.
+            observe: receives the bytes of the file in their order.
         """
         with self._unfinished(None) as writing:
             with path.open("rb") as file:
                 while chunk := file.read(COPY_BYTES):
                     writing.write(chunk)
+                    if observe is not None:
+                        observe(chunk)
             key = chips_key(writing.sha256)
             if expected_sha256 in (None, writing.sha256) and not self.exists(key):
                 self._place(writing.finish(), key)

@@ -21,11 +21,12 @@ from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage, Outlook
 from app.db.schema import JobResponse
 from app.db.tokens import Token
-from app.errors import AmersError, Conflict, InputError, NoSuchJob, NoSuchProcess
+from app.errors import AmersError, Conflict, DamagedFile, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
 from app.usecases.blocks.ingestion import INGEST_BLOCK
+from app.usecases.damage import report_damage
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work
 from app.usecases.registration.job import REGISTER_SCENE
@@ -214,6 +215,8 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
             results = commit(connection)
             attempts.succeed(connection, job.id, attempt, results)
     except AmersError as error:
+        if isinstance(error, DamagedFile):
+            report_damage(database, error)
         log.info("job %s failed: %s: %s", job.id, type(error).__name__, error)
         with database.transaction() as connection:
             attempts.fail(connection, job.id, attempt, error_details(error, storage))

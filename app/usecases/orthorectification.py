@@ -14,10 +14,11 @@ from app.db import registrations
 from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError
+from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
-from app.usecases.scenes import local_image
+from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile, read_terrain
 from services.formats.images.bands import one_band
 from services.formats.images.ortho import write_cog
@@ -230,17 +231,20 @@ def _run(work: Work) -> Commit:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
         model = image.with_name(inputs.model) if inputs.model else None
         if refined is not None:
-            model = work.storage.fetch(refined, Path(folder))
+            with named_by_row(refined):
+                model = work.storage.fetch(refined, Path(folder))
         geoid = image.with_name(inputs.geoid) if inputs.geoid else None
-        ortho = run_orthorectification(
-            image,
-            TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
-            Path(folder) / ORTHO_NAME,
-            model=model,
-            ortho_map=inputs.map,
-            options=inputs.options,
-            progress=work.progress,
-        )
+        files = [*stored_keys(scene), *([] if refined is None else [refined])]
+        with suspecting_damage(work.database, work.storage, files):
+            ortho = run_orthorectification(
+                image,
+                TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
+                Path(folder) / ORTHO_NAME,
+                model=model,
+                ortho_map=inputs.map,
+                options=inputs.options,
+                progress=work.progress,
+            )
         keys = store_results(work, {ORTHO_NAME: ortho.path})
 
     def commit(connection: Connection) -> dict[str, Any]:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, Literal
 from uuid import UUID
 
+from app.db import stored_files
 from app.db.engine import Database
 from app.db.jobs import attempts
 from app.db.jobs.jobs import Job
 from app.errors import NotFound
 from app.storage import Storage
 from app.usecases import quotas
+from app.usecases.damage import named_by_row
 from app.usecases.processes import Work, results_folder
 from app.usecases.registration.deliverables import media_type
 
@@ -43,7 +45,7 @@ class ResultFile:
 
 
 def store_results(work: Work, files: Mapping[str, Path]) -> dict[str, str]:
-    """Put the files of an attempt into the storage; returns their keys by name.
+    """Put the files of an attempt into the storage and record their checksums; returns keys by name.
 
     Their size is reserved from the owner's quota first.
 
@@ -54,10 +56,14 @@ def store_results(work: Work, files: Mapping[str, Path]) -> dict[str, str]:
     size_bytes = sum(path.stat().st_size for path in files.values())
     with work.database.transaction() as connection:
         quotas.reserve_results(connection, work.settings, work.job, size_bytes)
-    return {
-        name: work.storage.put_file(f"{work.attempt_folder}/{name}", path).key
+    stored = {
+        name: work.storage.put_file(f"{work.attempt_folder}/{name}", path)
         for name, path in files.items()
     }
+    with work.database.transaction() as connection:
+        for file in stored.values():
+            stored_files.record_result(connection, work.job.id, file.key, file.size_bytes, file.sha256)
+    return {name: file.key for name, file in stored.items()}
 
 
 def discard_attempt(database: Database, storage: Storage, job_id: UUID, attempt: int) -> None:
@@ -92,7 +98,7 @@ def requested_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[
     files = []
     for name, requested in job.outputs.items():
         if name in keys:
-            too_large = not is_only_raw_output and storage.size(keys[name]) > LARGEST_VALUE_BYTES
+            too_large = not is_only_raw_output and _size(storage, keys[name]) > LARGEST_VALUE_BYTES
             by_reference = too_large or requested == "reference"
             files.append(ResultFile(name, keys[name], "reference" if by_reference else "value"))
     return {name: values[name] for name in job.outputs if name in values}, files
@@ -112,8 +118,13 @@ def result_key(job: Job, name: str) -> str:
 
 def file_bytes(storage: Storage, file: ResultFile) -> bytes:
     """The content of a file."""
-    with storage.open(file.key) as opened:
+    with named_by_row(file.key), storage.open(file.key) as opened:
         return opened.read()
+
+
+def _size(storage: Storage, key: str) -> int:
+    with named_by_row(key):
+        return storage.size(key)
 
 
 def file_value(storage: Storage, file: ResultFile) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from app.db.uploads import AnnouncedFile
 from app.errors import Conflict, InputError, NotFound, StorageOutage, TooLarge, TooMany
 from app.storage import Storage, StoredFile, Writing
 from app.usecases import quotas
+from app.usecases.damage import named_by_row
 from app.usecases.installation import Installation
 from app.usecases.server_files import file_below
 from services.errors import FormatError
@@ -258,15 +259,25 @@ def local_image(storage: Storage, settings: Settings, scene: SceneRow, scratch: 
     Raises:
         Conflict: the scene has no files.
         InputError: the image of a scene on the server is no longer in its place.
+        DamagedFile: a file of the scene is missing from the storage.
     """
     if scene.reference is not None and scene.state != "removed":
         return server_image(settings, scene.reference)
     if scene.file_key is None:
         raise Conflict(f"scene {scene.id} was removed, or its image has not arrived yet")
-    for key in storage.keys(folder_of(scene.id)):
-        if key != scene.file_key:
+    image, *beside = stored_keys(scene)
+    for key in beside:
+        with named_by_row(key):
             storage.fetch(key, scratch)
-    return storage.fetch(scene.file_key, scratch)
+    with named_by_row(image):
+        return storage.fetch(image, scratch)
+
+
+def stored_keys(scene: SceneRow) -> list[str]:
+    """The storage keys of the files of a scene, the image first; none if they lie on the server."""
+    if scene.file_key is None:
+        return []
+    return [scene.file_key, *(f"{folder_of(scene.id)}/{name}" for name in scene.models)]
 
 
 def visible_scene(connection: Connection, caller: Token, scene_id: UUID) -> SceneRow:

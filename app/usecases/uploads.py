@@ -326,7 +326,7 @@ def _complete(installation: Installation, upload: UploadRow, path: Path) -> None
             key = block_key(upload)
             storage.link(path, key)
             with database.transaction() as connection:
-                uploads.finish(connection, upload.id, key)
+                uploads.finish(connection, upload.id, key, sha256=sha256)
     except AmersError:
         with database.transaction() as connection:
             _delete_row(connection, upload)

@@ -1,6 +1,7 @@
 """An exported block ingests again as the same points; an export writes outside of transactions."""
 
 import zipfile
+from functools import partial
 from uuid import UUID
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from app.db import engine
 from app.db import points as point_store
+from app.db.stored_files import find_chip_checksums
 from app.errors import InputError, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
@@ -19,7 +21,7 @@ from app.usecases.processes import Work
 from services.formats.block.check import check_block
 from services.formats.block.document import rectangle
 from services.types import point_chips
-from tests.app.job_queue import claim, new_job
+from tests.app.job_queue import claim, claimed, new_job
 from tests.factories import BOX, make_block
 from tests.statements import run_sql
 
@@ -30,8 +32,8 @@ OPEN_TRANSACTIONS = """select count(*) from pg_stat_activity
 
 
 @pytest.fixture
-def chips(storage):
-    chips = StoredChips(storage)
+def chips(connection, storage):
+    chips = StoredChips(storage, partial(find_chip_checksums, connection))
     yield chips
     chips.close()
 
@@ -138,7 +140,8 @@ def test_no_transaction_is_open_while_an_export_writes_files(
             with psycopg.connect(dsn, autocommit=True) as watcher:
                 open_transactions.append(watcher.execute(OPEN_TRANSACTIONS).fetchone()[0])
 
-    work = Work(new_job(database), ExportBlock(BOX), database, storage, settings, count_transactions)
+    job = claimed(database, new_job(database).id)
+    work = Work(job, ExportBlock(BOX), database, storage, settings, count_transactions)
     EXPORT_BLOCK.run(work)
     assert set(open_transactions) == {0}
 

@@ -1,5 +1,7 @@
 """The life of a block in the store, from ingestion to withdrawal, and the points that it serves."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -7,6 +9,7 @@ from pyproj import Geod
 from shapely import Polygon
 
 from app.db import points as point_store
+from app.db.stored_files import find_chip_checksums
 from app.errors import Conflict, NotFound
 from app.storage import StoredChips
 from app.usecases.blocks import lifecycle
@@ -109,7 +112,7 @@ def test_the_store_gives_back_the_points_of_the_block(connection, storage, inges
     assert (points.views.image == expected.views.image).all()
     assert_allclose(points.views.azimuth_deg, expected.views.azimuth_deg, rtol=float32_rounding)
     assert repr(points.views.images) == repr(expected.views.images)
-    chips = StoredChips(storage)
+    chips = StoredChips(storage, partial(find_chip_checksums, connection))
     for row in range(len(points)):
         assert (point_chips(points, chips, row) == made.chips(row)).all()
     chips.close()
@@ -130,7 +133,7 @@ def test_the_store_mixes_blocks_without_mixing_their_images_and_chips(connection
 
     assert len(points) == 35
     assert len(points.views.images) == 8
-    chips = StoredChips(storage)
+    chips = StoredChips(storage, partial(find_chip_checksums, connection))
     for row in range(35):
         of, own = (made[0], row) if row < 15 else (made[1], row - 15)
         assert (point_chips(points, chips, row) == of.chips(own)).all()

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from app.config import Settings
-from app.errors import InputError, NotFound, TooLarge
+from app.errors import DamagedFile, InputError, NotFound, TooLarge
 from app.storage import Storage, StoredChips, chips_key, open_storage
 from services.conventions import CHIP_SIZE
-from services.errors import FormatError
 from tests.app.s3_server import running_bucket
 
 SEVERAL_PARTS = 12_000_000
@@ -95,12 +94,12 @@ def test_chips_are_read_from_a_bucket_by_ranges(storage: Storage, tmp_path: Path
     first, again = (storage.put_chips(tmp_path / "chips.npy") for _ in range(2))
     assert first == again
     assert first.key == chips_key(first.sha256)
-    stored = StoredChips(storage)
+    stored = StoredChips(storage, {}.get)
     np.testing.assert_array_equal(stored.read(first.key, 17, 3), chips[17:20])
-    with pytest.raises(FormatError, match="50 chips"):
+    with pytest.raises(DamagedFile, match="50 chips"):
         stored.read(first.key, 49, 2)
     storage.put("chips/none.npy", [b"none"])
-    with pytest.raises(FormatError, match="cannot be read as a NumPy array"):
+    with pytest.raises(DamagedFile, match="cannot be read as a NumPy array"):
         stored.read("chips/none.npy", 0, 1)
 
 

@@ -161,4 +161,6 @@ def test_chips_that_are_not_where_the_store_says_are_an_error_before_the_reply_b
 ):
     for file in storage.folder.rglob("*.npy"):
         file.unlink()
-    assert get(CHIPS, ids=str(FIRST)).status_code == 404
+    reply = get(CHIPS, ids=str(FIRST))
+    assert reply.status_code == 500
+    assert "missing from the storage" in reply.json()["detail"]

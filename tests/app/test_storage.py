@@ -13,10 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.errors import InputError, NotFound, TooLarge
+from app.errors import DamagedFile, InputError, NotFound, TooLarge
 from app.storage import Storage, StoredChips, chips_key
 from services.conventions import CHIP_SIZE
-from services.errors import FormatError
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def storage(tmp_path):
 
 @pytest.fixture
 def stored_chips(storage):
-    chips = StoredChips(storage)
+    chips = StoredChips(storage, {}.get)
     yield chips
     chips.close()
 
@@ -168,7 +167,7 @@ def test_chips_are_read_by_row(storage, stored_chips, tmp_path, dtype):
 @pytest.mark.parametrize(("row", "count"), [(-1, 1), (0, 10), (9, 1), (8, 2), (3, -1)])
 def test_rows_that_a_chip_file_does_not_have_are_refused(storage, stored_chips, tmp_path, row, count):
     np.save(tmp_path / "0000.npy", numbered(9))
-    with pytest.raises(FormatError, match="9 chips"):
+    with pytest.raises(DamagedFile, match="9 chips"):
         stored_chips.read(storage.put_chips(tmp_path / "0000.npy").key, row, count)
 
 
@@ -203,7 +202,7 @@ def npy(array: np.ndarray) -> bytes:
 )
 def test_a_file_that_is_not_of_chips_is_refused(storage, stored_chips, content):
     storage.put("chips/x.npy", [content])
-    with pytest.raises(FormatError):
+    with pytest.raises(DamagedFile):
         stored_chips.read("chips/x.npy", 0, 2)
 
 

@@ -6,4 +6,5 @@ select
     (select count(*) from procrastinate_jobs where status = 'todo') as queue,
     (select coalesce(sum(n_points - n_unserved), 0) from block
         where state = 'published')::bigint as points,
+    (select count(*) from damaged_file) as damaged_files,
     pg_database_size(current_database()) as database_bytes

@@ -16,7 +16,7 @@ from app.db.engine import Connection
 from app.db.points import StoredPoints
 from app.db.tokens import Token
 from app.errors import InputError, NotFound
-from app.storage import StoredChips
+from app.usecases.damage import open_chips
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.results import store_results
 from services.formats.block.document import (
@@ -132,6 +132,9 @@ def write_selected(
         chips: of the storage.
         folder: must not exist.
         progress: receives the fraction done and a message.
+
+    Raises:
+        DamagedFile: chips are missing or do not have their checksums; nothing is written.
     """
     write_block(
         folder,
@@ -229,7 +232,7 @@ def _run(work: Work) -> Commit:
     work.progress(0.0, "reading points")
     with work.database.snapshot() as connection:
         selected = select_points(connection, work.inputs, MOST_POINTS)
-    chips = StoredChips(work.storage)
+    chips = open_chips(work.database, work.storage)
     try:
         with TemporaryDirectory(prefix="amers-export-") as scratch:
             folder = Path(scratch) / "block"

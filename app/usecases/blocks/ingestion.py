@@ -13,6 +13,7 @@ from app.db.tokens import Token
 from app.errors import InputError, NotFound
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.uploads import find_uploaded_block
+from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from services.errors import FormatError
 from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
@@ -88,9 +89,11 @@ def _unpack(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
     if key is None:
         raise NotFound(f"no uploaded block {upload_id}")
     work.progress(0.0, "unpacking the block")
-    archive = work.storage.fetch(key, scratch)
+    with named_by_row(key):
+        archive = work.storage.fetch(key, scratch)
     limits = ArchiveLimits(UNPACKED_TIMES * work.settings.upload_limit_bytes)
-    members = check_archive(archive, limits)
+    with suspecting_damage(work.database, work.storage, [key]):
+        members = check_archive(archive, limits)
     root = _block_root(archive.name, members)
     folder = scratch / "block"
     targets = {}
@@ -98,7 +101,8 @@ def _unpack(work: Work, upload_id: UUID | None, scratch: Path) -> Path:
         target = folder / member.path.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
         targets[member.path] = target
-    unpack_archive(archive, targets, limits)
+    with suspecting_damage(work.database, work.storage, [key]):
+        unpack_archive(archive, targets, limits)
     return folder
 
 

@@ -19,7 +19,8 @@ from services.formats.block.check import check_block, check_checksums
 from services.formats.block.document import AccuracyFigure
 from services.formats.block.document_json import BLOCK_JSON, parse_block_json
 from services.formats.block.reader import BlockContents, block_member
-from services.formats.chips.npy_files import ChipFile, read_chip_file
+from services.formats.chips.checksums import ChipHasher
+from services.formats.chips.npy_files import read_chip_file
 from services.quality.block import BlockQuality, block_quality
 from services.types import Progress, no_progress, part_of
 
@@ -280,19 +281,19 @@ def _store_chips(
     """
     names, stated_sha256 = contents.points.chip_files, contents.document.checksums
 
-    def store(name: str) -> tuple[StoredFile, ChipFile]:
+    def store(name: str) -> tuple[StoredFile, StoredChipFile]:
         path = block_member(folder, name)
         layout = read_chip_file(path, name)
-        return storage.put_chips(path, stated_sha256[name].lower()), layout
+        hasher = ChipHasher(layout)
+        file = storage.put_chips(path, stated_sha256[name].lower(), hasher.update)
+        dtype, checksums = np.dtype(layout.dtype).name, hasher.checksums().tobytes()
+        return file, StoredChipFile(name, file.key, dtype, layout.count, checksums)
 
     progress(0.0, "storing chips")
-    stored: dict[str, tuple[StoredFile, ChipFile]] = {}
+    stored: dict[str, tuple[StoredFile, StoredChipFile]] = {}
     with ThreadPoolExecutor(PARALLEL_COPIES) as pool:
         for name, file in zip(names, pool.map(store, names), strict=True):
             stored[name] = file
             progress(len(stored) / len(names), "storing chips")
     check_checksums({name: file.sha256 for name, (file, _) in stored.items()}, contents.document)
-    return [
-        StoredChipFile(name, file.key, np.dtype(layout.dtype).name, layout.count)
-        for name, (file, layout) in stored.items()
-    ]
+    return [chips for _, chips in stored.values()]

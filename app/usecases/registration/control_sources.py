@@ -7,7 +7,8 @@ from pathlib import Path
 
 from app.db.engine import Database
 from app.db.points import control_points
-from app.storage import Storage, StoredChips
+from app.storage import Storage
+from app.usecases.damage import open_chips
 from services.formats.block.check import check_block
 from services.formats.block.reader import FolderChips
 from services.reports.report import BlockUsed
@@ -60,7 +61,7 @@ def points_of_store(database: Database, storage: Storage) -> FindPoints:
             stored = control_points(connection, outline)
         blocks = tuple(BlockUsed(block.id, block.version) for block in stored.blocks)
         frame_sigma_m = _worst_sigma_m([block.frame_sigma_m for block in stored.blocks])
-        return ControlSet(stored.points, StoredChips(storage), blocks, frame_sigma_m)
+        return ControlSet(stored.points, open_chips(database, storage), blocks, frame_sigma_m)
 
     return find
 

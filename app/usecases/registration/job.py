@@ -10,6 +10,7 @@ from app.auth import Scope
 from app.db import scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
+from app.usecases.damage import suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_store
@@ -22,7 +23,7 @@ from app.usecases.registration.register import (
 )
 from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
-from app.usecases.scenes import local_image
+from app.usecases.scenes import local_image, stored_keys
 from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
 from services.registration.options import RegistrationOptions
@@ -74,14 +75,15 @@ def _run(work: Work) -> Commit:
         scene = present_scene(connection, inputs.scene)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
-        registered = run_registration(
-            _scene_files(inputs, image, scene.sigma_m),
-            _control_sources(work, inputs.method),
-            Path(folder),
-            options=inputs.options,
-            copy_image=inputs.copy_image,
-            progress=work.progress,
-        )
+        with suspecting_damage(work.database, work.storage, stored_keys(scene)):
+            registered = run_registration(
+                _scene_files(inputs, image, scene.sigma_m),
+                _control_sources(work, inputs.method),
+                Path(folder),
+                options=inputs.options,
+                copy_image=inputs.copy_image,
+                progress=work.progress,
+            )
         gsd_m = scene_gsd_m(registered.scene)
         keys = store_results(work, registered.files)
 

@@ -1,0 +1,100 @@
+"""Files of the storage as rows name them: their checksums, and which of them are damaged."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from uuid import UUID
+
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.dialects.postgresql import insert
+
+from app.db.blocks import ID_BITS
+from app.db.engine import Connection
+from app.db.rows import every
+from app.db.schema import chip_file, clock, damaged_file, result_file, upload
+from app.db.statements import named
+
+NAMED_FILES = named("stored_files.sql", "named_files")
+POINTS_OF_CHIPS = named("stored_files.sql", "points_of_chips")
+
+
+@dataclass(frozen=True)
+class NamedFile:
+    """A file of the storage that a row names.
+
+    Attributes:
+        storage_key: of the file.
+        kind: chips, scene image, side file, upload archive or result.
+        size_bytes: None if unknown; of a file of chips without its header.
+        sha256: in hexadecimal; None if unknown.
+    """
+
+    storage_key: str
+    kind: str
+    size_bytes: int | None
+    sha256: str | None
+
+
+def read_named_files(connection: Connection, keys: list[str] | None = None) -> list[NamedFile]:
+    """The files that rows name, by key; with `keys`, those of them that rows name."""
+    return every(NamedFile, connection.execute(NAMED_FILES, {"keys": keys}))
+
+
+def find_chip_checksums(connection: Connection, storage_key: str) -> bytes | None:
+    """The checksums of the chips of a file; None if they are not recorded."""
+    statement = select(chip_file.c.chip_checksums).where(
+        chip_file.c.storage_key == storage_key, chip_file.c.chip_checksums.is_not(None)
+    )
+    checksums: bytes | None = connection.scalar(statement.limit(1))
+    return checksums
+
+
+def record_chip_checksums(connection: Connection, storage_key: str, checksums: bytes) -> bool:
+    """Record the checksums of the chips of a file; returns whether other ones were recorded before."""
+    of_file = chip_file.c.storage_key == storage_key
+    other = select(func.count()).where(of_file, chip_file.c.chip_checksums != checksums)
+    n_other = connection.scalar(other) or 0
+    connection.execute(
+        update(chip_file)
+        .where(of_file, chip_file.c.chip_checksums.is_distinct_from(checksums))
+        .values(chip_checksums=checksums)
+    )
+    return n_other > 0
+
+
+def record_upload_checksum(connection: Connection, storage_key: str, sha256: str) -> None:
+    """Record the checksum of an uploaded archive."""
+    of_file = upload.c.file_key == storage_key
+    connection.execute(update(upload).where(of_file).values(sha256=sha256))
+
+
+def record_result(
+    connection: Connection, job_id: UUID, storage_key: str, size_bytes: int, sha256: str
+) -> None:
+    """Record size and checksum of a file of the results of a job."""
+    values = {"size_bytes": size_bytes, "sha256": sha256}
+    statement = insert(result_file).values(storage_key=storage_key, job_id=job_id, **values)
+    connection.execute(
+        statement.on_conflict_do_update(index_elements=[result_file.c.storage_key], set_=values)
+    )
+
+
+def points_of_chips(connection: Connection, storage_key: str, rows: list[int] | None) -> list[int]:
+    """Ids of the points with chips in some rows of a file; None means all rows."""
+    parameters = {"storage_key": storage_key, "rows": rows, "id_bits": ID_BITS}
+    return list(connection.scalars(POINTS_OF_CHIPS, parameters))
+
+
+def record_damage(connection: Connection, storage_key: str, reason: str) -> None:
+    """Record that a file was found damaged or missing."""
+    statement = insert(damaged_file).values(storage_key=storage_key, reason=reason)
+    connection.execute(
+        statement.on_conflict_do_update(
+            index_elements=[damaged_file.c.storage_key],
+            set_={"reason": reason, "last_found_at": clock},
+        )
+    )
+
+
+def keep_damages(connection: Connection, storage_keys: Iterable[str]) -> None:
+    """Forget all damages but those of some files."""
+    connection.execute(delete(damaged_file).where(damaged_file.c.storage_key.not_in(list(storage_keys))))
