@@ -8,6 +8,7 @@ from typing import Any
 from app.config import Settings
 from app.db import engine
 from app.db.engine import Connection
+from app.db.usage import read_all_usage
 from app.storage import Storage
 from app.worker.sweep import sweep_files
 from benchmarks._faults_caller import ENDED, Caller
@@ -40,6 +41,7 @@ def check_outcome(dsn: str, installation: KilledInstallation, caller: Caller) ->
                 *wrong_scenes(connection, storage, caller),
                 *wrong_blocks(connection, jobs),
                 *wrong_files(connection, storage),
+                *wrong_ledger(connection, storage),
             ]
     return {
         "ended": dict(Counter(f"{job['kind']} {job['state']}" for job in jobs)),
@@ -144,3 +146,12 @@ def wrong_files(connection: Connection, storage: Storage) -> list[str]:
         if hashlib.sha256(storage.path(key).read_bytes()).hexdigest() != Path(key).stem:
             wrong.append(f"{key}: not the chips of that checksum")
     return wrong
+
+
+def wrong_ledger(connection: Connection, storage: Storage) -> list[str]:
+    """Bytes that the quotas of all owners count and the storage does not hold, or the reverse."""
+    counted = sum(usage.total_bytes for usage in read_all_usage(connection))
+    stored = sum(
+        storage.size(key) for top in ("scenes", "results", "uploads") for key in storage.keys(top)
+    )
+    return [] if counted == stored else [f"quotas count {counted} bytes, the storage holds {stored}"]
