@@ -51,6 +51,7 @@ class Settings(BaseSettings):
         read_timeout_seconds: time limit of the database for one statement of a reading request.
         job_memory_bytes, job_seconds: limits of one job on memory and time.
         result_days: days until the result files of a job are removed; None keeps them.
+        min_free_bytes: free bytes on the disk of the data folder below which `/readyz` says so.
         trash_days: days until files that the sweep removed are deleted; 0 deletes them at once.
         lease_seconds: time after which another worker takes over the job of a silent worker.
         storage_url: S3-compatible bucket for the files, `s3://BUCKET/PREFIX`; None for the data folder.
@@ -95,6 +96,7 @@ class Settings(BaseSettings):
     job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
     result_days: float | None = Field(default=None, gt=0)
+    min_free_bytes: int = Field(default=2 * GIBIBYTE, ge=0)
     trash_days: float = Field(default=TRASH_DAYS, ge=0)
     lease_seconds: float = Field(default=30.0, gt=0)
     storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")

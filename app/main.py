@@ -43,6 +43,8 @@ from app.oidc import Issuer
 from app.storage import open_storage
 from app.usecases import storage_identity
 from app.usecases.damage import open_chips
+from app.usecases.installation import Installation
+from app.usecases.readiness import Readiness
 from app.web import page
 
 DESCRIPTION = (
@@ -115,9 +117,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             storage_identity.announce, app.state.database.transaction, app.state.storage
         )
         app.state.chips = open_chips(app.state.database, app.state.storage)
+        app.state.readiness = Readiness(Installation(app.state.database, app.state.storage, settings))
         try:
             yield
         finally:
+            app.state.readiness.close()
             app.state.chips.close()
             await run_in_threadpool(opening.__exit__, None, None, None)
 

@@ -6,10 +6,9 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from app.api import processes, stac
-from app.api.deps import DatabaseDep
 from app.api.features import Format
 from app.api.models.base import Link
-from app.api.models.documents import Conformance, Health, Landing
+from app.api.models.documents import Conformance, Health, Landing, PartReadiness, ReadinessReport
 from app.api.negotiation import (
     DOCUMENTS,
     HTML,
@@ -22,7 +21,7 @@ from app.api.negotiation import (
 )
 from app.api.pages import Cell, Page, document_page
 from app.api.routes import CallerRoute
-from app.db.engine import check_postgis
+from app.usecases.readiness import Readiness, overall
 
 router = APIRouter(tags=["system"], route_class=CallerRoute)
 
@@ -139,9 +138,15 @@ def alive() -> Health:
     return Health(status="alive")
 
 
-@router.get("/readyz")
-def ready(*, database: DatabaseDep) -> Health:
-    """Report that the process and the database answer."""
-    with database.reading() as connection:
-        check_postgis(connection)
-    return Health(status="ready")
+@router.get("/readyz", responses={503: {"model": ReadinessReport}})
+def ready(*, request: Request, response: Response) -> ReadinessReport:
+    """Report what of the service works; 503 when requests that read cannot be answered."""
+    readiness: Readiness = request.app.state.readiness
+    parts = readiness.check()
+    status = overall(parts)
+    if status == "not ready":
+        response.status_code = 503
+    return ReadinessReport(
+        status=status,
+        parts={name: PartReadiness.model_validate(part) for name, part in parts.items()},
+    )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
+from sqlalchemy import Connection, text
 
 from app.errors import InputError
 
@@ -34,6 +35,12 @@ def status(dsn: str) -> SchemaStatus:
         if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
             found = connection.execute("select version_num from alembic_version").fetchone()
     return SchemaStatus(found=found[0] if found else None, needed=newest_revision())
+
+
+def current(connection: Connection) -> str | None:
+    """The version of the schema of a database that has tables of Amers."""
+    revision: str | None = connection.scalar(text("select version_num from alembic_version"))
+    return revision
 
 
 def ensure_schema(dsn: str, *, upgradable: bool) -> None:

@@ -24,10 +24,13 @@ class InstallationFigures:
 
 def installation_figures(connection: Connection, data_folder: Path) -> InstallationFigures:
     """The present figures of an installation."""
-    # The first write creates the data folder; before that, the nearest existing parent is measured.
-    existing = next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
-    disk = shutil.disk_usage(existing)
+    disk = shutil.disk_usage(existing_folder(data_folder))
     return InstallationFigures(metrics.read_gauges(connection), disk.free, disk.total)
+
+
+def existing_folder(data_folder: Path) -> Path:
+    """The data folder, or its nearest existing parent: the first write creates the data folder."""
+    return next(folder for folder in (data_folder, *data_folder.parents) if folder.exists())
 
 
 def list_changes(

@@ -8,6 +8,7 @@ restored from an older backup: it does not know the newest files.
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 
 from app.db import installation, uploads
 from app.db.engine import Connection, Database
@@ -21,6 +22,10 @@ log = logging.getLogger(__name__)
 
 Begin = Callable[[], AbstractContextManager[Connection]]
 """Begins a transaction."""
+UNNAMED = (
+    "the storage names no installation: it is not mounted, it is another one, or the database does not "
+    "know its files"
+)
 KNOWN_SHARE = 0.95
 """A storage of an earlier version is adopted if rows of the database name this share of its files."""
 ADVICE = (
@@ -31,8 +36,11 @@ ADVICE = (
 
 
 def mismatch(connection: Connection, storage: Storage) -> str | None:
-    """Why the storage does not belong to the database, with what to do; None if it belongs to it."""
-    return _mismatch(connection, storage, installation.read(connection))
+    """Why the storage does not belong to the database, with what to do; None if it belongs to it.
+
+    A storage that names no installation belongs to none; `prepare` looks whether to adopt it.
+    """
+    return _compare(storage, installation.read(connection), lambda: UNNAMED)
 
 
 def require_match(database: Database, storage: Storage) -> None:
@@ -55,7 +63,7 @@ def prepare(begin: Begin, storage: Storage) -> str | None:
     """
     with begin() as connection:
         row = installation.lock(connection)
-        reason = _mismatch(connection, storage, row)
+        reason = _compare(storage, row, partial(_without_marker, connection, storage, row))
         if reason is not None:
             return reason
         if row.storage_generation == 0:
@@ -96,13 +104,16 @@ def _write_marker(begin: Begin, storage: Storage) -> InstallationRow:
     return row
 
 
-def _mismatch(connection: Connection, storage: Storage, row: InstallationRow) -> str | None:
+def _compare(
+    storage: Storage, row: InstallationRow, without_marker: Callable[[], str | None]
+) -> str | None:
+    """Why a storage does not belong to a database; `without_marker` answers where there is none."""
     try:
         marker = read_marker(storage)
     except InputError as error:
         return f"{error}. {ADVICE}"
     if marker is None:
-        reason = _without_marker(connection, storage, row)
+        reason = without_marker()
     elif marker.installation != row.id:
         reason = (
             f"the storage belongs to installation {marker.installation}, the database to {row.id}: "

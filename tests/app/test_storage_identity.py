@@ -9,6 +9,7 @@ from datetime import date
 from pathlib import Path
 from uuid import uuid4
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 
@@ -24,7 +25,9 @@ from app.usecases.tokens import create_token
 from app.worker import sweep
 from app.worker.sweep import Sweeper, sweep_files
 from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.running_service import running_service
 from tests.app.s3_server import running_bucket
+from tests.app.worker_processes import wait_until
 from tests.factories import make_block
 from tests.statements import run_sql
 
@@ -88,16 +91,23 @@ def use(settings: Settings, folder: Path, seed: int) -> None:
 
 
 @pytest.fixture(params=["folder", "bucket"])
-def full(
-    request: pytest.FixtureRequest, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Full]:
+def kind(request: pytest.FixtureRequest) -> str:
+    """The kind of the storage."""
+    return str(request.param)
+
+
+@pytest.fixture
+def full(kind: str, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Full]:
     """An installation whose storage is full."""
     with running_bucket(monkeypatch) as url:
         settings = Settings(
             database_url=dsn,
             data_folder=tmp_path / "data",
-            storage_url=url if request.param == "bucket" else None,
+            storage_url=url if kind == "bucket" else None,
         )
+        if settings.storage_url is not None:
+            # For services in processes of their own.
+            monkeypatch.setenv("AMERS_STORAGE_URL", settings.storage_url)
         use(settings, tmp_path, 1)
         yield Full(dsn, settings, contents(open_storage(settings)))
 
@@ -154,6 +164,7 @@ def test_an_empty_database_beside_a_full_storage_removes_nothing(
         assert_untouched(full, empty, "that of another installation", monkeypatch, caplog)
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_an_empty_database_beside_a_storage_of_an_earlier_version_removes_nothing(
     full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
@@ -162,6 +173,7 @@ def test_an_empty_database_beside_a_storage_of_an_earlier_version_removes_nothin
         assert_untouched(full, empty, f"knows 0 of its {len(full.files)} files", monkeypatch, caplog)
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_a_database_of_another_installation_removes_nothing(
     full: Full,
     cluster: Cluster,
@@ -188,6 +200,26 @@ def test_an_older_backup_of_the_database_removes_nothing(
         assert_untouched(full, backup, "the database is older than the storage", monkeypatch, caplog)
 
 
+def test_a_service_on_an_empty_database_beside_a_full_storage_says_so_and_removes_nothing(
+    full: Full, cluster: Cluster, tmp_path: Path
+):
+    log = tmp_path / "service.log"
+    with another(cluster) as empty:
+        settings = full.settings.model_copy(
+            update={"database_url": Settings(database_url=empty).database_url}
+        )
+        with running_service(settings, log) as url:
+            reply = httpx.get(f"{url}/readyz", timeout=30)
+            wait_until(lambda: log.read_text().count("amers store adopt") >= 2, "API and worker log it")
+    assert reply.status_code == 503
+    storage = reply.json()["parts"]["storage"]
+    assert storage["status"] == "failed"
+    assert "another installation" in storage["reason"]
+    assert "amers store adopt" in storage["reason"]
+    assert contents(open_storage(full.settings)) == full.files
+
+
+@pytest.mark.parametrize("kind", ["folder"])
 def test_a_storage_that_is_not_mounted_gets_no_files_of_its_own(
     full: Full, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
@@ -198,6 +230,7 @@ def test_a_storage_that_is_not_mounted_gets_no_files_of_its_own(
     assert not open_storage(unmounted).exists(MARKER)
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Full):
     storage = open_storage(full.settings)
     storage.delete(MARKER)
@@ -209,6 +242,7 @@ def test_a_storage_of_an_earlier_version_is_adopted_by_its_own_database(full: Fu
     assert contents(storage) == full.files
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_an_adopted_storage_is_swept_by_its_new_database_and_not_by_the_former_one(
     full: Full, cluster: Cluster
 ):
@@ -253,6 +287,7 @@ def test_what_the_sweep_removes_lies_in_the_trash_for_days_of_calendar_and_uptim
         assert bool(storage.keys(TRASH)) == is_left, later
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
     full: Full, caplog: pytest.LogCaptureFixture
 ):
@@ -269,6 +304,7 @@ def test_many_unknown_files_at_once_stay_until_an_operator_lets_them_go(
     assert len(storage.keys(TRASH)) == len(stray)
 
 
+@pytest.mark.parametrize("kind", ["folder"])
 def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
     storage, stop = open_storage(full.settings), threading.Event()
     storage.put(f"scenes/{uuid4()}/left.tif", [b"left by a killed process"])
@@ -283,6 +319,7 @@ def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
     assert contents(storage) == before
 
 
+@pytest.mark.parametrize("kind", ["bucket"])
 def test_a_file_too_large_to_be_copied_by_the_bucket_goes_to_the_trash_in_parts(
     full: Full, monkeypatch: pytest.MonkeyPatch
 ):

@@ -234,7 +234,7 @@ export interface NewTokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  storage_quota_bytes: number | null;
+  upload_quota_bytes: number | null;
   job_quota: number | null;
   secret: string;
 }
@@ -543,7 +543,6 @@ export interface StatusInfo {
   links: Link[];
   "amers:queuePosition"?: number;
   "amers:estimatedEnd"?: string;
-  "amers:priority"?: number;
 }
 
 export interface StoredFile {
@@ -614,7 +613,7 @@ export interface TokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  storage_quota_bytes: number | null;
+  upload_quota_bytes: number | null;
   job_quota: number | null;
 }
 

@@ -18,6 +18,20 @@ class Health(Reply):
     status: str
 
 
+class PartReadiness(Reply):
+    """The state of one part of the service; `degraded` affects uploads and jobs, not reading."""
+
+    status: Literal["ok", "degraded", "failed"]
+    reason: str | None = Missing
+
+
+class ReadinessReport(Reply):
+    """The state of the service by part: database, schema, storage, worker, disk."""
+
+    status: Literal["ready", "degraded", "not ready"]
+    parts: dict[str, PartReadiness]
+
+
 class Conformance(Reply):
     """The conformance classes of the service."""
 

@@ -16,6 +16,7 @@ PAST_JOBS = 20
 BEATING_S = 30
 """A worker of the queue gives a sign of life every ten seconds; one silent for longer does not count."""
 
+COUNT_WORKERS = named("jobs.sql", "count_workers")
 OUTLOOK = named("jobs.sql", "outlook")
 
 
@@ -66,3 +67,8 @@ def outlook(connection: Connection, job_id: UUID) -> Outlook:
     """The place of a job in the queue and its expected end."""
     values = {"id": job_id, "past": PAST_JOBS, "beating_s": BEATING_S, "nobody": UUID(int=0)}
     return first(Outlook, connection.execute(OUTLOOK, values)) or Outlook(None, None)
+
+
+def count_workers(connection: Connection) -> int:
+    """The number of workers that are alive."""
+    return int(connection.scalar(COUNT_WORKERS, {"beating_s": BEATING_S}) or 0)

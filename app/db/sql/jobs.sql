@@ -97,3 +97,8 @@ select case own.state when 'accepted' then (select count(*) + 1 from before) end
         else greatest(clock_timestamp(), claimed_at + make_interval(secs => own.seconds))
     end as expected_end
 from own, queued, under_way, workers
+
+-- name: count_workers
+-- The workers that have sent a heartbeat lately.
+select count(*) from procrastinate_workers
+where last_heartbeat > clock_timestamp() - make_interval(secs => :beating_s)

@@ -1,0 +1,148 @@
+"""Readiness: what of an installation works, by part, checked at most every few seconds."""
+
+import shutil
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as TooSlow
+from dataclasses import dataclass
+from typing import Literal
+
+import psycopg
+
+from app.db import engine, revisions
+from app.db.engine import Connection
+from app.db.jobs import progress
+from app.errors import NotFound, StorageOutage
+from app.usecases import storage_identity
+from app.usecases.installation import Installation
+from app.usecases.operations import existing_folder
+
+VALID_S = 2.0
+"""A result is repeated for this time, so that frequent probes cost nothing."""
+STORAGE_LIMIT_S = 5.0
+"""A storage that takes longer to write and read a tiny file does not answer."""
+PROBE = "probe.txt"
+"""Key of the tiny file; top-level keys belong to no block, scene or job."""
+NEEDED_TO_READ = ("database", "schema", "storage")
+
+State = Literal["ok", "degraded", "failed"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """The state of one part of an installation.
+
+    Attributes:
+        status: `degraded`: requests that read are answered, others may fail.
+        reason: what is wrong and what to do; None for `ok`.
+    """
+
+    status: State
+    reason: str | None = None
+
+
+OK = Part("ok")
+
+
+class Readiness:
+    """The state of the parts of an installation. Threads may share it."""
+
+    def __init__(self, installation: Installation) -> None:
+        self._installation = installation
+        self._lock = threading.Lock()
+        self._parts: dict[str, Part] = {}
+        self._checked_at = float("-inf")
+        # One thread: a storage that does not answer holds up no more than one.
+        self._prober = ThreadPoolExecutor(1, thread_name_prefix="storage-probe")
+        self._probe: Future[Part] | None = None
+
+    def check(self) -> dict[str, Part]:
+        """The state by part; while one caller checks, the others get the last result."""
+        if not self._lock.acquire(blocking=not self._parts):
+            return self._parts
+        try:
+            if time.monotonic() - self._checked_at > VALID_S:
+                self._parts = self._check()
+                self._checked_at = time.monotonic()
+            return self._parts
+        finally:
+            self._lock.release()
+
+    def close(self) -> None:
+        """End the thread of the probes."""
+        self._prober.shutdown(wait=False, cancel_futures=True)
+
+    def _check(self) -> dict[str, Part]:
+        try:
+            with self._installation.database.reading() as connection:
+                engine.check_postgis(connection)
+                parts = {"database": OK, "schema": _schema(connection), "worker": _worker(connection)}
+        except psycopg.Error:
+            parts = {"database": Part("failed", "the database does not answer")}
+        return {**parts, "storage": self._storage(), "disk": _disk(self._installation)}
+
+    def _storage(self) -> Part:
+        if self._probe is None or self._probe.done():
+            self._probe = self._prober.submit(_storage, self._installation)
+        try:
+            return self._probe.result(STORAGE_LIMIT_S)
+        except TooSlow:
+            return Part("failed", f"the storage has not answered within {STORAGE_LIMIT_S:g} s")
+
+
+def overall(parts: dict[str, Part]) -> Literal["ready", "degraded", "not ready"]:
+    """The state of an installation: without a part that is needed to read it is not ready."""
+    if any(parts[name].status == "failed" for name in NEEDED_TO_READ if name in parts):
+        return "not ready"
+    return "ready" if all(part == OK for part in parts.values()) else "degraded"
+
+
+def _schema(connection: Connection) -> Part:
+    found, needed = revisions.current(connection), revisions.newest_revision()
+    if found == needed:
+        return OK
+    return Part(
+        "failed",
+        f"the schema of the database is at revision {found}, this Amers needs {needed}: run "
+        "`amers db upgrade`, or the Amers that the database was upgraded for",
+    )
+
+
+def _worker(connection: Connection) -> Part:
+    if progress.count_workers(connection):
+        return OK
+    return Part("degraded", "no worker is alive: jobs wait until `amers worker` runs")
+
+
+def _storage(installation: Installation) -> Part:
+    """The storage belongs to the database, and a tiny file can be written and read."""
+    storage = installation.storage
+    try:
+        with installation.database.reading() as connection:
+            reason = storage_identity.mismatch(connection, storage)
+    except psycopg.Error:
+        return Part("failed", "it is not known whether the storage belongs to the database")
+    except (StorageOutage, OSError):
+        return Part("failed", "the storage does not answer")
+    if reason is not None:
+        return Part("failed", reason)
+    try:
+        storage.put(PROBE, [PROBE.encode()])
+        with storage.open(PROBE) as file:
+            file.read()
+    except (StorageOutage, OSError, NotFound):
+        return Part("degraded", "no file can be written into the storage: uploads and jobs fail")
+    return OK
+
+
+def _disk(installation: Installation) -> Part:
+    settings = installation.settings
+    free_bytes = shutil.disk_usage(existing_folder(settings.data_folder)).free
+    if free_bytes >= settings.min_free_bytes:
+        return OK
+    return Part(
+        "degraded",
+        f"{free_bytes} bytes are free on the disk of the data folder, fewer than AMERS_MIN_FREE_BYTES "
+        f"({settings.min_free_bytes})",
+    )
