@@ -153,7 +153,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(RequestLog, metrics=app.state.metrics)
     app.add_middleware(ReplyHeaders)
     error_responses.install(app)
-    openapi.install(app)
+    openapi.install(app, ROUTERS, settings)
     for router in ROUTERS:
         app.include_router(router)
     return app

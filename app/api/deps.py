@@ -11,9 +11,10 @@ from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
 
 from app import request_context
+from app.api.access import needs
 from app.api.body import body_of
 from app.api.turns import Turns
-from app.auth import Scope, authenticate, authenticate_identity, require
+from app.auth import Scope, authenticate, authenticate_identity, require, require_token
 from app.config import Settings
 from app.db.engine import Database
 from app.db.tokens import Token
@@ -127,18 +128,27 @@ async def takes_upload(request: Request, caller: CallerDep) -> None:
 UploadTurn = Depends(takes_upload)
 
 
+@needs(None)
+async def _token_holder(caller: CallerDep) -> Token:
+    return require_token(caller)
+
+
+@needs(Scope.READ)
 async def _reader(caller: CallerDep) -> Token:
     return require(caller, Scope.READ)
 
 
+@needs(Scope.REGISTER)
 async def _registrar(caller: CallerDep) -> Token:
     return require(caller, Scope.REGISTER)
 
 
+@needs(Scope.ADMIN)
 async def _admin(caller: CallerDep) -> Token:
     return require(caller, Scope.ADMIN)
 
 
+@needs(Scope.READ, "public_points")
 async def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
     """A caller with scope `read`, or any caller if points are public."""
     if caller is None and settings.public_points:
@@ -146,6 +156,7 @@ async def _points_reader(caller: CallerDep, settings: SettingsDep) -> Token | No
     return require(caller, Scope.READ)
 
 
+@needs(Scope.MONITOR, "public_metrics")
 async def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | None:
     """A caller with scope `monitor`, or any caller if metrics are public."""
     if caller is None and settings.public_metrics:
@@ -153,6 +164,7 @@ async def _metrics_reader(caller: CallerDep, settings: SettingsDep) -> Token | N
     return require(caller, Scope.MONITOR)
 
 
+TokenHolder = Annotated[Token, Depends(_token_holder)]
 Reader = Annotated[Token, Depends(_reader)]
 Registrar = Annotated[Token, Depends(_registrar)]
 Admin = Annotated[Token, Depends(_admin)]

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
+from app.api.access import needs
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import Page, count_text, features_page
@@ -54,6 +55,7 @@ def viewer_of(collection: CollectionDep, caller: CallerDep, settings: SettingsDe
     return Viewer() if caller is None else Viewer(caller.id, is_administrator(caller))
 
 
+@needs(Scope.READ, "public_points")
 async def _viewer(collection: CollectionDep, caller: CallerDep, settings: SettingsDep) -> Viewer:
     return viewer_of(collection, caller, settings)
 

@@ -1,14 +1,20 @@
 """The OpenAPI description: what FastAPI makes of the code, completed for clients of OGC API."""
 
+from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
+from app.api.access import BEARER, declared_security
 from app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
 from app.api.models.base import Link, Problem
 from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
+from app.auth import Scope
+from app.config import Settings
 from app.db.features.collection import Collection, Property
 from app.usecases.features.items import COLLECTIONS
 from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
@@ -26,7 +32,7 @@ PLACES: dict[str, dict[str, Any]] = {
 }
 
 
-def install(app: FastAPI) -> None:
+def install(app: FastAPI, routers: Sequence[APIRouter], settings: Settings) -> None:
     """Give an application the completed description."""
 
     def openapi() -> dict[str, Any]:
@@ -34,10 +40,20 @@ def install(app: FastAPI) -> None:
             document = get_openapi(
                 title=app.title, version=app.version, description=app.description, routes=app.routes
             )
+            _declare_access(document, routers, settings)
             app.openapi_schema = _completed(document)
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _declare_access(document: dict[str, Any], routers: Sequence[APIRouter], settings: Settings) -> None:
+    """Give each operation the `security` that its dependencies declare."""
+    for route in chain.from_iterable(router.routes for router in routers):
+        if isinstance(route, APIRoute) and route.include_in_schema:
+            security = declared_security(route.dependant, settings)
+            for method in (route.methods or ()) if security else ():
+                document["paths"][route.path_format][method.lower()]["security"] = security
 
 
 def _completed(document: dict[str, Any]) -> dict[str, Any]:
@@ -47,8 +63,7 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
     for collection in COLLECTIONS.values():
         schemas |= collection_schemas(collection)
     schemas |= _model_schemas()
-    document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
-    document["security"] = [{"bearer": []}, {}]
+    document["components"]["securitySchemes"] = {BEARER: {"type": "http", "scheme": "bearer"}}
     for path, operations in list(document["paths"].items()):
         for operation in operations.values():
             operation["responses"].pop("422", None)
@@ -115,6 +130,8 @@ def _of_collection(operation: dict[str, Any], collection: Collection, path: str)
         "operationId": f"{operation['operationId']}_{collection.id}",
         "parameters": parameters,
     }
+    if not collection.is_open:
+        own["security"] = [{BEARER: [str(Scope.REGISTER)]}]
     if path.endswith("/items"):
         own["parameters"] = parameters + [_equal(item) for item in collection.queryables.values()]
     if path.endswith(("/items", "/search")):

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Query, Request, Response, status
 from pydantic import BaseModel, ConfigDict, Field
 
+from app.api.access import FURTHER_SCOPES, Public
 from app.api.deps import InstallationDep, Reader
 from app.api.jobs import job_url, status_info
 from app.api.models.base import Link
@@ -70,7 +71,7 @@ class Execute(BaseModel):
     )
 
 
-@router.get("/processes")
+@router.get("/processes", dependencies=[Public])
 def list_processes(
     *,
     request: Request,
@@ -90,7 +91,7 @@ def list_processes(
     )
 
 
-@router.get("/processes/{process_id}")
+@router.get("/processes/{process_id}", dependencies=[Public])
 def describe_process(*, process_id: str, request: Request) -> ProcessDescription:
     """Return one process with its inputs and outputs."""
     process = jobs.find_process(process_id)
@@ -117,7 +118,11 @@ def describe_process(*, process_id: str, request: Request) -> ProcessDescription
     return ProcessDescription(**_summary(str(request.base_url), process), inputs=inputs, outputs=outputs)
 
 
-@router.post("/processes/{process_id}/execution", status_code=status.HTTP_201_CREATED)
+@router.post(
+    "/processes/{process_id}/execution",
+    status_code=status.HTTP_201_CREATED,
+    openapi_extra={FURTHER_SCOPES: ["register", "admin"]},
+)
 def execute(
     *,
     process_id: str,

@@ -10,6 +10,7 @@ from fastapi.encoders import jsonable_encoder
 from fastapi.responses import JSONResponse
 
 from app import errors
+from app.api.access import Public
 from app.api.deps import DatabaseDep, Reader, StorageDep
 from app.api.error_responses import HTTP_STATUS, OGC_EXCEPTIONS, problem
 from app.api.files import file_reply
@@ -80,6 +81,7 @@ def download_result(
 
 @router.get(
     "/schemas/report.json",
+    dependencies=[Public],
     response_class=Response,
     responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
 )

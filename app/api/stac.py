@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from app.api import features
+from app.api.access import needs
 from app.api.deps import CallerDep, DatabaseDep, SettingsDep
 from app.api.features import (
     CrsUri,
@@ -44,6 +45,7 @@ from app.api.negotiation import (
 )
 from app.api.processes import inlined
 from app.api.routes import CallerRoute
+from app.auth import Scope
 from app.db.engine import Database
 from app.db.features.collection import Viewer
 from app.db.features.outlines import SCENES
@@ -173,6 +175,7 @@ class SceneSearchBody(SceneSearch):
         return value
 
 
+@needs(Scope.REGISTER)
 async def _scenes_viewer(caller: CallerDep, settings: SettingsDep) -> Viewer:
     return viewer_of(SCENES, caller, settings)
 

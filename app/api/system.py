@@ -6,6 +6,7 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 
 from app.api import processes, stac
+from app.api.access import Public
 from app.api.features import Format
 from app.api.models.base import Link
 from app.api.models.documents import Conformance, Health, Landing, PartReadiness, ReadinessReport
@@ -74,7 +75,7 @@ LINKS = (
 )
 
 
-@router.get("/", response_class=Response, responses=described(Landing, HTML))
+@router.get("/", dependencies=[Public], response_class=Response, responses=described(Landing, HTML))
 def landing(*, request: Request, f: Format = None) -> Response:
     """Return the landing page with links to everything else."""
     refuse_unknown(request, {"f"})
@@ -98,7 +99,12 @@ def landing(*, request: Request, f: Format = None) -> Response:
     return document_page(request, Page(title, description, list(pages.values())))
 
 
-@router.get("/conformance", response_class=Response, responses=described(Conformance, HTML))
+@router.get(
+    "/conformance",
+    dependencies=[Public],
+    response_class=Response,
+    responses=described(Conformance, HTML),
+)
 def conformance(*, request: Request, f: Format = None) -> Response:
     """Return the conformance classes of OGC API and STAC that the service implements."""
     refuse_unknown(request, {"f"})
@@ -132,13 +138,13 @@ def description(*, request: Request, f: Format = None) -> Response:
     return document_page(request, page)
 
 
-@router.get("/healthz")
+@router.get("/healthz", dependencies=[Public])
 def alive() -> Health:
     """Report that the process answers."""
     return Health(status="alive")
 
 
-@router.get("/readyz", responses={503: {"model": ReadinessReport}})
+@router.get("/readyz", dependencies=[Public], responses={503: {"model": ReadinessReport}})
 def ready(*, request: Request, response: Response) -> ReadinessReport:
     """Report what of the service works; 503 when requests that read cannot be answered."""
     readiness: Readiness = request.app.state.readiness

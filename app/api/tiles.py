@@ -4,6 +4,7 @@ import hashlib
 
 from fastapi import APIRouter, Request, Response
 
+from app.api.access import Public
 from app.api.deps import DatabaseDep
 from app.api.features import CollectionDep, ViewerDep
 from app.api.models.base import Link
@@ -33,7 +34,7 @@ REL = "http://www.opengis.net/def/rel/ogc/1.0"
 GEOMETRY_DIMENSION = {"Point": 0, "Polygon": 2}
 
 
-@router.get("/tileMatrixSets")
+@router.get("/tileMatrixSets", dependencies=[Public])
 def tile_matrix_sets(*, request: Request) -> TileMatrixSets:
     """List the tile matrix sets: the grids of tiles."""
     href = f"{request.base_url}tileMatrixSets/{MATRIX_SET}"
@@ -42,7 +43,7 @@ def tile_matrix_sets(*, request: Request) -> TileMatrixSets:
     return TileMatrixSets(tile_matrix_sets=[item])
 
 
-@router.get("/tileMatrixSets/{matrix_set}")
+@router.get("/tileMatrixSets/{matrix_set}", dependencies=[Public])
 def tile_matrix_set(*, matrix_set: str) -> TileMatrixSet:
     """Return the tile matrix set WebMercatorQuad: the square of web maps, halved with each zoom."""
     _refuse_other(matrix_set)

@@ -3,10 +3,10 @@
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import Admin, CallerDep, DatabaseDep
+from app.api.deps import Admin, DatabaseDep, TokenHolder
 from app.api.models.administration import NewTokenRecord, TokenRecord, TokenRecords
 from app.api.routes import CallerRoute
-from app.auth import Scope, require_token
+from app.auth import Scope
 from app.usecases import tokens
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=CallerRoute)
@@ -57,9 +57,9 @@ def list_tokens(*, database: DatabaseDep, caller: Admin) -> TokenRecords:
 
 
 @router.get("/self")
-def own_token(*, caller: CallerDep) -> TokenRecord:
+def own_token(*, caller: TokenHolder) -> TokenRecord:
     """Return the token of this request."""
-    return TokenRecord.model_validate(require_token(caller))
+    return TokenRecord.model_validate(caller)
 
 
 @router.delete("/{token_id}")

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from app.api.access import FURTHER_SCOPES, Public
 from app.api.body import body_chunks
 from app.api.deps import (
     DatabaseDep,
@@ -49,7 +50,7 @@ Version = Depends(_version)
 router = APIRouter(prefix="/uploads", tags=["uploads"], route_class=CallerRoute)
 
 
-@router.options("", status_code=204)
+@router.options("", status_code=204, dependencies=[Public])
 def capabilities(*, settings: SettingsDep) -> Response:
     """Return the version and the extensions of tus that the service supports."""
     headers = {
@@ -61,7 +62,12 @@ def capabilities(*, settings: SettingsDep) -> Response:
     return Response(status_code=204, headers=TUS | headers)
 
 
-@router.post("", status_code=201, dependencies=[Version])
+@router.post(
+    "",
+    status_code=201,
+    dependencies=[Version],
+    openapi_extra={FURTHER_SCOPES: ["admin"]},
+)
 def create(
     *,
     request: Request,

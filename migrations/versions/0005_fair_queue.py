@@ -1,7 +1,7 @@
 """The fair queue: priorities, delays, the turns of owners; queue entries no longer name a job.
 
-It locks the tables of jobs and of the queue for as long as two indexes on the open jobs take: about a second
-with a million jobs.
+It locks the tables of jobs and of the queue for as long as two indexes on the open jobs take: about a
+second with a million jobs.
 """
 
 from alembic import op
