@@ -1,5 +1,6 @@
 """Orthorectify a scene through its model and a terrain: for the command line, and as a process."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,12 +11,14 @@ from uuid import UUID
 import numpy as np
 
 from app.auth import Scope
-from app.db import registrations
+from app.db import registrations, scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
-from app.errors import InputError
+from app.errors import InputError, TooLarge
+from app.usecases import quotas
 from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
+from app.usecases.quotas import FREE_ROOM
 from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
 from app.usecases.scenes import local_image, stored_keys
@@ -24,6 +27,7 @@ from services.formats.images.bands import one_band
 from services.formats.images.ortho import write_cog
 from services.formats.images.raster import RasterImage
 from services.formats.images.scenes import read_scene
+from services.imagery.scene import Scene, scene_gsd_m
 from services.map_grid import MapGrid
 from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
 from services.types import Progress, no_progress
@@ -31,6 +35,11 @@ from services.types import Progress, no_progress
 ORTHO_NAME = "ortho.tif"
 REFINED_NAME = "refined_RPC.TXT"
 """Name of the refined model among the outputs of a registration."""
+FINEST_GSD = 0.5
+"""A job makes no map that is finer than this share of the ground sampling of its scene."""
+MOST_MAP_PIXELS = 16
+"""A job makes no map with more than this many times the pixels of its scene: a narrow scene that lies
+askew needs up to 10 times as many at its own ground sampling."""
 _KEPT_TYPES = ("uint8", "uint16", "int16", "float32")
 
 
@@ -99,6 +108,59 @@ class OrthorectifyScene:
     options: OrthoOptions = field(default_factory=OrthoOptions)
 
 
+@dataclass(frozen=True)
+class MapLimits:
+    """The limits of the map of a job: what the scene warrants, and the quota of the owner.
+
+    Attributes:
+        room_bytes: what is left of the quota; None without one.
+    """
+
+    room_bytes: int | None
+
+    def check(self, scene: Scene, grid: MapGrid, pixel_bytes: int) -> None:
+        """Refuse a map that the scene or the quota does not warrant.
+
+        Args:
+            pixel_bytes: size of a pixel with all its bands.
+
+        Raises:
+            InputError: the map is finer than the scene, or larger.
+            TooLarge: the map does not fit into what is left of the quota.
+        """
+        require_warranted_gsd(_ground_sampling_m(grid), scene_gsd_m(scene))
+        lines, samples = grid.shape
+        most = MOST_MAP_PIXELS * math.prod(scene.image.shape)
+        if lines * samples > most:
+            raise InputError(
+                f"the map would have {lines} x {samples} pixels, at most {most:,} are allowed, "
+                f"{MOST_MAP_PIXELS} times those of the scene: give a larger gsd_m, or a crs for this "
+                "part of the world"
+            )
+        # A third more with overviews; compression makes it smaller.
+        size_bytes = lines * samples * pixel_bytes * 4 // 3
+        if self.room_bytes is not None and size_bytes > self.room_bytes:
+            raise TooLarge(
+                f"the map may have {size_bytes} bytes, {self.room_bytes} are left of the storage quota: "
+                f"give a larger gsd_m, or {FREE_ROOM}"
+            )
+
+
+def require_warranted_gsd(gsd_m: float, of_scene_m: float) -> None:
+    """Refuse a map that is much finer than its scene.
+
+    Raises:
+        InputError: the ground sampling is below `FINEST_GSD` of that of the scene.
+    """
+    finest_m = FINEST_GSD * of_scene_m
+    # The ground sampling of a scene differs a little from place to place.
+    if gsd_m < 0.95 * finest_m:
+        raise InputError(
+            f"map.gsd_m: {gsd_m:.4g} m found, at least {finest_m:.4g} m expected, half of the "
+            f"{of_scene_m:.4g} m of the scene: a finer map shows no more"
+        )
+
+
 _DEFAULT_MAP = OrthoMap()
 _DEFAULT_OPTIONS = OrthoOptions()
 
@@ -111,6 +173,7 @@ def run_orthorectification(
     model: Path | None = None,
     ortho_map: OrthoMap = _DEFAULT_MAP,
     options: OrthoOptions = _DEFAULT_OPTIONS,
+    limits: MapLimits | None = None,
     progress: Progress = no_progress,
 ) -> Orthorectified:
     """Write a scene with all its bands as a cloud-optimised GeoTIFF on a map.
@@ -124,6 +187,7 @@ def run_orthorectification(
         model: file of the scene's model; None finds it by its name.
         ortho_map: reference system and ground sampling.
         options: of the orthorectification.
+        limits: of the map; None on the command line, which has none.
         progress: receives the fraction done and a message.
 
     Raises:
@@ -141,6 +205,8 @@ def run_orthorectification(
     bands = [replace(raster, mix=one_band(band)) for band in _data_bands(raster)]
     grid = choose_grid(scene, ground, ortho_map.crs, ortho_map.gsd_m)
     dtype, nodata = _pixel_type(raster)
+    if limits is not None:
+        limits.check(scene, grid, len(bands) * np.dtype(dtype).itemsize)
     counter = _DataPixels()
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
     error_px = write_cog(output, grid, windows, bands=len(bands), dtype=dtype, nodata=nodata)
@@ -196,6 +262,9 @@ def _data_bands(image: RasterImage) -> list[int]:
 def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> None:
     check_scene(connection, caller, inputs.scene)
     check_file_names(inputs, "dem", "model", "geoid")
+    scene = scenes.find_scene(connection, inputs.scene)
+    if scene is not None and scene.gsd_m is not None and inputs.map.gsd_m is not None:
+        require_warranted_gsd(inputs.map.gsd_m, scene.gsd_m)
     if inputs.registration is not None:
         if inputs.model is not None:
             raise InputError("model, registration: only one of both is expected")
@@ -227,6 +296,8 @@ def _run(work: Work) -> Commit:
         refined = None
         if inputs.registration is not None:
             refined = _refined_key(connection, inputs.scene, inputs.registration)
+        owner = work.job.owner
+        room = None if owner is None else quotas.room_left(connection, work.settings, owner)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
         model = image.with_name(inputs.model) if inputs.model else None
@@ -243,6 +314,7 @@ def _run(work: Work) -> Commit:
                 model=model,
                 ortho_map=inputs.map,
                 options=inputs.options,
+                limits=MapLimits(room),
                 progress=work.progress,
             )
         keys = store_results(work, {ORTHO_NAME: ortho.path})
