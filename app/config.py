@@ -50,9 +50,12 @@ class Settings(BaseSettings):
         pool_size: largest number of connections of one API process, for reading and again for writing.
         read_timeout_seconds: time limit of the database for one statement of a reading request.
         job_memory_bytes, job_seconds: limits of one job on memory and time.
+        job_file_bytes: largest file that a job may write.
         result_days: days until the result files of a job are removed; None keeps them.
         min_free_bytes: free bytes on the disk of the data folder below which `/readyz` says so.
         trash_days: days until files that the sweep removed are deleted; 0 deletes them at once.
+        job_record_days: days until an ended job without files is removed; None keeps it.
+        audit_days: days until rows of the audit are removed; None keeps them.
         lease_seconds: time after which another worker takes over the job of a silent worker.
         storage_url: S3-compatible bucket for the files, `s3://BUCKET/PREFIX`; None for the data folder.
         scene_folder: scenes below it can be registered without an upload; None allows none.
@@ -95,9 +98,12 @@ class Settings(BaseSettings):
     read_timeout_seconds: float = Field(default=10.0, gt=0)
     job_memory_bytes: int = Field(default=8 * GIBIBYTE, ge=64 * MEBIBYTE)
     job_seconds: float = Field(default=3600.0, gt=0)
-    result_days: float | None = Field(default=None, gt=0)
     min_free_bytes: int = Field(default=2 * GIBIBYTE, ge=0)
     trash_days: float = Field(default=TRASH_DAYS, ge=0)
+    job_file_bytes: int = Field(default=128 * GIBIBYTE, ge=MEBIBYTE)
+    result_days: float | None = Field(default=90.0, gt=0)
+    job_record_days: float | None = Field(default=365.0, gt=0)
+    audit_days: float | None = Field(default=730.0, ge=30)
     lease_seconds: float = Field(default=30.0, gt=0)
     storage_url: str | None = Field(default=None, pattern=r"^s3://[a-z0-9][a-z0-9.-]+(/[\w.-]+)*/?$")
     scene_folder: Path | None = None
@@ -139,6 +145,11 @@ class Settings(BaseSettings):
     @classmethod
     def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(str(ip_network(proxy)) for proxy in proxies)
+
+    @field_validator("result_days", "job_record_days", "audit_days", mode="before")
+    @classmethod
+    def _never(cls, value: object) -> object:
+        return None if isinstance(value, str) and value.strip().lower() == "never" else value
 
     @field_validator("data_folder")
     @classmethod

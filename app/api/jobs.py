@@ -3,10 +3,10 @@
 from typing import Annotated, Literal
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, BackgroundTasks, Depends, Query, Request
 from pydantic import BaseModel, Field
 
-from app.api.deps import DatabaseDep, Reader
+from app.api.deps import DatabaseDep, Reader, StorageDep
 from app.api.models.base import Link
 from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
 from app.api.negotiation import JSON
@@ -16,6 +16,8 @@ from app.db.schema import JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs
 from app.usecases.features.query import parse_interval
+from app.usecases.processes import results_folder
+from app.usecases.results import delete_files
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)
 
@@ -108,10 +110,25 @@ def show_messages(*, job_id: JobId, request: Request, database: DatabaseDep, cal
 
 
 @router.delete("/jobs/{job_id}")
-def dismiss_job(*, job_id: JobId, request: Request, database: DatabaseDep, caller: Reader) -> StatusInfo:
-    """Dismiss a job that has not ended; its worker stops within seconds."""
+def dismiss_job(
+    *,
+    job_id: JobId,
+    request: Request,
+    database: DatabaseDep,
+    storage: StorageDep,
+    caller: Reader,
+    after_commit: BackgroundTasks,
+) -> StatusInfo:
+    """Dismiss a job that has not ended, or remove an ended one with its messages and results.
+
+    The worker of a dismissed job stops within seconds. The measures of a registration stay in the
+    histories of its points.
+    """
     with database.transaction() as connection:
-        return status_info(request, jobs.dismiss(connection, caller, job_id))
+        job = jobs.dismiss(connection, caller, job_id)
+    if job.results_removed_at is not None:
+        after_commit.add_task(delete_files, storage, results_folder(job_id))
+    return status_info(request, job)
 
 
 def job_url(request: Request, job: Job) -> str:

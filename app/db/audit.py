@@ -13,7 +13,11 @@ from sqlalchemy import select
 from app.db.engine import Connection
 from app.db.rows import columns_of, every
 from app.db.schema import audit
+from app.db.statements import named
 
+REMOVE_OLD = named("audit.sql", "remove_old")
+MOST_REMOVED = 100_000
+"""Largest number of changes that one sweep removes."""
 KINDS = ("token", "block", "scene", "job", "point", "reference_image", "audit")
 
 
@@ -44,6 +48,16 @@ class Change:
 
 
 COLUMNS = columns_of(Change, audit)
+
+
+def remove_old(connection: Connection, older_than_s: float) -> int:
+    """Remove the oldest changes, up to the first one that is younger; returns how many.
+
+    The trigger `audit_removal` checks the range and leaves a row about it. Nothing is removed before the
+    oldest change exceeds its age by a day, so that there is one such row a day.
+    """
+    removed = connection.execute(REMOVE_OLD, {"older_than_s": older_than_s, "most": MOST_REMOVED})
+    return int(removed.scalar_one())
 
 
 def list_changes(

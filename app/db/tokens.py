@@ -131,6 +131,11 @@ def revoke_token(connection: Connection, token_id: UUID) -> Token:
     return only(Token, connection.execute(statement))
 
 
+def find_token(connection: Connection, token_id: UUID) -> Token:
+    """The token with that id."""
+    return only(Token, connection.execute(select(*COLUMNS).where(token.c.id == token_id)))
+
+
 def lock_token(connection: Connection, token_id: UUID) -> Token:
     """The token; others who count what it uses wait until the end of the transaction."""
     statement = select(*COLUMNS).where(token.c.id == token_id).with_for_update(key_share=True)

@@ -4,7 +4,8 @@ import logging
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from tempfile import gettempdir
 from typing import Any
 from uuid import UUID
@@ -21,7 +22,7 @@ from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage, Outlook
 from app.db.schema import JobResponse
 from app.db.tokens import Token
-from app.errors import AmersError, Conflict, DamagedFile, InputError, NoSuchJob, NoSuchProcess
+from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess
 from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
@@ -179,18 +180,25 @@ def read_messages(connection: Connection, caller: Token, job_id: UUID) -> list[J
 
 
 def dismiss(connection: Connection, caller: Token, job_id: UUID) -> Job:
-    """Dismiss a job; the worker stops the work within seconds.
+    """Dismiss a job that has not ended, or remove one that has ended with its messages and results.
+
+    The worker stops the work of a dismissed job within seconds. The registration that a removed job made
+    stays, because points have its measures in their histories. The caller deletes the files of a removed
+    job (`results.delete_files`) once the transaction is committed: rows go before files.
+
+    Returns:
+        The dismissed job. `results_removed_at` of a removed one has a value.
 
     Raises:
         NoSuchJob: there is none, or the caller may not see it.
-        Conflict: the job has ended; its record and its results stay.
     """
     job = visible_job(connection, caller, job_id)
-    if not jobs.dismiss(connection, job_id):
-        job = visible_job(connection, caller, job_id)
-        if job.state != "dismissed":
-            raise Conflict(f"job {job_id} is {job.state} and cannot be dismissed; its results stay")
-    return visible_job(connection, caller, job_id)
+    if jobs.dismiss(connection, job_id):
+        return visible_job(connection, caller, job_id)
+    if not jobs.delete_ended(connection, [job_id]):
+        raise NoSuchJob(f"no job {job_id}")
+    removed_at = datetime.now(UTC)
+    return replace(job, state="dismissed", message="removed", results_removed_at=removed_at)
 
 
 def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: int) -> None:

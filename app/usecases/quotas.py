@@ -56,6 +56,12 @@ def require_room(
     return left
 
 
+def room_left(connection: Connection, settings: Settings, owner: UUID) -> int:
+    """The bytes that are left of the storage quota of a token now; others may take them."""
+    quota = storage_quota(settings, tokens.find_token(connection, owner))
+    return max(quota - usage.read_usage(connection, owner).total_bytes, 0)
+
+
 def require_free_upload(connection: Connection, settings: Settings, owner: UUID) -> None:
     """Refuse another resumable upload to a token that has as many open ones as allowed; locks the token.
 

@@ -10,7 +10,7 @@ from uuid import UUID
 
 from app.db import stored_files
 from app.db.engine import Database
-from app.db.jobs import attempts
+from app.db.jobs import attempts, jobs
 from app.db.jobs.jobs import Job
 from app.errors import NotFound
 from app.storage import Storage
@@ -77,6 +77,19 @@ def discard_attempt(database: Database, storage: Storage, job_id: UUID, attempt:
     delete_files(storage, f"{results_folder(job_id)}/{attempt}")
     with database.transaction() as connection:
         attempts.release_results(connection, job_id, attempt)
+
+
+def reconcile_results(database: Database, storage: Storage) -> None:
+    """Delete what lost attempts have left, and measure results whose sizes were never recorded."""
+    with database.transaction() as connection:
+        lost = attempts.lost_reservations(connection)
+        unmeasured = jobs.unmeasured(connection)
+    for job_id, attempt in lost.items():
+        discard_attempt(database, storage, job_id, attempt)
+    for job_id in unmeasured:
+        size_bytes = sum(storage.size(key) for key in storage.keys(results_folder(job_id)))
+        with database.transaction() as connection:
+            jobs.set_measured(connection, job_id, size_bytes)
 
 
 def delete_files(storage: Storage, folder: str) -> None:

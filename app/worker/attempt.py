@@ -21,9 +21,10 @@ from app.db.engine import Database
 from app.db.jobs import attempts
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job
-from app.errors import is_no_room
+from app.errors import StorageOutage, is_no_room
 from app.request_context import Origin, working_for
-from app.storage import Storage
+from app.storage import Storage, open_storage
+from app.usecases import results
 
 FAILURES_ALLOWED = 3
 """A job fails when this many attempts at it have ended without an outcome."""
@@ -92,6 +93,10 @@ class Attempts:
             self._supervise(job)
         except LostJob as lost:
             log.info("%s", lost)
+        try:
+            results.discard_attempt(self.database, open_storage(self.settings), job.id, job.attempt)
+        except (OperationalError, StorageOutage) as outage:
+            log.warning("job %s: the sweep has to delete the files of its attempt: %s", job.id, outage)
 
     def _supervise(self, job: Job) -> None:
         """Run the process, and update the job when the process did not write an outcome."""
@@ -128,6 +133,14 @@ class Attempts:
                 "Memory limit",
                 f"the job needs more memory than {limit}, the limit of this service "
                 "(AMERS_JOB_MEMORY_BYTES)",
+            )
+        elif code == -signal.SIGXFSZ:
+            limit = f"{self.settings.job_file_bytes / 2**20:.0f} MiB"
+            self._fail(
+                job,
+                "File size limit",
+                f"the job writes a file larger than {limit}, the limit of this service "
+                "(AMERS_JOB_FILE_BYTES)",
             )
         elif failures >= FAILURES_ALLOWED and code == NO_ROOM:
             self._fail(job, "No room", f"a disk of the service was full in {failures} attempts")

@@ -3,7 +3,7 @@
 Started as `python -m app.worker.run JOB ATTEMPT WORKER_PID MEMORY_BYTES`.
 
 Exit codes: 0 the outcome is written or no longer needed, 77 out of memory, 78 a disk is full, others for
-a crash or an outage.
+a crash or an outage. SIGXFSZ ends a process that writes too large a file.
 """
 
 import ctypes
@@ -43,6 +43,7 @@ def main(arguments: list[str]) -> int:
     try:
         with working_for(origin), pooled(settings.database_url.get_secret_value(), settings) as database:
             limit_memory(int(memory_bytes))
+            limit_files(settings.job_file_bytes)
             do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:
         log.info("%s", lost)
@@ -73,6 +74,13 @@ def limit_memory(extra_bytes: int) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + extra_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def limit_files(largest_bytes: int) -> None:
+    """Make the kernel end this process by SIGXFSZ when it writes a larger file, in whatever library."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest_bytes, largest_bytes))
 
 
 if __name__ == "__main__":

@@ -14,10 +14,9 @@ import psycopg
 from app.config import TRASH_DAYS, Settings
 from app.db import scenes, uptime
 from app.db.engine import Database, limit_lock_wait
-from app.db.jobs import attempts, jobs, queue
-from app.request_context import Origin, working_for
+from app.db.jobs import attempts, queue
 from app.storage import Storage, trash
-from app.usecases import garbage_collection, storage_identity
+from app.usecases import garbage_collection, results, retention, storage_identity
 from app.usecases.blocks.uploads import remove_expired_archives
 from app.usecases.garbage_collection import Bin, remove_unnamed_chips, remove_unnamed_files
 from app.usecases.uploads import UPLOAD_PREFIX, remove_abandoned_uploads
@@ -67,7 +66,7 @@ class Sweeper:
                     storage_identity.prepare(self.database.transaction, self.storage)
                 if time.monotonic() > next_files_at:
                     next_files_at += FILES_EVERY_S
-                    sweep_results(self.database, self.settings.result_days)
+                    sweep_records(self.database, self.storage, self.settings)
                     sweep_files(
                         self.database,
                         self.storage,
@@ -92,13 +91,15 @@ def sweep_jobs(database: Database, lease_s: float, running_limit: int | None = N
             log.warning("%d tickets of the queue were lost and are issued again", issued)
 
 
-def sweep_results(database: Database, result_days: float | None) -> None:
-    """Mark the results of jobs that ended this many days ago as removed; None keeps all results."""
-    if result_days is None:
+def sweep_records(database: Database, storage: Storage, settings: Settings) -> None:
+    """Remove results, jobs and audit rows that are older than the settings keep them.
+
+    Nothing is removed from a storage that does not belong to the database.
+    """
+    if not storage_identity.announce(database.transaction, storage):
         return
-    with working_for(Origin(actor_name="retention")), database.transaction() as connection:
-        for job_id in jobs.remove_old_results(connection, 86_400.0 * result_days):
-            log.info("job %s: removed its results, which are older than %g days", job_id, result_days)
+    results.reconcile_results(database, storage)
+    retention.remove_what_is_old(database, storage, settings)
 
 
 def sweep_files(

@@ -5,18 +5,18 @@ from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
 
+from app.config import Settings
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs, progress
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import Outlook
 from app.storage import Storage
-from app.worker.sweep import sweep_files, sweep_results
+from app.worker.sweep import sweep_records
 from tests.app.job_queue import claim
 from tests.statements import run_sql
 
 LEASE_S = 30.0
-LONGEST_JOB_S = 3600.0
 a_slow_machine = timedelta(seconds=15)
 """Time that a test may take between its steps, during which running jobs grow older."""
 
@@ -128,7 +128,7 @@ def test_jobs_of_one_transaction_wait_in_the_order_of_the_queue(connection: Conn
 
 
 def test_old_results_are_removed_and_the_job_reports_it(
-    client: TestClient, bearer, database: Database, storage: Storage
+    client: TestClient, bearer, database: Database, storage: Storage, settings: Settings
 ):
     me, admin = bearer("register"), bearer("admin")
     scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
@@ -148,12 +148,16 @@ def test_old_results_are_removed_and_the_job_reports_it(
                 [86_400.0 * age_days, job.id],
             )
             urls.append(url)
-    sweep_results(database, None)
-    sweep_files(database, storage, LONGEST_JOB_S)
-    assert len(storage.keys("results")) == 2, "without a setting all are kept"
+    kept_for_two_days = settings.model_copy(update={"result_days": 2.0})
+    sweep_records(database, storage, settings.model_copy(update={"result_days": None}))
+    sweep_records(database, storage, kept_for_two_days)
+    assert len(storage.keys("results")) == 2, "the service has not run for two days: the clock jumped"
+    with database.transaction() as connection:
+        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 2.5 * 86400")
+    sweep_records(database, storage, settings.model_copy(update={"result_days": None}))
+    assert len(storage.keys("results")) == 2, "all are kept for ever"
     for _ in range(2):
-        sweep_results(database, 2.0)
-        sweep_files(database, storage, LONGEST_JOB_S)
+        sweep_records(database, storage, kept_for_two_days)
     old, young = urls
     assert storage.keys("results") == [f"results/{young.rsplit('/', 1)[1]}/1/report.json"]
     document = client.get(old, headers=me).json()

@@ -111,6 +111,14 @@ def release_results(connection: Connection, job_id: UUID, attempt: int) -> None:
     )
 
 
+def lost_reservations(connection: Connection) -> dict[UUID, int]:
+    """Jobs that neither run nor have succeeded and have room reserved, each with its last attempt."""
+    statement = select(job.c.id, job.c.attempt).where(
+        job.c.results_bytes > 0, job.c.state.not_in(("running", "successful"))
+    )
+    return {row.id: row.attempt for row in connection.execute(statement)}
+
+
 def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[str, Any]) -> None:
     """End a job with its results; the last statement of the transaction that writes them.
 

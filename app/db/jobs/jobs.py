@@ -5,16 +5,18 @@ from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import ColumnElement, extract, func, select, tuple_, update
+from sqlalchemy import ColumnElement, delete, extract, func, select, tuple_, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection
 from app.db.jobs.queue import issue_ticket, replace_spent_ticket
-from app.db.rows import columns_of, every, first
-from app.db.schema import JobResponse, JobState, clock, job
+from app.db.rows import among, columns_of, every, first
+from app.db.schema import JobResponse, JobState, clock, job, registration, uptime_s
 
 OPEN: tuple[JobState, ...] = ("accepted", "running")
 """States of jobs that have not ended."""
+MOST_DELETED = 10_000
+"""Largest number of jobs that one sweep deletes or measures."""
 DURATION_S = extract("epoch", func.coalesce(job.c.finished_at, clock) - job.c.started_at)
 
 
@@ -179,20 +181,77 @@ def dismiss(connection: Connection, job_id: UUID) -> bool:
     return dismissed.rowcount == 1
 
 
+def delete_ended(connection: Connection, job_ids: list[UUID]) -> list[UUID]:
+    """Delete those of some jobs that have ended, with their messages; returns their ids.
+
+    A registration stays without its job and without files, because points have its measures in their
+    histories.
+    """
+    _forget_files(connection, job_ids)
+    deleted = delete(job).where(among(job.c.id, job_ids), job.c.state.not_in(OPEN)).returning(job.c.id)
+    return list(connection.scalars(deleted))
+
+
 def remove_old_results(connection: Connection, older_than_s: float) -> list[UUID]:
-    """Give up the results of jobs that ended so long ago; their files are swept, the jobs stay."""
-    removed = connection.execute(
+    """Give up the results of jobs that ended so long ago; returns the ids of these jobs."""
+    removed = connection.scalars(
         update(job)
         .where(
             job.c.state == "successful",
             job.c.results_removed_at.is_(None),
             job.c.results.has_key("files"),
-            job.c.finished_at < clock - timedelta(seconds=older_than_s),
+            *_older_than(older_than_s),
         )
         .values(results_removed_at=clock, results_bytes=0)
         .returning(job.c.id)
     )
-    return list(removed.scalars())
+    job_ids = list(removed)
+    _forget_files(connection, job_ids)
+    return job_ids
+
+
+def delete_old(connection: Connection, older_than_s: float) -> int:
+    """Delete jobs without files that ended so long ago, the oldest first; returns how many."""
+    old = (
+        select(job.c.id)
+        .where(job.c.state.not_in(OPEN), job.c.results_bytes == 0, *_older_than(older_than_s))
+        .order_by(job.c.finished_at)
+        .limit(MOST_DELETED)
+    )
+    return len(delete_ended(connection, list(connection.scalars(old))))
+
+
+def unmeasured(connection: Connection) -> list[UUID]:
+    """Some of the jobs whose results were stored before sizes were recorded."""
+    statement = select(job.c.id).where(job.c.results_bytes.is_(None)).limit(MOST_DELETED)
+    return list(connection.scalars(statement))
+
+
+def set_measured(connection: Connection, job_id: UUID, size_bytes: int) -> None:
+    """Record the size of the results of a job that has none recorded."""
+    connection.execute(
+        update(job)
+        .where(job.c.id == job_id, job.c.results_bytes.is_(None))
+        .values(results_bytes=size_bytes)
+    )
+
+
+def _older_than(older_than_s: float) -> tuple[ColumnElement[bool], ...]:
+    """Conditions: the job ended so long ago, and the service has run for as long since it was created.
+
+    A clock that jumps ahead thus makes no job old.
+    """
+    return (
+        job.c.finished_at < clock - timedelta(seconds=older_than_s),
+        job.c.created_at_uptime_s < uptime_s - older_than_s,
+    )
+
+
+def _forget_files(connection: Connection, job_ids: list[UUID]) -> None:
+    """Empty the lists of files of the registrations of some jobs."""
+    connection.execute(
+        update(registration).where(among(registration.c.job_id, job_ids)).values(files={})
+    )
 
 
 def _conditions(wanted: JobFilter) -> list[ColumnElement[bool]]:

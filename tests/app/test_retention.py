@@ -1,0 +1,205 @@
+"""What ended long ago is removed, by the clock and by the time that the service has run."""
+
+from uuid import UUID
+
+import psycopg
+import pytest
+
+from app.config import Settings, read_settings
+from app.db import registrations
+from app.db.audit import list_changes
+from app.db.engine import Connection, Database
+from app.db.jobs import attempts, jobs
+from app.errors import InputError
+from app.request_context import Origin, working_for
+from app.storage import Storage
+from app.usecases.tokens import create_token
+from app.worker.sweep import sweep_records
+from tests.app.job_queue import claim
+from tests.statements import run_sql
+
+OLDER = (
+    "update job set finished_at = finished_at - make_interval(days => %s)",
+    "alter table audit disable trigger audit_only_grows",
+    "update audit set at = at - make_interval(days => %s)",
+    "alter table audit enable trigger audit_only_grows",
+)
+
+
+def clock_jumps(database: Database, days: int) -> None:
+    """Make everything recorded this many days older."""
+    with database.transaction() as connection:
+        for statement in OLDER:
+            run_sql(connection, statement, [days] if "%s" in statement else [])
+
+
+def service_runs(database: Database, days: int) -> None:
+    """Let the service run for days."""
+    clock_jumps(database, days)
+    with database.transaction() as connection:
+        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * %s", [days])
+
+
+def successful_job(database: Database, storage: Storage) -> UUID:
+    """A registration job with a file of 100 bytes."""
+    with database.transaction() as connection:
+        job = jobs.create(connection, "register-scene", {})
+        assert job is not None
+        assert claim(connection, job.id)
+        key = storage.put(f"results/{job.id}/1/report.json", [bytes(100)]).key
+        attempts.reserve_results(connection, job.id, 1, 100)
+        registrations.insert_registration(
+            connection,
+            job_id=job.id,
+            scene_id=None,
+            block_versions=[],
+            options={},
+            report={"verdict": "good"},
+            verdict="good",
+            files={"report.json": key},
+        )
+        attempts.succeed(connection, job.id, 1, {"files": {"report.json": key}})
+    return job.id
+
+
+def find(database: Database, job_id: UUID) -> jobs.Job | None:
+    with database.transaction() as connection:
+        return jobs.find(connection, job_id)
+
+
+def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
+    database: Database, storage: Storage, settings: Settings
+):
+    job_id = successful_job(database, storage)
+    clock_jumps(database, 5000)
+    sweep_records(database, storage, settings)
+    assert storage.keys("results"), "the clock jumped, but the service has not run"
+    service_runs(database, 91)
+    sweep_records(database, storage, settings)
+    assert storage.keys("results") == []
+    kept = find(database, job_id)
+    assert kept is not None
+    assert kept.results_removed_at is not None
+    service_runs(database, 275)
+    sweep_records(database, storage, settings)
+    assert find(database, job_id) is None
+    with database.transaction() as connection:
+        row = run_sql(connection, "select job_id, files, verdict from registration").fetchone()
+    assert row == {"job_id": None, "files": {}, "verdict": "good"}
+
+
+def test_jobs_with_files_stay_when_results_are_kept_for_ever(
+    database: Database, storage: Storage, settings: Settings
+):
+    job_id = successful_job(database, storage)
+    service_runs(database, 5000)
+    sweep_records(database, storage, settings.model_copy(update={"result_days": None}))
+    assert find(database, job_id) is not None
+    assert len(storage.keys("results")) == 1
+
+
+def test_results_stored_before_sizes_were_recorded_are_measured(
+    database: Database, storage: Storage, settings: Settings
+):
+    job_id = successful_job(database, storage)
+    with database.transaction() as connection:
+        run_sql(connection, "update job set results_bytes = null")
+    sweep_records(database, storage, settings)
+    with database.transaction() as connection:
+        row = run_sql(connection, "select results_bytes from job where id = %s", [job_id]).fetchone()
+    assert row == {"results_bytes": 100}
+
+
+def test_the_oldest_rows_of_the_audit_are_removed_and_a_row_says_so(
+    database: Database, storage: Storage, settings: Settings
+):
+    with database.transaction() as connection:
+        create_token(connection, "old", ["read"])
+        create_token(connection, "old too", ["read"])
+    service_runs(database, 700)
+    with database.transaction() as connection:
+        create_token(connection, "young", ["read"])
+    clock_jumps(database, 5000)
+    sweep_records(database, storage, settings)
+    assert len(all_changes(database)) == 3, "the clock jumped, but the service has not run"
+    clock_jumps(database, -5000)
+    service_runs(database, 40)
+    sweep_records(database, storage, settings)
+    young, removal = sorted(all_changes(database), key=lambda change: change.id)
+    assert (young.after or {})["name"] == "young"
+    assert (removal.kind, removal.action, removal.actor_name) == ("audit", "deleted", "retention")
+    first, last = removal.subject.split("-")
+    assert (int(first), int(last)) == (young.id - 2, young.id - 1)
+    assert removal.before is not None
+    assert removal.before["rows"] == 2
+
+
+def all_changes(database: Database) -> list:
+    with database.transaction() as connection:
+        return list_changes(connection, 1000, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("days", "statement"),
+    [
+        (29, "delete from audit"),
+        (1000, "delete from audit where id = (select max(id) from audit)"),
+        (1000, "update audit set actor_name = 'x'"),
+        (1000, "truncate audit"),
+    ],
+)
+def test_the_audit_gives_up_nothing_but_its_oldest_rows(
+    connection: Connection, database: Database, days: int, statement: str
+):
+    for name in ("a", "b"):
+        create_token(connection, name, ["read"])
+    connection.commit()
+    service_runs(database, days)
+    with pytest.raises(psycopg.errors.InsufficientPrivilege, match="only grows"):
+        run_sql(connection, statement)
+
+
+def test_a_removed_job_leaves_its_owner_in_the_audit(connection: Connection, database: Database):
+    owner = create_token(connection, "owner", ["register"]).token
+    job = jobs.create(connection, "register-scene", {}, owner.id)
+    assert job is not None
+    connection.commit()
+    with working_for(Origin(actor_name="worker", job_id=job.id)), database.transaction() as own:
+        jobs.dismiss(own, job.id)
+    with database.transaction() as own:
+        assert jobs.delete_ended(own, [job.id]) == [job.id]
+    recorded = list_changes(connection, 10, None, "job", str(job.id))
+    assert [change.action for change in recorded] == ["deleted", "changed", "created"]
+    assert recorded[1].actor == owner.id
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "kept_days"),
+    [
+        ("AMERS_RESULT_DAYS", "never", None),
+        ("AMERS_JOB_RECORD_DAYS", "Never", None),
+        ("AMERS_AUDIT_DAYS", "never", None),
+        ("AMERS_RESULT_DAYS", "2.5", 2.5),
+    ],
+)
+def test_never_keeps_what_a_setting_would_remove(
+    variable: str, value: str, kept_days: float | None, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(variable, value)
+    assert getattr(read_settings(), variable.removeprefix("AMERS_").lower()) == kept_days
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "message"),
+    [
+        ("AMERS_RESULT_DAYS", "sometimes", "AMERS_RESULT_DAYS"),
+        ("AMERS_AUDIT_DAYS", "29", "greater than or equal to 30"),
+        ("AMERS_QUOTA_UPLOAD_BYTES", "1000", "is now AMERS_QUOTA_STORAGE_BYTES"),
+    ],
+)
+def test_settings_that_would_not_be_followed_are_refused(
+    variable: str, value: str, message: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(InputError, match=message):
+        read_settings()

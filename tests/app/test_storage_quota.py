@@ -1,0 +1,353 @@
+"""One quota over everything that a token keeps in the storage, in a folder and in a bucket."""
+
+import io
+import threading
+import zipfile
+from base64 import b64encode
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db import engine, usage
+from app.db.engine import Connection, Database
+from app.db.jobs import attempts, jobs
+from app.errors import TooLarge
+from app.storage import Storage, open_storage
+from app.usecases import quotas, results
+from app.usecases.blocks import lifecycle
+from app.usecases.installation import Installation
+from app.usecases.scenes import SentFile, upload_scene, upload_side_file
+from app.usecases.tokens import create_token
+from tests.app.job_queue import claim
+from tests.app.ledger import bytes_in_ledger, bytes_in_storage, job_runner, make_token
+from tests.app.s3_server import running_bucket
+from tests.factories import BOX, make_block
+
+TIFF = b"II*\0" + bytes(996)
+TUS = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream"}
+PATIENCE_S = 30.0
+in_both = pytest.mark.parametrize("settings", ["folder", "bucket"], indirect=True)
+
+
+@pytest.fixture
+def settings(
+    request: pytest.FixtureRequest, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Settings]:
+    own = Settings(
+        database_url=dsn, data_folder=tmp_path / "data", quota_open_uploads=2, quota_kept_jobs=2
+    )
+    if getattr(request, "param", "folder") == "folder":
+        yield own
+    else:
+        with running_bucket(monkeypatch) as url:
+            yield own.model_copy(update={"storage_url": url})
+
+
+@pytest.fixture
+def storage(settings: Settings) -> Storage:
+    return open_storage(settings)
+
+
+@pytest.fixture
+def admin(bearer: Callable[[str], dict[str, str]]) -> dict[str, str]:
+    return bearer("admin")
+
+
+@pytest.fixture
+def published(connection: Connection, storage: Storage, tmp_path: Path) -> None:
+    """A published block, whose points can be exported."""
+    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block").folder)
+    lifecycle.publish_block(connection, "calanques")
+    connection.commit()
+
+
+def zipped(**files: bytes) -> bytes:
+    """An archive; in names, `_` stands for a dot."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name.replace("_", "."), data)
+    return out.getvalue()
+
+
+def announce(client: TestClient, me: dict[str, str], size: int, name: str, **more: str):
+    """The reply to the announcement of a resumable upload."""
+    pairs = {"filename": name, **more}.items()
+    metadata = ",".join(f"{key} {b64encode(value.encode()).decode()}" for key, value in pairs)
+    headers = me | TUS | {"Upload-Length": str(size), "Upload-Metadata": metadata}
+    return client.post("/uploads", headers=headers)
+
+
+def send(client: TestClient, me: dict[str, str], data: bytes, name: str, **more: str):
+    """The reply to the only piece of a resumable upload."""
+    announced = announce(client, me, len(data), name, **more)
+    assert announced.status_code == 201, announced.text
+    url = announced.headers["location"]
+    return client.patch(url, content=data, headers=me | TUS | {"Upload-Offset": "0"})
+
+
+def used_bytes(client: TestClient, me: dict[str, str], dsn: str) -> int:
+    """What the ledger counts for a caller."""
+    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
+    with engine.connect(dsn) as connection:
+        return usage.read_usage(connection, owner).total_bytes
+
+
+@in_both
+def test_a_token_with_a_quota_of_one_byte_leaves_nothing_by_any_way(
+    client: TestClient,
+    admin: dict[str, str],
+    storage: Storage,
+    settings: Settings,
+    database: Database,
+    published: None,
+):
+    me = make_token(client, admin, storage_quota_bytes=1)
+    for body in (TIFF, iter([TIFF[:500], TIFF[500:]])):
+        refused = client.post("/scenes?name=a.tif", content=body, headers=me)
+        assert refused.status_code == 413, refused.text
+    assert announce(client, me, 1000, "a.tif").status_code == 413
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
+    side_file = client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * 10, headers=me)
+    assert side_file.status_code == 404, "the scene belongs to another token"
+    assert client.delete(f"/scenes/{scene}", headers=admin).status_code == 204
+
+    export = job_runner(client, database, settings, me)("export-block", bbox=BOX)
+    assert (export["status"], export["error"]["error"]) == ("failed", "TooLarge")
+    assert "of 1 bytes are used" in export["error"]["detail"]
+
+    assert announce(client, me, 1, "a.tif").status_code == 201
+    full = client.post("/processes/export-block/execution", json={"inputs": {"bbox": BOX}}, headers=me)
+    assert full.status_code == 413, "the quota is full before the job begins"
+    assert bytes_in_storage(storage) == 0
+
+
+@in_both
+def test_an_archive_counts_unpacked_and_is_refused_before_it_is_unpacked(
+    client: TestClient, admin: dict[str, str], storage: Storage, dsn: str
+):
+    archive = zipped(a_tif=TIFF[:4] + bytes(200_000), a_RPC_TXT=b"x" * 100)
+    assert len(archive) < 2000
+    me = make_token(client, admin, storage_quota_bytes=100_000)
+    refused = send(client, me, archive, "a.zip")
+    assert refused.status_code == 413
+    assert "unpacked to 200" in refused.json()["detail"]
+    assert (bytes_in_storage(storage), used_bytes(client, me, dsn)) == (0, 0)
+    roomy = make_token(client, admin, storage_quota_bytes=200_200)
+    assert send(client, roomy, archive, "a.zip").status_code == 204
+    assert used_bytes(client, roomy, dsn) == bytes_in_storage(storage) == 200_104
+
+
+def test_files_beside_a_scene_count_for_its_owner(
+    client: TestClient, admin: dict[str, str], storage: Storage, dsn: str
+):
+    me = make_token(client, admin, storage_quota_bytes=1500)
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=me).json()["id"]
+    for size, status in ((400, 200), (450, 413), (100, 200), (390, 200)):
+        beside = client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=b"x" * size, headers=me)
+        assert beside.status_code == status, (size, beside.text)
+    assert used_bytes(client, me, dsn) == 1390
+    for chunks in ([b"x" * 60, b"x" * 60], [b"x" * 50]):
+        chunked = client.put(f"/scenes/{scene}/files/b_RPC.TXT", content=iter(chunks), headers=me)
+    assert chunked.status_code == 200
+    by_admin = client.put(f"/scenes/{scene}/files/c_RPC.TXT", content=b"x" * 100, headers=admin)
+    assert by_admin.status_code == 413, "the bytes count for the owner, whoever sends them"
+    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) == 1440
+
+
+def test_a_scene_has_no_more_side_files_than_allowed(
+    client: TestClient, admin: dict[str, str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("app.usecases.scenes.MOST_SIDE_FILES", 2)
+    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
+    statuses = [
+        client.put(f"/scenes/{scene}/files/{name}.txt", content=b"", headers=admin).status_code
+        for name in ("a", "b", "c", "a")
+    ]
+    assert statuses == [200, 200, 429, 200]
+
+
+def test_a_token_has_no_more_open_uploads_than_allowed(client: TestClient, admin: dict[str, str]):
+    me = make_token(client, admin)
+    statuses = [announce(client, me, 10, "a.tif").status_code for _ in range(3)]
+    assert statuses == [201, 201, 429]
+    url = announce(client, admin, 10, "a.tif").headers["location"]
+    assert client.delete(url, headers=admin | TUS).status_code == 204, "others are not affected"
+
+
+def test_a_token_keeps_no_more_jobs_than_allowed_and_can_remove_them(
+    client: TestClient, admin: dict[str, str]
+):
+    me = make_token(client, admin)
+
+    def ask():
+        return client.post(
+            "/processes/export-block/execution", json={"inputs": {"bbox": BOX}}, headers=me
+        )
+
+    made = [ask().headers["location"] for _ in range(2)]
+    for url in made:
+        assert client.delete(url, headers=me).json()["status"] == "dismissed"
+    refused = ask()
+    assert refused.status_code == 429
+    assert "DELETE /jobs/ID" in refused.json()["detail"]
+    assert client.delete(made[0], headers=me).json()["status"] == "dismissed"
+    assert client.get(made[0], headers=me).status_code == 404
+    assert ask().status_code == 201
+
+
+def test_bodies_without_a_length_cannot_exceed_the_quota_together(
+    settings: Settings, database: Database, storage: Storage
+):
+    installation = Installation(database, storage, settings)
+    with database.transaction() as connection:
+        me = create_token(connection, "me", ["register"], storage_quota_bytes=2000).token
+    scene = upload_scene(installation, me, SentFile("a.tif", [TIFF], len(TIFF)))
+    arrived, go_on = threading.Event(), threading.Event()
+
+    def slow() -> Iterator[bytes]:
+        yield TIFF[:100]
+        arrived.set()
+        assert go_on.wait(PATIENCE_S)
+        yield TIFF[100:400]
+
+    first = threading.Thread(
+        target=upload_side_file, args=(installation, me, scene.id, SentFile("b.txt", slow()))
+    )
+    first.start()
+    try:
+        assert arrived.wait(PATIENCE_S)
+        with pytest.raises(TooLarge, match="exceeds the storage quota of token me: 2000 of 2000 bytes"):
+            upload_scene(installation, me, SentFile("c.tif", [TIFF]))
+        with pytest.raises(TooLarge):
+            upload_side_file(installation, me, scene.id, SentFile("d.txt", [b"x"], 1))
+    finally:
+        go_on.set()
+        first.join()
+    with database.transaction() as connection:
+        assert usage.read_usage(connection, me.id).total_bytes == bytes_in_storage(storage) == 1400
+
+
+def test_results_of_jobs_at_the_same_time_cannot_exceed_the_quota_together(
+    settings: Settings, database: Database
+):
+    with database.transaction() as connection:
+        me = create_token(connection, "me", ["register"], storage_quota_bytes=1000).token
+        made = [jobs.create(connection, "register-scene", {}, me.id) for _ in range(2)]
+    with database.transaction() as connection:
+        first, second = (claim(connection, job.id) for job in made if job is not None)
+    assert first is not None
+    assert second is not None
+    outcomes: list[str] = []
+    together = threading.Barrier(2)
+
+    def reserve(job: jobs.Job) -> None:
+        together.wait(PATIENCE_S)
+        try:
+            with database.transaction() as connection:
+                quotas.reserve_results(connection, settings, job, 600)
+            outcomes.append("reserved")
+        except TooLarge:
+            outcomes.append("refused")
+
+    threads = [threading.Thread(target=reserve, args=(job,)) for job in (first, second)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["refused", "reserved"]
+
+
+@in_both
+def test_an_owner_removes_the_results_of_a_job_and_the_history_stays(
+    client: TestClient,
+    admin: dict[str, str],
+    storage: Storage,
+    settings: Settings,
+    database: Database,
+    published: None,
+    dsn: str,
+):
+    me = make_token(client, admin)
+    job = job_runner(client, database, settings, me)("export-block", bbox=BOX)
+    assert job["status"] == "successful", job
+    here = f"/jobs/{job['jobID']}"
+    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) > 1000
+    stranger = make_token(client, admin)
+    assert client.delete(here, headers=stranger).status_code == 404
+    assert client.delete(here, headers=me).json()["status"] == "dismissed"
+    assert client.get(here, headers=me).status_code == 404
+    assert used_bytes(client, me, dsn) == bytes_in_storage(storage) == 0
+    record = client.get("/audit", params={"subject": job["jobID"]}, headers=admin).json()["changes"]
+    assert record[0]["action"] == "deleted"
+
+
+def test_an_attempt_that_is_lost_gives_its_room_back(
+    settings: Settings, database: Database, storage: Storage
+):
+    with database.transaction() as connection:
+        me = create_token(connection, "me", ["register"]).token
+        made = [jobs.create(connection, "register-scene", {}, me.id) for _ in range(3)]
+    for ending, job in zip(("fail", "dismiss", "succeed"), made, strict=True):
+        assert job is not None
+        with database.transaction() as connection:
+            attempt = claim(connection, job.id)
+            assert attempt is not None
+            quotas.reserve_results(connection, settings, attempt, 100)
+        storage.put(f"results/{job.id}/1/a", [bytes(100)])
+        with database.transaction() as connection:
+            if ending == "fail":
+                attempts.fail(connection, job.id, 1, {"title": "x"})
+            elif ending == "dismiss":
+                jobs.dismiss(connection, job.id)
+            else:
+                attempts.succeed(connection, job.id, 1, {"files": {"a": f"results/{job.id}/1/a"}})
+    assert bytes_in_storage(storage) == 300
+    results.reconcile_results(database, storage)
+    with database.transaction() as connection:
+        assert usage.read_usage(connection, me.id).result_bytes == bytes_in_storage(storage) == 100
+
+
+@in_both
+def test_the_ledger_equals_the_storage_after_a_mixed_run(
+    client: TestClient,
+    admin: dict[str, str],
+    storage: Storage,
+    settings: Settings,
+    database: Database,
+    published: None,
+    dsn: str,
+):
+    callers = [make_token(client, admin), make_token(client, admin, storage_quota_bytes=150_000)]
+    for me in callers:
+        kept, removed = (
+            client.post("/scenes?name=a.tif", content=body, headers=me).json()["id"]
+            for body in (TIFF, iter([TIFF, b"more"]))
+        )
+        for scene in (kept, removed):
+            for content in (b"x" * 300, b"x" * 200):
+                client.put(f"/scenes/{scene}/files/a_RPC.TXT", content=content, headers=me)
+        assert send(client, me, b"x" * 50, "b_RPC.TXT", scene=kept).status_code == 204
+        assert send(client, me, TIFF, "b.tif").status_code == 204
+        archive = zipped(c_tif=TIFF + bytes(9000), c_RPC_TXT=b"x")
+        assert send(client, me, archive, "c.zip").status_code == 204
+        assert client.post("/scenes?name=a.tif", content=b"no image", headers=me).status_code == 422
+        assert client.delete(f"/scenes/{removed}", headers=me).status_code == 204
+        run = job_runner(client, database, settings, me)
+        run("export-block", bbox=BOX)
+        run("export-block", bbox=(50.0, 43.0, 51.0, 44.0))
+    archive = zipped(block_json=b"{}")
+    assert client.put("/blocks/uploads/b.zip", content=archive, headers=admin).status_code < 300
+    assert client.put("/blocks/uploads/b.zip", content=iter([archive]), headers=admin).status_code < 300
+    with engine.connect(dsn) as connection:
+        assert bytes_in_ledger(connection) == bytes_in_storage(storage)
+        held = {one.owner: one for one in usage.read_all_usage(connection)}
+    roomy, small = (held[UUID(client.get("/tokens/self", headers=me).json()["id"])] for me in callers)
+    assert (roomy.scenes, roomy.jobs, roomy.open_uploads) == (3, 2, 0)
+    assert roomy.scene_bytes == small.scene_bytes == 1000 + 200 + 50 + 1000 + 10_000 + 1
+    assert roomy.result_bytes > 150_000
+    assert small.result_bytes == 0
