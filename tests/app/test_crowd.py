@@ -48,7 +48,7 @@ def app(dsn: str, tmp_path: Path) -> FastAPI:
 def client_of(app: FastAPI, headers: dict[str, str] | None = None) -> httpx.AsyncClient:
     """A client in the process of a started application."""
     return httpx.AsyncClient(
-        transport=httpx.ASGITransport(app), base_url="http://service", headers=headers
+        transport=httpx.ASGITransport(app), base_url="http://localhost", headers=headers
     )
 
 
@@ -72,11 +72,11 @@ def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
     # Pages of more pieces than are read ahead keep their connection while others wait for it.
     monkeypatch.setattr(features, "ROWS_AT_ONCE", POINTS // 6)
     kinds = [
-        ("GET", f"http://service{ITEMS}/{FIRST_ID}", 200),
-        ("GET", f"http://service{ITEMS}?limit=10000", 200),
-        ("GET", f"http://service{ITEMS}/{FIRST_ID + 1}/chips", 200),
-        ("GET", "http://service/tokens", 200),
-        ("POST", "http://service/tokens", 201),
+        ("GET", f"http://localhost{ITEMS}/{FIRST_ID}", 200),
+        ("GET", f"http://localhost{ITEMS}?limit=10000", 200),
+        ("GET", f"http://localhost{ITEMS}/{FIRST_ID + 1}/chips", 200),
+        ("GET", "http://localhost/tokens", 200),
+        ("POST", "http://localhost/tokens", 201),
     ]
     headers = bearer("admin")
     body = {"name": "one of many", "scopes": ["read"]}
@@ -103,7 +103,7 @@ def test_a_reader_of_a_page_in_pieces_who_is_gone_gives_the_only_connection_back
     scope = {
         **{"type": "http", "method": "GET", "scheme": "http", "path": ITEMS, "root_path": ""},
         "query_string": b"limit=10000",
-        "headers": [(b"host", b"service"), (b"authorization", token["Authorization"].encode())],
+        "headers": [(b"host", b"localhost"), (b"authorization", token["Authorization"].encode())],
     }
 
     async def read_on() -> None:
