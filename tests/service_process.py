@@ -68,9 +68,20 @@ class Service:
             return False
 
     def workers(self) -> list[int]:
-        """The processes, other than the API, that have a lease of the cluster."""
+        """The workers that have a lease of the cluster."""
+        return self._children("worker")
+
+    def apis(self) -> list[int]:
+        """The processes of the API that have a lease of the cluster."""
+        return self._children("api")
+
+    def _children(self, kind: str) -> list[int]:
         lease = self.cluster.folder / "lease"
-        return [number for number in users_of(lease) if number != self.process.pid]
+        return [
+            number
+            for number in users_of(lease)
+            if f"\0{kind}\0".encode() in Path(f"/proc/{number}/cmdline").read_bytes()
+        ]
 
 
 def users_of(file: Path) -> list[int]:

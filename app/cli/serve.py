@@ -1,40 +1,31 @@
-"""`amers serve`: the API and one worker."""
+"""`amers serve`: the API and one worker, each a process that is restarted when it dies.
 
-import gc
+This process supervises: it has the private database, the listening sockets and the two processes. It
+imports little and reads nothing that a caller sends. A crash of the API ends neither the worker nor the
+connections that wait to be accepted.
+"""
+
 import logging
-import os
-import subprocess
-import sys
+import signal
+import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from importlib import import_module
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Annotated
 
 import typer
-import uvicorn
 
 from app import logs
-from app.api import connections
+from app.cli.supervisor import Child, Supervisor
 from app.config import Settings, read_settings
 from app.db import revisions
 from app.db.cluster import embedded
+from app.errors import InputError
 
-if TYPE_CHECKING:
-    from fastapi import FastAPI
-
-WORKER = """
-import ctypes, os, signal, sys
-from app.cli.main import main
-ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: end when the parent is killed
-if os.getppid() == int(sys.argv.pop()):
-    main()
-"""
-FIRST_PAUSE_S = 1.0
-LONGEST_PAUSE_S = 60.0
-STOP_SECONDS = 20.0
-DRAIN_SECONDS = 30
-"""Time that requests under way have to finish when the service stops."""
+BACKLOG = 2048
+"""Connections that wait to be accepted, as while the API is restarted."""
+API_ENDING_S = 45.0
+"""Time to complete requests under way (30 s) and to close what the API has opened."""
 WATCH_S = 2.0
 
 log = logging.getLogger(__name__)
@@ -49,30 +40,53 @@ def serve(
     """Run the API and one worker, until Ctrl-C."""
     settings = read_settings()
     logs.configure(settings)
-    with embedded.database(settings) as dsn:
+    supervisor = Supervisor()
+    with ExitStack() as stack:
+        listeners = _listeners(host or settings.host, port or settings.port)
+        close = stack.enter_context(ExitStack())
+        for listener in listeners:
+            close.enter_context(listener)
+        dsn = stack.enter_context(embedded.database(settings))
         revisions.ensure_schema(dsn, upgradable=settings.database_url is None)
-        command = (sys.executable, "-c", WORKER, "worker", str(os.getpid()))
-        with database_watched(settings), companion(command if worker else None):
-            uvicorn.run(
-                _application(),
-                factory=True,
-                host=host or settings.host,
-                port=port or settings.port,
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                **connections.server_options(settings),
-                timeout_graceful_shutdown=DRAIN_SECONDS,
-            )
+        with database_watched(settings):
+            supervisor.run(_children(listeners, worker), at_stop=close.close)
+    if supervisor.exit_code:
+        raise typer.Exit(supervisor.exit_code)
 
 
-def _application() -> "Callable[[], FastAPI]":
-    """The factory of the application, imported without a search for garbage: what is imported stays."""
-    gc.disable()
-    create_app: Callable[[], FastAPI] = import_module("app.main").create_app
-    gc.freeze()
-    gc.enable()
-    return create_app
+def _children(listeners: list[socket.socket], worker: bool) -> list[Child]:
+    descriptors = tuple(listener.fileno() for listener in listeners)
+    api = Child(
+        "the API",
+        "from app.cli.api_process import run; run([int(text) for text in sys.argv[2:]])",
+        ("api", *map(str, descriptors)),
+        death_signal=signal.SIGKILL,
+        descriptors=descriptors,
+        ending_s=API_ENDING_S,
+        must_start=True,
+    )
+    the_worker = Child("the worker", "from app.cli.main import main; main()", ("worker",))
+    return [api, the_worker] if worker else [api]
+
+
+def _listeners(host: str, port: int) -> list[socket.socket]:
+    """Sockets that listen on all addresses of a host.
+
+    Raises:
+        InputError: there is no such host, or the port is used or forbidden.
+    """
+    listeners: list[socket.socket] = []
+    try:
+        places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        for family, _, _, _, address in dict.fromkeys(places):
+            listeners.append(socket.create_server(address[:2], family=family, backlog=BACKLOG))
+    except OSError as error:
+        for listener in listeners:
+            listener.close()
+        raise InputError(
+            f"cannot listen on {host}, port {port}: {error.strerror}: choose another with --host, --port"
+        ) from None
+    return listeners
 
 
 @contextmanager
@@ -94,51 +108,3 @@ def database_watched(settings: Settings) -> Iterator[None]:
     finally:
         stop.set()
         watcher.join()
-
-
-@contextmanager
-def companion(command: tuple[str, ...] | None) -> Iterator[None]:
-    """Run a command beside this one: restart it when it dies, stop it at the end of the context."""
-    if command is None:
-        yield
-        return
-    stop = threading.Event()
-    keeper = threading.Thread(
-        target=_keep_running, args=(command, stop), name="worker-keeper", daemon=True
-    )
-    keeper.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        keeper.join()
-
-
-def _keep_running(command: tuple[str, ...], stop: threading.Event) -> None:
-    """Run a command until `stop`; the pause before a restart doubles when it dies soon."""
-    pause_s = FIRST_PAUSE_S
-    while not stop.is_set():
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
-        lived_s = _wait(process, stop)
-        if stop.is_set():
-            break
-        pause_s = FIRST_PAUSE_S if lived_s > LONGEST_PAUSE_S else min(2 * pause_s, LONGEST_PAUSE_S)
-        log.error(
-            "the worker ended with exit code %d and is restarted in %.0f s", process.returncode, pause_s
-        )
-        stop.wait(pause_s)
-
-
-def _wait(process: "subprocess.Popen[bytes]", stop: threading.Event) -> float:
-    """Wait until the process ends, or end it on `stop`; returns how many seconds it lived."""
-    lived_s = 0.0
-    while process.poll() is None and not stop.wait(0.2):
-        lived_s += 0.2
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(STOP_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-    return lived_s

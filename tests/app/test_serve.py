@@ -4,11 +4,14 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
+import httpx
 import numpy as np
 import pytest
 
@@ -56,15 +59,42 @@ def test_a_killed_worker_is_replaced(service):
     assert service.is_ready()
 
 
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_killed_api_is_replaced_while_its_callers_wait_and_its_worker_lives(service, ending):
+    workers, (api,) = service.workers(), service.apis()
+    os.kill(api, ending)
+    assert until(lambda: not Path(f"/proc/{api}").exists())
+    # A connection is not refused: it waits until the next process of the API accepts it.
+    assert httpx.get(f"{service.url}/readyz", timeout=60).status_code == 200
+    assert service.apis() not in ([], [api])
+    assert service.workers() == workers
+    assert f"the API ended with exit code {-ending} and is restarted" in service.log.read_text()
+
+
+def test_a_used_port_ends_the_service_with_the_reason(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as used:
+        port = used.getsockname()[1]
+        run = subprocess.run(
+            [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)],
+            env=os.environ | {"AMERS_DATA_FOLDER": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    assert run.returncode == 2
+    assert f"amers: cannot listen on 127.0.0.1, port {port}: Address already in use" in run.stderr
+
+
 def test_a_killed_database_is_restarted(service):
     os.kill(int((service.cluster.data / "postmaster.pid").read_text().splitlines()[0]), signal.SIGKILL)
     assert until(service.is_ready)
 
 
-def test_a_service_that_is_killed_leaves_no_worker_behind(service):
+def test_a_service_that_is_killed_leaves_neither_api_nor_worker_behind(service):
     service.process.kill()
     service.process.wait(timeout=60)
     assert until(lambda: users_of(service.cluster.folder / "lease") == [])
+    assert refuses(service.port)
 
 
 def test_requests_under_way_are_answered_when_the_service_is_stopped(service, tmp_path):

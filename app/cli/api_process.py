@@ -1,0 +1,52 @@
+"""The process of the API: `amers serve` starts it, and starts it again when it dies."""
+
+import gc
+import logging
+import socket
+from importlib import import_module
+
+import uvicorn
+
+from app import logs
+from app.api import connections
+from app.config import read_settings
+
+DRAIN_SECONDS = 30
+"""Time that requests under way have to finish when the service stops."""
+
+log = logging.getLogger(__name__)
+
+
+class _Server(uvicorn.Server):
+    """A server that logs when it is ready on given sockets; uvicorn does so for its own only."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listener in sockets or []:
+            host, port = listener.getsockname()[:2]
+            log.info("running on http://%s:%d", f"[{host}]" if ":" in host else host, port)
+
+
+def run(descriptors: list[int]) -> None:
+    """Serve the API until a signal.
+
+    Args:
+        descriptors: file descriptors of sockets that listen; they are closed at the signal.
+    """
+    settings = read_settings()
+    logs.configure(settings)
+    # What is imported stays: a search for garbage in it finds none.
+    gc.disable()
+    application = import_module("app.main").create_app
+    gc.freeze()
+    gc.enable()
+    config = uvicorn.Config(
+        application,
+        factory=True,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        **connections.server_options(settings),
+        timeout_graceful_shutdown=DRAIN_SECONDS,
+    )
+    _Server(config).run([socket.socket(fileno=number) for number in descriptors])
