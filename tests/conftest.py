@@ -24,9 +24,15 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add `--fast`."""
+    """Add `--fast` and `--attacks`."""
     parser.addoption(
         "--fast", action="store_true", help="leave out journeys, long tests, tests that need a database"
+    )
+    parser.addoption(
+        "--attacks",
+        choices=("bounded", "full"),
+        default="bounded",
+        help="how many hostile values and filters to try: some, or all as `make test-security` does",
     )
 
 
