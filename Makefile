@@ -8,7 +8,7 @@ READY := .venv/ready
 PAGE := app/web/built/index.html
 LONG := faults load stress
 
-.PHONY: demo test test-fast check docs serve bench bench-registration bench-load bench-faults postgis page chromium
+.PHONY: demo test test-fast test-security check docs serve bench bench-registration bench-load bench-faults postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
@@ -21,6 +21,10 @@ test: check postgis page chromium
 # Under two minutes on two cores: no database, no journeys, nothing long. It reports what it leaves out.
 test-fast: $(READY)
 	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder
+
+# All operations with all callers, and all hostile values, filters, archives and images: some minutes.
+test-security: postgis
+	$(BIN)/python -m pytest -m security --attacks full -n auto --dist loadfile --no-loadscope-reorder
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

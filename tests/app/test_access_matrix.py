@@ -24,6 +24,8 @@ from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import SIGMA_M, make_flat_world
 from tests.app.hostile_installation import Installation, hostile_installation, told
 
+pytestmark = pytest.mark.security
+
 METHODS = ("get", "head", "options", "post", "put", "patch", "delete")
 UNDESCRIBED = {"/api", "/map", "/map/{name}"}
 """Routes that are no part of the description: the description itself, and the page."""

@@ -27,6 +27,8 @@ from tests.app.hostile_installation import (
 )
 from tests.factories import make_block
 
+pytestmark = pytest.mark.security
+
 TUS = {"Tus-Resumable": "1.0.0"}
 Files = dict[str, bytes]
 

@@ -15,6 +15,8 @@ from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.flat_world import make_flat_world
 from tests.app.hostile_installation import CANARY, Installation, hostile_installation, told
 
+pytestmark = pytest.mark.security
+
 CASES = [*BAD_REQUESTS, *DELIVERIES]
 
 

@@ -20,6 +20,8 @@ from app.usecases.jobs import do_attempt
 from tests.app.job_queue import claim
 from tests.factories import BOX, make_block
 
+pytestmark = pytest.mark.security
+
 
 def ingested_by_job(client, settings, admin, body: dict) -> dict:
     """The outcome of an ingestion requested over HTTP and done by the code of the worker process."""

@@ -17,6 +17,8 @@ from app.api.routes import CallerRoute
 from app.config import Settings
 from app.main import create_app
 
+pytestmark = pytest.mark.security
+
 PIECE = b"II*\0" + bytes(16_380)
 UPLOAD_LIMIT_BYTES = 400_000
 BODY_LIMIT_BYTES = 200_000

@@ -19,6 +19,8 @@ from app.db.points import POINTS
 from app.errors import InvalidParameter
 from tests.app.filter_attacks import NAMED
 
+pytestmark = pytest.mark.security
+
 OVERFLOW = "-" * 3900 + "1"
 ENDLESS = "(" * 40 + "1" + ",2)" * 40
 

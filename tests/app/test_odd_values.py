@@ -16,7 +16,7 @@ from tests.app.odd_values import Target, in_url, json_text, targets, with_member
 from tests.app.running_service import Served, service_with_a_block
 from tests.app.test_access_matrix import OPERATIONS
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.security]
 
 VALUES = {"bounded": 800, "full": 10_000}
 LONGEST_REPLY_S = 30.0

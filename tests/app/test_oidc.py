@@ -14,6 +14,8 @@ from app.db import engine
 from app.main import create_app
 from app.usecases.tokens import revoke_token
 
+pytestmark = pytest.mark.security
+
 
 class LocalIssuer:
     """An issuer with one key, and the requests it received."""

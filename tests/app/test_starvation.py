@@ -19,6 +19,8 @@ from app.usecases.tokens import create_token
 from tests.app.bystander import Bystander, bystander
 from tests.app.running_service import Served, service_with_a_block
 
+pytestmark = pytest.mark.security
+
 POINTS = 2_100
 """More features than are built as one text, so that they are streamed."""
 SMALL_WINDOW = 4096

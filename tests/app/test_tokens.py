@@ -13,6 +13,8 @@ from app.errors import Conflict, InputError, NotAllowed, NotFound
 from app.usecases.tokens import create_token, list_tokens, revoke_token
 from tests.statements import run_sql
 
+pytestmark = pytest.mark.security
+
 ALLOWED = {
     "read": {Scope.READ},
     "register": {Scope.READ, Scope.REGISTER},
