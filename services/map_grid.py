@@ -5,10 +5,13 @@ from functools import cache
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
 
+from services.errors import InputError
 from services.geodesy import longitudes_near, metres_per_degree_at
 from services.types import Array, BoolArray
 
+AUTHORITIES = ("EPSG", "ESRI", "IGNF", "OGC")
 _DIFFERENCE_M = 50.0
 """Half the length of the central differences of a derivative. Their relative error is the square of this
 length over the radius of the Earth, 1e-10."""
@@ -82,6 +85,42 @@ class MapGrid:
         return np.asarray(
             ((line_sample >= -0.5) & (line_sample <= np.array(self.shape) - 0.5)).all(axis=1)
         )
+
+
+def crs_of_code(code: str) -> CRS:
+    """The reference system with a code such as "EPSG:32631", from the database of PROJ.
+
+    Definitions, files and addresses, which PROJ would accept too, are refused.
+
+    Raises:
+        InputError: the text is no such code, or the database does not have it.
+    """
+    authority, _, number = code.partition(":")
+    if authority in AUTHORITIES and number.isascii() and number.isalnum():
+        try:
+            return CRS.from_authority(authority, number)
+        except CRSError:
+            pass
+    raise InputError(
+        f"{code[:80]!r} is no known reference system; expected a code of {', '.join(AUTHORITIES)}, "
+        "such as EPSG:32631"
+    )
+
+
+def check_map_code(code: str) -> None:
+    """Refuse a reference system that no map on the Earth can have.
+
+    Raises:
+        InputError: it is not known, has no map coordinates, or is not of the Earth.
+    """
+    crs = crs_of_code(code)
+    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    if not (parts[0].is_projected or parts[0].is_geographic):
+        raise InputError(f"{code}: {crs.name} has no map coordinates; a projected system expected")
+    try:
+        xy_of_lon_lat(code, np.zeros((1, 2)))
+    except ProjError as error:
+        raise InputError(f"{code}: {crs.name} cannot be reached from WGS 84") from error
 
 
 def xy_of_lon_lat(crs: str, lon_lat: Array) -> Array:

@@ -27,6 +27,7 @@ from app.errors import (
     TooMany,
     is_no_room,
 )
+from app.json_values import usable
 from app.usecases.damage import report_damage
 
 PROBLEM_JSON = "application/problem+json"
@@ -88,7 +89,9 @@ def problem(
         "status": status,
         "detail": detail,
     }
-    return JSONResponse(jsonable_encoder({**body, **more}), status, headers, media_type=PROBLEM_JSON)
+    return JSONResponse(
+        usable(jsonable_encoder({**body, **more})), status, headers, media_type=PROBLEM_JSON
+    )
 
 
 def status_of(error: AmersError) -> int:

@@ -20,15 +20,16 @@ from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.quotas import FREE_ROOM
 from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
+from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile, read_terrain
+from services.formats.elevation.geoid import vertical_crs
 from services.formats.images.bands import one_band
 from services.formats.images.ortho import write_cog
 from services.formats.images.raster import RasterImage
 from services.formats.images.scenes import read_scene
 from services.imagery.scene import Scene, scene_gsd_m
-from services.map_grid import MapGrid
+from services.map_grid import MapGrid, check_map_code
 from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choose_grid, orthorectify
 from services.types import Progress, no_progress
 
@@ -262,9 +263,17 @@ def _data_bands(image: RasterImage) -> list[int]:
 def _check(connection: Connection, caller: Token, inputs: OrthorectifyScene) -> None:
     check_scene(connection, caller, inputs.scene)
     check_file_names(inputs, "dem", "model", "geoid")
+    if inputs.map.gsd_m is not None and not inputs.map.gsd_m > 0.0:
+        raise InputError(f"map.gsd_m: {inputs.map.gsd_m:g} found, a length above 0 m expected")
     scene = scenes.find_scene(connection, inputs.scene)
     if scene is not None and scene.gsd_m is not None and inputs.map.gsd_m is not None:
         require_warranted_gsd(inputs.map.gsd_m, scene.gsd_m)
+    if inputs.map.crs is not None:
+        with naming("map.crs"):
+            check_map_code(inputs.map.crs)
+    if inputs.vertical is not None:
+        with naming("vertical"):
+            vertical_crs(inputs.vertical)
     if inputs.registration is not None:
         if inputs.model is not None:
             raise InputError("model, registration: only one of both is expected")

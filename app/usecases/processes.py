@@ -1,7 +1,7 @@
 """What a process is: work that users request and workers do, in the sense of OGC API - Processes."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 from uuid import UUID
 
@@ -13,6 +13,7 @@ from app.db.engine import Connection, Database
 from app.db.jobs.jobs import Job
 from app.db.tokens import Token
 from app.errors import InputError
+from app.json_values import unusable_value
 from app.storage import Storage
 from services.docstrings import attribute_descriptions
 from services.types import Progress
@@ -97,6 +98,7 @@ class Process:
         """
         adapter: TypeAdapter[Any] = TypeAdapter(self.inputs)
         try:
+            _refuse_unusable(document, self.id)
             inputs = adapter.validate_python(document)
         except ValidationError as error:
             problems = "; ".join(
@@ -104,6 +106,8 @@ class Process:
                 for item in error.errors()
             )
             raise InputError(f"inputs of {self.id}: {problems}") from None
+        # A text such as "NaN" becomes a number only now.
+        _refuse_unusable(asdict(inputs), self.id)
         unknown = _unknown_fields(document, adapter.dump_python(inputs, mode="json"))
         if unknown:
             raise InputError(f"inputs of {self.id}: {', '.join(unknown)}: no such input")
@@ -123,6 +127,13 @@ class Process:
         """JSON Schema of the inputs."""
         adapter: TypeAdapter[Any] = TypeAdapter(self.inputs)
         return adapter.json_schema()
+
+
+def _refuse_unusable(inputs: dict[str, Any], process_id: str) -> None:
+    """Refuse inputs that no job can store: infinite numbers, NaN, and texts that are not Unicode."""
+    problem = unusable_value(inputs, "inputs")
+    if problem is not None:
+        raise InputError(f"{problem} ({process_id})")
 
 
 def _unknown_fields(document: dict[str, Any], understood: dict[str, Any], path: str = "") -> list[str]:

@@ -1,5 +1,7 @@
 """Checks of jobs on an uploaded scene: of the scene, and of the names of files beside its image."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from uuid import UUID
 
@@ -37,6 +39,15 @@ def check_file_names(inputs: Any, *fields: str) -> None:
         name = getattr(inputs, field)
         if name is not None and name != clean_name(name):
             raise InputError(f"{field}: {name!r} is not the name of a file uploaded beside the image")
+
+
+@contextmanager
+def naming(field: str) -> Iterator[None]:
+    """Put the name of an input before the message of its refusal."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{field}: {error}") from None
 
 
 def present_scene(connection: Connection, scene_id: UUID) -> SceneRow:

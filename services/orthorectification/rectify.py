@@ -12,7 +12,7 @@ from services.errors import CoverageError, InputError
 from services.geodesy import metres_per_degree
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window, block_means, low_pass
-from services.map_grid import MapGrid, utm_of, xy_of_lon_lat
+from services.map_grid import MapGrid, check_map_code, utm_of, xy_of_lon_lat
 from services.orthorectification.mapping import map_into_image, occluded_ground
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
@@ -83,8 +83,11 @@ def choose_grid(
 
     Raises:
         CoverageError: the terrain does not reach the scene.
-        InputError: the scene is outside the map, or the map would be too large.
+        InputError: the reference system is not known, the scene is outside the map, or the map would be
+            too large.
     """
+    if crs is not None:
+        check_map_code(crs)
     positions = _grid_over(scene.image.shape)
     low, high = scene.model.height_range_m
     around = terrain.around(_located(scene.model, positions, (low, high)))

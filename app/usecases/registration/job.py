@@ -22,8 +22,9 @@ from app.usecases.registration.register import (
     run_registration,
 )
 from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_file_names, check_scene, present_scene
+from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from app.usecases.scenes import local_image, stored_keys
+from services.formats.gcp.marked_points import check_heights
 from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
 from services.registration.options import RegistrationOptions
@@ -66,6 +67,9 @@ def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None
     check_file_names(inputs, "model", "mask", "check_points")
     if inputs.bands is not None:
         parse_bands(inputs.bands)
+    if inputs.check_heights is not None:
+        with naming("check_heights"):
+            check_heights(inputs.check_heights)
 
 
 def _run(work: Work) -> Commit:

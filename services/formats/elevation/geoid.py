@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
-from pyproj.exceptions import CRSError, ProjError
+from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
-from services.errors import VerticalDatumError
+from services.errors import InputError, VerticalDatumError
+from services.map_grid import crs_of_code
 from services.terrain import Geoid
 from services.types import Array
 
@@ -77,7 +78,7 @@ def vertical_crs(name: str) -> CRS | None:
     """The vertical reference system with a name; None for the ellipsoid.
 
     Args:
-        name: "ellipsoid", "EGM84", "EGM96", "EGM2008", or a definition for PROJ such as "EPSG:5720".
+        name: "ellipsoid", "EGM84", "EGM96", "EGM2008", or a code such as "EPSG:5720".
 
     Raises:
         VerticalDatumError: the name is none of these.
@@ -85,13 +86,13 @@ def vertical_crs(name: str) -> CRS | None:
     if name.lower() in ("ellipsoid", "wgs84", "wgs 84"):
         return None
     try:
-        crs = CRS.from_user_input(NAMED.get(name.upper(), name))
-    except CRSError:
+        crs = crs_of_code(NAMED.get(name.upper(), name))
+    except InputError:
         crs = None
     if crs is None or not crs.is_vertical or crs.is_compound:
         raise VerticalDatumError(
-            f"vertical datum: {name} given; expected ellipsoid, {', '.join(NAMED)} or the code of a "
-            "vertical reference system"
+            f"vertical datum: {name[:80]} given; expected ellipsoid, {', '.join(NAMED)} or the code of "
+            "a vertical reference system"
         )
     return crs
 

@@ -15,6 +15,7 @@ Only the readers and writers of these formats convert: everywhere else the centr
 (0, 0) and heights are above the WGS 84 ellipsoid.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,12 +25,15 @@ from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
 
-from services.errors import FormatError, VerticalDatumError
+from services.errors import FormatError, InputError, VerticalDatumError
+from services.map_grid import crs_of_code
 from services.types import Array, BoolArray
 
 WGS84_3D = CRS.from_epsg(4979)
 ELLIPSOID = "ellipsoid"
 """The `heights` of a caller whose heights are above the ellipsoid of their reference system."""
+NAMES_FILES = re.compile(r"\b(init|\w*grids|catalog)\s*=|proj\s*=\s*pipeline", re.IGNORECASE)
+"""Parts of a PROJ string that make PROJ read other files."""
 
 StrArray = npt.NDArray[np.str_]
 
@@ -136,17 +140,31 @@ def to_wgs84(
 
 
 def parse_crs(definition: str, source: str) -> CRS:
-    """The reference system of a definition: a code, WKT or a PROJ string.
+    """The reference system of a definition: a code, WKT or a PROJ string that names no other files.
 
     Raises:
-        FormatError: PROJ does not understand the definition.
+        FormatError: PROJ does not understand the definition, or it names files.
     """
     try:
+        if NAMES_FILES.search(definition):
+            raise CRSError("definitions of files are not read")
         return CRS.from_user_input(definition)
     except CRSError:
         raise FormatError(
             f"{source}: expected a reference system, such as EPSG:32633, found {definition[:60]!r}"
         ) from None
+
+
+def check_heights(heights: str) -> None:
+    """Refuse what is neither "ellipsoid" nor the code of a vertical reference system.
+
+    Raises:
+        InputError: the heights cannot be used.
+    """
+    if heights != ELLIPSOID and not crs_of_code(heights).is_vertical:
+        raise VerticalDatumError(
+            f"heights: {heights} given, {ELLIPSOID!r} or a vertical reference system expected"
+        )
 
 
 def _with_heights(crs: CRS, heights: str | None, source: str) -> CRS:
@@ -157,9 +175,9 @@ def _with_heights(crs: CRS, heights: str | None, source: str) -> CRS:
         )
     if heights == ELLIPSOID:
         return crs.to_3d()
-    vertical = parse_crs(heights, source)
-    if not vertical.is_vertical:
-        raise VerticalDatumError(
-            f"{source}: heights: {heights} given, {ELLIPSOID!r} or a vertical reference system expected"
-        )
+    try:
+        check_heights(heights)
+    except InputError as error:
+        raise VerticalDatumError(f"{source}: {error}") from None
+    vertical = crs_of_code(heights)
     return CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical])

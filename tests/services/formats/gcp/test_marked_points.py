@@ -16,7 +16,7 @@ from rasterio.transform import RPCTransformer, from_gcps
 
 from services.errors import AmersError, FormatError, InputError, VerticalDatumError
 from services.formats.gcp.json_formats import format_opf, opf_camera_id, parse_geojson_points, parse_opf
-from services.formats.gcp.marked_points import MarkedPoints, marked_points
+from services.formats.gcp.marked_points import MarkedPoints, marked_points, parse_crs
 from services.formats.gcp.odm import format_gcp_list, parse_gcp_list
 from services.formats.gcp.pci import format_pci_text, parse_pci_text
 from services.formats.gcp.reader import read_control_points
@@ -279,8 +279,22 @@ def test_heights_without_a_datum_are_refused(name: str) -> None:
         VerticalDatumError, match=r"EPSG:4326 given, .* a vertical reference system expected"
     ):
         read_control_points(GOLDEN / name, "EPSG:4326")
-    with pytest.raises(FormatError, match=r"expected a reference system, .* found 'sea'"):
+    with pytest.raises(VerticalDatumError, match=r"'sea' is no known reference system"):
         read_control_points(GOLDEN / name, "sea")
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad",
+        "+init=/etc/passwd:root",
+        "+proj=longlat +ellps=WGS84 +nadgrids=/etc/passwd",
+        "+proj=longlat +ellps=WGS84 +geoidgrids=http://127.0.0.1:9/x +type=crs",
+    ],
+)
+def test_a_reference_system_that_names_files_is_refused(definition: str) -> None:
+    with pytest.raises(FormatError, match="expected a reference system"):
+        parse_crs(definition, "a file")
 
 
 def test_the_geoid_height_of_an_opf_point_is_added() -> None:
