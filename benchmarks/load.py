@@ -136,9 +136,11 @@ def _measure(
                 if wrong:
                     load.errors[f"{kind}: {wrong}"] += 1
 
+    (api,) = service.apis()
+
     def sample() -> None:
         while not stop.wait(SAMPLE_EVERY_S):
-            for name, pid in (("api", service.process.pid), ("worker", worker)):
+            for name, pid in (("api", api), ("worker", worker)):
                 memory[name].append(_resident_bytes(pid))
 
     threads = [threading.Thread(target=client, args=(number,)) for number in range(clients)]

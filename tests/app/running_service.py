@@ -18,7 +18,7 @@ from app.usecases.blocks import lifecycle
 from app.usecases.tokens import create_token
 from services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
-from tests.app.worker_processes import wait_until
+from tests.app.worker_processes import children, wait_until
 from tests.factories import make_block
 from tests.service_process import free_port, until
 
@@ -32,7 +32,7 @@ class Served:
         authorization: the header of a caller.
         folder: where its log and the caller's files may lie.
         dsn: of its database.
-        pid: of its process.
+        pid: of the process of its API.
     """
 
     url: str
@@ -79,7 +79,8 @@ def service_with_a_block(
         try:
             assert until(lambda: _answers(url)), log.read_text()
             authorization = {"Authorization": f"Bearer {secret}"}
-            yield Served(url, made.points, authorization, folder, dsn, process.pid)
+            (api,) = children(process.pid)
+            yield Served(url, made.points, authorization, folder, dsn, api)
         finally:
             process.terminate()
             process.wait()
