@@ -27,7 +27,7 @@ WORKERS = 2
 LONGEST_REST_S = 1.0
 """Longest time until a killed process is restarted."""
 PATIENCE_S = 120.0
-VICTIMS = ("api", "worker", "attempt", "database")
+VICTIMS = ("api", "worker", "server", "attempt", "database")
 
 
 @dataclass
@@ -229,19 +229,22 @@ class KilledInstallation:
                 self.wait_ready()
 
     def _numbers(self, victim: str) -> list[int]:
-        """The processes of a kind; those of the database server count as one."""
+        """The processes of a kind; `server` forks the attempts, those of the database count as one."""
         if victim == "database":
             with suppress(OSError, IndexError, ValueError):
                 server = int((self.cluster.data / "postmaster.pid").read_text().splitlines()[0])
                 return [server, *children(server)]
             return []
-        name = "worker" if victim == "attempt" else victim
+        name = "api" if victim == "api" else "worker"
         alive = [
             service.process.pid
             for key, service in self._services.items()
             if key.startswith(name) and service.process is not None and service.process.poll() is None
         ]
-        return alive if victim != "attempt" else [child for one in alive for child in children(one)]
+        if victim in ("api", "worker"):
+            return alive
+        servers = [server for worker in alive for server in children(worker)]
+        return servers if victim == "server" else [one for server in servers for one in children(server)]
 
 
 def children(parent: int) -> list[int]:

@@ -7,8 +7,6 @@ longer its own, and updates the job when the process ended without an outcome.
 import logging
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +23,7 @@ from app.errors import StorageOutage, is_no_room
 from app.request_context import Origin, working_for
 from app.storage import Storage, open_storage
 from app.usecases import results
+from app.worker.warm_process import WarmProcess, WarmServer
 
 FAILURES_ALLOWED = 3
 """A job fails when this many attempts at it have ended without an outcome."""
@@ -35,16 +34,6 @@ OUT_OF_MEMORY = 77
 """Exit code of a process that reached its memory limit."""
 NO_ROOM = 78
 """Exit code of a process that found a disk full."""
-
-LIMITED_LIBRARIES = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "2",
-    "GDAL_CACHEMAX": "64",
-    "GDAL_PAM_ENABLED": "NO",
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-}
 
 log = logging.getLogger(__name__)
 
@@ -63,12 +52,14 @@ class Attempts:
 
     Attributes:
         database: with the jobs.
+        processes: starts the processes of the attempts.
         settings: of the installation.
         worker: name of this worker, recorded in its jobs.
         should_stop: whether the worker must stop; called several times a second during an attempt.
     """
 
     database: Database
+    processes: WarmServer
     settings: Settings
     worker: str
     should_stop: Callable[[], bool]
@@ -170,36 +161,24 @@ class Attempts:
         arguments = (job.id, job.attempt, os.getpid(), self.settings.job_memory_bytes)
         storage = Storage(self.settings.data_folder / "storage")
         with storage.scratch_folder(f"job-{job.id}-") as folder:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "app.worker.run", *map(str, arguments)],
-                env=os.environ | LIMITED_LIBRARIES | self._installation() | {"TMPDIR": str(folder)},
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
+            process = self.processes.start(
+                "app.worker.run:main", [str(value) for value in arguments], {"TMPDIR": str(folder)}
             )
             try:
                 return self._watch(job, process)
             finally:
-                _kill(process)
+                process.close()
 
-    def _installation(self) -> dict[str, str]:
-        """Variables with the places of the files and of the database that this worker keeps running."""
-        ingest = self.settings.ingest_folder
-        return {
-            "AMERS_DATABASE_URL": self.database.dsn,
-            "AMERS_DATA_FOLDER": str(self.settings.data_folder),
-            **({} if ingest is None else {"AMERS_INGEST_FOLDER": str(ingest)}),
-        }
-
-    def _watch(self, job: Job, process: "subprocess.Popen[bytes]") -> int:
+    def _watch(self, job: Job, process: WarmProcess) -> int:
         """Renew the lease until the process ends or must end."""
         lease_s = self.settings.lease_seconds
         beat_s = min(lease_s / 3.0, LONGEST_BEAT_S)
         started = renewed = time.monotonic()
         while True:
-            try:
-                return process.wait(min(POLL_S, beat_s))
-            except subprocess.TimeoutExpired:
-                now = time.monotonic()
+            code = process.wait(min(POLL_S, beat_s))
+            if code is not None:
+                return code
+            now = time.monotonic()
             if self.should_stop():
                 raise Stopped
             if now - started > self.settings.job_seconds:
@@ -218,10 +197,3 @@ class Attempts:
             log.warning("job %s: the lease could not be renewed: %s", job.id, outage)
             return False
         return True
-
-
-def _kill(process: "subprocess.Popen[bytes]") -> None:
-    """Kill the process and everything it started; does nothing when it has ended."""
-    if process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()

@@ -21,6 +21,7 @@ from app.storage import Storage, open_storage
 from app.usecases import storage_identity
 from app.worker.attempt import Attempts
 from app.worker.sweep import Sweeper
+from app.worker.warm_process import WarmServer
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 LONGEST_POLL_S = 5.0
@@ -43,12 +44,26 @@ def run_worker(settings: Settings) -> None:
     for number in ENDING:
         signal.signal(number, lambda *_: stop.set())
     storage = open_storage(settings)
-    with engine.opened(settings) as database, _sweeping(database, storage, settings, stop):
+    with (
+        engine.opened(settings) as database,
+        WarmServer(_installation(settings, database)) as processes,
+        _sweeping(database, storage, settings, stop),
+    ):
         while not stop.is_set() and not storage_identity.announce(database.transaction, storage):
             stop.wait(STORAGE_RETRY_S)
         loop = asyncio.new_event_loop()
         # Not asyncio.run: it waits for ever when a task of the queue swallows its cancellation.
-        loop.run_until_complete(_Worker(database, settings, stop).run())
+        loop.run_until_complete(_Worker(database, processes, settings, stop).run())
+
+
+def _installation(settings: Settings, database: Database) -> dict[str, str]:
+    """Variables with the places of the files and of the database that this worker keeps running."""
+    ingest = settings.ingest_folder
+    return {
+        "AMERS_DATABASE_URL": database.dsn,
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+        **({} if ingest is None else {"AMERS_INGEST_FOLDER": str(ingest)}),
+    }
 
 
 @contextmanager
@@ -67,6 +82,7 @@ def _sweeping(
 @dataclass
 class _Worker:
     database: Database
+    processes: WarmServer
     settings: Settings
     stop: threading.Event
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
@@ -96,7 +112,7 @@ class _Worker:
 
     async def _work(self) -> None:
         app = procrastinate.App(connector=procrastinate.PsycopgConnector(conninfo=self.database.dsn))
-        attempts = Attempts(self.database, self.settings, self.name, self.stop.is_set)
+        attempts = Attempts(self.database, self.processes, self.settings, self.name, self.stop.is_set)
 
         @app.task(name=queue.TASK, queue=queue.QUEUE)
         def do_next_job() -> None:

@@ -22,7 +22,7 @@ from app.storage import Storage
 from tests.app.flat_world import make_flat_world
 from tests.app.worker_processes import (
     alive,
-    children,
+    attempts_of,
     ended,
     running_worker,
     scene_to_register,
@@ -149,7 +149,7 @@ def test_a_worker_that_is_cut_off_loses_its_job_to_another_and_works_again_once_
     job = ask(40)
     with running_worker(by(reached[0]), tmp_path / "lost.log", *lost.enter) as worker:
         under_way(client, job, me)
-        (process,) = children(worker.pid)
+        (process,) = attempts_of(worker)
         lost.line("down")
         with running_worker(by(reached[1]), tmp_path / "other.log", *other.enter):
             ended_job = ended(client, job, me)

@@ -8,7 +8,9 @@ from pathlib import Path
 from uuid import UUID
 
 import pytest
+import rasterio
 from fastapi.testclient import TestClient
+from rasterio.windows import Window
 
 from app.config import Settings
 from app.db import engine
@@ -18,7 +20,7 @@ from app.storage import Storage
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.app.worker_processes import (
     alive,
-    children,
+    attempts_of,
     ended,
     kill,
     running_worker,
@@ -105,7 +107,7 @@ def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
     job = ask()
     with running_worker(settings, log) as first:
         under_way(client, job, me)
-        (process,) = children(first.pid)
+        (process,) = attempts_of(first)
         kill(first.pid)
         first.wait()
         wait_until(lambda: not alive(process), "the job's process dies with its worker", 5.0)
@@ -128,7 +130,7 @@ def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
     job = ask()
     with running_worker(settings, log) as worker:
         under_way(client, job, me)
-        (process,) = children(worker.pid)
+        (process,) = attempts_of(worker)
         kill(process)
         ended_job = ended(client, job, me)
         assert worker.poll() is None
@@ -146,7 +148,7 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
     job = ask()
     with running_worker(settings, log) as worker:
         under_way(client, job, me)
-        (process,) = children(worker.pid)
+        (process,) = attempts_of(worker)
         assert client.delete(job, headers=me).json()["status"] == "dismissed"
         wait_until(lambda: not alive(process), "the work stops", 5.0)
         other = ended(client, ask(1), me)
@@ -167,7 +169,7 @@ def test_a_stopped_worker_gives_its_job_back_at_once(
     job = ask()
     with running_worker(patient, log) as worker:
         under_way(client, job, me)
-        (process,) = children(worker.pid)
+        (process,) = attempts_of(worker)
         started = time.monotonic()
         worker.send_signal(signal.SIGTERM)
         worker.wait(10.0)
@@ -183,16 +185,33 @@ def test_a_stopped_worker_gives_its_job_back_at_once(
     assert stopped.failures == 0
 
 
+def with_empty_ground(scene: Path, times: int, path: Path) -> Path:
+    """A copy of a scene with empty ground around it, whose quicklook needs more memory."""
+    with rasterio.open(scene) as small:
+        size = {"width": times * small.width, "height": times * small.height}
+        with rasterio.open(path, "w", **small.profile | size | {"compress": "deflate"}) as large:
+            rpc = small.rpcs
+            for name in ("line_scale", "samp_scale", "long_scale", "lat_scale", "height_scale"):
+                # The polynomials are linear: a model over more ground has larger scales.
+                setattr(rpc, name, times * getattr(rpc, name))
+            large.rpcs = rpc
+            large.write(small.read(1), 1, window=Window(0, 0, small.width, small.height))
+    return path
+
+
 def test_a_job_over_its_memory_limit_fails_cleanly_and_the_worker_lives_on(
     client: TestClient,
     me: dict[str, str],
-    ask: Callable[..., str],
+    world: FlatWorld,
     settings: Settings,
     dsn: str,
+    storage: Storage,
     log: Path,
+    tmp_path: Path,
 ):
+    large = with_empty_ground(world.tagged, 6, tmp_path / "large.tif")
+    job = scene_to_register(client, me, storage, dsn, world, large)(1)
     narrow = settings.model_copy(update={"job_memory_bytes": 64 * MEBIBYTE})
-    job = ask()
     with running_worker(narrow, log) as worker:
         ended_job = ended(client, job, me)
         assert worker.poll() is None
@@ -228,7 +247,7 @@ def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
     job = ask()
     with running_worker(settings, log) as sleeper:
         under_way(client, job, me)
-        (process,) = children(sleeper.pid)
+        (process,) = attempts_of(sleeper)
         sleeper.send_signal(signal.SIGSTOP)
         os.kill(process, signal.SIGSTOP)
         with running_worker(settings, log):

@@ -69,6 +69,11 @@ def children(pid: int) -> list[int]:
     return pids
 
 
+def attempts_of(worker: "subprocess.Popen[bytes]") -> list[int]:
+    """The processes of the attempts of a worker, which the server of its warm processes has forked."""
+    return [attempt for server in children(worker.pid) for attempt in children(server)]
+
+
 def alive(pid: int) -> bool:
     """Whether a process is running."""
     try:
@@ -116,18 +121,25 @@ def under_way(client: TestClient, job_url: str, headers: dict[str, str]) -> dict
 
 
 def scene_to_register(
-    client: TestClient, headers: dict[str, str], storage: Storage, dsn: str, world: FlatWorld
+    client: TestClient,
+    headers: dict[str, str],
+    storage: Storage,
+    dsn: str,
+    world: FlatWorld,
+    image: Path | None = None,
 ) -> Callable[[int], str]:
     """A scene in a service that has its points.
+
+    Args:
+        image: of the scene, instead of that of the world.
 
     Returns:
         What asks for its registration and returns the address of the job. It takes how many passes
         the work is made of: one is done in a blink, many leave time to do harm in the middle.
     """
     publish_world(dsn, storage, world)
-    upload = client.post(
-        f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=world.tagged.read_bytes(), headers=headers
-    )
+    content = (image or world.tagged).read_bytes()
+    upload = client.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=content, headers=headers)
 
     def ask(passes: int) -> str:
         inputs = {"scene": upload.json()["id"], "options": {"fine_stages": passes}}
