@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import jwt
@@ -10,29 +11,41 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from fastapi.testclient import TestClient
 
+from app import oidc
 from app.db import engine
+from app.errors import NotAllowed
 from app.main import create_app
+from app.oidc import Issuer
 from app.usecases.tokens import revoke_token
 
 pytestmark = pytest.mark.security
 
 
 class LocalIssuer:
-    """An issuer with one key, and the requests it received."""
+    """An issuer with one key, and the requests it received.
+
+    Attributes:
+        more: further members of its key.
+        answering: while it is not set, a request for the keys waits.
+    """
 
     def __init__(self) -> None:
         self.key = ec.generate_private_key(ec.SECP256R1())
         self.asked: list[str] = []
+        self.more: dict[str, object] = {"use": "sig"}
+        self.answering = threading.Event()
+        self.answering.set()
         issuer = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 issuer.asked.append(self.path)
+                issuer.answering.wait(20.0)
                 public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(issuer.key.public_key()))
                 document = (
-                    {"keys": [{**public, "kid": "one", "use": "sig"}]}
+                    {"keys": [{"kty": "oct"}, 1, {**public, "kid": "one", **issuer.more}]}
                     if self.path == "/keys"
-                    else {"jwks_uri": f"{issuer.url}/keys"}
+                    else {"issuer": issuer.url, "jwks_uri": f"{issuer.url}/keys"}
                 )
                 self.send_response(200)
                 self.end_headers()
@@ -45,7 +58,7 @@ class LocalIssuer:
         self.url = f"http://127.0.0.1:{self.server.server_port}"
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
-    def token(self, key=None, algorithm="ES256", kid="one", **claims) -> dict[str, str]:
+    def token(self, key=None, algorithm="ES256", kid="one", header=(), **claims) -> dict[str, str]:
         """Headers with a token; `claims` replace the default ones, and None leaves one out."""
         usual = {
             "iss": self.url,
@@ -56,7 +69,7 @@ class LocalIssuer:
             "scope": "openid amers:register",
         }
         chosen = {name: value for name, value in {**usual, **claims}.items() if value is not None}
-        made = jwt.encode(chosen, key or self.key, algorithm, {"kid": kid})
+        made = jwt.encode(chosen, key or self.key, algorithm, {"kid": kid, **dict(header)})
         return {"Authorization": f"Bearer {made}"}
 
 
@@ -64,6 +77,7 @@ class LocalIssuer:
 def issuer():
     issuer = LocalIssuer()
     yield issuer
+    issuer.answering.set()
     issuer.server.shutdown()
     issuer.server.server_close()
 
@@ -95,6 +109,27 @@ def test_a_token_of_the_issuer_opens_what_its_claim_is_mapped_to(client, issuer)
         {"iss": "https://elsewhere.example"},
         {"sub": None},
         {"kid": "two"},
+        {"header": {"typ": "logout+jwt"}},
+        {"header": {"typ": "dpop+jwt"}},
+        {"header": {"typ": "ID"}},
+        {"header": {"crit": ["exp"]}},
+        {"at_hash": "x"},
+        {"nonce": "of an ID token"},
+        {"sub": ""},
+        {"sub": " "},
+        {"sub": "u" * 256},
+        {"sub": "a\0b"},
+        {"sub": "\ud800"},
+        {"scope": 7},
+        {"scope": float("nan")},
+        {"scope": True},
+        {"scope": {"amers:admin": True}},
+        {"scope": [["amers:admin"]]},
+        {"scope": ["amers:admin", 1]},
+        {"exp": float("inf")},
+        {"exp": [1]},
+        {"nbf": float("inf")},
+        {"iat": float("inf")},
     ],
 )
 def test_a_token_that_is_not_a_valid_one_for_us_is_refused(client, issuer, claims):
@@ -126,9 +161,76 @@ def test_an_identity_is_revoked_here_whatever_its_issuer_says(client, issuer, ds
 
 
 def test_unknown_keys_do_not_cause_repeated_requests_to_the_issuer(client, issuer):
+    assert oidc.LEAST_PAUSE_S >= 60.0
     for number in range(5):
         client.get("/tokens/self", headers=issuer.token(kid=f"unknown-{number}"))
     assert issuer.asked.count("/keys") == 1
+
+
+def test_access_tokens_of_rfc_9068_are_accepted(client, issuer):
+    for kind in ("at+jwt", "application/at+jwt", "JWT"):
+        reply = client.get("/tokens/self", headers=issuer.token(header={"typ": kind}))
+        assert reply.status_code == 200, kind
+    nonce = issuer.token(header={"typ": "at+jwt"}, nonce="some issuers copy it")
+    assert client.get("/tokens/self", headers=nonce).status_code == 200
+
+
+def test_a_name_that_no_row_can_have_is_replaced_by_the_subject(client, issuer):
+    for name in ("\ud800", "a\0b", 7, {}, " "):
+        mine = client.get("/tokens/self", headers=issuer.token(sub=f"u-{name!r}", name=name))
+        assert (mine.status_code, mine.json()["name"]) == (200, f"u-{name!r}")
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"use": "enc"}, {"key_ops": ["encrypt"]}, {"alg": "ES384"}, {"alg": "ECDH-ES"}, {"kid": 7}],
+)
+def test_a_key_that_is_not_for_these_signatures_verifies_none(client, issuer, more):
+    issuer.more = more
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 401
+
+
+def test_a_key_without_a_use_verifies_signatures(client, issuer):
+    issuer.more = {"key_ops": ["verify"], "alg": "ES256"}
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
+
+
+def test_a_slow_issuer_delays_only_who_waits_for_its_answer(client, issuer, monkeypatch):
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
+    # The keys are old, and the issuer does not answer.
+    monkeypatch.setattr(oidc, "KEYS_LIVE_S", 0.0)
+    monkeypatch.setattr(oidc, "LEAST_PAUSE_S", 0.0)
+    issuer.answering.clear()
+    with ThreadPoolExecutor(30) as callers:
+        unknown = [
+            callers.submit(client.get, "/tokens/self", headers=issuer.token(kid=f"no-{number}"))
+            for number in range(10)
+        ]
+        started = time.monotonic()
+        known = [callers.submit(client.get, "/tokens/self", headers=issuer.token()) for _ in range(10)]
+        assert [one.result().status_code for one in known] == [200] * 10
+        assert time.monotonic() - started < oidc.TIMEOUT_S, "nobody waited for the issuer"
+        issuer.answering.set()
+        assert [one.result().status_code for one in unknown] == [401] * 10
+
+
+def test_keys_of_an_issuer_that_no_longer_answers_die(client, issuer, monkeypatch):
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
+    issuer.server.shutdown()
+    issuer.server.server_close()
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 200
+    monkeypatch.setattr(oidc, "KEYS_DIE_S", 0.0)
+    assert client.get("/tokens/self", headers=issuer.token()).status_code == 401
+
+
+def test_a_document_of_another_issuer_or_of_any_size_is_not_used(settings, issuer):
+    other = Issuer(settings.model_copy(update={"oidc_issuer": f"{issuer.url}/"}))
+    with pytest.raises(NotAllowed):
+        other.identify(issuer.token(iss=f"{issuer.url}/")["Authorization"].split()[1])
+    issuer.more["x"] = "x" * (2 << 20)
+    large = Issuer(settings.model_copy(update={"oidc_issuer": issuer.url}))
+    with pytest.raises(NotAllowed):
+        large.identify(issuer.token()["Authorization"].split()[1])
 
 
 def test_tokens_of_our_own_go_on_beside_those_of_the_issuer(client, bearer):
