@@ -3,11 +3,17 @@
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.api.deps import Admin, DatabaseDep, TokenHolder
-from app.api.models.administration import NewTokenRecord, TokenRecord, TokenRecords
+from app.api.deps import Admin, DatabaseDep, SettingsDep, TokenHolder
+from app.api.models.administration import (
+    NewTokenRecord,
+    OwnersUsage,
+    OwnerUsage,
+    TokenRecord,
+    TokenRecords,
+)
 from app.api.routes import CallerRoute
 from app.auth import Scope
-from app.usecases import tokens
+from app.usecases import tokens, usage
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=CallerRoute)
 
@@ -56,10 +62,25 @@ def list_tokens(*, database: DatabaseDep, caller: Admin) -> TokenRecords:
     return TokenRecords(tokens=[TokenRecord.model_validate(token) for token in listed])
 
 
+@router.get("/usage")
+def all_usage(*, database: DatabaseDep, settings: SettingsDep, caller: Admin) -> OwnersUsage:
+    """List what every owner keeps in storage and queue, largest first."""
+    with database.reading() as connection:
+        owners = usage.read_all_usage(connection, settings)
+    return OwnersUsage(owners=[OwnerUsage.model_validate(owner) for owner in owners])
+
+
 @router.get("/self")
 def own_token(*, caller: TokenHolder) -> TokenRecord:
     """Return the token of this request."""
     return TokenRecord.model_validate(caller)
+
+
+@router.get("/self/usage")
+def own_usage(*, database: DatabaseDep, settings: SettingsDep, caller: TokenHolder) -> OwnerUsage:
+    """Return what the token of this request keeps in storage and queue, and its storage quota."""
+    with database.reading() as connection:
+        return OwnerUsage.model_validate(usage.read_usage(connection, settings, caller))
 
 
 @router.delete("/{token_id}")

@@ -30,7 +30,7 @@ COMMANDS = {
     "reference": "Reference images, for scenes on ground without control points.",
     "production": "Make new blocks of points from images.",
     "db": "The database and its schema: upgrade, status, backup, restore.",
-    "store": "The storage of the files: adopt, sweep, trash.",
+    "store": "The storage of the files: usage, adopt, sweep, trash.",
     "token": "Tokens of the callers of the API.",
     "demo": "Run the whole work on a simulated world.",
     "serve": "Run the API and one worker.",

@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show, show_one
+from app.cli.output import AsJson, Row, as_size, print_json, show, show_one
 from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db import engine
 from app.errors import InputError
 from app.storage import open_storage, trash
-from app.usecases import garbage_collection, storage_identity
+from app.usecases import garbage_collection, storage_identity, usage
 
 app = typer.Typer(no_args_is_help=True)
 trash_app = typer.Typer(no_args_is_help=True, help="Files that the sweep removed.")
@@ -27,6 +27,37 @@ def adopt(as_json: AsJson = False) -> None:
         row = storage_identity.adopt(partial(transaction, settings), storage)
     record = {"storage": storage.place, "installation": row.id, "generation": row.storage_generation}
     show_one(record, as_json=as_json)
+
+
+@app.command("usage")
+def show_usage(as_json: AsJson = False) -> None:
+    """Show what every owner keeps in the storage, and what belongs to nobody."""
+    settings = read_settings()
+    with transaction(settings) as connection:
+        owners = usage.read_all_usage(connection, settings)
+        unowned = usage.read_unowned(connection, open_storage(settings))
+    total_bytes = sum(row.total_bytes for row in owners) + sum(row.total_bytes for row in unowned)
+    if as_json:
+        print_json({"owners": owners, "unowned": unowned, "total_bytes": total_bytes})
+        return
+    rows: list[Row] = [
+        {
+            "owner": row.name,
+            "scenes": row.scenes,
+            "open uploads": row.open_uploads,
+            "jobs": row.jobs,
+            "results": as_size(row.result_bytes),
+            "total": as_size(row.total_bytes),
+            "quota": None if row.quota_bytes is None else as_size(row.quota_bytes),
+            "share": None if row.share is None else f"{row.share:.1%}",
+        }
+        for row in owners
+    ]
+    blank = dict.fromkeys(("scenes", "open uploads", "jobs", "results"))
+    ends = {"quota": None, "share": None}
+    for what, size in [(row.what, row.total_bytes) for row in unowned] + [("total", total_bytes)]:
+        rows.append({"owner": what, **blank, "total": as_size(size), **ends})
+    show(rows, as_json=False)
 
 
 @app.command()

@@ -128,9 +128,13 @@ class BucketStorage(Storage):
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a prefix, sorted."""
+        return sorted(self.sizes(prefix))
+
+    def sizes(self, prefix: str) -> dict[str, int]:
+        """The keys of all files below a prefix, each with its size in bytes."""
         with _storage_errors(prefix):
             pages = obstore.list(self.store, prefix=checked_key(prefix))
-            return sorted(entry["path"] for page in pages for entry in page)
+            return {entry["path"]: int(entry["size"]) for page in pages for entry in page}
 
     def _download(self, key: str, file: IO[bytes]) -> None:
         with _storage_errors(key):

@@ -249,10 +249,19 @@ class Storage:
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""
-        files = (
-            path for path in self._locate(prefix).rglob("*") if path.is_file() and not path.is_symlink()
-        )
-        return sorted(path.relative_to(self.folder).as_posix() for path in files)
+        return sorted(path.relative_to(self.folder).as_posix() for path in self._files(prefix))
+
+    def sizes(self, prefix: str) -> dict[str, int]:
+        """The keys of all files below a folder of the storage, each with its size in bytes."""
+        sizes = {}
+        for path in self._files(prefix):
+            with suppress(FileNotFoundError):
+                sizes[path.relative_to(self.folder).as_posix()] = path.stat().st_size
+        return sizes
+
+    def _files(self, prefix: str) -> Iterator[Path]:
+        paths = self._locate(prefix).rglob("*")
+        return (path for path in paths if path.is_file() and not path.is_symlink())
 
     def sweep_unfinished(self, older_than_s: float, spare: str) -> list[str]:
         """Delete the unfinished files of killed writers; returns their names.

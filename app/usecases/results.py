@@ -87,7 +87,7 @@ def reconcile_results(database: Database, storage: Storage) -> None:
     for job_id, attempt in lost.items():
         discard_attempt(database, storage, job_id, attempt)
     for job_id in unmeasured:
-        size_bytes = sum(storage.size(key) for key in storage.keys(results_folder(job_id)))
+        size_bytes = sum(storage.sizes(results_folder(job_id)).values())
         with database.transaction() as connection:
             jobs.set_measured(connection, job_id, size_bytes)
 

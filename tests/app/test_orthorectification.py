@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from app.config import Settings
-from app.db import engine, registrations
+from app.db import engine, registrations, scenes
+from app.db.engine import Database
 from app.db.jobs import jobs
 from app.errors import AmersError
 from app.storage import Storage
@@ -27,7 +28,9 @@ from services.formats.images.raster import write_raster
 from services.formats.sensor_models.rpc_text import format_rpc_text, parse_rpc_text
 from services.geodesy import metres_per_degree
 from services.sensors.rpc import RpcModel
+from services.types import Acquisition
 from tests.app.job_queue import claim
+from tests.app.ledger import job_runner, make_token
 
 MODEL = parse_rpc_text((Path(__file__).parents[1] / "golden" / "invented_RPC.TXT").read_text())
 a_pixel = 1.0
@@ -190,6 +193,52 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     refused = client.post("/processes/orthorectify/execution", json={"inputs": unknown}, headers=me)
     assert refused.status_code == 422
     assert "did not register scene" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("ortho_map", "quota_bytes", "error", "named"),
+    [
+        ({"gsd_m": 0.05}, None, "InputError", "a finer map shows no more"),
+        ({"crs": "+proj=utm +zone=31 +units=cm"}, None, "InputError", "16 times those of the scene"),
+        ({}, 300_000, "TooLarge", "left of the storage quota"),
+    ],
+)
+def test_a_job_makes_no_map_that_its_scene_and_quota_do_not_warrant(
+    ortho_map: dict,
+    quota_bytes: int | None,
+    error: str,
+    named: str,
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    settings: Settings,
+    storage: Storage,
+    database: Database,
+    tmp_path: Path,
+) -> None:
+    image, dem = write_inputs(tmp_path)
+    me = make_token(client, bearer("admin"), storage_quota_bytes=quota_bytes)
+    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
+    client.put(f"/scenes/{scene}/files/dem.tif", content=dem.read_bytes(), headers=me)
+    run = job_runner(client, database, settings, me)
+    job = run("orthorectify", scene=scene, dem="dem.tif", vertical="ellipsoid", map=ortho_map)
+    assert (job["status"], job["error"]["error"]) == ("failed", error), job
+    assert named in job["error"]["detail"]
+    assert storage.keys("results") == []
+
+
+def test_a_map_finer_than_its_scene_is_refused_at_the_request_once_the_scene_is_known(
+    client: TestClient, bearer: Callable[[str], dict[str, str]], dsn: str, tmp_path: Path
+) -> None:
+    me = bearer("register")
+    scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+    with engine.connect(dsn) as connection:
+        scenes.describe(connection, UUID(scene), Acquisition("a"), (300, 400), 0.5)
+    statuses = []
+    for gsd_m in (0.2, 0.25):
+        inputs = {"scene": scene, "dem": "dem.tif", "map": {"gsd_m": gsd_m}}
+        reply = client.post("/processes/orthorectify/execution", json={"inputs": inputs}, headers=me)
+        statuses.append(reply.status_code)
+    assert statuses == [422, 201]
 
 
 @pytest.mark.real_data

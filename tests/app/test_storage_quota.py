@@ -1,6 +1,7 @@
 """One quota over everything that a token keeps in the storage, in a folder and in a bucket."""
 
 import io
+import json
 import threading
 import zipfile
 from base64 import b64encode
@@ -10,7 +11,9 @@ from uuid import UUID
 
 import pytest
 from fastapi.testclient import TestClient
+from typer.testing import CliRunner
 
+from app.cli.main import app
 from app.config import Settings
 from app.db import engine, usage
 from app.db.engine import Connection, Database
@@ -351,3 +354,45 @@ def test_the_ledger_equals_the_storage_after_a_mixed_run(
     assert roomy.scene_bytes == small.scene_bytes == 1000 + 200 + 50 + 1000 + 10_000 + 1
     assert roomy.result_bytes > 150_000
     assert small.result_bytes == 0
+
+
+@in_both
+def test_usage_is_shown_to_callers_administrators_and_operators(
+    client: TestClient,
+    admin: dict[str, str],
+    storage: Storage,
+    settings: Settings,
+    database: Database,
+    published: None,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    me = make_token(client, admin, storage_quota_bytes=4000)
+    assert client.post("/scenes?name=a.tif", content=TIFF, headers=me).status_code == 201
+    assert announce(client, me, 600, "b.tif").status_code == 201
+    stray = storage.put(f"scenes/{UUID(int=1)}/stray.tif", [bytes(70)])
+    storage.put("trash/2026-01-01_1h/scenes/a", [bytes(30)])
+    own = client.get("/tokens/self/usage", headers=me).json()
+    assert (own["scenes"], own["open_uploads"], own["total_bytes"], own["share"]) == (2, 1, 1600, 0.4)
+    assert client.get("/tokens/usage", headers=me).status_code == 403
+    assert client.get("/tokens/usage", headers=admin).json()["owners"] == [own]
+
+    assert settings.database_url is not None
+    monkeypatch.setenv("AMERS_DATABASE_URL", settings.database_url.get_secret_value())
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
+    if settings.storage_url is not None:
+        monkeypatch.setenv("AMERS_STORAGE_URL", settings.storage_url)
+    shown = CliRunner().invoke(app, ["store", "usage", "--json"])
+    assert shown.exit_code == 0, shown.output
+    document = json.loads(shown.stdout)
+    assert document["owners"] == [own]
+    unowned = {row["what"]: (row["files"], row["total_bytes"]) for row in document["unowned"]}
+    (chips,) = storage.keys("chips")
+    assert unowned == {
+        "chips of blocks": (1, storage.size(chips)),
+        "trash": (1, 30),
+        "unfinished": (1, 0),
+        "no row": (1, stray.size_bytes),
+    }
+    table = CliRunner().invoke(app, ["store", "usage"]).stdout
+    assert "small\t2\t1\t0\t0 B\t1.6 KiB\t3.9 KiB\t40.0%" in table
+    assert table.splitlines()[-1].startswith("total")

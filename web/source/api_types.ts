@@ -234,7 +234,7 @@ export interface NewTokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  upload_quota_bytes: number | null;
+  storage_quota_bytes: number | null;
   job_quota: number | null;
   secret: string;
 }
@@ -243,6 +243,29 @@ export interface OutputDescription {
   title: string;
   description?: string;
   schema: Record<string, unknown>;
+}
+
+export interface OwnerUsage {
+  owner: string | null;
+  name: string;
+  scenes: number;
+  open_uploads: number;
+  jobs: number;
+  scene_bytes: number;
+  upload_bytes: number;
+  result_bytes: number;
+  total_bytes: number;
+  quota_bytes: number | null;
+  share: number | null;
+}
+
+export interface OwnersUsage {
+  owners: OwnerUsage[];
+}
+
+export interface PartReadiness {
+  status: "ok" | "degraded" | "failed";
+  reason?: string;
 }
 
 export interface PointFeature {
@@ -419,6 +442,11 @@ export interface PublishedBlock {
   superseded: BlockRecord | null;
 }
 
+export interface ReadinessReport {
+  status: "ready" | "degraded" | "not ready";
+  parts: Record<string, PartReadiness>;
+}
+
 export interface Reference {
   id: number;
   name: string;
@@ -543,6 +571,7 @@ export interface StatusInfo {
   links: Link[];
   "amers:queuePosition"?: number;
   "amers:estimatedEnd"?: string;
+  "amers:priority"?: number;
 }
 
 export interface StoredFile {
@@ -613,7 +642,7 @@ export interface TokenRecord {
   expires_at: string | null;
   revoked_at: string | null;
   subject: string | null;
-  upload_quota_bytes: number | null;
+  storage_quota_bytes: number | null;
   job_quota: number | null;
 }
 

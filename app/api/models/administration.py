@@ -35,6 +35,31 @@ class TokenRecords(Reply):
     tokens: list[TokenRecord]
 
 
+class OwnerUsage(Reply):
+    """What one owner keeps; bytes include what is reserved for files that arrive.
+
+    `owner` and `quota_bytes` are null for the command line, `share` without a quota.
+    """
+
+    owner: UUID | None
+    name: str
+    scenes: int
+    open_uploads: int
+    jobs: int
+    scene_bytes: int
+    upload_bytes: int
+    result_bytes: int
+    total_bytes: int
+    quota_bytes: int | None
+    share: float | None
+
+
+class OwnersUsage(Reply):
+    """What every owner keeps who keeps something, the largest first."""
+
+    owners: list[OwnerUsage]
+
+
 class Reference(Reply):
     """A reference image; paths are below AMERS_REFERENCE_FOLDER."""
 
