@@ -1,5 +1,6 @@
 """The HTTP application: its routers and its middleware."""
 
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
@@ -47,6 +48,10 @@ from app.usecases.damage import open_chips
 from app.usecases.installation import Installation
 from app.usecases.readiness import Readiness
 from app.web import page
+
+SWITCH_INTERVAL_S = 0.0005
+"""A thread that computes a large reply lets others run after so long; a small request waits several
+times for its turn of the interpreter."""
 
 DESCRIPTION = (
     "An open base of 3D ground control points with image chips, "
@@ -110,6 +115,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = deps.threads_for(settings)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         opening = engine.opened(settings)
         app.state.settings = settings
         app.state.database = await run_in_threadpool(opening.__enter__)

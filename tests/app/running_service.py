@@ -19,7 +19,7 @@ from app.usecases.tokens import create_token
 from services.types import ControlPoints
 from tests.app.conftest import TEMPLATE, fresh_database
 from tests.app.worker_processes import children, wait_until
-from tests.factories import make_block
+from tests.factories import MadeBlock, make_block
 from tests.service_process import free_port, until
 
 
@@ -45,16 +45,16 @@ class Served:
 
 @contextmanager
 def service_with_a_block(
-    cluster: Cluster, folder: Path, scope: str, count: int = 60, **environment: str
+    cluster: Cluster, folder: Path, scope: str, made: MadeBlock | None = None, **environment: str
 ) -> Iterator[Served]:
     """A service without a worker and a token with one scope; the service is stopped at the end.
 
     Args:
-        count: number of points of the block.
+        made: its block; by default one of 60 points.
         environment: its settings, such as `AMERS_POOL_SIZE="2"`.
     """
     with fresh_database(cluster, TEMPLATE) as dsn:
-        made = make_block(folder / "block", count=count)
+        made = made or make_block(folder / "block", count=60)
         settings = Settings(database_url=dsn, data_folder=folder / "data")
         with engine.connect(dsn) as connection:
             lifecycle.ingest_block(connection, Storage(settings.data_folder / "storage"), made.folder)

@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPConnection
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -18,33 +18,40 @@ from app.db import engine
 from app.usecases.tokens import create_token
 from tests.app.bystander import Bystander, bystander
 from tests.app.running_service import Served, service_with_a_block
+from tests.factories import make_block
 
 pytestmark = pytest.mark.security
+
+pytestmark = pytest.mark.long
 
 POINTS = 2_100
 """More features than are built as one text, so that they are streamed."""
 SMALL_WINDOW = 4096
-HEAD_S, BODY_S, RATE_S = 1.0, 1.5, 1.0
+HEAD_S, BODY_S, RATE_S, READ_S = 1.0, 1.5, 1.0, 2.0
 CONNECTIONS, PER_ADDRESS = 60, 50
 PATIENCE_S = 20.0
 MEBIBYTE = 1 << 20
 FILE_BYTES = 12 * MEBIBYTE
+REPLIES = 20
 POINT = f"/collections/points/items/{1 << 26}"
 MEMORY_BYTES = 40 * MEBIBYTE
-ENDED = (ConnectionError, BrokenPipeError)
+ENDED = (ConnectionError,)
 
 
 @pytest.fixture(scope="module")
 def served(cluster, tmp_path_factory) -> Iterator[Served]:
     """A service with short limits, and the token of an attacker."""
+    folder = tmp_path_factory.mktemp("served")
+    made = make_block(folder / "block", count=POINTS, n_images=2, gsds_m=(2.0,), dtype=np.uint8)
     with service_with_a_block(
         cluster,
-        tmp_path_factory.mktemp("served"),
+        folder,
         "register",
-        count=POINTS,
+        made,
         AMERS_HEAD_SECONDS=str(HEAD_S),
         AMERS_BODY_SECONDS=str(BODY_S),
         AMERS_RATE_SECONDS=str(RATE_S),
+        AMERS_READ_TIMEOUT_SECONDS=str(READ_S),
         AMERS_CONNECTIONS=str(CONNECTIONS),
         AMERS_CONNECTIONS_PER_ADDRESS=str(PER_ADDRESS),
     ) as served:
@@ -228,17 +235,15 @@ def test_twelve_readers_who_take_nothing_are_given_up(served, unharmed, file_pat
     path = file_path if kind == "file" else f"/collections/points/items?limit={POINTS}"
     with lines(served, 12) as opened:
         for line in opened:
-            line.sendall(head("GET", path, served.authorization))
-        time.sleep(6 * RATE_S)
+            # More replies than the buffers of the connection have room for.
+            line.sendall(REPLIES * head("GET", path, served.authorization))
+        time.sleep(5 * RATE_S)
         for line in opened:
-            taken = 0
-            try:
+            received = b""
+            with suppress(*ENDED):
                 while piece := line.recv(MEBIBYTE):
-                    taken += len(piece)
-            except (OSError, TimeoutError):
-                pass
-            if kind == "file":
-                assert taken < FILE_BYTES
+                    received += piece
+            assert received.count(b"HTTP/1.1 200") < REPLIES
 
 
 def test_sixteen_heavy_filters_of_one_caller_leave_connections_to_others(served, unharmed) -> None:
@@ -257,11 +262,10 @@ def test_sixteen_heavy_filters_of_one_caller_leave_connections_to_others(served,
     def ask() -> None:
         connection = HTTPConnection(urlsplit(served.url).netloc, timeout=60)
         headers = {"Content-Type": "application/json", **served.authorization}
-        started = time.monotonic()
         connection.request("POST", "/collections/points/search", body, headers)
         reply = connection.getresponse()
-        statuses.append((reply.status, reply.read()[:200], time.monotonic() - started))
+        statuses.append(reply.status)
 
     at_once(16, ask)
-    print(statuses)
-    assert {status for status, *_ in statuses} <= {200, 429, 503}
+    assert len(statuses) == 16
+    assert set(statuses) <= {200, 429, 503}, statuses
