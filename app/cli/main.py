@@ -29,7 +29,7 @@ COMMANDS = {
     "scene": "Register and orthorectify scenes.",
     "reference": "Reference images, for scenes on ground without control points.",
     "production": "Make new blocks of points from images.",
-    "db": "The database and its schema: upgrade, status, backup, restore.",
+    "db": "The database: schema, backup and restore with the stored files.",
     "store": "The storage of the files: usage, adopt, sweep, trash.",
     "token": "Tokens of the callers of the API.",
     "demo": "Run the whole work on a simulated world.",

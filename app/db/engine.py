@@ -211,6 +211,11 @@ def check_postgis(connection: Connection) -> None:
     connection.execute(select(func.postgis_version()))
 
 
+def export_snapshot(connection: Connection) -> str:
+    """A name under which other connections see what this transaction sees, as long as it lasts."""
+    return str(connection.scalar(select(func.pg_export_snapshot())))
+
+
 def limit_lock_wait(connection: Connection, seconds: float) -> None:
     """Let statements fail that wait longer for a lock, until the end of the transaction."""
     connection.execute(select(func.set_config("lock_timeout", f"{seconds:g}s", True)))

@@ -48,6 +48,12 @@ def batches(storage: Storage) -> dict[str, list[str]]:
     return contents
 
 
+def find(storage: Storage, key: str) -> str | None:
+    """The key of a file in the trash, the newest if there are several; None if it is not there."""
+    found = [f"{TRASH}/{batch}/{key}" for batch, keys in batches(storage).items() if key in keys]
+    return found[-1] if found else None
+
+
 def put_back(storage: Storage, batch: str, keys: Iterable[str]) -> list[str]:
     """Move files of a batch back to their former keys, if these are free; returns the keys."""
     free = [key for key in keys if not storage.exists(key)]

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import psycopg
@@ -18,6 +19,9 @@ from app.db.engine import Connection, Database
 from app.main import create_app
 from app.storage import MARKER, Storage
 from app.usecases.tokens import create_token
+
+if TYPE_CHECKING:
+    from tests.app import full_storage
 
 TEMPLATE = "amers_template"
 
@@ -116,3 +120,20 @@ def token(dsn: str) -> Callable[[str], str]:
 def bearer(token: Callable[[str], str]) -> Callable[[str], dict[str, str]]:
     """Makes the headers of a caller with a scope: `client.get(path, headers=bearer("read"))`."""
     return lambda scope: {"Authorization": f"Bearer {token(scope)}"}
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def kind(request: pytest.FixtureRequest) -> str:
+    """The kind of a storage."""
+    return str(request.param)
+
+
+@pytest.fixture
+def full(
+    kind: str, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator["full_storage.Full"]:
+    """An installation whose storage is full."""
+    from tests.app import full_storage  # which needs this module
+
+    with full_storage.filled(kind, dsn, tmp_path, monkeypatch) as full:
+        yield full

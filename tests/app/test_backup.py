@@ -136,17 +136,15 @@ def test_a_destroyed_installation_is_restored_and_gives_the_same_answers(place: 
             *chips,
         )
 
-        archive, copy = place / "amers.dump", place / "storage"
-        amers(service, "db", "backup", archive)
-        shutil.copytree(service.folder / "storage", copy, ignore=shutil.ignore_patterns("unfinished"))
+        backup = place / "backup"
+        assert amers(service, "db", "backup", backup)["damaged"] == []
         before = answers(service, secret, paths)
         assert {path: status for path, (status, _) in before.items() if status != 200} == {}
     finally:
         service.end()
 
     shutil.rmtree(place / "data")
-    shutil.copytree(copy, place / "data" / "storage")
-    amers(service, "db", "restore", archive)
+    amers(service, "db", "restore", backup)
     restored = started(place / "data")
     try:
         after = answers(restored, secret, paths)

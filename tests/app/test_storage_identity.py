@@ -2,126 +2,30 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from uuid import uuid4
 
 import httpx
 import pytest
-from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine
 from app.db.cluster.embedded import Cluster
-from app.main import create_app
-from app.storage import MARKER, Storage, open_storage, trash
+from app.storage import MARKER, open_storage, trash
 from app.storage.trash import TRASH, Moment
 from app.usecases import garbage_collection, storage_identity
-from app.usecases.blocks.lifecycle import ingest_block
-from app.usecases.tokens import create_token
 from app.worker import sweep
 from app.worker.sweep import Sweeper, sweep_files
-from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.full_storage import FAMILIES, Full, another, contents, run_service
 from tests.app.running_service import running_service
-from tests.app.s3_server import running_bucket
 from tests.app.worker_processes import wait_until
-from tests.factories import make_block
 from tests.statements import run_sql
 
-TIFF = b"II*\0" + bytes(1000)
 JOB_S = 3600.0
 LEASE_S = 0.3
 LONGEST_WAIT_S = 5.0
-FAMILIES = ("chips", "scenes", "results", "uploads")
-
-
-@dataclass(frozen=True)
-class Full:
-    """An installation with files of every family.
-
-    Attributes:
-        dsn: of its database, which nobody is connected to.
-        settings: with its storage.
-        files: key to content.
-    """
-
-    dsn: str
-    settings: Settings
-    files: dict[str, bytes]
-
-
-def contents(storage: Storage) -> dict[str, bytes]:
-    """All files of a storage but its marker, and its uploads that are still arriving."""
-    files = {}
-    for key in (key for family in FAMILIES for key in storage.keys(family)):
-        with storage.open(key) as file:
-            files[key] = file.read()
-    arriving = storage.scratch().glob("upload-*")
-    return files | {path.name: path.read_bytes() for path in arriving}
-
-
-def use(settings: Settings, folder: Path, seed: int) -> None:
-    """Run a service for a moment: it gets a block, a scene, an archive, a result, a begun upload."""
-    storage = open_storage(settings)
-    dsn = settings.database_url.get_secret_value() if settings.database_url else ""
-    with TestClient(create_app(settings)) as client:
-        with engine.connect(dsn) as connection:
-            made = make_block(folder / f"block-{seed}", count=5, seed=seed, version=f"1.{seed}")
-            ingest_block(connection, storage, made.folder)
-            secret = create_token(connection, "a user", ["admin"]).secret
-            job = run_sql(
-                connection,
-                "insert into job (id, kind, state, attempt, inputs, finished_at)"
-                " values (gen_random_uuid(), 'register-scene', 'successful', 1, '{}', now())"
-                " returning id",
-            ).fetchone()["id"]
-        client.headers["Authorization"] = f"Bearer {secret}"
-        client.post("/scenes?name=a.tif", content=TIFF).raise_for_status()
-        client.put("/blocks/uploads/a.zip", content=b"PK\3\4" * 10).raise_for_status()
-        storage.put(f"results/{job}/1/report.json", [b"{}"])
-        announced = {
-            "Upload-Length": "20",
-            "Upload-Metadata": "filename YS50aWY=",
-            "Tus-Resumable": "1.0.0",
-        }
-        client.post("/uploads", headers=announced).raise_for_status()
-
-
-@pytest.fixture(params=["folder", "bucket"])
-def kind(request: pytest.FixtureRequest) -> str:
-    """The kind of the storage."""
-    return str(request.param)
-
-
-@pytest.fixture
-def full(kind: str, dsn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Full]:
-    """An installation whose storage is full."""
-    with running_bucket(monkeypatch) as url:
-        settings = Settings(
-            database_url=dsn,
-            data_folder=tmp_path / "data",
-            storage_url=url if kind == "bucket" else None,
-        )
-        if settings.storage_url is not None:
-            # For services in processes of their own.
-            monkeypatch.setenv("AMERS_STORAGE_URL", settings.storage_url)
-        use(settings, tmp_path, 1)
-        yield Full(dsn, settings, contents(open_storage(settings)))
-
-
-@contextmanager
-def another(cluster: Cluster, dsn: str | None = None) -> Iterator[str]:
-    """A database of an installation of its own; or a copy of a database, as a restored backup is."""
-    with fresh_database(
-        cluster, TEMPLATE if dsn is None else dsn.split("dbname=")[1].split()[0]
-    ) as copy:
-        if dsn is None:
-            with engine.connect(copy) as connection:
-                run_sql(connection, "update installation set id = gen_random_uuid()")
-        yield copy
 
 
 def swept(settings: Settings, monkeypatch: pytest.MonkeyPatch, until: Callable[[], bool]) -> None:
@@ -183,7 +87,7 @@ def test_a_database_of_another_installation_removes_nothing(
 ):
     with another(cluster) as other:
         elsewhere = Settings(database_url=other, data_folder=tmp_path / "elsewhere")
-        use(elsewhere, tmp_path, 2)
+        run_service(elsewhere, tmp_path, 2)
         assert_untouched(full, other, "that of another installation", monkeypatch, caplog)
 
 
@@ -195,7 +99,7 @@ def test_an_older_backup_of_the_database_removes_nothing(
     caplog: pytest.LogCaptureFixture,
 ):
     with another(cluster, full.dsn) as backup:
-        use(full.settings, tmp_path, 3)
+        run_service(full.settings, tmp_path, 3)
         assert len(contents(open_storage(full.settings))) == 2 * len(full.files)
         assert_untouched(full, backup, "the database is older than the storage", monkeypatch, caplog)
 

@@ -11,8 +11,13 @@ from app.db.cluster.binaries import find_binaries
 from app.errors import Conflict, InputError
 
 
-def dump(dsn: str, file: Path) -> None:
+def dump(dsn: str, file: Path, snapshot: str | None = None) -> None:
     """Write the database into an archive: one moment of it, while others go on.
+
+    Args:
+        dsn: of the database.
+        file: to write.
+        snapshot: the moment, exported by a transaction; None for the present one.
 
     Raises:
         Conflict: the file exists.
@@ -22,7 +27,8 @@ def dump(dsn: str, file: Path) -> None:
         raise Conflict(f"{file} exists")
     unfinished = file.with_name(f".{file.name}.unfinished")
     try:
-        options = ("--format=custom", "--no-owner", "--no-privileges")
+        options = ["--format=custom", "--no-owner", "--no-privileges"]
+        options += [] if snapshot is None else [f"--snapshot={snapshot}"]
         _run(dsn, "pg_dump", *options, f"--file={unfinished}")
         unfinished.replace(file)
     finally:
@@ -38,14 +44,20 @@ def restore(dsn: str, file: Path) -> None:
     """
     if not file.is_file():
         raise InputError(f"no file {file}")
-    with psycopg.connect(dsn) as connection:
-        if connection.execute("select to_regclass('alembic_version')").fetchone() != (None,):
-            raise Conflict(
-                "the database has tables already: restore into an empty one (another AMERS_DATA_FOLDER)"
-            )
+    if has_tables(dsn):
+        raise Conflict(
+            "the database has tables already: restore into an empty one (another AMERS_DATA_FOLDER)"
+        )
     # Who may read is granted anew: the roles of the cluster that the archive came from may be gone.
     whole = ("--single-transaction", "--exit-on-error", "--no-owner", "--no-privileges")
     _run(dsn, "pg_restore", *whole, str(file))
+
+
+def has_tables(dsn: str) -> bool:
+    """Whether a database has tables of Amers."""
+    with psycopg.connect(dsn) as connection:
+        row = connection.execute("select to_regclass('alembic_version')").fetchone()
+    return row != (None,)
 
 
 def _program(dsn: str, name: str) -> Path:
