@@ -78,7 +78,7 @@ class _InstallationCollector(Collector):
             blocks.add_metric((state,), number)
         yield blocks
         for name, text, value in (
-            ("amers_queue_length", "Jobs in the queue that no worker has taken.", store.queue),
+            ("amers_queue_length", "Jobs that wait for a worker.", store.queue),
             (
                 "amers_oldest_waiting_job_seconds",
                 "Age of the oldest job that waits, seconds.",

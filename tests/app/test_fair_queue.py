@@ -6,11 +6,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from uuid import UUID, uuid4
 
 import pytest
 from fastapi.testclient import TestClient
 
+from app.config import Settings
 from app.db import engine
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs, progress, queue
@@ -19,7 +21,7 @@ from app.usecases.tokens import create_token
 from app.worker.attempt import FAILURES_ALLOWED
 from app.worker.sweep import sweep_jobs
 from tests.app.job_queue import LEASE_S, let_lease_lapse, tickets
-from tests.app.worker_processes import wait_until
+from tests.app.worker_processes import ended, running_worker, wait_until
 from tests.statements import run_sql
 
 FLOOD = 1000
@@ -345,3 +347,25 @@ def test_a_worker_killed_between_its_ticket_and_the_claim_leaves_the_job_to_othe
     with database.transaction() as connection:
         assert tickets(connection) == 1
         assert claim(connection).id == waiting
+
+
+def test_a_real_worker_does_the_job_of_another_owner_before_the_rest_of_a_flood(
+    client: TestClient, settings: Settings, bearer, tmp_path: Path
+):
+    """Each job fails quickly: its scene is no image."""
+    jobs_of: dict[str, list[str]] = {}
+    for name, count in (("many", 6), ("one", 1)):
+        me = bearer("register")
+        scene = client.post("/scenes?name=a.tif", content=b"II*\0" + bytes(100), headers=me).json()["id"]
+        body = {"inputs": {"scene": scene}}
+        made = [
+            client.post("/processes/register-scene/execution", json=body, headers=me)
+            for _ in range(count)
+        ]
+        jobs_of[name] = [str(reply.json()["jobID"]) for reply in made]
+    admin = bearer("admin")
+    with running_worker(settings, tmp_path / "log"):
+        ended(client, f"/jobs/{jobs_of['one'][0]}", admin)
+        states = [client.get(f"/jobs/{job}", headers=admin).json()["status"] for job in jobs_of["many"]]
+    assert states[0] == "failed", "the oldest job of all came first"
+    assert states[2:] == ["accepted"] * 4

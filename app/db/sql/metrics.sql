@@ -3,7 +3,7 @@
 select
     (select coalesce(extract(epoch from clock_timestamp() - min(created_at)), 0)
         from job where state = 'accepted')::float8 as oldest_waiting_s,
-    (select count(*) from procrastinate_jobs where status = 'todo') as queue,
+    (select count(*) from job where state = 'accepted') as queue,
     (select coalesce(sum(n_points - n_unserved), 0) from block
         where state = 'published')::bigint as points,
     (select count(*) from damaged_file) as damaged_files,
