@@ -1,6 +1,7 @@
 """Errors of the entry points and the store; those of the science are in `services.errors`."""
 
 import errno
+import re
 
 from services.errors import AmersError, ComputationError, InputError
 
@@ -18,10 +19,20 @@ __all__ = [
     "StorageOutage",
     "TooLarge",
     "TooMany",
+    "is_no_memory",
     "is_no_room",
 ]
 DISK_FULL = "53100"
 """SQLSTATE of PostgreSQL's error `disk_full`."""
+CV_NO_MEMORY = -4
+"""Code of OpenCV's error `StsNoMem`."""
+GDAL_NO_MEMORY = "CPLE_OutOfMemoryError"
+NO_MEMORY = re.compile(
+    r"out of memory|cannot allocate|can't allocate|unable to allocate|failed to allocate|bad_alloc"
+    r"|not enough memory|can't start new thread",
+    re.IGNORECASE,
+)
+"""How libraries say that they got no memory, where their errors have no class or code of their own."""
 
 
 class InvalidParameter(InputError):
@@ -79,6 +90,27 @@ def is_no_room(error: BaseException) -> bool:
     return (
         isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     ) or getattr(error, "sqlstate", None) == DISK_FULL
+
+
+def is_no_memory(error: BaseException) -> bool:
+    """Whether an error, or one that caused it, means that this process got no memory.
+
+    Libraries report it in their own ways, by class, code or text: GDAL, OpenCV, libpq, C++. What the
+    server of the database reports is the state of another process.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError) or type(cause).__name__ == GDAL_NO_MEMORY:
+            return True
+        if isinstance(cause, OSError) and cause.errno == errno.ENOMEM:
+            return True
+        if type(cause).__module__ == "cv2" and getattr(cause, "code", None) == CV_NO_MEMORY:
+            return True
+        is_ours = isinstance(cause, AmersError) or getattr(cause, "sqlstate", None) is not None
+        if not is_ours and NO_MEMORY.search(str(cause)):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return False
 
 
 class NotAllowed(AmersError):

@@ -22,7 +22,7 @@ from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage, Outlook
 from app.db.schema import JobResponse
 from app.db.tokens import Token
-from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess
+from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess, is_no_memory
 from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
@@ -207,6 +207,7 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
     An `AmersError` ends the job as failed; any other exception is left to the caller.
 
     Raises:
+        MemoryError: a file seemed unusable because there was no memory to read it.
         LostJob: this attempt is no longer the current one; nothing is written.
     """
     with database.transaction() as connection:
@@ -223,6 +224,8 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
             results = commit(connection)
             attempts.succeed(connection, job.id, attempt, results)
     except AmersError as error:
+        if is_no_memory(error):
+            raise MemoryError from error
         if isinstance(error, DamagedFile):
             report_damage(database, error)
         log.info("job %s failed: %s: %s", job.id, type(error).__name__, error)

@@ -9,19 +9,15 @@ a crash or an outage. SIGXFSZ ends a process that writes too large a file.
 import logging
 from uuid import UUID
 
-import cv2
-
 from app import logs
 from app.config import read_settings
 from app.db.engine import pooled
 from app.db.jobs.attempts import LostJob
-from app.errors import is_no_room
+from app.errors import is_no_memory, is_no_room
 from app.request_context import Origin, working_for
 from app.usecases.jobs import do_attempt
 from app.worker.attempt import NO_ROOM, OUT_OF_MEMORY
 from app.worker.warm_server import limit_files, limit_memory
-
-CV_NO_MEMORY = -4
 
 log = logging.getLogger(__name__)
 
@@ -40,13 +36,9 @@ def main(arguments: list[str]) -> int:
             do_attempt(database, settings, UUID(job_id), int(attempt))
     except LostJob as lost:
         log.info("%s", lost)
-    except MemoryError:
-        return OUT_OF_MEMORY
-    except cv2.error as error:
-        if error.code == CV_NO_MEMORY:
-            return OUT_OF_MEMORY
-        raise
     except Exception as error:
+        if is_no_memory(error):
+            return OUT_OF_MEMORY
         if not is_no_room(error):
             raise
         log.exception("a disk is full")
