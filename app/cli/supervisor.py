@@ -112,7 +112,12 @@ class Supervisor:
         pause_s, is_first = FIRST_PAUSE_S, True
         while not self._stop.is_set():
             begin = time.monotonic()
-            process = child.start()
+            try:
+                process = child.start()
+            except OSError as error:
+                log.error("%s cannot be started now: %s", child.name, error)
+                self._stop.wait(LONGEST_PAUSE_S)
+                continue
             while process.poll() is None and not self._stop.wait(POLL_S):
                 pass
             if self._stop.is_set():

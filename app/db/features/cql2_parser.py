@@ -18,16 +18,17 @@ CPU_S = 1
 
 def main() -> None:
     """Reply to requests until the socket is closed."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    _limit(resource.RLIMIT_AS, MEMORY_BYTES)
+    _limit(resource.RLIMIT_CORE, 0)
+    _limit(resource.RLIMIT_FSIZE, 0)
     sys.path.insert(0, sys.argv[1])
     import cql2
 
     parsers = {b"t": cql2.parse_text, b"j": cql2.parse_json}
     while head := _read(5):
         text = _read(int.from_bytes(head[1:], "big")).decode()
-        _renew_cpu_time()
+        # The system ends this process when the filter takes more than one to two seconds of CPU.
+        _limit(resource.RLIMIT_CPU, int(time.process_time()) + 1 + CPU_S)
         try:
             sign, reply = b"+", json.dumps(parsers[head[:1]](text).to_json())
         except BaseException as error:  # A panic of the library is no Exception.
@@ -36,10 +37,10 @@ def main() -> None:
         _write(sign + len(content).to_bytes(4, "big") + content)
 
 
-def _renew_cpu_time() -> None:
-    """Let the system end this process when the next filter takes more than one to two seconds of CPU."""
-    limit_s = int(time.process_time()) + 1 + CPU_S
-    resource.setrlimit(resource.RLIMIT_CPU, (limit_s, resource.RLIM_INFINITY))
+def _limit(kind: int, value: int) -> None:
+    """Set the soft limit of a resource, within the hard limit that this process has inherited."""
+    _, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
 
 
 def _read(size: int) -> bytes:
