@@ -1,17 +1,21 @@
 """`amers store`: the storage of the files."""
 
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from app.cli.output import AsJson, Row, as_size, print_json, show, show_one
+from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db import engine
 from app.errors import InputError
 from app.storage import open_storage, trash
 from app.usecases import garbage_collection, storage_identity, usage
+from app.usecases.installation import Installation
+from app.usecases.store_verification import Finding, verify_store
 
 app = typer.Typer(no_args_is_help=True)
 trash_app = typer.Typer(no_args_is_help=True, help="Files that the sweep removed.")
@@ -71,6 +75,47 @@ def sweep(as_json: AsJson = False) -> None:
     show([{"key": key} for key in keys], as_json=as_json)
 
 
+@app.command()
+def verify(
+    *,
+    repair: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FROM",
+            exists=True,
+            file_okay=False,
+            help="Replace rotten and missing files by their copies below this folder: a copy of the "
+            "storage, or a backup.",
+        ),
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(metavar="MB/S", min=0.001, help="Read no faster, megabytes per second.")
+    ] = 100.0,
+    as_json: AsJson = False,
+) -> None:
+    """Read every file and report what is rotten, missing or not known; exit code 1 if anything is."""
+    settings = read_settings()
+    storage = open_storage(settings)
+    with engine.opened(settings) as database:
+        storage_identity.require_match(database, storage)
+        installation = Installation(database, storage, settings)
+        with shown_progress() as progress:
+            outcome = verify_store(installation, progress, rate, repair)
+    if as_json:
+        print_json(outcome)
+    else:
+        show([_finding(finding) for finding in outcome.findings], as_json=False)
+        n_bad = sum(not finding.repaired for finding in outcome.findings)
+        typer.echo(
+            f"{outcome.n_files} files of {outcome.size_bytes / 1e6:,.1f} MB read: {n_bad} not as they "
+            f"should be, {len(outcome.findings) - n_bad} repaired; {outcome.n_recorded} had no checksum "
+            "before",
+            err=True,
+        )
+    if not outcome.is_whole:
+        raise typer.Exit(1)
+
+
 @trash_app.command("list")
 def list_trash(as_json: AsJson = False) -> None:
     """List the files in the trash, oldest first."""
@@ -96,3 +141,15 @@ def restore(
 def empty(as_json: AsJson = False) -> None:
     """Delete all files in the trash."""
     show_one({"deleted": trash.empty(open_storage(read_settings()))}, as_json=as_json)
+
+
+def _finding(finding: Finding) -> Row:
+    points = ", ".join(map(str, finding.first_points))
+    more = " …" if finding.n_points > len(finding.first_points) else ""
+    return {
+        "file": finding.key,
+        "kind": finding.kind or "-",
+        "state": "repaired" if finding.repaired else finding.state,
+        "what": finding.detail,
+        "points": f"{finding.n_points}: {points}{more}" if finding.n_points else "-",
+    }

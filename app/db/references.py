@@ -5,7 +5,7 @@ from datetime import datetime
 
 import numpy as np
 import shapely
-from sqlalchemy import JSON, Numeric, bindparam, cast, delete, func, insert, select
+from sqlalchemy import JSON, Numeric, bindparam, cast, delete, func, insert, or_, select, update
 from sqlalchemy.dialects import postgresql
 
 from app.db.engine import Connection
@@ -13,6 +13,7 @@ from app.db.features.antimeridian import TURNS_DEG, on_the_map
 from app.db.rows import columns_of, every, first
 from app.db.schema import reference_image, reference_point
 from app.db.statements import named
+from app.db.stored_files import NamedFile
 from services.types import Array, BoolArray, IntArray
 
 FEW_ATTEMPTS = 3
@@ -24,7 +25,11 @@ COUNT_PLACES = named("references.sql", "count_places")
 
 @dataclass(frozen=True)
 class NewReferenceImage:
-    """The columns of a new reference image, as in `ReferenceRow`."""
+    """The columns of a new reference image, as in `ReferenceRow`.
+
+    Attributes:
+        checksums: path of each of its files to the SHA-256 of the file.
+    """
 
     name: str
     image: str
@@ -33,6 +38,7 @@ class NewReferenceImage:
     geoid: str | None
     sigma_m: float | None
     gsd_m: float
+    checksums: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,30 @@ def list_references(connection: Connection) -> list[ReferenceRow]:
     """All references, by name."""
     statement = select(*COLUMNS).order_by(reference_image.c.name)
     return every(ReferenceRow, connection.execute(statement))
+
+
+def read_reference_files(connection: Connection) -> list[NamedFile]:
+    """The files of all references, each once; the size is not recorded."""
+    checksums: dict[str, str | None] = {}
+    columns = reference_image.c
+    statement = select(columns.image, columns.dem, columns.geoid, columns.checksums).order_by(columns.id)
+    for row in connection.execute(statement):
+        for path in (row.image, row.dem, row.geoid):
+            if path is not None:
+                checksums[path] = (row.checksums or {}).get(path) or checksums.get(path)
+    return [NamedFile(path, "reference", None, sha256) for path, sha256 in sorted(checksums.items())]
+
+
+def record_checksum(connection: Connection, path: str, sha256: str) -> None:
+    """Record the SHA-256 of a file in the rows of the references that name the file."""
+    columns = reference_image.c
+    checksum = cast({path: sha256}, postgresql.JSONB)
+    others = func.coalesce(columns.checksums, cast({}, postgresql.JSONB))
+    connection.execute(
+        update(reference_image)
+        .where(or_(columns.image == path, columns.dem == path, columns.geoid == path))
+        .values(checksums=others.op("||")(checksum))
+    )
 
 
 def delete_reference(connection: Connection, name: str) -> bool:

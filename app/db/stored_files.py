@@ -1,10 +1,9 @@
 """Files of the storage as rows name them: their checksums, and which of them are damaged."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from uuid import UUID
 
-from sqlalchemy import delete, func, select, update
+from sqlalchemy import delete, select, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.blocks import ID_BITS
@@ -14,16 +13,17 @@ from app.db.schema import chip_file, clock, damaged_file, result_file, upload
 from app.db.statements import named
 
 NAMED_FILES = named("stored_files.sql", "named_files")
+FOLDERS_IN_PROGRESS = named("stored_files.sql", "folders_in_progress")
 POINTS_OF_CHIPS = named("stored_files.sql", "points_of_chips")
 
 
 @dataclass(frozen=True)
 class NamedFile:
-    """A file of the storage that a row names.
+    """A file that a row names.
 
     Attributes:
-        storage_key: of the file.
-        kind: chips, scene image, side file, upload archive or result.
+        storage_key: of the file; of a reference, its path below AMERS_REFERENCE_FOLDER.
+        kind: chips, scene image, side file, upload archive, result or reference.
         size_bytes: None if unknown; of a file of chips without its header.
         sha256: in hexadecimal; None if unknown.
     """
@@ -39,6 +39,11 @@ def read_named_files(connection: Connection, keys: list[str] | None = None) -> l
     return every(NamedFile, connection.execute(NAMED_FILES, {"keys": keys}))
 
 
+def folders_in_progress(connection: Connection) -> set[str]:
+    """The folders of the storage that files are being written into."""
+    return set(connection.scalars(FOLDERS_IN_PROGRESS))
+
+
 def find_chip_checksums(connection: Connection, storage_key: str) -> bytes | None:
     """The checksums of the chips of a file; None if they are not recorded."""
     statement = select(chip_file.c.chip_checksums).where(
@@ -48,17 +53,10 @@ def find_chip_checksums(connection: Connection, storage_key: str) -> bytes | Non
     return checksums
 
 
-def record_chip_checksums(connection: Connection, storage_key: str, checksums: bytes) -> bool:
-    """Record the checksums of the chips of a file; returns whether other ones were recorded before."""
+def record_chip_checksums(connection: Connection, storage_key: str, checksums: bytes) -> None:
+    """Record the checksums of the chips of a file."""
     of_file = chip_file.c.storage_key == storage_key
-    other = select(func.count()).where(of_file, chip_file.c.chip_checksums != checksums)
-    n_other = connection.scalar(other) or 0
-    connection.execute(
-        update(chip_file)
-        .where(of_file, chip_file.c.chip_checksums.is_distinct_from(checksums))
-        .values(chip_checksums=checksums)
-    )
-    return n_other > 0
+    connection.execute(update(chip_file).where(of_file).values(chip_checksums=checksums))
 
 
 def record_upload_checksum(connection: Connection, storage_key: str, sha256: str) -> None:
@@ -95,6 +93,11 @@ def record_damage(connection: Connection, storage_key: str, reason: str) -> None
     )
 
 
-def keep_damages(connection: Connection, storage_keys: Iterable[str]) -> None:
-    """Forget all damages but those of some files."""
-    connection.execute(delete(damaged_file).where(damaged_file.c.storage_key.not_in(list(storage_keys))))
+def forget_damage(connection: Connection, storage_key: str) -> None:
+    """Forget the damage of a file that is whole again."""
+    connection.execute(delete(damaged_file).where(damaged_file.c.storage_key == storage_key))
+
+
+def forget_unnamed_damage(connection: Connection, named_keys: list[str]) -> None:
+    """Forget the damage of files that no row names any more."""
+    connection.execute(delete(damaged_file).where(damaged_file.c.storage_key.not_in(named_keys)))

@@ -1,6 +1,5 @@
 """Damage of stored files that is met while they are used: name the file, and alarm the operator."""
 
-import hashlib
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,8 +8,7 @@ from app.db import stored_files
 from app.db.engine import Database
 from app.errors import DamagedFile, InputError, NotFound
 from app.storage import Storage, StoredChips
-
-READ_BYTES = 1 << 20
+from app.storage.content import read_content
 
 log = logging.getLogger(__name__)
 
@@ -78,8 +76,5 @@ def sha256_of(storage: Storage, key: str) -> str:
     Raises:
         DamagedFile: the file is missing.
     """
-    digest = hashlib.sha256()
     with named_by_row(key), storage.open(key) as file:
-        while piece := file.read(READ_BYTES):
-            digest.update(piece)
-    return digest.hexdigest()
+        return read_content(file, lambda size_bytes: None, of_chips=False).sha256

@@ -1,5 +1,6 @@
 """Reference images of an installation: add, list, find one for a scene, record where scenes matched."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,11 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
         geoid=new.geoid,
         sigma_m=new.sigma_m,
         gsd_m=reference.model.grid.gsd_m,
+        checksums={
+            path: _sha256(_path_below(settings, field, path))
+            for field, path in (("image", new.image), ("dem", new.dem), ("geoid", new.geoid))
+            if path is not None
+        },
     )
     row = references.insert_reference(connection, image, scene_footprint(scene))
     if row is None:
@@ -171,6 +177,11 @@ def _reference_files(settings: Settings, reference: NewReference | ReferenceRow)
         raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
     image = _path_below(settings, "image", reference.image)
     return ReferenceFiles(image, terrain, reference.sigma_m)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _path_below(settings: Settings, field: str, path: str) -> Path:

@@ -37,3 +37,13 @@ where f.storage_key = :storage_key
         or exists (select from unnest(cast(:rows as bigint[])) as chip_row
                    where chip_row >= p.chip_row and chip_row < p.chip_row + p.chip_count))
 order by p.id
+
+-- name: folders_in_progress
+-- Folders of the storage in which files without a row may lie for a moment: they are being written.
+select 'scenes/' || id as folder from scene where state = 'uploading'
+union
+select 'scenes/' || scene_id from upload where finished_at is null and scene_id is not null
+union
+select 'uploads/' || id from upload where finished_at is null
+union
+select 'results/' || id || '/' || attempt from job where state = 'running'
