@@ -30,7 +30,7 @@ COMMANDS = {
     "reference": "Reference images, for scenes on ground without control points.",
     "production": "Make new blocks of points from images.",
     "db": "The database: schema, backup and restore with the stored files.",
-    "store": "The storage of the files: usage, adopt, sweep, trash.",
+    "store": "The storage of the files: verify, usage, adopt, sweep, trash.",
     "token": "Tokens of the callers of the API.",
     "demo": "Run the whole work on a simulated world.",
     "serve": "Run the API and one worker.",

@@ -82,8 +82,8 @@ class StoredChips:
             raise DamagedFile(file, "the disk cannot read it") from error
         if chips.checksums is not None:
             rows = damaged_rows(data, chips.layout, row, chips.checksums)
-            if len(rows):
-                raise DamagedFile(file, damage_of_rows(rows.tolist(), chips.layout.count))
+            if rows:
+                raise DamagedFile(file, damage_of_rows(rows, chips.layout.count))
         return decoded
 
     def _find(self, file: str) -> _OpenChipFile:

@@ -10,7 +10,6 @@ import numpy.typing as npt
 import xxhash
 
 from services.formats.chips.npy_files import ChipFile
-from services.types import IntArray
 
 CHECKSUM = np.dtype("<u4")
 """How the checksums of a file are kept: one after the other, in the order of its chips."""
@@ -46,7 +45,7 @@ class ChipHasher:
         return np.array(self._checksums, dtype=CHECKSUM)
 
 
-def damaged_rows(data: bytes, layout: ChipFile, row: int, expected: Checksums) -> IntArray:
+def damaged_rows(data: bytes, layout: ChipFile, row: int, expected: Checksums) -> list[int]:
     """The rows of the chips that do not have their checksums.
 
     Args:
@@ -55,12 +54,15 @@ def damaged_rows(data: bytes, layout: ChipFile, row: int, expected: Checksums) -
         row: of the first of these chips in the file.
         expected: the checksums of all chips of the file.
     """
-    size, bytes_of = layout.chip_bytes, memoryview(data)
-    found = [
-        _lower_bits(xxhash.xxh3_64_intdigest(bytes_of[start : start + size]))
-        for start in range(0, len(data), size)
-    ]
-    return row + np.flatnonzero(np.array(found, dtype=CHECKSUM) != expected[row : row + len(found)])
+    size, chips = layout.chip_bytes, memoryview(data)
+    starts = range(0, len(data), size)
+    computed = [_lower_bits(xxhash.xxh3_64_intdigest(chips[at : at + size])) for at in starts]
+    recorded = expected[row : row + len(computed)].tolist()
+    # Lists: for the few chips of a point, arrays take longer than the checksums.
+    if computed == recorded:
+        return []
+    pairs = enumerate(zip(computed, recorded, strict=True), start=row)
+    return [at for at, (found, stated) in pairs if found != stated]
 
 
 def _lower_bits(digest: int) -> int:
