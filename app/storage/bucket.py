@@ -3,7 +3,7 @@
 import io
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -21,8 +21,6 @@ RETRY_TIMEOUT = timedelta(seconds=20)
 """A failing request is repeated for this time; then it raises `StorageOutage`."""
 COPY_LIMIT_BYTES = 5 << 30
 """Largest file that S3 copies in one request."""
-PART_BYTES = 16 << 20
-"""Size of the parts of a larger file: 10,000 of them, the most that S3 accepts, are 156 GiB."""
 
 
 @dataclass(frozen=True)
@@ -111,20 +109,17 @@ class BucketStorage(Storage):
     def move(self, key: str, new_key: str) -> None:
         """Give a file another key; does nothing if there is no such file.
 
-        The storage service copies the file, unless it is too large for one request.
+        The storage service copies the file; one that is too large for that goes through this machine.
         """
-        if not self.exists(key):
-            return
-        with _storage_errors(key):
+        with suppress(NotFound), _storage_errors(key):
             if self.size(key) <= COPY_LIMIT_BYTES:
                 obstore.copy(self.store, checked_key(key), checked_key(new_key))
             else:
-                parts = obstore.get(self.store, key).stream(min_chunk_size=PART_BYTES)
-                # An iterator: of the stream itself, obstore expects asynchronous parts.
-                obstore.put(
-                    self.store, checked_key(new_key), (part for part in parts), chunk_size=PART_BYTES
-                )
-        self.delete(key)
+                with self._unfinished(None) as writing:
+                    for chunk in obstore.get(self.store, key).stream(min_chunk_size=COPY_BYTES):
+                        writing.write(chunk)
+                    self._place(writing.finish(), new_key)
+            self.delete(key)
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a prefix, sorted."""

@@ -243,9 +243,10 @@ class Storage:
     def move(self, key: str, new_key: str) -> None:
         """Give a file another key; does nothing if there is no such file."""
         path = self._locate(key)
-        if path.is_file():
+        # Another process may move or delete it at the same time.
+        with suppress(FileNotFoundError):
             self._place(path, new_key)
-            self.delete(key)
+        self.delete(key)
 
     def keys(self, prefix: str) -> list[str]:
         """The keys of all files below a folder of the storage, sorted."""

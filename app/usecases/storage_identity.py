@@ -73,6 +73,15 @@ def prepare(begin: Begin, storage: Storage) -> str | None:
     return None
 
 
+def advance(begin: Begin, storage: Storage) -> None:
+    """Advance the generation of a storage and its database, if they belong together."""
+    with begin() as connection:
+        if _compare(storage, installation.lock(connection), lambda: UNNAMED) is not None:
+            return
+        installation.advance(connection)
+    _write_marker(begin, storage)
+
+
 def announce(begin: Begin, storage: Storage) -> bool:
     """Prepare the storage and log what stands against it; returns whether it belongs to the database."""
     try:

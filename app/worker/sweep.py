@@ -63,7 +63,7 @@ class Sweeper:
                 )
                 if time.monotonic() > next_generation_at:
                     next_generation_at += GENERATION_EVERY_S
-                    storage_identity.prepare(self.database.transaction, self.storage)
+                    storage_identity.advance(self.database.transaction, self.storage)
                 if time.monotonic() > next_files_at:
                     next_files_at += FILES_EVERY_S
                     sweep_records(self.database, self.storage, self.settings)

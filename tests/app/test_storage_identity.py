@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from pathlib import Path
 from uuid import uuid4
@@ -13,7 +14,7 @@ import pytest
 from app.config import Settings
 from app.db import engine
 from app.db.cluster.embedded import Cluster
-from app.storage import MARKER, open_storage, trash
+from app.storage import MARKER, open_storage, read_marker, trash
 from app.storage.trash import TRASH, Moment
 from app.usecases import garbage_collection, storage_identity
 from app.worker import sweep
@@ -221,6 +222,25 @@ def test_nothing_is_swept_at_the_first_ticks_of_a_worker(full: Full):
         stop.set()
         thread.join()
     assert contents(storage) == before
+
+
+def test_a_worker_advances_the_generation_of_its_storage(full: Full, monkeypatch: pytest.MonkeyPatch):
+    storage = open_storage(full.settings)
+    before = read_marker(storage)
+    monkeypatch.setattr(sweep, "GENERATION_EVERY_S", 0.0)
+    swept(full.settings, monkeypatch, lambda: read_marker(storage) != before)
+    after = read_marker(storage)
+    assert before is not None
+    assert after is not None
+    assert (after.installation, after.generation > before.generation) == (before.installation, True)
+
+
+def test_a_file_that_two_workers_sweep_at_once_is_moved_once(full: Full):
+    storage = open_storage(full.settings)
+    storage.put("scenes/stray", [b"x"])
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: storage.move("scenes/stray", "trash/stray"), range(8)))
+    assert (storage.exists("scenes/stray"), storage.open("trash/stray").read()) == (False, b"x")
 
 
 @pytest.mark.parametrize("kind", ["bucket"])
