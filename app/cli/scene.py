@@ -1,45 +1,41 @@
 """`amers scene`: register and orthorectify scenes."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from app.cli.output import AsJson, print_json, show_one
+from app.cli.output import AsJson, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.remote import Service, ServiceFailure
-from app.config import read_settings
-from app.db import engine
-from app.errors import AmersError, ComputationError, InputError
-from app.storage import open_storage
-from app.usecases.orthorectification import OrthoMap, run_orthorectification
-from app.usecases.references import references_of_store
-from app.usecases.registration.control_sources import points_of_block, points_of_store
-from app.usecases.registration.reference_source import ReferenceFiles, given_reference
-from app.usecases.registration.register import (
-    ControlSources,
-    SceneFiles,
-    image_key,
-    record_registration,
-    run_registration,
+from app.cli.scene_registration import (
+    Control,
+    Outcome,
+    SceneRequest,
+    images_of,
+    outcome_of,
+    register_many,
+    registrar,
 )
+from app.errors import AmersError, ComputationError, InputError
+from app.usecases.orthorectification import OrthoMap, run_orthorectification
+from app.usecases.registration.reference_source import ReferenceFiles
+from app.usecases.registration.register import SceneFiles
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
-from services.reports.document import report_document
-from services.types import Progress
 
 app = typer.Typer(no_args_is_help=True)
 
-Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
-"""Registers one scene into a folder and returns its report; the last argument copies the image too."""
+_TABLE = ("active", "shift_m", "residual_rms_px", "ce90_predicted_px", "check_ce90_m", "seconds")
+"""Figures of a scene in the table of many scenes."""
 
 
 @app.command()
 def register(
-    scenes: Annotated[list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    scenes: Annotated[
+        list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
+    ],
     *,
     block: Annotated[
         Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
@@ -80,6 +76,9 @@ def register(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder; each of several scenes gets one inside it.")
     ] = Path("registered"),
+    jobs: Annotated[
+        int, typer.Option(help="Number of scenes registered at once, each in a process.", min=1)
+    ] = 1,
     server: Annotated[
         str | None, typer.Option(help="Address of an Amers service that does the registration.")
     ] = None,
@@ -91,29 +90,43 @@ def register(
 ) -> None:
     """Refine the sensor models of scenes on control points; write report, points and refined models.
 
+    Each of several scenes gets a folder in the output folder, and a failed one does not stop the others.
+
     The points come from the store unless --block, --reference or --server is given.
     """
+    images = images_of(scenes)
+    is_one_scene = len(scenes) == len(images) == 1 and not scenes[0].is_dir()
     files_of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
     _refuse_contradictions(block, reference, dem, server)
-    _refuse_shared_files(scenes, [name for name, file in files_of_one.items() if file is not None])
+    _refuse_shared_files(images, [name for name, file in files_of_one.items() if file is not None])
+    if server is not None and jobs > 1:
+        raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
+    terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
+    control = Control(block, None if reference is None else ReferenceFiles(reference, terrain))
+    requests = [
+        SceneRequest(
+            SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights),
+            output if is_one_scene else output / image.stem,
+            copy_image,
+        )
+        for image in images
+    ]
     try:
-        terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
-        reference_files = None if reference is None else ReferenceFiles(reference, terrain)
-        with _registrar(block, reference_files, server, token) as register_one:
-            outcomes = [
-                _outcome(
-                    register_one,
-                    SceneFiles(scene, model, sigma_m, bands, mask, check_points, check_heights),
-                    folder,
-                    copy_image,
-                )
-                for scene, folder in _output_folders(scenes, output)
-            ]
+        if server is not None:
+            with Service(server, token or "") as service:
+                outcomes = [outcome_of(service.register, request) for request in requests]
+        elif is_one_scene:
+            with registrar(control) as register_one:
+                outcomes = [outcome_of(register_one, requests[0])]
+        else:
+            outcomes = register_many(requests, control, jobs)
     except ServiceFailure as failure:
         typer.echo(f"amers: {failure}", err=True)
         raise typer.Exit(1) from failure
-    records = [outcome for outcome in outcomes if isinstance(outcome, dict)]
-    _show(records, as_json=as_json, is_one_scene=len(scenes) == 1)
+    if is_one_scene:
+        _show_one_scene(outcomes[0], as_json=as_json)
+    else:
+        _show_scenes(requests, outcomes, as_json=as_json)
     _raise_worst([outcome for outcome in outcomes if isinstance(outcome, AmersError)])
 
 
@@ -192,110 +205,32 @@ def _refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
         )
 
 
-def _output_folders(scenes: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
-    for scene in scenes:
-        yield scene, output if len(scenes) == 1 else output / scene.stem
-
-
-@contextmanager
-def _registrar(
-    block: Path | None, reference: ReferenceFiles | None, server: str | None, token: str | None
-) -> Iterator[Register]:
-    """The function that registers scenes: on given files, by a service, or on the store."""
-    if block is not None or reference is not None:
-        yield _on_files(block, reference)
-    elif server is not None:
-        with Service(server, token or "") as service:
-            yield service.register
+def _show_one_scene(outcome: Outcome, *, as_json: bool) -> None:
+    if isinstance(outcome, AmersError):
+        if as_json:
+            print_json([])
+    elif as_json:
+        print_json(outcome)
     else:
-        with _on_store() as register_one:
-            yield register_one
+        show_one({name: _rounded(value) for name, value in outcome.items()}, as_json=False)
 
 
-def _on_files(block: Path | None, reference: ReferenceFiles | None) -> Register:
-    """A function that registers scenes on a block folder, a reference, or both."""
-    sources = ControlSources(
-        find_points=None if block is None else points_of_block(block),
-        find_reference=None if reference is None else given_reference(reference),
-    )
-
-    def register_one(
-        files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
-    ) -> dict[str, Any]:
-        registered = run_registration(files, sources, folder, copy_image=copy_image, progress=progress)
-        return report_document(registered.report)
-
-    return register_one
-
-
-@contextmanager
-def _on_store() -> Iterator[Register]:
-    """A function that registers scenes on the store and records the registrations there."""
-    settings = read_settings()
-    storage = open_storage(settings)
-    with engine.opened(settings) as database:
-        sources = ControlSources(
-            points_of_store(database, storage), references_of_store(database, settings)
-        )
-
-        def register_one(
-            files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
-        ) -> dict[str, Any]:
-            registered = run_registration(
-                files, sources, folder, copy_image=copy_image, progress=progress
-            )
-            with database.transaction() as connection:
-                record_registration(connection, registered, image_key(files.image))
-            return report_document(registered.report)
-
-        yield register_one
-
-
-def _outcome(
-    register_one: Register, files: SceneFiles, folder: Path, copy_image: bool
-) -> dict[str, Any] | AmersError:
-    """The figures to show of one registered scene, or the error that ended its registration."""
-    try:
-        with shown_progress() as progress:
-            report = register_one(files, folder, progress, copy_image)
-    except AmersError as error:
-        return error
-    if report["verdict"] == "failed":
-        return ComputationError(
-            f"{files.image}: the registration has the verdict failed, do not use its model; see "
-            f"{folder / 'report.html'}"
-        )
-    counts, correction = report["point_counts"], report["correction"]
-    return {
-        "scene": files.image,
-        "verdict": report["verdict"],
-        "visible": counts["visible"],
-        "matched": counts["matched"],
-        "active": counts["active"],
-        "correction": correction["order"],
-        "shift_px": correction["shift_px"],
-        "shift_m": correction["shift_m"],
-        "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
-        "ce90_predicted_px": report["predicted"]["worst_px"],
-        **_check_figures(report["checks"]),
-        "output": folder,
-    }
-
-
-def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
-    """The figures to show of independent check points, if there are any."""
-    if not checks:
-        return {}
-    accuracy = checks[0]["accuracy"]
-    return {"check_points": accuracy["n"], "check_ce90_m": accuracy["ce90_m"]["value"]}
-
-
-def _show(records: list[dict[str, Any]], *, as_json: bool, is_one_scene: bool) -> None:
+def _show_scenes(requests: list[SceneRequest], outcomes: list[Outcome], *, as_json: bool) -> None:
+    """Print a record for every scene, or a table of the figures that compare scenes."""
     if as_json:
-        print_json(records[0] if is_one_scene and records else records)
+        errors = {
+            k: {"scene": requests[k].files.image, "error": str(outcome)}
+            for k, outcome in enumerate(outcomes)
+            if isinstance(outcome, AmersError)
+        }
+        print_json([errors.get(k, outcome) for k, outcome in enumerate(outcomes)])
         return
-    for record in records:
-        show_one({name: _rounded(value) for name, value in record.items()}, as_json=False)
+    rows = []
+    for request, outcome in zip(requests, outcomes, strict=True):
+        figures = {} if isinstance(outcome, AmersError) else outcome
+        row = {"scene": request.files.image, "verdict": figures.get("verdict", "not registered")}
+        rows.append(row | {name: _rounded(figures.get(name)) for name in _TABLE})
+    show(rows, as_json=False)
 
 
 def _rounded(value: Any) -> Any:

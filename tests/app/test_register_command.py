@@ -163,6 +163,64 @@ def test_the_command_registers_with_the_store_and_records_the_measures(
     assert rows == {"n": 40}
 
 
+def test_a_folder_of_scenes_is_registered_by_two_processes_and_a_bad_scene_stops_none(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    scenes, folder = tmp_path / "scenes", tmp_path / "out"
+    scenes.mkdir()
+    content = world.tagged.read_bytes()
+    (scenes / "b.tif").write_bytes(content[:100_000])
+    (scenes / "a.tif").write_bytes(content)
+    (scenes / "notes.txt").write_text("no image")
+    (tmp_path / "c.tif").write_bytes(content)
+    command = ("scene", "register", scenes, tmp_path / "c.tif", "--block", world.block)
+    options = ("--sigma-m", SIGMA_M, "--jobs", 2, "-o", folder)
+    result = amers(*command, *options, "--json")
+    assert result.returncode == 2
+    assert "b.tif" in result.stderr
+    assert "Traceback" not in result.stderr
+    first, bad, last = json.loads(result.stdout)
+    assert [Path(record["scene"]).name for record in (first, bad, last)] == ["a.tif", "b.tif", "c.tif"]
+    assert "truncated or damaged" in bad["error"]
+    for record, name in ((first, "a"), (last, "c")):
+        assert record["verdict"] in ("good", "usable")
+        assert record["seconds"] > 0.0
+        assert Path(record["output"]) == folder / name
+        assert_registered(folder / name, world)
+    table = amers(*command[:2], tmp_path / "c.tif", scenes / "a.tif", *command[4:], *options)
+    assert table.returncode == 0, table.stderr
+    rows = [line.split("\t") for line in table.stdout.splitlines()]
+    assert [(Path(row[0]).name, row[1]) for row in rows] == [
+        ("c.tif", last["verdict"]),
+        ("a.tif", first["verdict"]),
+    ]
+
+
+def test_many_scenes_are_registered_with_the_store_and_recorded(
+    amers: Amers, world: FlatWorld, published: None, tmp_path: Path, dsn: str
+):
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    for name in ("a.tif", "b.tif"):
+        (scenes / name).write_bytes(world.tagged.read_bytes())
+    options = ("--sigma-m", SIGMA_M, "--jobs", 2, "-o", tmp_path / "out")
+    result = amers("scene", "register", scenes, *options)
+    assert result.returncode == 0, result.stderr
+    with engine.connect(dsn) as connection:
+        rows = run_sql(connection, "select count(*) as n from registration").fetchone()
+    assert rows == {"n": 2}
+
+
+def test_a_folder_without_an_image_and_jobs_for_a_service_are_refused(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    (tmp_path / "empty").mkdir()
+    refused = amers("scene", "register", tmp_path / "empty", "--block", world.block)
+    assert (refused.returncode, "no image" in refused.stderr) == (2, True), refused.stderr
+    refused = amers("scene", "register", world.tagged, "--server", "http://127.0.0.1:1", "--jobs", 2)
+    assert (refused.returncode, "--jobs: the workers" in refused.stderr) == (2, True), refused.stderr
+
+
 def test_the_exit_code_of_the_command_shows_the_kind_of_error(
     amers: Amers, world: FlatWorld, tmp_path: Path
 ):
