@@ -37,7 +37,6 @@ from app.api.hosts import TrustedHosts
 from app.api.reply_headers import ReplyHeaders
 from app.api.request_log import RequestLog, RequestMetrics
 from app.api.routes import CallerRoute
-from app.api.strict_json import StrictJson
 from app.api.tus import TusRequests
 from app.config import Settings, read_settings
 from app.db import engine
@@ -143,7 +142,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
     )
     app.router.route_class = CallerRoute
-    app.add_middleware(StrictJson)
     app.add_middleware(BoundedBodies, settings=settings)
     app.add_middleware(
         CORSMiddleware,

@@ -8,13 +8,18 @@ from fastapi import Request, Response
 from fastapi.dependencies.models import Dependant
 from fastapi.dependencies.utils import solve_dependencies
 from fastapi.routing import APIRoute
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 
 from app.api import deps
-from app.api.body import body_of
+from app.api.body import ANONYMOUS_BODY_BYTES, body_of
 from app.api.connections import network_of
 from app.api.streams import Streamed
 from app.api.turns import Turns
 from app.db.tokens import Token
+from app.json_values import unusable_body
+
+Handler = Callable[[Request], Coroutine[Any, Any, Response]]
 
 
 class CallerRoute(APIRoute):
@@ -25,7 +30,7 @@ class CallerRoute(APIRoute):
     waits for a turn of this caller. A route whose endpoint does not ask for its caller is FastAPI's own.
     """
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+    def get_route_handler(self) -> Handler:
         """The function that replies to requests."""
         handle = super().get_route_handler()
         needed = self.dependant.dependencies
@@ -37,13 +42,14 @@ class CallerRoute(APIRoute):
 
         async def handle_for_caller(request: Request) -> Response:
             caller = await deps.identify(request)
+            reply = partial(handle, request)
             if has_body:
                 await _solve(guards, request)
                 if caller is not None:
                     body_of(request).accept_from_caller()
-                await request.body()
+                reply = partial(_check_and_handle, handle, request, await request.body())
             turns: Turns = request.app.state.uploads if takes_upload else request.app.state.turns
-            return await _in_turn(turns, _key(request, caller), partial(handle, request))
+            return await _in_turn(turns, _key(request, caller), reply)
 
         return handle_for_caller
 
@@ -61,6 +67,20 @@ async def _solve(guards: Dependant, request: Request) -> None:
         async_exit_stack=request.scope["fastapi_inner_astack"],
         embed_body_fields=False,
     )
+
+
+async def _check_and_handle(handle: Handler, request: Request, body: bytes) -> Response:
+    """The reply of an endpoint to a JSON body, unless the body has a value that JSON does not have.
+
+    A large body is checked in a thread, where it delays nobody else.
+    """
+    if len(body) <= ANONYMOUS_BODY_BYTES:
+        problem = unusable_body(body)
+    else:
+        problem = await run_in_threadpool(unusable_body, body)
+    if problem is not None:
+        raise HTTPException(422, problem)
+    return await handle(request)
 
 
 def _key(request: Request, caller: Token | None) -> Hashable:

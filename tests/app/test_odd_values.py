@@ -15,6 +15,7 @@ from app.usecases.jobs import PROCESSES
 from tests.app.odd_values import Target, in_url, json_text, targets, with_member
 from tests.app.running_service import Served, service_with_a_block
 from tests.app.test_access_matrix import OPERATIONS
+from tests.factories import make_block
 
 pytestmark = [pytest.mark.long, pytest.mark.security]
 
@@ -55,7 +56,8 @@ BODIES: dict[str, Any] = {
 def served(cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A service in a process of its own, with a published block and an administrator."""
     folder = tmp_path_factory.mktemp("odd")
-    with service_with_a_block(cluster, folder, "admin", count=20) as served:
+    made = make_block(folder / "block", count=20)
+    with service_with_a_block(cluster, folder, "admin", made) as served:
         yield served
 
 
