@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -47,11 +48,12 @@ def ensure_schema(dsn: str, *, upgradable: bool) -> None:
     """Bring the schema up to date, or say that it is not.
 
     Raises:
-        InputError: the schema is another one and may not be upgraded here.
+        InputError: the schema is of another Amers, or is an older one and may not be upgraded here.
     """
     state = status(dsn)
     if state.current:
         return
+    _refuse_foreign(state)
     if not upgradable:
         raise InputError(
             f"the schema of the database is at revision {state.found or 'none'}, "
@@ -64,16 +66,12 @@ def upgrade(dsn: str) -> None:
     """Apply the migrations that the database lacks; safe when several commands do it at once.
 
     Raises:
-        InputError: the database was upgraded by a newer Amers.
+        InputError: the database was upgraded by a newer Amers, or by another program.
     """
     from alembic import command
     from alembic.config import Config
 
-    state = status(dsn)
-    if state.found is not None and state.found > state.needed:
-        raise InputError(
-            f"the database is at revision {state.found}, newer than this Amers knows ({state.needed})"
-        )
+    _refuse_foreign(status(dsn))
     config = Config()
     config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
     config.attributes["dsn"] = dsn
@@ -87,8 +85,38 @@ def migrations_folder() -> Path:
 
 
 def newest_revision() -> str:
-    """The revision this Amers needs; migrations are named `REVISION_what_it_does.py`, in order."""
-    return max(path.name.split("_")[0] for path in (migrations_folder() / "versions").glob("[0-9]*.py"))
+    """The revision this Amers needs."""
+    return max(_revisions())
+
+
+def require_current(connection: Connection) -> None:
+    """Refuse to work on a database that was upgraded while this process ran.
+
+    Raises:
+        InputError: the schema is not the one that this Amers needs.
+    """
+    found, needed = current(connection), newest_revision()
+    if found != needed:
+        raise InputError(
+            f"the schema of the database is at revision {found} by now, this process needs {needed}: "
+            "restart it with the Amers that has upgraded the database"
+        )
+
+
+@cache
+def _revisions() -> frozenset[str]:
+    """All revisions of this Amers; migrations are named `REVISION_what_it_does.py`, in order."""
+    scripts = (migrations_folder() / "versions").glob("[0-9]*.py")
+    return frozenset(path.name.split("_")[0] for path in scripts)
+
+
+def _refuse_foreign(state: SchemaStatus) -> None:
+    if state.found is not None and state.found not in _revisions():
+        raise InputError(
+            f"the schema of the database is at revision {state.found}, which this Amers does not know "
+            f"(it needs {state.needed}): a newer Amers, or another program, has made it. Install the "
+            "Amers that upgraded the database, or name another database in AMERS_DATABASE_URL"
+        )
 
 
 def _grant_reading(dsn: str) -> None:

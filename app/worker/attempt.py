@@ -15,6 +15,7 @@ from typing import Any
 from psycopg import OperationalError
 
 from app.config import Settings
+from app.db import revisions
 from app.db.engine import Database
 from app.db.jobs import attempts
 from app.db.jobs.attempts import LostJob
@@ -65,8 +66,14 @@ class Attempts:
     should_stop: Callable[[], bool]
 
     def do_next_job(self) -> None:
-        """Claim the next job and do one attempt at it; does nothing when no job may be claimed."""
+        """Claim the next job and do one attempt at it; does nothing when no job may be claimed.
+
+        Raises:
+            InputError: the database was upgraded while this worker ran; no job is claimed.
+        """
         with self.database.transaction() as connection:
+            # The sweep of a worker that fits the database queues the ticket again.
+            revisions.require_current(connection)
             job = attempts.claim_next(
                 connection,
                 self.worker,
