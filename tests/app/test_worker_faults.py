@@ -157,6 +157,30 @@ def test_a_dismissed_job_stops_within_seconds_and_leaves_no_result(
     assert results_of(dsn, job) == 0
 
 
+def test_a_job_that_writes_too_large_a_file_fails_at_once_and_leaves_nothing(
+    client: TestClient,
+    me: dict[str, str],
+    ask: Callable[..., str],
+    settings: Settings,
+    storage: Storage,
+    dsn: str,
+    log: Path,
+):
+    small = client.get(ask(1), headers=me).json()["inputs"]
+    # The image has 2.9 MB, and so has its copy.
+    body = {"inputs": {"scene": small["scene"], "copy_image": True}}
+    job = client.post("/processes/register-scene/execution", json=body, headers=me).headers["location"]
+    with running_worker(settings, log, AMERS_JOB_FILE_BYTES=str(MEBIBYTE)):
+        failed_job = ended(client, job, me)
+    assert failed_job["status"] == "failed"
+    assert failed_job["error"]["title"] == "File size limit"
+    assert "larger than 1 MiB" in failed_job["error"]["detail"]
+    assert attempt_of(dsn, job) == 1
+    job_id = failed_job["jobID"]
+    assert storage.keys(f"results/{job_id}") == []
+    assert not list(storage.scratch().glob(f"job-{job_id}*"))
+
+
 def test_a_stopped_worker_gives_its_job_back_at_once(
     client: TestClient,
     me: dict[str, str],
