@@ -1,5 +1,6 @@
 """Jobs: create one for a process, follow it, dismiss it, and do one attempt at it."""
 
+import json
 import logging
 import re
 import time
@@ -36,6 +37,8 @@ PROCESSES: dict[str, Process] = {
     process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)
 }
 LONGEST_KEY = 200
+LARGEST_INPUTS_BYTES = 64 << 10
+"""Jobs are kept, and so are their inputs."""
 MOST_MESSAGES = 1000
 REPORT_INTERVAL_S = 0.5
 
@@ -102,6 +105,11 @@ def execute(
     outputs = None if request.outputs is None else dict(request.outputs)
     inputs = process.format_inputs(parsed)
     checked = JobRequest(process.id, inputs, outputs, request.response, request.priority)
+    size_bytes = len(json.dumps(checked.inputs))
+    if size_bytes > LARGEST_INPUTS_BYTES:
+        raise InputError(
+            f"inputs of {process.id}: {size_bytes} bytes found, at most {LARGEST_INPUTS_BYTES} expected"
+        )
     if idempotency_key is not None:
         earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
         if earlier is not None:

@@ -203,6 +203,13 @@ def test_a_token_keeps_no_more_jobs_than_allowed_and_can_remove_them(
     assert ask().status_code == 201
 
 
+def test_inputs_of_a_job_have_a_limit(client: TestClient, admin: dict[str, str]):
+    inputs = {"bbox": BOX, "title": "x" * 70_000}
+    refused = client.post("/processes/export-block/execution", json={"inputs": inputs}, headers=admin)
+    assert refused.status_code == 422
+    assert "at most 65536 expected" in refused.json()["detail"]
+
+
 def test_bodies_without_a_length_cannot_exceed_the_quota_together(
     settings: Settings, database: Database, storage: Storage
 ):
