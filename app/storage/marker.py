@@ -39,7 +39,7 @@ def read_marker(storage: Storage) -> Marker | None:
         fields = json.loads(content)
         return Marker(UUID(fields["installation"]), int(fields["generation"]))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{MARKER} of the storage cannot be understood: {content[:200]!r}") from error
+        raise InputError(f"{MARKER} of the storage is damaged: no installation can be read") from error
 
 
 def write_marker(storage: Storage, marker: Marker) -> None:
