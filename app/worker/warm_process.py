@@ -27,6 +27,9 @@ LIMITED_LIBRARIES = {
 ENDING_S = 5.0
 """Longest time that a server may take to report the end of a process it was asked to kill."""
 
+WITHDRAWING_S = 0.2
+"""Time until a server that has not replied is taken to be loading; it skips the request later."""
+
 log = logging.getLogger(__name__)
 
 
@@ -63,11 +66,11 @@ class WarmProcess:
         return int(self._received.split()[1])
 
     def close(self) -> None:
-        """Kill the process, unless it has ended, and wait for its end."""
+        """Kill the process and wait for its end; one that has not started yet never does."""
         with self._connection:
             with suppress(OSError):
                 self._connection.shutdown(socket.SHUT_WR)
-            if self.wait(ENDING_S) is None:
+            if self.wait(WITHDRAWING_S) is None and self._received and self.wait(ENDING_S) is None:
                 self._server.close()
 
 

@@ -90,6 +90,9 @@ def _serve(control: socket.socket) -> None:
                             _kill(child.pid)
                         return
                     connection = socket.socket(fileno=descriptors[0])
+                    if _is_withdrawn(connection):
+                        connection.close()
+                        continue
                     child = _fork(json.loads(message), connection, [control, selector], children)
                     children[child.pid] = child
                     selector.register(child.ending, selectors.EVENT_READ, child)
@@ -107,6 +110,14 @@ def _serve(control: socket.socket) -> None:
                 with suppress(KeyError):
                     selector.unregister(child.connection)
                 _report_end(child)
+
+
+def _is_withdrawn(connection: socket.socket) -> bool:
+    """Whether the one who asked for a process has closed its side before the process started."""
+    try:
+        return connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
 
 
 def _fork(

@@ -131,6 +131,17 @@ def test_a_killed_server_takes_its_processes_along_and_the_next_one_gets_a_new_s
         assert run(server, "end_with", "7") == 7
 
 
+def test_a_process_that_is_closed_while_the_server_loads_never_starts(tmp_path: Path) -> None:
+    with WarmServer({}) as server:
+        process = server.start(f"{FUNCTIONS}:describe", [str(tmp_path / "facts")], {})
+        began = time.monotonic()
+        process.close()
+        a_short_lease_s = 2.0
+        assert time.monotonic() - began < a_short_lease_s
+        assert run(server, "end_with", "5") == 5
+    assert not (tmp_path / "facts").exists()
+
+
 def test_a_killed_parent_takes_the_server_and_its_processes_along(tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", LONELY, str(tmp_path / "pids")])
     try:
