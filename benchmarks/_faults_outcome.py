@@ -9,7 +9,9 @@ from app.config import Settings
 from app.db import engine
 from app.db.engine import Connection
 from app.db.usage import read_all_usage
+from app.errors import InputError
 from app.storage import Storage
+from app.usecases.backups.manifest import find_problems, read_manifest
 from app.worker.sweep import sweep_files
 from benchmarks._faults_caller import ENDED, Caller
 from benchmarks._killed_installation import LEASE_S, KilledInstallation
@@ -42,6 +44,7 @@ def check_outcome(dsn: str, installation: KilledInstallation, caller: Caller) ->
                 *wrong_blocks(connection, jobs),
                 *wrong_files(connection, storage),
                 *wrong_ledger(connection, storage),
+                *wrong_backups(installation),
             ]
     return {
         "ended": dict(Counter(f"{job['kind']} {job['state']}" for job in jobs)),
@@ -155,3 +158,17 @@ def wrong_ledger(connection: Connection, storage: Storage) -> list[str]:
         storage.size(key) for top in ("scenes", "results", "uploads") for key in storage.keys(top)
     )
     return [] if counted == stored else [f"quotas count {counted} bytes, the storage holds {stored}"]
+
+
+def wrong_backups(installation: KilledInstallation) -> list[str]:
+    """Backups that are not as their manifest says, or are not whole although their command succeeded."""
+    wrong = [f"{folder.name}: gone" for folder in installation.finished_backups if not folder.is_dir()]
+    for folder in sorted(path for path in installation.backups.glob("[!.]*") if path.is_dir()):
+        try:
+            manifest = read_manifest(folder)
+        except InputError as error:
+            wrong.append(f"{folder.name}: {error}")
+            continue
+        problems = [*find_problems(folder, manifest), *(item.key for item in manifest.damaged)]
+        wrong += [f"{folder.name}: {problem}" for problem in problems]
+    return wrong

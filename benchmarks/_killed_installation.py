@@ -27,7 +27,7 @@ WORKERS = 2
 LONGEST_REST_S = 1.0
 """Longest time until a killed process is restarted."""
 PATIENCE_S = 120.0
-VICTIMS = ("api", "worker", "server", "attempt", "database")
+VICTIMS = ("supervisor", "api", "worker", "warm server", "attempt", "database")
 
 
 @dataclass
@@ -229,22 +229,28 @@ class KilledInstallation:
                 self.wait_ready()
 
     def _numbers(self, victim: str) -> list[int]:
-        """The processes of a kind; `server` forks the attempts, those of the database count as one."""
+        """The processes of a kind; those of the database server count as one."""
         if victim == "database":
             with suppress(OSError, IndexError, ValueError):
                 server = int((self.cluster.data / "postmaster.pid").read_text().splitlines()[0])
                 return [server, *children(server)]
             return []
-        name = "api" if victim == "api" else "worker"
+        # `amers serve` supervises the API; a worker has a warm server, which forks the attempts.
+        service, generation = {
+            "supervisor": ("api", 0),
+            "api": ("api", 1),
+            "worker": ("worker", 0),
+            "warm server": ("worker", 1),
+            "attempt": ("worker", 2),
+        }[victim]
         alive = [
-            service.process.pid
-            for key, service in self._services.items()
-            if key.startswith(name) and service.process is not None and service.process.poll() is None
+            one.process.pid
+            for key, one in self._services.items()
+            if key.startswith(service) and one.process is not None and one.process.poll() is None
         ]
-        if victim in ("api", "worker"):
-            return alive
-        servers = [server for worker in alive for server in children(worker)]
-        return servers if victim == "server" else [one for server in servers for one in children(server)]
+        for _ in range(generation):
+            alive = [child for one in alive for child in children(one)]
+        return alive
 
 
 def children(parent: int) -> list[int]:

@@ -19,7 +19,10 @@ if os.getppid() == parent:
     {statement}
 """
 FIRST_PAUSE_S = 1.0
-LONGEST_PAUSE_S = 60.0
+LONGEST_PAUSE_S = 10.0
+"""Longest pause before a restart: what dies again and again must not be away for long."""
+SHORT_LIFE_S = 60.0
+"""A process that lived for less doubles the pause before its next restart."""
 POLL_S = 0.2
 
 log = logging.getLogger(__name__)
@@ -123,7 +126,7 @@ class Supervisor:
             if self._stop.is_set():
                 self._end(process, child)
                 return
-            is_short = time.monotonic() - begin < LONGEST_PAUSE_S
+            is_short = time.monotonic() - begin < SHORT_LIFE_S
             if child.must_start and is_first and is_short and process.returncode > 0:
                 log.error("%s cannot start: exit code %d", child.name, process.returncode)
                 self.exit_code = process.returncode
