@@ -84,8 +84,8 @@ def verify(
             metavar="FROM",
             exists=True,
             file_okay=False,
-            help="Replace rotten and missing files by their copies below this folder: a copy of the "
-            "storage, or a backup.",
+            help="Replace rotten and missing files by their copies in this folder: a backup, or a copy "
+            "of the storage.",
         ),
     ] = None,
     rate: Annotated[

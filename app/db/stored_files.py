@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from uuid import UUID
 
+import numpy as np
 from sqlalchemy import delete, select, update
 from sqlalchemy.dialects.postgresql import insert
 
@@ -77,9 +78,13 @@ def record_result(
 
 
 def points_of_chips(connection: Connection, storage_key: str, rows: list[int] | None) -> list[int]:
-    """Ids of the points with chips in some rows of a file; None means all rows."""
-    parameters = {"storage_key": storage_key, "rows": rows, "id_bits": ID_BITS}
-    return list(connection.scalars(POINTS_OF_CHIPS, parameters))
+    """Ids of the points with chips in some rows, in ascending order, of a file; None means all rows."""
+    found = connection.execute(POINTS_OF_CHIPS, {"storage_key": storage_key, "id_bits": ID_BITS}).all()
+    points = np.array([tuple(point) for point in found], dtype=np.int64).reshape(-1, 3)
+    if rows is None:
+        return [int(point) for point in points[:, 0]]
+    n_before, n_until = np.searchsorted(rows, [points[:, 1], points[:, 1] + points[:, 2]])
+    return [int(point) for point in points[n_until > n_before, 0]]
 
 
 def record_damage(connection: Connection, storage_key: str, reason: str) -> None:

@@ -228,9 +228,12 @@ def verify_store(
         installation: whose files are read.
         progress: receives the fraction done and the key of a file.
         rate_mb_s: limit of the rate of reading, megabytes per second.
-        copies: a folder with files under the same keys; a rotten or missing file is replaced by its
-            copy there if that has the right checksum. The rotten one goes to the trash.
+        copies: a folder with files under the same keys, or a backup or data folder, which have them in
+            `storage`. A rotten or missing file is replaced by its copy there if that has the right
+            checksum; the rotten one goes to the trash.
     """
+    if copies is not None and (copies / "storage").is_dir():
+        copies = copies / "storage"
     database = installation.database
     with database.reading() as connection:
         named = stored_files.read_named_files(connection)

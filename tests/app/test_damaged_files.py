@@ -1,6 +1,7 @@
 """Flipped bits and lost files in the storage: found by verification, export and use, and repaired."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,10 @@ from tests.statements import run_sql
 Bearer = Callable[[str], dict[str, str]]
 CHIPS = "/collections/points/chips"
 EXPORT = {"inputs": {"bbox": list(BOX)}}
-EVERY_KIND = {"chips", "scene image", "side file", "upload archive", "result", "reference"}
+STORED = {"chips", "scene image", "side file", "upload archive", "result"}
+"""Kinds of files in the storage."""
+REFERENCES = {"reference image": "image.tif", "reference terrain": "terrain.tif"}
+EVERY_KIND = STORED | set(REFERENCES)
 FAST_MB_S = 1e6
 
 
@@ -99,14 +103,14 @@ class Filled:
         return self.installation.storage
 
     def content(self, kind: str) -> bytes:
-        if kind == "reference":
-            return self._reference.read_bytes()
+        if kind in REFERENCES:
+            return self._reference(kind).read_bytes()
         with self.storage.open(self.keys[kind]) as file:
             return file.read()
 
     def replace(self, kind: str, content: bytes) -> None:
         """Change a file in its place, as a disk does: who has it open sees the change."""
-        path = self._reference if kind == "reference" else self.storage.local(self.keys[kind])
+        path = self._reference(kind) if kind in REFERENCES else self.storage.local(self.keys[kind])
         if path is not None:
             path.write_bytes(content)
         else:
@@ -141,11 +145,10 @@ class Filled:
         lines = self.client.get("/metrics", headers=self.monitor).text.splitlines()
         return float(next(line for line in lines if line.startswith("amers_damaged_files ")).split()[1])
 
-    @property
-    def _reference(self) -> Path:
+    def _reference(self, kind: str) -> Path:
         folder = self.installation.settings.reference_folder
         assert folder is not None
-        return folder / self.keys["reference"]
+        return folder / self.keys[kind]
 
 
 @pytest.fixture
@@ -174,7 +177,7 @@ def filled(
             client,
             me,
             bearer("monitor"),
-            {"chips": chips_key, "reference": "terrain.tif"},
+            {"chips": chips_key, **REFERENCES},
             {p["id"]: range(p["chip_row"], p["chip_row"] + p["chip_count"]) for p in points},
             tmp_path / "copies",
             "",
@@ -185,23 +188,24 @@ def filled(
         filled.keys["side file"] = f"scenes/{scene}/terrain.tif"
         filled.keys["upload archive"] = storage.keys("uploads")[0]
         filled.keys["result"] = storage.keys("results")[0]
-        for kind, key in filled.keys.items():
-            copy = tmp_path / "copies" / key
+        for kind in STORED:
+            copy = tmp_path / "copies" / filled.keys[kind]
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(filled.content(kind))
         yield Filled(**{**vars(filled), "job": job["location"]})
 
 
-def states(verification: Verification) -> dict[str, str]:
-    """State of each finding, by its kind."""
-    return {finding.kind: finding.state for finding in verification.findings}
+def states(filled: Filled, verification: Verification) -> dict[str, str]:
+    """State of each finding, by the kind of the file."""
+    kinds = {key: kind for kind, key in filled.keys.items()}
+    return {kinds[finding.key]: finding.state for finding in verification.findings}
 
 
 def test_a_whole_storage_has_no_findings(filled: Filled):
     assert set(filled.keys) == EVERY_KIND
     verification = filled.verify()
     assert verification.findings == ()
-    assert verification.n_files == len(EVERY_KIND) + 1  # The reference has an image and a terrain.
+    assert verification.n_files == len(EVERY_KIND)
     assert verification.n_recorded == 0
 
 
@@ -212,27 +216,29 @@ def test_a_flipped_bit_in_each_kind_of_file_is_found_and_repaired_from_copies(fi
 
     verification = filled.verify()
 
-    assert states(verification) == dict.fromkeys(EVERY_KIND, "rotten")
-    assert {finding.key for finding in verification.findings} == set(filled.keys.values())
+    assert states(filled, verification) == dict.fromkeys(EVERY_KIND, "rotten")
     assert filled.damaged_files() == len(EVERY_KIND)
     repaired = filled.verify(filled.copies).findings
-    assert {finding.kind for finding in repaired if not finding.repaired} == {"reference"}
-    for kind in EVERY_KIND - {"reference"}:
+    assert {finding.key for finding in repaired if not finding.repaired} == set(REFERENCES.values())
+    for kind in STORED:
         assert filled.content(kind) == whole[kind]
-    filled.replace("reference", whole["reference"])
+    for kind in REFERENCES:
+        filled.replace(kind, whole[kind])
     assert filled.verify().findings == ()
     assert filled.damaged_files() == 0
     (discarded,) = trash.batches(filled.storage).values()
-    assert set(discarded) == set(filled.keys.values()) - {filled.keys["reference"]}
+    assert set(discarded) == {filled.keys[kind] for kind in STORED}
 
 
 def test_missing_files_are_found_and_put_back(filled: Filled):
-    stored = EVERY_KIND - {"reference"}
-    for kind in stored:
+    for kind in STORED:
         filled.storage.delete(filled.keys[kind])
 
-    assert states(filled.verify()) == dict.fromkeys(stored, "missing")
-    assert all(finding.repaired for finding in filled.verify(filled.copies).findings)
+    assert states(filled, filled.verify()) == dict.fromkeys(STORED, "missing")
+    backup = filled.copies.parent / "backup"
+    backup.mkdir()
+    shutil.move(filled.copies, backup / "storage")
+    assert all(finding.repaired for finding in filled.verify(backup).findings)
     assert filled.verify().findings == ()
 
 
@@ -298,10 +304,10 @@ def test_files_of_an_earlier_version_get_checksums_at_the_first_verification(
 
     first = filled.verify()
 
-    assert (first.findings, first.n_recorded) == ((), 5)
+    assert (first.findings, first.n_recorded) == ((), 2 + len(REFERENCES) + 1)
     for kind in EVERY_KIND:
         filled.flip(kind)
-    assert states(filled.verify()) == dict.fromkeys(EVERY_KIND, "rotten")
+    assert states(filled, filled.verify()) == dict.fromkeys(EVERY_KIND, "rotten")
 
 
 @in_a_folder
@@ -388,6 +394,34 @@ def test_damaged_chips_are_not_served_and_alarm_the_operator(
     assert filled.verify(filled.copies).is_whole
     assert filled.get(f"{item}/1").status_code == 200
     assert filled.damaged_files() == 0
+
+
+@in_a_folder
+def test_an_archive_of_chips_ends_where_damage_begins_and_alarms_the_operator(
+    filled: Filled, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("services.formats.chips.stacks.CHIPS_PER_PIECE", 16)
+    filled.flip_chip(max(rows[-1] for rows in filled.chip_rows.values()))
+    ids = ",".join(map(str, filled.chip_rows))
+    whole_bytes = 101 * 101 * 2 * sum(map(len, filled.chip_rows.values()))
+
+    reply = filled.get(f"{CHIPS}?ids={ids}")
+
+    assert 0 < len(reply.content) < whole_bytes
+    assert filled.damaged_files() == 1
+
+
+@in_a_folder
+def test_a_verification_reads_no_faster_than_its_rate(filled: Filled, monkeypatch: pytest.MonkeyPatch):
+    waits: list[float] = []
+    monkeypatch.setattr("app.usecases.store_verification.time.sleep", waits.append)
+    a_thousandth_of_a_megabyte_per_s = 0.001
+    verification = verify_store(
+        filled.installation, lambda fraction, key: None, a_thousandth_of_a_megabyte_per_s
+    )
+    due_s = verification.size_bytes / 1000.0
+    assert due_s > 1000.0
+    assert waits[-1] == pytest.approx(due_s, rel=0.1)
 
 
 def test_a_missing_file_is_an_error_of_the_service_until_its_owner_removes_it(filled: Filled):

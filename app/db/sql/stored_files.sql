@@ -28,14 +28,11 @@ where cast(:keys as text[]) is null or storage_key = any(cast(:keys as text[]))
 order by storage_key
 
 -- name: points_of_chips
--- Ids of the points with chips in some rows of a file of chips; null rows: in any row.
-select p.id
+-- The points with chips in a file, by id, each with its rows of the file.
+select p.id, p.chip_row, p.chip_count
 from chip_file f join point p on p.id >= f.block_number::bigint << :id_bits
     and p.id < (f.block_number + 1)::bigint << :id_bits and p.chip_file = f.id
 where f.storage_key = :storage_key
-    and (cast(:rows as bigint[]) is null
-        or exists (select from unnest(cast(:rows as bigint[])) as chip_row
-                   where chip_row >= p.chip_row and chip_row < p.chip_row + p.chip_count))
 order by p.id
 
 -- name: folders_in_progress
