@@ -24,7 +24,7 @@ UPLOAD_LIMIT_BYTES = 400_000
 BODY_LIMIT_BYTES = 200_000
 JSON = (b"content-type", b"application/json")
 SOON_S = 0.3
-EXCHANGES = ("/scenes/reference", "/scenes/reference/", "/scenes%2Freference", "/scenes/../scenes")
+LIKE_UPLOADS = ("/scenes/reference", "/scenes/reference/", "/scenes%2Freference", "/scenes/../scenes")
 """Paths that a limit by prefix took for uploads."""
 
 
@@ -97,14 +97,14 @@ class Sender:
 
 def operations(app: FastAPI) -> list[tuple[str, str, APIRoute]]:
     """Every method and path of the service, with identifiers that do not exist, and its route."""
-    found = []
+    listed = []
     for context in iter_route_contexts(app.routes):
         route = context.original_route
         if isinstance(route, APIRoute):
             names = dict.fromkeys(route.param_convertors, str(uuid4()))
             path = context.path.format(**{**names, "collection": "points", "process_id": "x"})
-            found += [(method, path, route) for method in sorted(context.methods)]
-    return found
+            listed += [(method, path, route) for method in sorted(context.methods)]
+    return listed
 
 
 def uploads(route: APIRoute) -> bool:
@@ -117,14 +117,14 @@ def bearer_header(bearer: Any, scope: str) -> tuple[bytes, bytes]:
 
 def test_nobody_without_a_token_gets_more_than_a_small_body_read(app: FastAPI) -> None:
     for method, path, route in operations(app):
-        for asked in {method, "HEAD", "OPTIONS", "GET", "PUT"}:
-            sender = Sender().request(app, asked, path, JSON)
-            assert sender.read_bytes <= ANONYMOUS_BODY_BYTES + len(PIECE), (asked, path)
+        for sent_method in {method, "HEAD", "OPTIONS", "GET", "PUT"}:
+            sender = Sender().request(app, sent_method, path, JSON)
+            assert sender.read_bytes <= ANONYMOUS_BODY_BYTES + len(PIECE), (sent_method, path)
         if uploads(route):
             assert Sender().request(app, method, path, (b"tus-resumable", b"1.0.0")).status == 401
 
 
-@pytest.mark.parametrize("path", EXCHANGES)
+@pytest.mark.parametrize("path", LIKE_UPLOADS)
 @pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "GET", "HEAD", "OPTIONS"])
 def test_a_path_like_that_of_an_upload_is_none(app: FastAPI, method: str, path: str) -> None:
     assert Sender().request(app, method, path, JSON).read_bytes <= ANONYMOUS_BODY_BYTES + len(PIECE)
@@ -175,7 +175,7 @@ def test_an_upload_may_take_its_time_while_it_keeps_the_least_rate(app: FastAPI,
     assert (reply.status, reply.read_bytes > UPLOAD_LIMIT_BYTES) == (413, True)
 
 
-def test_every_route_that_asks_for_its_caller_knows_him_before_it_reads_a_body(app: FastAPI) -> None:
+def test_every_route_with_a_body_knows_its_caller_before_it_reads_the_body(app: FastAPI) -> None:
     for _, path, route in operations(app):
         if route.body_field is not None or uploads(route):
             assert isinstance(route, CallerRoute), path
