@@ -6,9 +6,9 @@ export OMP_NUM_THREADS := 1
 BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
-LONG := faults load stress
+LONG := faults load stress throughput
 
-.PHONY: demo test test-fast test-security check docs serve bench bench-registration bench-load bench-faults postgis page chromium
+.PHONY: demo test test-fast test-security check docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
@@ -47,6 +47,9 @@ bench-load: postgis
 
 bench-faults: postgis
 	$(BIN)/python -m benchmarks.faults
+
+bench-throughput: postgis
+	$(BIN)/python -m benchmarks.throughput --scenes 200
 
 bench-registration: $(READY)
 	$(BIN)/python -m benchmarks.stress
