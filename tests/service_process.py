@@ -76,12 +76,16 @@ class Service:
         return self._children("api")
 
     def _children(self, kind: str) -> list[int]:
-        lease = self.cluster.folder / "lease"
-        return [
-            number
-            for number in users_of(lease)
-            if f"\0{kind}\0".encode() in Path(f"/proc/{number}/cmdline").read_bytes()
-        ]
+        users = users_of(self.cluster.folder / "lease")
+        return [number for number in users if f"\0{kind}\0".encode() in command_of(number)]
+
+
+def command_of(process: int) -> bytes:
+    """The command line of a process, each part ended by NUL; nothing of one that has ended."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return b""
 
 
 def users_of(file: Path) -> list[int]:
