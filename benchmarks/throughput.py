@@ -47,6 +47,8 @@ SIGMA_M = float(np.hypot(*ERROR_M))
 DISTINCT_SCENES = 2
 WORKERS = 2
 OPEN_JOBS = 6
+POLL_S = 2.0
+"""Interval of the requests for the states of open jobs, which cost the API CPU time too."""
 PATIENCE_S = 300.0
 ENDED = ("successful", "failed", "dismissed")
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -249,7 +251,7 @@ def _register_all(client: httpx.Client, images: list[Path]) -> None:
             body = {"inputs": {"scene": scene.json()["id"]}}
             job = client.post("/processes/register-scene/execution", json=body).raise_for_status()
             running[job.headers["location"]] = image
-        time.sleep(0.5)
+        time.sleep(POLL_S)
         for location in tuple(running):
             document = client.get(location).json()
             if document["status"] not in ENDED:
