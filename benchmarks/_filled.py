@@ -90,7 +90,10 @@ def lay_out(count: int, block_points: int = BLOCK_POINTS) -> Ground:
 def fill(
     dsn: str, count: int, console: Console | None = None, block_points: int = BLOCK_POINTS
 ) -> Ground:
-    """Fill an empty store of the newest schema with published points; indexes are built at the end."""
+    """Fill an empty store of the newest schema with published points; indexes are built at the end.
+
+    The role of the connection string has to be a superuser.
+    """
     ground = lay_out(count, block_points)
     blocks = len(ground.west_south_deg)
     with engine.connect(dsn) as connection:

@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from benchmarks import _servers
@@ -111,10 +111,11 @@ def filled(count: int, console: Console) -> Iterator[Store]:
     with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name, ExitStack() as stack:
         folder = Path(name)
         folder.chmod(0o755)
-        dsn = stack.enter_context(Cluster(folder / "postgres", durable=False).lease())
+        cluster = Cluster(folder / "postgres", durable=False)
+        dsn = stack.enter_context(cluster.lease())
         revisions.upgrade(dsn)
         start = time.perf_counter()
-        ground = fill(dsn, count, console)
+        ground = fill(cluster.dsn(DATABASE, SUPERUSER), count, console)
         console.print(f"{count:,} points in {time.perf_counter() - start:.0f} s")
         made = make_block(
             folder / "block",

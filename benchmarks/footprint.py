@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from app.db.engine import Connection
 from app.db.features.bbox import Box
 from app.db.features.collection import Viewer
@@ -62,9 +62,10 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="amers-bench-", dir="/tmp") as name:
         Path(name).chmod(0o755)
-        with Cluster(Path(name) / "postgres", durable=False).lease() as dsn:
+        cluster = Cluster(Path(name) / "postgres", durable=False)
+        with cluster.lease() as dsn:
             revisions.upgrade(dsn)
-            ground = fill(dsn, arguments.points)
+            ground = fill(cluster.dsn(DATABASE, SUPERUSER), arguments.points)
             with engine.connect(dsn) as connection:
                 sizes = (1_000, 2_000)
                 outcomes = [measure(connection, ground, size, arguments.repeats) for size in sizes]

@@ -14,7 +14,7 @@ from pydantic import SecretStr
 
 from app.config import Settings
 from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import SUPERUSER, Cluster
 from app.db.engine import Connection, Database
 from app.main import create_app
 from app.storage import MARKER, Storage
@@ -31,24 +31,28 @@ def cluster(open_folder: Path) -> Iterator[Cluster]:
     """A running cluster whose database `amers_template` has the schema."""
     cluster = Cluster(open_folder / "postgres", durable=False)
     with cluster.lease():
-        with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
+        with psycopg.connect(cluster.dsn("postgres", SUPERUSER), autocommit=True) as connection:
             connection.execute(sql.SQL("create database {}").format(sql.Identifier(TEMPLATE)))
+        cluster.hand_over(TEMPLATE)
         revisions.upgrade(cluster.dsn(TEMPLATE))
         yield cluster
 
 
 @contextmanager
 def fresh_database(cluster: Cluster, template: str) -> Iterator[str]:
-    """The connection string of a new database, dropped at the end."""
-    name = sql.Identifier(f"test_{uuid4().hex}")
-    with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
+    """The connection string of a new database of the application's role, dropped at the end."""
+    name = f"test_{uuid4().hex}"
+    with psycopg.connect(cluster.dsn("postgres", SUPERUSER), autocommit=True) as connection:
         connection.execute(
-            sql.SQL("create database {} template {}").format(name, sql.Identifier(template))
+            sql.SQL("create database {} template {}").format(
+                sql.Identifier(name), sql.Identifier(template)
+            )
         )
         try:
-            yield cluster.dsn(name.as_string(connection).strip('"'))
+            cluster.hand_over(name)
+            yield cluster.dsn(name)
         finally:
-            connection.execute(sql.SQL("drop database {} with (force)").format(name))
+            connection.execute(sql.SQL("drop database {} with (force)").format(sql.Identifier(name)))
 
 
 @pytest.fixture

@@ -87,7 +87,7 @@ def test_a_ready_service_has_a_database_that_answers(client):
 
 
 def test_connections_that_the_database_has_closed_are_replaced_before_use(client, dsn):
-    ours = "datname = current_database() and pid <> pg_backend_pid()"
+    ours = "datname = current_database() and usename = current_user and pid <> pg_backend_pid()"
     with engine.connect(dsn) as connection:
         run_sql(
             connection, f"select pg_terminate_backend(pid, 10000) from pg_stat_activity where {ours}"

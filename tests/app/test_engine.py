@@ -42,7 +42,7 @@ def test_connections_that_died_in_the_pool_are_replaced_unseen(dsn: str, databas
     with psycopg.connect(dsn, autocommit=True) as other:
         other.execute(
             "select pg_terminate_backend(pid, 10000) from pg_stat_activity"
-            " where datname = current_database() and pid <> pg_backend_pid()"
+            " where datname = current_database() and usename = current_user and pid <> pg_backend_pid()"
         )
     for context in (database.reading, database.transaction):
         with context() as connection:

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import DATABASE, SUPERUSER, Cluster
 from app.errors import is_no_room
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
@@ -161,7 +161,7 @@ def test_a_full_disk_of_the_database_is_reported_and_the_block_loads_once_there_
     try:
         with cluster.lease() as dsn:
             revisions.upgrade(dsn)
-            with engine.connect(dsn) as connection:
+            with engine.connect(cluster.dsn(DATABASE, SUPERUSER)) as connection:
                 # With a new segment of the log, it is the table that has no room.
                 run_sql(connection, "select pg_switch_wal()")
                 run_sql(connection, "checkpoint")

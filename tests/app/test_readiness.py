@@ -11,7 +11,7 @@ from psycopg import sql
 
 from app.config import Settings
 from app.db import engine
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import SUPERUSER, Cluster
 from app.db.engine import Database
 from app.main import create_app
 from app.storage import Marker, Storage, open_storage, write_marker
@@ -70,7 +70,7 @@ def test_another_schema_is_named_with_what_to_do(part, dsn):
 
 def test_a_database_that_does_not_answer_is_named(part, cluster: Cluster, dsn):
     name = dsn.split("dbname=")[1].split()[0]
-    with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
+    with psycopg.connect(cluster.dsn("postgres", SUPERUSER), autocommit=True) as connection:
         for allowed in ("false", "true"):
             connection.execute(
                 sql.SQL("alter database {} allow_connections {}").format(

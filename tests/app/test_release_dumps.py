@@ -13,11 +13,12 @@ from fastapi.testclient import TestClient
 
 from app.config import Settings
 from app.db import engine, revisions
-from app.db.cluster.embedded import Cluster
+from app.db.cluster.embedded import SUPERUSER, Cluster
 from app.db.jobs import attempts
 from app.main import create_app
 from app.worker.sweep import sweep_jobs
 from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.full_storage import database_name
 from tests.app.job_queue import LEASE_S
 from tests.app.test_schema import catalogue, differences
 from tests.statements import run_sql
@@ -37,8 +38,11 @@ Counts = dict[str, int]
 def upgraded(cluster: Cluster, request: pytest.FixtureRequest) -> Iterator[tuple[str, Counts]]:
     """The connection string of an upgraded dump, and how many rows its tables had before."""
     with fresh_database(cluster, "template1") as dsn:
-        with psycopg.connect(dsn) as connection:
+        # As in the private cluster of a release before roles: a superuser owns all of it.
+        name = database_name(dsn)
+        with psycopg.connect(cluster.dsn(name, SUPERUSER)) as connection:
             connection.execute(gzip.decompress(request.param.read_bytes()))
+        cluster.hand_over(name)
         assert revisions.status(dsn).found == request.param.name.split(".")[0]
         before = counts(dsn)
         revisions.upgrade(dsn)

@@ -144,7 +144,7 @@ CHANGES = {
     "revoke select on block from amers_reader": "grant block to amers_reader",
     "grant insert on token to amers_reader": "grant token to amers_reader",
     "alter default privileges in schema public revoke select on tables from amers_reader": (
-        "default grant r of amers"
+        "default grant r of amers_app"
     ),
     "create table surplus (id int)": "table surplus",
     "alter table point enable row level security": "table point",

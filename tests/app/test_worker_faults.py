@@ -328,7 +328,8 @@ def test_a_worker_outlives_the_loss_of_all_its_connections(
             run_sql(
                 connection,
                 "select pg_terminate_backend(pid) from pg_stat_activity"
-                " where datname = current_database() and pid <> pg_backend_pid()",
+                " where datname = current_database() and usename = current_user"
+                " and pid <> pg_backend_pid()",
             )
         ended_job = ended(client, job, me)
         other = ended(client, ask(1), me)

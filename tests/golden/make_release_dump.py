@@ -222,10 +222,7 @@ def main(folder: Path) -> None:
     world = make_flat_world(folder / "world", size=600, points=12)
     (folder / "references").mkdir()
     cluster = Cluster(folder / "postgres", durable=False)
-    with cluster.lease():
-        with psycopg.connect(cluster.dsn("postgres"), autocommit=True) as connection:
-            connection.execute("create database release")
-        dsn = cluster.dsn("release")
+    with cluster.lease() as dsn:
         revisions.upgrade(dsn)
         settings = Settings(
             database_url=SecretStr(dsn),

@@ -50,7 +50,8 @@ def restore(dsn: str, file: Path) -> None:
         )
     # Who may read is granted anew: the roles of the cluster that the archive came from may be gone.
     whole = ("--single-transaction", "--exit-on-error", "--no-owner", "--no-privileges")
-    _run(dsn, "pg_restore", *whole, str(file))
+    # Only the owner of PostGIS, a superuser, may restore its comment; Amers has no comments.
+    _run(dsn, "pg_restore", *whole, "--no-comments", str(file))
 
 
 def has_tables(dsn: str) -> bool:

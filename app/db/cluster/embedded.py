@@ -5,6 +5,9 @@ when the command ends, however it ends. The server is started by whoever finds n
 lock `turn`, and stopped by the last to leave: the one whose lease can be made exclusive. After a kill of
 all commands the server stays, and the next command uses it and stops it. After a kill of the server the
 next command starts it, and PostgreSQL recovers by itself.
+
+Commands connect as the role `amers_app`, which owns the database and is not a superuser. Only this
+module connects as the superuser, to create the database and hand it over.
 """
 
 import fcntl
@@ -26,13 +29,15 @@ from app.config import Settings
 from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from app.errors import InputError
 
-ROLE = "amers"
+ROLE = "amers_app"
+SUPERUSER = "amers"
 DATABASE = "amers"
 CREATE_DATABASE = "create database amers"
 SOCKET_NAME = ".s.PGSQL.5432"
 LONGEST_SOCKET_PATH = 107
 START_SECONDS = 120.0
 LEAVING_SECONDS = 10.0
+LOCK_SECONDS = 20.0
 
 CONFIGURATION = """\
 listen_addresses = ''
@@ -106,6 +111,7 @@ class Cluster:
             with self._turn():
                 fcntl.flock(lease, fcntl.LOCK_SH)
                 self._make_running(user)
+                self._make_database(user)
             yield self.dsn(DATABASE)
         finally:
             with self._turn():
@@ -140,9 +146,27 @@ class Cluster:
             Path("/tmp") / f"amers-{hashlib.sha256(os.fsencode(self.folder.resolve())).hexdigest()[:16]}"
         )
 
-    def dsn(self, name: str) -> str:
+    def dsn(self, name: str, role: str = ROLE) -> str:
         """The connection string of one database of the cluster."""
-        return make_conninfo(host=str(self.sockets), port=5432, user=ROLE, dbname=name)
+        return make_conninfo(host=str(self.sockets), port=5432, user=role, dbname=name)
+
+    def hand_over(self, name: str) -> None:
+        """Make the application's role the owner of a database, with PostGIS, and of all it contains.
+
+        Raises:
+            InputError: somebody else uses tables whose owner changes.
+        """
+        from app.db.statements import sql_file
+
+        options = f"-c lock_timeout={LOCK_SECONDS:g}s"
+        try:
+            with psycopg.connect(self.dsn(name, SUPERUSER), options=options) as connection:
+                connection.execute(sql_file("ownership.sql").encode())
+        except psycopg.errors.LockNotAvailable as error:
+            raise InputError(
+                f"the tables in {self.folder} need another owner, {ROLE}, and a command of a former "
+                "Amers uses them: end it, then start this command again"
+            ) from error
 
     def is_running(self) -> bool:
         """Whether the server answers, now or as soon as it has started or recovered."""
@@ -193,12 +217,23 @@ class Cluster:
         self._configure(user)
         self._forget_dead_server()
         self._start(user)
-        with psycopg.connect(self.dsn("postgres"), autocommit=True) as connection:
-            known = connection.execute(
-                "select from pg_database where datname = %s", [DATABASE]
+
+    def _make_database(self, user: ServerUser) -> None:
+        """Create the database, or take over that of a former Amers, which a superuser owns."""
+        with psycopg.connect(self.dsn("postgres", SUPERUSER), autocommit=True) as connection:
+            owner = connection.execute(
+                "select pg_get_userbyid(datdba) from pg_database where datname = %s", [DATABASE]
             ).fetchone()
-            if known is None:
+            if owner is None:
                 connection.execute(CREATE_DATABASE)
+            if owner != (ROLE,):
+                self.hand_over(DATABASE)
+            try:
+                psycopg.connect(self.dsn(DATABASE)).close()
+            except psycopg.OperationalError:
+                # A former Amers has started the server, which admits the superuser only.
+                self._configure(user)
+                connection.execute("select pg_reload_conf()")
 
     def _initialise(self, user: ServerUser) -> None:
         unfinished = self.folder / "data.unfinished"
@@ -211,7 +246,7 @@ class Cluster:
                     "--pgdata",
                     str(unfinished),
                     "--username",
-                    ROLE,
+                    SUPERUSER,
                     "--encoding",
                     "UTF8",
                     "--locale",
@@ -233,7 +268,9 @@ class Cluster:
         for name, text in {
             "amers.conf": configuration,
             "pg_hba.conf": "local all all peer map=amers\n",
-            "pg_ident.conf": "".join(f'amers "{person}" {ROLE}\n' for person in people),
+            "pg_ident.conf": "".join(
+                f'amers "{person}" {role}\n' for person in people for role in (ROLE, SUPERUSER)
+            ),
         }.items():
             path = self.data / name
             path.write_text(text)

@@ -1,11 +1,14 @@
 -- Let the reading role read all tables, those of later migrations too.
 -- Roles belong to the cluster and not to the database: this is no migration, and a restore runs it again.
--- Where the owner of the database may not create roles, requests are read as the owner, still read-only.
+-- Where the owner of the database may not create roles and nobody has made the role, requests are read as
+-- the owner, still read-only.
 do $$ begin
-    begin
-        create role amers_reader nologin;
-    exception when duplicate_object or unique_violation then null;
-    end;
+    if not exists (select from pg_roles where rolname = 'amers_reader') then
+        begin
+            create role amers_reader nologin;
+        exception when duplicate_object or unique_violation then null;
+        end;
+    end if;
     if not pg_has_role('amers_reader', 'member') then
         execute format('grant amers_reader to %I', current_user);
     end if;
