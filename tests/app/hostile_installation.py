@@ -32,6 +32,7 @@ LEFT_BY_JOBS = (
     "audit",
     "job",
     "job_message",
+    "job_turn",
     "upload",
     "scene",
     "procrastinate_jobs",
