@@ -142,7 +142,7 @@ def make_points(place: Installation, world: FlatWorld, folder: Path) -> None:
 def make_scenes_and_jobs(place: Installation, world: FlatWorld) -> None:
     """Owners with scenes, uploads under way, and jobs in each state."""
     image, nonsense = world.tagged.read_bytes(), b"II*\0" + bytes(200)
-    owner, _ = place.token("owner", ["register"], job_quota=6, upload_quota_bytes=10_000_000)
+    owner, _ = place.token("owner", ["register"], job_quota=6, storage_quota_bytes=10_000_000)
     other, _ = place.token("other", ["read", "register"])
     _, revoked = place.token("revoked", ["read"], days=30)
     place.ask("DELETE", f"/tokens/{revoked}", place.admin)
