@@ -86,7 +86,8 @@ class Supervisor:
             at_stop: called before the processes are ended.
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            if signal.getsignal(number) != signal.SIG_IGN:
+            # `nohup` ignores SIGHUP. Shells without job control ignore SIGINT, which must work then too.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, self._note)
         keepers = [
             threading.Thread(target=self._keep_running, args=(child,), name=f"keeper of {child.name}")

@@ -218,13 +218,13 @@ FILTERS = [
         "search NaN",
         SEARCH,
         b'{"intersects": {"type": "Point", "coordinates": [NaN, NaN]}}',
-        "geometry",
+        "intersects.coordinates",
     ),
     body(
         "search infinite",
         SEARCH,
         b'{"intersects": {"type": "Point", "coordinates": [Infinity, 0]}}',
-        "geometry",
+        "intersects.coordinates",
     ),
     body("search too deep", SEARCH, b'{"filter": ' + DEEP.encode() + b"}"),
     body(

@@ -199,7 +199,8 @@ def test_a_service_rectifies_a_scene_on_a_terrain_uploaded_beside_it(
     ("ortho_map", "quota_bytes", "error", "named"),
     [
         ({"gsd_m": 0.05}, None, "InputError", "a finer map shows no more"),
-        ({"crs": "+proj=utm +zone=31 +units=cm"}, None, "InputError", "16 times those of the scene"),
+        # A grid in links of 0.2 m: a step of as many units as the scene has metres is too small.
+        ({"crs": "EPSG:30200"}, None, "InputError", "16 times those of the scene"),
         ({}, 300_000, "TooLarge", "left of the storage quota"),
     ],
 )
