@@ -27,7 +27,7 @@ NITF = (GOLDEN / "invented_rpc00b.ntf").read_bytes()
 NITF_HEADER = 404
 FILE_LENGTH, HEADER_LENGTH, SEGMENTS = 342, 354, 360
 """Positions of fields in the file header of the golden NITF."""
-LEFT_BY_WORKERS = (*LEFT_BY_JOBS, "job_turn", "procrastinate_workers", "installation")
+LEFT_BY_WORKERS = (*LEFT_BY_JOBS, "procrastinate_workers", "installation")
 LEFT_BY_WORKERS += ("installation.json",)
 
 Make = Callable[[FlatWorld], bytes]
@@ -84,6 +84,23 @@ def nitf_record(length: str) -> bytes:
     return NITF.replace(b"RPC00B01041", b"RPC00B" + length.encode())
 
 
+def nitf_extension(name: str, data: bytes, overflow: str = "") -> bytes:
+    """The golden NITF with a data extension segment whose own lengths are right.
+
+    Args:
+        name: of the extension (DESID).
+        data: of the extension.
+        overflow: for TRE_OVERFLOW, the header and the item that its records belong to.
+    """
+    number = SEGMENTS + 28
+    subheader = f"DE{name:<25}01U".ljust(197).encode() + overflow.encode() + b"0000"
+    lengths = f"001{len(subheader):04d}{len(data):09d}".encode()
+    content = bytearray(NITF[:number] + lengths + NITF[number + 3 :] + subheader + data)
+    content[FILE_LENGTH:HEADER_LENGTH] = f"{len(content):012d}".encode()
+    content[HEADER_LENGTH:SEGMENTS] = f"{NITF_HEADER + len(lengths) - 3:06d}".encode()
+    return bytes(content)
+
+
 BOMBS: dict[str, tuple[str, Make]] = {
     "deflate": ("scene.tif", expanding(6_000, compress="deflate", zlevel=9, blockysize=512)),
     "zstd": ("scene.tif", expanding(10_000, compress="zstd", blockysize=512)),
@@ -115,6 +132,23 @@ BOMBS: dict[str, tuple[str, Make]] = {
     "nitf of an endless record": ("scene.ntf", always(nitf_record("99999"))),
     "nitf of a negative record": ("scene.ntf", always(nitf_record("-1041"))),
     "nitf of an empty record": ("scene.ntf", always(nitf_record("00000"))),
+    "nitf with an entity in its extension": (
+        "scene.ntf",
+        always(
+            nitf_extension(
+                "XML_DATA_CONTENT",
+                b"<!DOCTYPE a [<!ENTITY b SYSTEM 'file:///etc/passwd'>]><a>&b;</a>",
+            )
+        ),
+    ),
+    "nitf with lying records in its extension": (
+        "scene.ntf",
+        always(nitf_extension("TRE_OVERFLOW", b"RPC00B99999" + b"9" * 1041, "UDID  001")),
+    ),
+    "nitf with a catalogue of numbers in its extension": (
+        "scene.ntf",
+        always(nitf_extension("CSATTB DES", b"9" * 200_000)),
+    ),
     "nitf of 10^16 pixels": (
         "scene.ntf",
         always(NITF.replace(b"0000003200000048INT", b"9999999999999999INT")),
