@@ -26,7 +26,8 @@ def run_folder(where: Path = Path("/tmp")) -> Iterator[Path]:
         # It gets its name once it is locked, so that no other run takes this one for dead.
         (folder / f"{MARK}.new").rename(folder / MARK)
         yield folder
-    shutil.rmtree(folder, ignore_errors=True)
+        # Still locked: another run would take a folder without its lock for that of a killed run.
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def end_dead_runs(where: Path = Path("/tmp")) -> list[Path]:
