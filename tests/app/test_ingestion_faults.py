@@ -265,3 +265,47 @@ def test_postgresql_killed_before_the_commit_leaves_nothing(own, tmp_path):
         assert rows(connection) == dict.fromkeys(TABLES, 0)
         assert len(storage.keys("chips")) == 1
         assert len(remove_unnamed_chips(connection, Bin(storage))) == 1
+
+
+SERVED = """
+select b.id, b.version, b.state, count(p.id) filter (where p.superseded_by is null) as served
+from block b join point p on p.block_number = b.number group by b.number order by b.number
+"""
+
+
+def test_postgresql_killed_before_the_commit_of_a_publication_leaves_what_was_served(own, tmp_path):
+    """The new version withdraws the old one and takes the places of another block, or nothing of it."""
+    versions = (("coast", "1", 0), ("hills", "1", 1), ("coast", "2", 2))
+    made = [
+        make_block(tmp_path / f"{name}-{version}", name=name, version=version).folder
+        for name, version, _ in versions
+    ]
+    storage = Storage(tmp_path / "storage")
+
+    def served(connection) -> list[dict]:
+        return run_sql(connection, SERVED).fetchall()
+
+    def publish_and_kill(dsn: str) -> None:
+        with engine.connect(dsn) as connection:
+            lifecycle.publish_block(connection, "coast@2")
+            assert served(connection) != before
+            kill(own)
+
+    with own.lease() as dsn:
+        revisions.upgrade(dsn)
+        with engine.connect(dsn) as connection:
+            for folder, (_, _, priority) in zip(made, versions, strict=True):
+                lifecycle.ingest_block(connection, storage, folder, priority=priority)
+            lifecycle.publish_block(connection, "coast@1")
+            lifecycle.publish_block(connection, "hills")
+            before = served(connection)
+        with pytest.raises(psycopg.OperationalError):
+            publish_and_kill(dsn)
+
+    with own.lease() as dsn, engine.connect(dsn) as connection:
+        assert served(connection) == before
+        lifecycle.publish_block(connection, "coast@2")
+        after = served(connection)
+    assert [row["state"] for row in before] == ["published", "published", "staged"]
+    assert [row["state"] for row in after] == ["withdrawn", "published", "published"]
+    assert before[1]["served"] > 0 == after[1]["served"], "the new version takes all places"
