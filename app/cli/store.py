@@ -140,7 +140,12 @@ def restore(
 @trash_app.command()
 def empty(as_json: AsJson = False) -> None:
     """Delete all files in the trash."""
-    show_one({"deleted": trash.empty(open_storage(read_settings()))}, as_json=as_json)
+    settings = read_settings()
+    storage = open_storage(settings)
+    with engine.opened(settings) as database:
+        storage_identity.require_match(database, storage)
+        n_deleted = trash.empty(storage)
+    show_one({"deleted": n_deleted}, as_json=as_json)
 
 
 def _finding(finding: Finding) -> Row:

@@ -11,9 +11,11 @@ from uuid import uuid4
 import httpx
 import pytest
 
+from app.cli import store
 from app.config import Settings
 from app.db import engine
 from app.db.cluster.embedded import Cluster
+from app.errors import Conflict
 from app.storage import MARKER, open_storage, read_marker, trash
 from app.storage.trash import TRASH, Moment
 from app.usecases import garbage_collection, storage_identity
@@ -67,6 +69,25 @@ def test_an_empty_database_beside_a_full_storage_removes_nothing(
     assert {key.split("/")[0].split("-")[0] for key in full.files} == {*FAMILIES, "upload"}
     with another(cluster) as empty:
         assert_untouched(full, empty, "that of another installation", monkeypatch, caplog)
+
+
+@pytest.mark.parametrize("kind", ["folder"])
+def test_the_trash_of_another_installation_is_not_emptied(
+    full: Full, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+):
+    storage = open_storage(full.settings)
+    key = next(key for key in full.files if storage.exists(key))
+    trash.discard(storage, [key], Moment(date(2026, 11, 22), 310))
+    before = contents(storage)
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(full.settings.data_folder))
+    with another(cluster) as empty:
+        monkeypatch.setenv("AMERS_DATABASE_URL", empty)
+        with pytest.raises(Conflict, match="amers store adopt"):
+            store.empty()
+    assert contents(storage) == before
+    monkeypatch.setenv("AMERS_DATABASE_URL", full.dsn)
+    store.empty()
+    assert storage.keys(TRASH) == []
 
 
 @pytest.mark.parametrize("kind", ["folder"])
