@@ -26,7 +26,7 @@ from services.formats.images.raster import DRIVER_OF_SIGNATURE
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)
-MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc")
+MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc", ".geom")
 MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
 RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
 """Terrains, masks and geoid grids: they may be as large as images."""

@@ -1,4 +1,4 @@
-"""Writes the invented RPC into this folder in four formats, without the code under test."""
+"""Writes the invented RPC into this folder in five formats, without the code under test."""
 
 from pathlib import Path
 
@@ -109,8 +109,40 @@ def rpb(model):
     return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
 
 
+def geom(model, order):
+    """An OSSIM keyword list; order A has the terms of the second and third degree elsewhere."""
+    a_powers = [
+        *POWERS[:7], (1, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2), (3, 0, 0), (2, 1, 0), (2, 0, 1),
+        (1, 2, 0), (0, 3, 0), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3),
+    ]  # fmt: skip
+    powers = POWERS if order == "B" else a_powers
+    lines = ["type:  ossimRpcModel", f"polynomial_format:  {order}", "sensor:  PHR 1B"]
+    lines += ["// invented", "bias_error:  2.5", "rand_error:  0.25", f"line_off:  {LINE_OFF}"]
+    lines += [f"samp_off:  {SAMP_OFF}", f"line_scale:  {LINE_SCALE}", f"samp_scale:  {SAMP_SCALE}"]
+    lines += [f"lat_off:  {LAT_OFF}", f"long_off:  {LONG_OFF}", f"height_off:  {HEIGHT_OFF}"]
+    lines += [f"lat_scale:  {LAT_SCALE}", f"long_scale:  {LONG_SCALE}", f"height_scale:  {HEIGHT_SCALE}"]
+    for name in MAIN:
+        value_of = dict(zip(POWERS, model[name], strict=True))
+        lines += [f"{name.lower()}_coeff_{i:02d}:  {float(value_of[p])!r}" for i, p in enumerate(powers)]
+    lines += ["number_lines:  26000", "number_samples:  26500", "rect:  0 0 26499 25999"]
+    lines += ["number_of_adjustments:  1", "current_adjustment:  0"]
+    lines += ["adjustment_0.description:  Initial adjustment", "adjustment_0.number_of_params:  5"]
+    parameters = "intrack_offset", "crtrack_offset", "intrack_scale", "crtrack_scale", "map_rotation"
+    for k, name in enumerate(parameters):
+        stem = f"adjustment_0.adj_param_{k}"
+        sigma = 0.1 if name == "map_rotation" else 50
+        lines += [f"{stem}.description:  {name}", f"{stem}.center:  0", f"{stem}.parameter:  0"]
+        lines += [f"{stem}.sigma:  {sigma}", f"{stem}.lock_flag:  0"]
+    lines += ["support_data.image_date:  2024-05-28T10:25:07.4Z"]
+    lines += ['support_data.azimuth_angle:  """150.5 150.4 ', '150.3 """']
+    lines += ['support_data.elevation_angle:  """60.1 60.2 60.3 """']
+    return "\n".join(lines) + "\n"
+
+
 if __name__ == "__main__":
     model = polynomials()
+    (HERE / "invented.geom").write_text(geom(model, "B"))
+    (HERE / "invented_a.geom").write_text(geom(model, "A"))
     v2 = ("Direct_Model", "SAMP", "LINE"), ("Inverse_Model", "Inverse_Model_Validity_Domain")
     v3 = (
         ("ImagetoGround_Values", "LON", "LAT"),

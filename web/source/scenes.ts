@@ -8,7 +8,7 @@ import { go, type Place, type ShowView } from "./place";
 import { send, uploadModel } from "./upload";
 
 const IMAGES = ".tif,.tiff,.jp2,.j2k,.ntf,.nitf,.zip,.tar";
-const MODELS = ".txt,.xml,.rpb,.rpc";
+const MODELS = ".txt,.xml,.rpb,.rpc,.geom";
 
 /** Shows the scenes and jobs of the caller, and the form for a new scene. */
 export const showScenes: ShowView = async (place) => {
@@ -88,7 +88,7 @@ function uploadForm({ signal }: Place): HTMLElement {
     { onsubmit: (event) => void submit(event) },
     h("label", { for: "image" }, "Image", h("span", { class: "quiet" }, " GeoTIFF, JPEG 2000, NITF, or an archive")),
     image,
-    h("label", { for: "models" }, "Model files", h("span", { class: "quiet" }, " if not in the image: RPC text, RPB, DIMAP")),
+    h("label", { for: "models" }, "Model files", h("span", { class: "quiet" }, " if not in the image: RPC text, RPB, DIMAP, .geom")),
     models,
     h("label", { for: "sigma" }, "Accuracy of the model, metres"),
     sigma,

@@ -43,6 +43,7 @@ MEDIA_TYPES = {
     ".html": "text/html",
     ".txt": "text/plain",
     ".rpb": "text/plain",
+    ".geom": "text/plain",
     ".xml": "application/xml",
     ".tif": "image/tiff",
     ".tiff": "image/tiff",

@@ -12,6 +12,7 @@ from services.formats.images.bands import BandMix
 from services.formats.images.masks import apply_mask
 from services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from services.formats.sensor_models.dimap import parse_dimap_acquisition, parse_imaging_time
+from services.formats.sensor_models.geom import parse_geom_acquisition
 from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
 from services.formats.sensor_models.rpc_text import rpb_satellite
 from services.formats.text_files import read_text
@@ -149,6 +150,8 @@ def _acquisition(image: RasterImage, delivered: DeliveredModel) -> Acquisition:
         acquisition = _dimap_acquisition(delivered.path, image_id)
     elif delivered.convention == "rpb":
         acquisition = Acquisition(image_id, sensor=rpb_satellite(read_text(delivered.path)))
+    elif delivered.convention == "geom":
+        acquisition = parse_geom_acquisition(read_text(delivered.path), image_id, delivered.path.name)
     if not acquisition.sensor:
         tags = image.dataset.tags()
         sensor = tags.get("MISSION", "") + tags.get("MISSION_INDEX", "")

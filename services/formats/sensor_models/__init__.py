@@ -1,1 +1,1 @@
-"""Sensor models in files: RPC text, RPB, DIMAP, image tags, and corrections as JSON."""
+"""Sensor models in files: RPC text, RPB, DIMAP, .geom, image tags, and corrections as JSON."""

@@ -50,7 +50,7 @@ def write_refined(
     |---|---|
     | RPC of any source | `refined_RPC.TXT` |
     | RPC tags, NITF | `STEM_RPC.TXT`, which GDAL prefers to the tags of the image beside it |
-    | `_RPC.TXT`, RPB, DIMAP | the file under its own name |
+    | `_RPC.TXT`, RPB, DIMAP, `.geom` | the file under its own name |
     | map grid | `IMAGE.aux.xml`, which GDAL prefers to the map grid of the image beside it |
     | any of a GeoTIFF | a copy of the image with new tags, when `copy_image` |
 

@@ -10,7 +10,9 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
 from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
+from services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
 from services.formats.sensor_models.rpc_text import (
+    RPC00A_ORDER,
     format_rpb,
     format_rpc_text,
     parse_rpb,
@@ -21,10 +23,10 @@ from services.formats.sensor_models.rpc_text import (
 from services.formats.text_files import parse_number, read_text
 from services.sensors.rpc import RpcModel, check_rpc
 
-_RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
-"""Positions in RPC00A of the terms of RPC00B. Source: NGA STDI-0002."""
+Convention = Literal["tags", "text", "rpb", "dimap", "geom"]
 
-Convention = Literal["tags", "text", "rpb", "dimap"]
+_Found = tuple[RpcModel, Path, Convention, str]
+"""A model, its file and format, and what was mended in it."""
 
 _CROP_EVIDENCE = 2.0
 """How many times nearer to the first pixel the range of a model must start for an unambiguous choice."""
@@ -56,17 +58,19 @@ def read_rpc(
     """The RPC of an image, in the pixels of that image.
 
     The RPC is, in this order: the file `model_path`; the RPC tags of a GeoTIFF or the RPC00B of a NITF;
-    `STEM_RPC.TXT`, `STEM.RPB` or `STEM_RPC.XML` beside the image, or for `IMG_NAME_R1C1` the
-    `RPC_NAME.XML` of its DIMAP (in upper or lower case).
+    `STEM_RPC.TXT`, `STEM.RPB` or `STEM_RPC.XML` beside the image, for `IMG_NAME_R1C1` the `RPC_NAME.XML`
+    of its DIMAP, or `STEM.geom` (in upper or lower case).
 
     A crop often stores its position in the full scene as a geotransform of unit pixels without a
     reference system. Its RPC may then be for the full scene or for the crop. The range of the RPC,
     offset - scale to offset + scale, decides: it contains the image and starts near the first pixel of
-    the image it is for. Where both are possible, `crop_origin` must be given.
+    the image it is for. Where both are possible, `crop_origin` must be given. A position in which both
+    numbers end in .5 counts from the centre of the first pixel, as OTB wrote it before 2014, and not
+    from its corner: it stands for the whole pixel that follows.
 
     Args:
         path: of the image.
-        model_path: `_RPC.TXT`, `.RPB` or DIMAP file of any name; by default the one found.
+        model_path: `_RPC.TXT`, `.RPB`, DIMAP or `.geom` file of any name; by default the one found.
         crop_origin: line and sample of the first pixel of the image in the image that the RPC is for;
             (0, 0) when the RPC is in the pixels of the image; by default decided as above.
 
@@ -128,6 +132,8 @@ def _in_delivered_format(delivered: DeliveredModel, model: RpcModel) -> dict[str
         return {path.name: format_rpb(model, rpb_satellite(read_text(path)))}
     if delivered.convention == "dimap":
         return {path.name: format_dimap_rpc(read_text(path), model, path.name)}
+    if delivered.convention == "geom":
+        return {path.name: format_geom(model, read_text(path))}
     name = f"{path.stem}_RPC.TXT" if delivered.convention == "tags" else path.name
     return {name: format_rpc_text(model)}
 
@@ -137,9 +143,9 @@ def model_of_image(
 ) -> DeliveredModel:
     """The RPC of an open image; see `read_rpc`."""
     if model_path is not None:
-        model, path, convention = _read_model_file(model_path)
+        model, path, convention, mended = _read_model_file(model_path)
     else:
-        model, path, convention = _find_model(image)
+        model, path, convention, mended = _find_model(image)
     check_rpc(model, path.name)
     offset = _crop_offset(image)
     tile = re.search(r"_R(\d+)C(\d+)$", image.path.stem, re.IGNORECASE)
@@ -156,7 +162,8 @@ def model_of_image(
         origin, reason = (0.0, 0.0), "in the pixels of the image"
     model = replace(model, image_offset=model.image_offset - np.array(origin))
     _check_coverage(model, image, path)
-    return DeliveredModel(model, path, convention, origin, f"{convention} of {path.name}, {reason}")
+    note = ", ".join(part for part in (f"{convention} of {path.name}", mended, reason) if part)
+    return DeliveredModel(model, path, convention, origin, note)
 
 
 def has_rpc(image: RasterImage) -> bool:
@@ -164,13 +171,13 @@ def has_rpc(image: RasterImage) -> bool:
     return bool(image.dataset.tags(ns="RPC")) or bool(_files_beside(image)[1])
 
 
-def _find_model(image: RasterImage) -> tuple[RpcModel, Path, Convention]:
+def _find_model(image: RasterImage) -> _Found:
     tags = image.dataset.tags(ns="RPC")
     if tags:
         records = image.dataset.tags(ns="TRE")
         if "RPC00A" in records and "RPC00B" not in records:
             tags = {**tags, **_rpc00a_coefficients(records["RPC00A"])}
-        return _parse_tags(tags, image.path.name), image.path, "tags"
+        return _parse_tags(tags, image.path.name), image.path, "tags", ""
     names, files = _files_beside(image)
     if files:
         return _read_model_file(files[0])
@@ -187,18 +194,22 @@ def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
     airbus = re.fullmatch(r"IMG_(.+?)(_R\d+C\d+)?", stem, re.IGNORECASE)
     if airbus is not None:
         names.append(f"RPC_{airbus[1]}.XML")
+    names.append(f"{stem}.geom")
     beside = {file.name.upper(): file for file in image.path.resolve().parent.iterdir()}
     return names, [beside[name.upper()] for name in names if name.upper() in beside]
 
 
-def _read_model_file(path: Path) -> tuple[RpcModel, Path, Convention]:
+def _read_model_file(path: Path) -> _Found:
     """The RPC of a model file, whose content, not its name, decides on the format."""
     text = read_text(path)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
-        return parse_dimap_rpc(text, path.name), path, "dimap"
+        return parse_dimap_rpc(text, path.name), path, "dimap", ""
     if re.search(r"\bBEGIN_GROUP\b", text):
-        return parse_rpb(text, path.name), path, "rpb"
-    return parse_rpc_text(text, path.name), path, "text"
+        return parse_rpb(text, path.name), path, "rpb", ""
+    if is_geom(text):
+        model, mended = parse_geom(text, path.name)
+        return model, path, "geom", mended
+    return parse_rpc_text(text, path.name), path, "text", ""
 
 
 def _rpc00a_coefficients(record: str) -> dict[str, str]:
@@ -208,7 +219,7 @@ def _rpc00a_coefficients(record: str) -> dict[str, str]:
     """
     starts = {"LINE_NUM": 81, "LINE_DEN": 321, "SAMP_NUM": 561, "SAMP_DEN": 801}
     return {
-        f"{name}_COEFF": " ".join(record[start + 12 * i : start + 12 * (i + 1)] for i in _RPC00A_ORDER)
+        f"{name}_COEFF": " ".join(record[start + 12 * i : start + 12 * (i + 1)] for i in RPC00A_ORDER)
         for name, start in starts.items()
     }
 
@@ -230,9 +241,11 @@ def _crop_offset(image: RasterImage) -> tuple[float, float] | None:
     """Line and sample of the first pixel in the full scene, when the geotransform marks a crop."""
     t = image.dataset.transform
     unit = (t.a, t.b, t.d, t.e) == (1.0, 0.0, 0.0, 1.0)
-    if image.dataset.crs is not None or not unit or (t.c, t.f) == (0.0, 0.0):
+    if image.dataset.crs is not None or not unit:
         return None
-    return t.f, t.c
+    centred = t.c % 1.0 == 0.5 and t.f % 1.0 == 0.5
+    offset = (t.f + 0.5, t.c + 0.5) if centred else (t.f, t.c)
+    return None if offset == (0.0, 0.0) else offset
 
 
 def _choose_origin(

@@ -22,6 +22,9 @@ _TEXT_LINE = re.compile(rf"\s*(\w+)\s*[:=]\s*({NUMBER_PATTERN})(?:\s+[A-Za-z]+)?
 _RPB_NUMBER = re.compile(rf"\s*(\w+)\s*=\s*({NUMBER_PATTERN})\s*;?\s*")
 _RPB_LIST = re.compile(r"\b(\w+)\s*=\s*\(([^()]*)\)")
 
+RPC00A_ORDER = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 19)
+"""Positions in RPC00A of the terms of RPC00B. Source: NGA STDI-0002."""
+
 _POLYNOMIALS = ("LINE_NUM", "LINE_DEN", "SAMP_NUM", "SAMP_DEN")
 _RPB_KEYS = {
     "LINE_OFF": "lineOffset",
@@ -66,7 +69,7 @@ def parse_rpc_text(text: str, source: str = "RPC text") -> RpcModel:
 
 def format_rpc_text(model: RpcModel) -> str:
     """The text of a `_RPC.TXT` with a model; unknown stated errors are omitted."""
-    numbers = _numbers(model)
+    numbers = named_numbers(model)
     return "".join(f"{key}: {value!r}\n" for key, value in numbers.items())
 
 
@@ -112,7 +115,7 @@ def format_rpb(model: RpcModel, satellite: str = "") -> str:
         model: the model.
         satellite: content of the field `satId`.
     """
-    numbers = _numbers(model)
+    numbers = named_numbers(model)
     lines = [
         f'satId = "{satellite}";',
         'bandId = "P";',
@@ -179,7 +182,7 @@ def _lookup(numbers: dict[str, float], source: str) -> Numbers:
     return number
 
 
-def _numbers(model: RpcModel) -> dict[str, float]:
+def named_numbers(model: RpcModel) -> dict[str, float]:
     """The numbers of a model by their keys; unknown stated errors are omitted."""
     line, sample = model.image_offset.tolist()
     line_scale, sample_scale = model.image_scale.tolist()

@@ -1,5 +1,6 @@
 """Real deliveries: all models are read in the right pixels, and the images agree on the ground."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -165,9 +166,10 @@ def test_a_nitf_gives_its_model_its_accuracy_and_its_pixels(
     assert 0.3 < scene_gsd_m(scene) < 0.4
 
 
-def test_an_image_without_a_model_is_refused(real_data: Path) -> None:
+def test_an_image_without_a_model_is_refused(real_data: Path, tmp_path: Path) -> None:
+    image = shutil.copy(real_data / "phr_ventoux_pair" / "lowres_color_image.tif", tmp_path)
     with pytest.raises(FormatError, match="no sensor model"):
-        read_scene(real_data / "phr_ventoux_pair" / "lowres_color_image.tif")
+        read_scene(Path(image))
 
 
 def agreement(a: Scene, b: Scene, point: Array) -> tuple[float, float]:

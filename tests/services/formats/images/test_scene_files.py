@@ -15,6 +15,7 @@ from services.errors import FormatError
 from services.formats.images.raster import gdal_rpc
 from services.formats.images.scenes import prior_sigma_m, read_scene
 from services.formats.sensor_models.dimap import format_dimap_rpc
+from services.formats.sensor_models.geom import format_geom
 from services.formats.sensor_models.rpc_files import read_rpc, write_model
 from services.formats.sensor_models.rpc_text import format_rpb, format_rpc_text, parse_rpc_text
 from services.imagery.scene import scene_centre, scene_gsd_m
@@ -25,6 +26,7 @@ from services.types import Array
 
 GOLDEN = Path(__file__).parents[3] / "golden"
 FULL = parse_rpc_text((GOLDEN / "invented_RPC.TXT").read_text())
+GEOM = (GOLDEN / "invented.geom").read_text()
 V2 = (GOLDEN / "RPC_invented_v2.XML").read_text()
 ORIGIN = (9000.0, 15000.0)
 CROP = replace(FULL, image_offset=FULL.image_offset - np.array(ORIGIN))
@@ -37,8 +39,14 @@ a_hundredth_of_a_degree = 0.01
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
-def write_image(path: Path, tagged: RpcModel | None = None, placed: bool = False, **tags: str) -> Path:
-    transform = Affine(1, 0, ORIGIN[1], 0, 1, ORIGIN[0]) if placed else None
+def write_image(
+    path: Path,
+    tagged: RpcModel | None = None,
+    placed: bool = False,
+    first: float = 0.0,
+    **tags: str,
+) -> Path:
+    transform = Affine(1, 0, ORIGIN[1] + first, 0, 1, ORIGIN[0] + first) if placed else None
     with rasterio.open(
         path, "w", "GTiff", PIXELS.shape[1], PIXELS.shape[0], 1, dtype="uint16", transform=transform
     ) as file:
@@ -64,6 +72,7 @@ def misfit_px(a: RpcModel, b: RpcModel) -> float:
         ("IMG_a.RPB", format_rpb(CROP), "rpb"),
         ("IMG_a_RPC.XML", format_dimap_rpc(V2, CROP), "dimap"),
         ("RPC_a.XML", format_dimap_rpc(V2, CROP), "dimap"),
+        ("IMG_a.geom", format_geom(CROP, GEOM), "geom"),
     ],
 )
 def test_a_model_beside_the_image_is_found(
@@ -91,7 +100,7 @@ def test_without_a_model_the_message_lists_the_files_searched_for(tmp_path: Path
     path = write_image(tmp_path / "IMG_a_R1C1.tif")
     with pytest.raises(
         FormatError,
-        match=r"nor RPC tags, and no file IMG_a_R1C1_RPC.TXT, .*\.RPB, .*RPC_a\.XML lies beside",
+        match=r"no file IMG_a_R1C1_RPC.TXT, .*\.RPB, .*RPC_a\.XML, IMG_a_R1C1\.geom lies beside",
     ):
         read_rpc(path)
 
@@ -120,6 +129,24 @@ def test_a_crop_is_read_right_whether_its_model_is_the_full_scene_s_or_its_own(
     assert read.crop_origin == origin
     np.testing.assert_allclose(read.model.image_offset, CROP.image_offset, rtol=0, atol=a_nanopixel)
     assert "line 9000, sample 15000" in read.note
+
+
+def test_a_crop_placed_by_the_centre_of_its_first_pixel_is_the_same_crop(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "a.tif", placed=True, first=-0.5)
+    (tmp_path / "a.geom").write_text(GEOM)
+    read = read_rpc(path)
+    assert (read.convention, read.crop_origin) == ("geom", ORIGIN)
+    np.testing.assert_allclose(read.model.image_offset, CROP.image_offset, rtol=0, atol=a_nanopixel)
+
+
+def test_a_whole_image_placed_by_the_centre_of_its_first_pixel_is_no_crop(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with rasterio.open(
+        path, "w", "GTiff", 80, 60, 1, dtype="uint16", transform=Affine(1, 0, -0.5, 0, 1, -0.5)
+    ) as file:
+        file.write(PIXELS, 1)
+    (tmp_path / "a.geom").write_text(GEOM)
+    assert read_rpc(path).crop_origin == (0.0, 0.0)
 
 
 def test_a_crop_with_an_ambiguous_model_needs_its_origin(tmp_path: Path) -> None:
@@ -215,6 +242,7 @@ def refined(model: RpcModel) -> RpcModel:
         ("a_RPC.TXT", format_rpc_text(CROP)),
         ("a.RPB", format_rpb(CROP, "WV02")),
         ("a_RPC.XML", format_dimap_rpc(V2, CROP)),
+        ("a.geom", format_geom(CROP, GEOM)),
     ],
 )
 def test_a_refined_model_reads_back_from_every_file_it_is_written_to(
