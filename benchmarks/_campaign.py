@@ -19,7 +19,7 @@ from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World
-from services.types import Array, ControlPoints
+from services.types import Array, ControlPoints, Frame
 
 FRAME_SIGMA_M = 0.5
 LE90_OF_CE90 = 5.0 / 3.0
@@ -128,6 +128,7 @@ def _spoiled(
         points,
         lon_lat_h=move_metres(points.lon_lat_h, offset_m),
         covariance_m2=points.covariance_m2 + np.diag(sigma_m**2),
+        frames=(Frame.from_sigmas(FRAME_SIGMA_M, 0.0),),
         chip_row=chip_row,
     )
 
@@ -145,7 +146,6 @@ def attempt(
             prepared.points,
             replace(block, points=prepared.points),
             options,
-            frame_sigma_m=FRAME_SIGMA_M,
         )
     except AmersError as error:
         nan = float("nan")

@@ -9,7 +9,7 @@ from services.imagery.scene import Scene, scene_gsd_m, view_direction
 from services.imagery.source import ImageSource, ReducedImage, reduce_image, render_chip
 from services.matching.multi_image import chip_inside, chip_saliency, refine_on_chips, stored_chip
 from services.simulation.world import World
-from services.types import Array, ChipArray, ControlPoints, Views
+from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, Views
 
 LEAST_SALIENCY = 0.3
 
@@ -59,6 +59,8 @@ def lay_points(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=ground,
         covariance_m2=found.covariance_m2[kept],
+        block=np.zeros(n, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
         saliency=saliency[kept],
         health=np.ones(n),
         views=Views(

@@ -20,7 +20,7 @@ from services.simulation.render import STEEPEST
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.simulation.world import World, make_world
-from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
+from services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
 
 FINE_GSD_M, COARSE_GSD_M = 2.0, 20.0
 COARSE_REFERENCE_GSD_M = 8.0
@@ -241,6 +241,8 @@ def _unpacked(kept: "np.lib.npyio.NpzFile") -> Block:
         np.arange(n, dtype=np.int64),
         kept["lon_lat_h"],
         kept["covariance_m2"],
+        np.zeros(n, dtype=np.int64),
+        (UNKNOWN_FRAME,),
         kept["saliency"],
         np.ones(n),
         views,

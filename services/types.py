@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -80,6 +80,27 @@ class Views:
 
 
 @dataclass(frozen=True)
+class Frame:
+    """Position of the frame of a block on the Earth: an error that all points of the block share.
+
+    Attributes:
+        covariance_m2: (3, 3) of east, north, up; NaN where nobody stated it.
+    """
+
+    covariance_m2: Array
+
+    @classmethod
+    def from_sigmas(cls, horizontal_m: float, up_m: float) -> Self:
+        """The frame of independent errors, one standard deviation a coordinate; NaN when unknown."""
+        known = np.diag(np.array([horizontal_m, horizontal_m, up_m]) ** 2)
+        unknown = np.isnan(np.diagonal(known))
+        return cls(np.where(unknown[:, None] | unknown[None, :], np.nan, np.nan_to_num(known)))
+
+
+UNKNOWN_FRAME = Frame(np.full((3, 3), np.nan))
+
+
+@dataclass(frozen=True)
 class ControlPoints:
     """n control points, their views and the positions of their chips in files.
 
@@ -87,6 +108,8 @@ class ControlPoints:
         id: (n,) int64, unique.
         lon_lat_h: (n, 3).
         covariance_m2: (n, 3, 3) of east, north, up, relative to the frame of the point's block.
+        block: (n,) int64, rows of `frames`.
+        frames: of the blocks that the points come from.
         saliency: (n,) 0 to 1, how precisely the chip of the point can be located.
         health: (n,) `health` of the point: how often it is active in the final adjustment; 1 without a
             history.
@@ -99,6 +122,8 @@ class ControlPoints:
     id: IntArray
     lon_lat_h: Array
     covariance_m2: Array
+    block: IntArray
+    frames: tuple[Frame, ...]
     saliency: Array
     health: Array
     views: Views
@@ -127,6 +152,8 @@ class ControlPoints:
             id=self.id[rows],
             lon_lat_h=self.lon_lat_h[rows],
             covariance_m2=self.covariance_m2[rows],
+            block=self.block[rows],
+            frames=self.frames,
             saliency=self.saliency[rows],
             health=self.health[rows],
             views=views,

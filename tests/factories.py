@@ -18,7 +18,7 @@ from services.formats.block.document import (
 )
 from services.formats.block.writer import write_block
 from services.sensors.rpc import RpcModel
-from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
+from services.types import UNKNOWN_FRAME, Acquisition, Array, ChipArray, ControlPoints, Views
 
 GSDS_M = (0.5, 2.0)
 BOX = (5.2, 43.2, 5.3, 43.3)
@@ -90,6 +90,8 @@ def control_points(
         id=np.arange(count, dtype=np.int64),
         lon_lat_h=lon_lat_h,
         covariance_m2=factor @ factor.transpose(0, 2, 1),
+        block=np.zeros(count, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
         saliency=rng.uniform(0.0, 1.0, count).astype(np.float32).astype(np.float64),
         health=np.ones(count),
         views=Views(

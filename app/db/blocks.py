@@ -44,6 +44,9 @@ FRAME_SIGMA_M = cast(
 )
 """Standard deviation a coordinate of the frame of a block on the Earth; null if unstated."""
 
+FRAME = func.jsonb_path_query_first(block.c.metadata, text_constant('$."amers:frame"'), type_=JSONB)
+"""The frame of a block on the Earth, as its document states it; null if unstated."""
+
 INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
 

@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 
 from app.db.binary_copy import parse_copy
-from app.db.blocks import FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
+from app.db.blocks import FRAME, FRAME_SIGMA_M, ID_BITS, in_published_block, published_numbers
 from app.db.constants import integer_constant, text_constant
 from app.db.density import points_in_box
 from app.db.engine import Connection, driver
@@ -35,11 +35,12 @@ from app.db.features.collection import Collection, column_property
 from app.db.features.predicates import geometry_from_wkb, meets_box
 from app.db.features.query import AFTER_KEY, LIMIT
 from app.db.history import point_health, view_health
-from app.db.rows import columns_of, every
+from app.db.rows import columns_of
 from app.db.schema import block, chip_file, image, point, view
 from app.db.statements import CopyOut, HotStatement, hot
+from services.formats.block.frame_json import parse_frame
 from services.formats.block.tables import covariance_from_sigmas
-from services.types import Acquisition, Array, ControlPoints, IntArray, Views
+from services.types import Acquisition, Array, ControlPoints, Frame, IntArray, Views
 
 SERVED = and_(point.c.superseded_by.is_(None), point.c.suspended_at.is_(None))
 """Neither a better block has the point, nor an administrator has suspended it."""
@@ -142,14 +143,13 @@ class BlockVersion:
     """A version of a block that points came from.
 
     Attributes:
-        frame_sigma_m: how well its frame is known on the Earth, standard deviation a coordinate; None if
-            its producer gives none.
+        frame: how well its frame is known on the Earth.
     """
 
     number: int
     id: str
     version: str
-    frame_sigma_m: float | None
+    frame: Frame
 
 
 @dataclass(frozen=True)
@@ -242,6 +242,7 @@ def _with_views(
     ids = points["id"].astype(np.int64)
     views = _read(connection, _views_of_points(), {"ids": ids.tolist()}, VIEW_ARRAYS)
     numbers = np.unique(ids >> ID_BITS)
+    versions = _versions(connection, numbers)
     images, first_image = _images(connection, numbers)
     chip_files, storage_keys = _chip_files(connection, points["chip_file"].astype(np.int64))
     owner = views["point_id"].astype(np.int64)
@@ -254,6 +255,8 @@ def _with_views(
             _columns(points, "sigma_east", "sigma_north", "sigma_up"),
             _columns(points, "corr_east_north", "corr_east_up", "corr_north_up"),
         ),
+        block=np.searchsorted(numbers, ids >> ID_BITS).astype(np.int64),
+        frames=tuple(version.frame for version in versions),
         saliency=_columns(points, "saliency")[:, 0],
         health=point_health(connection, ids),
         views=Views(
@@ -269,7 +272,7 @@ def _with_views(
         chip_row=points["chip_row"].astype(np.int64),
         chip_files=storage_keys,
     )
-    return StoredPoints(control, _versions(connection, numbers))
+    return StoredPoints(control, versions)
 
 
 def _read(
@@ -304,7 +307,6 @@ _IMAGE_COLUMNS = columns_of(
     sun_azimuth_deg=_nan_if_null(image.c.sun_azimuth_deg),
 )
 _IMAGE_FIELDS = tuple(column.key for column in _IMAGE_COLUMNS)
-_VERSION_COLUMNS = columns_of(BlockVersion, block, frame_sigma_m=FRAME_SIGMA_M)
 _IMAGES = (
     select(image.c.block_number.label("block_number"), *_IMAGE_COLUMNS)
     .where(image.c.block_number == any_(IDS))
@@ -313,7 +315,17 @@ _IMAGES = (
 _STORAGE_KEYS = (
     select(chip_file.c.storage_key).where(chip_file.c.id == any_(IDS)).order_by(chip_file.c.id)
 )
-_VERSIONS = select(*_VERSION_COLUMNS).where(block.c.number == any_(IDS)).order_by(block.c.number)
+_VERSIONS = (
+    select(
+        block.c.number,
+        block.c.id,
+        block.c.version,
+        FRAME.label("frame"),
+        FRAME_SIGMA_M.label("frame_sigma_m"),
+    )
+    .where(block.c.number == any_(IDS))
+    .order_by(block.c.number)
+)
 
 
 def _images(connection: Connection, numbers: IntArray) -> tuple[tuple[Acquisition, ...], IntArray]:
@@ -332,5 +344,14 @@ def _chip_files(connection: Connection, files: IntArray) -> tuple[IntArray, tupl
 
 
 def _versions(connection: Connection, numbers: IntArray) -> tuple[BlockVersion, ...]:
-    rows = connection.execute(_VERSIONS, {"ids": numbers.tolist()})
-    return tuple(every(BlockVersion, rows))
+    """The versions of blocks, in the order of their numbers."""
+    rows = connection.execute(_VERSIONS, {"ids": numbers.tolist()}).mappings()
+    return tuple(
+        BlockVersion(
+            row["number"],
+            row["id"],
+            row["version"],
+            parse_frame(row["frame"], row["frame_sigma_m"]),
+        )
+        for row in rows
+    )

@@ -24,7 +24,7 @@ from services.production.from_ortho import (
 )
 from services.sensors.correction import fold_into_rpc
 from services.sensors.rpc import RpcModel
-from services.types import Array, Progress, no_progress, part_of
+from services.types import Array, ControlPoints, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -180,6 +180,7 @@ def _production_metadata(
     return _metadata(
         identity,
         scenes,
+        production.points,
         description=f"{n_points} ground control points with chips, from {len(scenes)} images",
         outline=production.outline,
         specification=BlockSpecification(
@@ -214,6 +215,7 @@ def _ortho_metadata(
     return _metadata(
         identity,
         [scene],
+        production.points,
         description=f"{n_points} ground control points with chips, from one ortho-image",
         outline=production.outline,
         specification=BlockSpecification(
@@ -237,6 +239,7 @@ def _ortho_metadata(
 def _metadata(
     identity: BlockIdentity,
     scenes: Sequence[Scene],
+    points: ControlPoints,
     *,
     description: str,
     outline: Array,
@@ -262,6 +265,7 @@ def _metadata(
         ),
         epoch=None if not dates else _decimal_year(max(dates)),
         accuracy=accuracy,
+        frame=points.frames[0],
     )
 
 

@@ -13,7 +13,7 @@ from services.reports.html import page_template
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel, check_rpc
-from services.types import Acquisition, ChipArray, ControlPoints, Views
+from services.types import UNKNOWN_FRAME, Acquisition, ChipArray, ControlPoints, Views
 
 _SIZE = 520
 _GSD_DEG = 1e-5
@@ -76,6 +76,8 @@ def _small_registration() -> tuple[Scene, ControlPoints, _Chips]:
         np.arange(n),
         ground,
         np.tile(0.01 * np.eye(3), (n, 1, 1)),
+        np.zeros(n, dtype=np.int64),
+        (UNKNOWN_FRAME,),
         np.ones(n),
         np.ones(n),
         views,

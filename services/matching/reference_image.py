@@ -20,7 +20,16 @@ from services.matching.control_points import PointMatches
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.sensors.base import SensorModel
 from services.terrain import Terrain, intersect_terrain
-from services.types import Array, FloatImage, IntArray, Progress, ViewMeasures, no_progress
+from services.types import (
+    UNKNOWN_FRAME,
+    Array,
+    FloatImage,
+    Frame,
+    IntArray,
+    Progress,
+    ViewMeasures,
+    no_progress,
+)
 
 _NODE_PX = 4
 """Pixels of a level between the lines of sight that are intersected with the terrain."""
@@ -39,8 +48,7 @@ class Reference:
         height_sigma_m: height of the terrain, one standard deviation.
         common_sigma_m: error that all positions measured on the image share, one standard deviation a
             coordinate: shadows and roofs lean the same way everywhere.
-        frame_sigma_m: position of the whole image on the Earth, one standard deviation a coordinate; NaN
-            when unknown.
+        frame: position of the whole image on the Earth, and of the heights of the terrain.
     """
 
     image: ImageSource
@@ -49,7 +57,7 @@ class Reference:
     sigma_m: float
     height_sigma_m: float
     common_sigma_m: float
-    frame_sigma_m: float = float("nan")
+    frame: Frame = UNKNOWN_FRAME
 
 
 @dataclass(frozen=True)

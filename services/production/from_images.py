@@ -1,5 +1,6 @@
 """BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, measure on chips, select, cut."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -26,6 +27,7 @@ from services.types import (
     BoolArray,
     ChipArray,
     ControlPoints,
+    Frame,
     IntArray,
     Observations,
     Progress,
@@ -157,15 +159,16 @@ def produce_points(
     )
     adjusted = _with_models(scenes, adjustment)
     rows, saliency = _select_points(adjusted, intersection, active, options)
-    points = _control_points(
-        intersection, rows, saliency, _views(adjusted, intersection, rows, active, options)
-    )
+    frame_sigma_m = float(np.sum([scene.sigma_m**-2.0 for scene in scenes]) ** -0.5)
+    frame = Frame.from_sigmas(frame_sigma_m, math.nan)
+    views = _views(adjusted, intersection, rows, active, options)
+    points = _control_points(intersection, rows, frame, saliency, views)
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
         before_px=_median_px(before.residual_px),
         after_px=_median_px(tied.residual_px),
         refined_px=_median_px(adjustment.residual_px[adjustment.active]),
-        frame_sigma_m=float(np.sum([scene.sigma_m**-2.0 for scene in scenes]) ** -0.5),
+        frame_sigma_m=frame_sigma_m,
     )
     progress(1.0, f"{len(points)} points")
 
@@ -297,7 +300,7 @@ def _select_points(
 
 
 def _control_points(
-    intersection: Intersection, rows: IntArray, saliency: Array, views: Views
+    intersection: Intersection, rows: IntArray, frame: Frame, saliency: Array, views: Views
 ) -> ControlPoints:
     """The selected rows of an intersection as control points of one chip file."""
     n = len(rows)
@@ -305,6 +308,8 @@ def _control_points(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=intersection.lon_lat_h[rows],
         covariance_m2=intersection.covariance_m2[rows],
+        block=np.zeros(n, dtype=np.int64),
+        frames=(frame,),
         saliency=saliency,
         health=np.ones(n),
         views=views,

@@ -1,5 +1,6 @@
 """ORTHO-IMAGE AND HEIGHTS IN -> NEW POINTS OUT: the salient corners of one image that lies on a map."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,6 +19,7 @@ from services.types import (
     ChipArray,
     ControlPoints,
     FloatImage,
+    Frame,
     Progress,
     Views,
     no_progress,
@@ -219,6 +221,8 @@ def _assembled(
         id=np.arange(n, dtype=np.int64),
         lon_lat_h=lon_lat_h,
         covariance_m2=np.tile(np.diag(variance_m2), (n, 1, 1)),
+        block=np.zeros(n, dtype=np.int64),
+        frames=(Frame.from_sigmas(scene.sigma_m, math.nan),),
         saliency=np.array([saliency for _, saliency in corners]),
         health=np.ones(n),
         views=Views(

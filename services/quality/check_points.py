@@ -12,7 +12,7 @@ from services.quality.criteria import at_most, verdict_of
 from services.quality.qualification import Qualification
 from services.quality.stability import ImageResiduals, residuals_in_image
 from services.sensors.correction import CorrectedModel
-from services.types import Array
+from services.types import Array, Frame
 
 MARKING_SIGMA_PX = 0.5
 """Precision with which a person marks a detail in an image, one standard deviation a coordinate, where
@@ -54,7 +54,7 @@ class CheckResult:
 
 
 def check_model(
-    model: CorrectedModel, adjustment: SceneAdjustment, points: CheckPoints, frame_sigma_m: float
+    model: CorrectedModel, adjustment: SceneAdjustment, points: CheckPoints, frame: Frame
 ) -> CheckResult:
     """The errors of a registered model at check points.
 
@@ -62,8 +62,7 @@ def check_model(
         model: registered.
         adjustment: the one that registered it.
         points: held out of it.
-        frame_sigma_m: accuracy of the frame of the control points on the Earth, one standard deviation a
-            coordinate; NaN when unknown: 0 is used.
+        frame: of the control on the Earth; 0 is used where it is unknown.
 
     Raises:
         CoverageError: the model has no image position for any of the points.
@@ -75,9 +74,10 @@ def check_model(
             f"none of the {len(expected)} check points lies where the model of the scene is valid: "
             "check that their coordinates are longitude, latitude and height, and belong to this scene"
         )
-    variance_m2 = np.nan_to_num(points.sigma_m) ** 2 + np.nan_to_num(frame_sigma_m) ** 2
+    ground_m2 = np.nan_to_num(points.sigma_m)[:, None, :] ** 2 * np.eye(3)
+    ground_m2 = ground_m2 + np.nan_to_num(frame.covariance_m2)
     derivative = model.project_derivative(points.lon_lat_h)
-    of_ground = (derivative * variance_m2[:, None, :]) @ derivative.transpose(0, 2, 1)
+    of_ground = derivative @ ground_m2 @ derivative.transpose(0, 2, 1)
     marking_px = np.nan_to_num(points.sigma_px, nan=MARKING_SIGMA_PX)
     of_marks = marking_px[:, None, None] ** 2 * np.eye(2)
     located = model.locate(points.line_sample, points.lon_lat_h[:, 2])

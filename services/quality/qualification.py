@@ -152,10 +152,7 @@ class Qualification:
 
 
 def qualify(
-    scene: AdjustedScene,
-    options: QualificationOptions,
-    rng: np.random.Generator,
-    frame_sigma_m: float,
+    scene: AdjustedScene, options: QualificationOptions, rng: np.random.Generator
 ) -> Qualification:
     """The quality figures of a registration, compared with their thresholds.
 
@@ -163,14 +160,12 @@ def qualify(
         scene: after its final adjustment.
         options: thresholds and sampling.
         rng: draws the points that are held out.
-        frame_sigma_m: systematic error of the frame of the points' blocks, one standard deviation a
-            coordinate; NaN when unknown.
     """
     measures, adjustment, shape = scene.measures, scene.adjustment, scene.shape
     point_counts = count_points(measures)
     residuals = residuals_in_image(measures.residual_px[measures.active])
     stability = measure_stability(scene, options.draws, options.kept_share, rng)
-    predicted = predict_accuracy(adjustment, shape, scene.gsd_m, options.grid, frame_sigma_m)
+    predicted = predict_accuracy(scene, options.grid)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     figures = _Figures(
         active_points=point_counts.active,

@@ -7,8 +7,8 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
-from services.quality.accuracy import CIRCULAR_CE90, Statistics, normal_ce90, statistics
-from services.types import Array, BoolArray, Measures
+from services.quality.accuracy import Statistics, normal_ce90, statistics
+from services.types import Array, BoolArray, Frame, Measures
 
 PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
 
@@ -22,6 +22,7 @@ class AdjustedScene:
         adjustment: of all active points.
         shape: lines and samples of the image.
         gsd_m: ground sampling of the image; it converts pixels to metres.
+        frame: of the control on the Earth.
         refit: repeats the adjustment on the measures of a mask (n,).
     """
 
@@ -29,6 +30,7 @@ class AdjustedScene:
     adjustment: SceneAdjustment
     shape: tuple[int, int]
     gsd_m: float
+    frame: Frame
     refit: Callable[[BoolArray], SceneAdjustment]
 
 
@@ -104,7 +106,7 @@ class PredictedAccuracy:
         std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner.
         ce90_px: (g, g) by the normal law.
         worst_px, median_px, worst_m, median_m: of `ce90_px` over the image.
-        frame_ce90_m: of the frame of the points' blocks, by the circular normal law; NaN when unknown.
+        frame_ce90_m: of the frame of the points' blocks, by the normal law; NaN when unknown.
     """
 
     std_line_px: Array
@@ -197,26 +199,18 @@ def _why_no_stability(active: int, held_count: int) -> str:
     return f"{active - held_count} of {active} active points gave no solution in any draw"
 
 
-def predict_accuracy(
-    adjustment: SceneAdjustment,
-    shape: tuple[int, int],
-    gsd_m: float,
-    grid: int,
-    frame_sigma_m: float,
-) -> PredictedAccuracy:
+def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
     """The covariance of the correction, propagated to a grid over the image.
 
     Args:
-        adjustment: with its covariance.
-        shape: lines and samples of the image.
-        gsd_m: ground sampling of the image.
+        scene: after its final adjustment.
         grid: nodes along each side.
-        frame_sigma_m: systematic error of the frame of the points' blocks; NaN when unknown.
     """
+    shape, gsd_m = scene.shape, scene.gsd_m
     line, sample = np.meshgrid(
         np.linspace(0.0, shape[0] - 1.0, grid), np.linspace(0.0, shape[1] - 1.0, grid), indexing="ij"
     )
-    covariance = adjustment.covariance_at(np.column_stack([line.ravel(), sample.ravel()]))
+    covariance = scene.adjustment.covariance_at(np.column_stack([line.ravel(), sample.ravel()]))
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
     ce90 = normal_ce90(covariance)
     worst, median = float(ce90.max()), float(np.median(ce90))
@@ -228,5 +222,5 @@ def predict_accuracy(
         median_px=median,
         worst_m=worst * gsd_m,
         median_m=median * gsd_m,
-        frame_ce90_m=CIRCULAR_CE90 * frame_sigma_m,
+        frame_ce90_m=float(normal_ce90(scene.frame.covariance_m2[None, :2, :2])[0]),
     )

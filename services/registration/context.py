@@ -20,14 +20,11 @@ class RegistrationContext:
         scene: as delivered.
         options: of all stages.
         progress: receives the fraction done and the work under way.
-        frame_sigma_m: accuracy of the frame of the control on the Earth, one standard deviation a
-            coordinate; NaN when unknown.
     """
 
     scene: Scene
     options: RegistrationOptions
     progress: Progress
-    frame_sigma_m: float
 
     @cached_property
     def gsd_m(self) -> float:

@@ -1,6 +1,5 @@
 """SCENE IN -> REGISTERED MODEL OUT: predict, match, adjust, qualify. Start reading here."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +8,7 @@ from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
 from services.matching.control_points import ChipSearch, match_points
+from services.quality.frames import shared_frame
 from services.quality.qualification import Qualification, qualify
 from services.quality.stability import AdjustedScene
 from services.registration.chip_selection import fine_gsd_m
@@ -31,6 +31,7 @@ from services.types import (
     BoolArray,
     ChipSource,
     ControlPoints,
+    Frame,
     IntArray,
     Measures,
     Progress,
@@ -49,6 +50,7 @@ class Registration:
         measures: one row for every point that the scene could show.
         views: results of the views of these points in the last search.
         search_stages: summaries of the searches, in order.
+        frame: of the control on the Earth, see `shared_frame`.
         qualification: quality figures and verdict.
     """
 
@@ -57,6 +59,7 @@ class Registration:
     measures: Measures
     views: ViewMeasures
     search_stages: tuple[SearchStage, ...]
+    frame: Frame
     qualification: Qualification
 
 
@@ -67,7 +70,6 @@ def register_scene(
     options: RegistrationOptions = RegistrationOptions(),
     *,
     progress: Progress = no_progress,
-    frame_sigma_m: float = math.nan,
 ) -> Registration:
     """Refine the model of a scene on control points.
 
@@ -77,8 +79,6 @@ def register_scene(
         chips: of the points.
         options: of all stages.
         progress: receives the fraction done and the work under way.
-        frame_sigma_m: accuracy of the frame of the points on the Earth, one standard deviation a
-            coordinate; it is reported beside the accuracy in that frame, never mixed into it.
 
     Raises:
         CoverageError: no point lies in the scene.
@@ -91,7 +91,6 @@ def register_scene(
         scene=scene,
         options=options,
         progress=progress,
-        frame_sigma_m=frame_sigma_m,
         points=points,
         chips=chips,
         image=CachedImage(scene.image),
@@ -149,11 +148,12 @@ def build_registration(
     def refit(used: BoolArray) -> SceneAdjustment:
         return adjust_search(scene, search, repetition, usable=used[search.rows])
 
-    adjusted = AdjustedScene(measures, adjustment, scene.image.shape, context.gsd_m, refit)
+    frame = shared_frame(points, measures.active)
+    adjusted = AdjustedScene(measures, adjustment, scene.image.shape, context.gsd_m, frame, refit)
     rng = np.random.default_rng(options.seed)
-    qualification = qualify(adjusted, options.qualification, rng, context.frame_sigma_m)
+    qualification = qualify(adjusted, options.qualification, rng)
     model = CorrectedModel(scene.model, adjustment.correction)
     view_measures = search.matches.view_measures
     views = replace(view_measures, point=search.rows[view_measures.point])
     context.progress(1.0, "registered")
-    return Registration(model, adjustment, measures, views, stages, qualification)
+    return Registration(model, adjustment, measures, views, stages, frame, qualification)

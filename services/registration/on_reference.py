@@ -98,7 +98,6 @@ def register_on_reference(
         scene=scene,
         options=options,
         progress=progress,
-        frame_sigma_m=reference.frame_sigma_m,
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )

@@ -22,6 +22,8 @@ def reference_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
         id=rows,
         lon_lat_h=lon_lat_h,
         covariance_m2=np.tile(np.diag(variance), (n, 1, 1)),
+        block=np.zeros(n, dtype=np.int64),
+        frames=(reference.frame,),
         saliency=np.ones(n),
         health=np.ones(n),
         views=Views(

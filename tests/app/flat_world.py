@@ -15,7 +15,7 @@ from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.rpc_text import format_rpc_text
 from services.imagery.source import ArrayImage, render_chip
 from services.sensors.rpc import RpcModel
-from services.types import Array, ChipArray, ControlPoints, FloatImage, Views
+from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Views
 from tests.factories import images, metadata
 
 CENTRE = np.array([5.25, 43.25])
@@ -131,6 +131,8 @@ def _control_points(lon_lat_h: Array, count: int) -> ControlPoints:
         id=np.arange(count, dtype=np.int64),
         lon_lat_h=lon_lat_h,
         covariance_m2=np.broadcast_to(np.diag([0.01, 0.01, 0.04]), (count, 3, 3)).copy(),
+        block=np.zeros(count, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
         saliency=np.full(count, 0.8),
         health=np.ones(count),
         views=Views(

@@ -154,6 +154,7 @@ def document(checksums):
                 {"name": "frame_sigma_m", "value": 2.5, "count": 2, "against": "models of the images"}
             ],
         },
+        "amers:frame": {"covariance_m2": [[6.25, 0.5, 1.0], [0.5, 6.25, -2.0], [1.0, -2.0, 25.0]]},
         "amers:provenance": {
             "software": "by hand",
             "version": "1",

@@ -14,7 +14,7 @@ from services.adjustment.image_correction import (
 )
 from services.quality.stability import AdjustedScene
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.types import Array, BoolArray, Measures
+from services.types import UNKNOWN_FRAME, Array, BoolArray, Frame, Measures
 
 SHAPE = (4000, 5000)
 GSD_M = 0.5
@@ -53,10 +53,13 @@ class Registered:
     truth: ImageCorrection
     shape: tuple[int, int] = SHAPE
     gsd_m: float = GSD_M
+    frame: Frame = UNKNOWN_FRAME
 
     def adjusted(self, refit: Callable[[BoolArray], SceneAdjustment] | None = None) -> AdjustedScene:
         """The adjusted scene, with its own function that repeats the adjustment or another one."""
-        return AdjustedScene(self.measures, self.adjustment, self.shape, self.gsd_m, refit or self.refit)
+        return AdjustedScene(
+            self.measures, self.adjustment, self.shape, self.gsd_m, self.frame, refit or self.refit
+        )
 
 
 def register(

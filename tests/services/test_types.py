@@ -4,7 +4,16 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.types import Acquisition, ControlPoints, IntArray, Observations, Views, health
+from services.types import (
+    UNKNOWN_FRAME,
+    Acquisition,
+    ControlPoints,
+    Frame,
+    IntArray,
+    Observations,
+    Views,
+    health,
+)
 
 view_counts = st.lists(st.integers(0, 4), min_size=1, max_size=8)
 
@@ -16,6 +25,8 @@ def points_with(counts: list[int]) -> ControlPoints:
         id=100 + np.arange(n),
         lon_lat_h=np.arange(3.0 * n).reshape(n, 3),
         covariance_m2=np.arange(9.0 * n).reshape(n, 3, 3),
+        block=np.arange(n) % 2,
+        frames=(Frame(np.eye(3)), UNKNOWN_FRAME),
         saliency=np.arange(float(n)) / n,
         health=1.0 - np.arange(n) / 100.0,
         views=Views(
@@ -44,11 +55,21 @@ def test_selected_points_keep_all_their_attributes(counts: list[int], data: st.D
     taken = points.take(rows)
     assert len(taken) == len(rows)
     assert taken.chip_files == points.chip_files
+    assert taken.frames is points.frames
     assert taken.views.images == points.views.images
     assert taken.views.start[0] == 0
     assert taken.views.start[-1] == len(taken.views.gsd_m) == len(taken.views.image)
     for new, old in enumerate(rows):
-        for name in ("id", "lon_lat_h", "covariance_m2", "saliency", "health", "chip_file", "chip_row"):
+        for name in (
+            "id",
+            "lon_lat_h",
+            "covariance_m2",
+            "block",
+            "saliency",
+            "health",
+            "chip_file",
+            "chip_row",
+        ):
             np.testing.assert_array_equal(getattr(taken, name)[new], getattr(points, name)[old])
         mine = slice(*taken.views.start[new : new + 2])
         theirs = slice(*points.views.start[old : old + 2])

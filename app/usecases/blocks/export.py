@@ -29,11 +29,13 @@ from services.formats.block.document import (
 )
 from services.formats.block.document_json import parse_block_json
 from services.formats.block.writer import write_block
+from services.quality.frames import shared_frame
 from services.types import (
     Array,
     ChipArray,
     ChipSource,
     ControlPoints,
+    Frame,
     Progress,
     no_progress,
     part_of,
@@ -161,6 +163,7 @@ def _metadata(
         len(set(views.image[first:end].tolist()))
         for first, end in zip(views.start[:-1], views.start[1:], strict=True)
     ]
+    frame = shared_frame(selected, np.ones(len(selected), dtype=np.bool_))
     epochs = {source.epoch for source in sources}
     return BlockMetadata(
         id=inputs.id,
@@ -176,21 +179,17 @@ def _metadata(
         ),
         provenance=Provenance("amers", "export", names, {"bbox": list(inputs.bbox)}),
         epoch=epochs.pop() if len(epochs) == 1 else None,
-        accuracy=sources[0].accuracy if len(sources) == 1 else _worst_frame(stored),
+        accuracy=sources[0].accuracy if len(sources) == 1 else _frame_figure(frame),
+        frame=frame,
     )
 
 
-def _worst_frame(stored: StoredPoints) -> tuple[AccuracyFigure, ...]:
-    """The frame accuracy of points of several blocks: the worst one, if all blocks state theirs."""
-    sigmas = [block.frame_sigma_m for block in stored.blocks]
-    if any(sigma is None for sigma in sigmas):
+def _frame_figure(frame: Frame) -> tuple[AccuracyFigure, ...]:
+    """The frame of points of several blocks as a figure, if all blocks state theirs."""
+    sigma_m = float(np.sqrt(np.diagonal(frame.covariance_m2)[:2].max()))
+    if not np.isfinite(sigma_m):
         return ()
-    worst = max(sigma for sigma in sigmas if sigma is not None)
-    return (
-        AccuracyFigure(
-            "absolute", FRAME_FIGURE, worst, 0, "as stated by the worst of the source blocks"
-        ),
-    )
+    return (AccuracyFigure("absolute", FRAME_FIGURE, sigma_m, 0, "as stated by the source blocks"),)
 
 
 def _with_unique_images(stored: StoredPoints) -> ControlPoints:

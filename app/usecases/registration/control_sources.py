@@ -1,7 +1,6 @@
 """Sources of control points for a scene: a block folder, or the published blocks of the store."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,14 +22,11 @@ class ControlSet:
         points: the control points.
         chips: source of their chips.
         blocks: that the points come from.
-        frame_sigma_m: accuracy of the worst frame of these blocks, one standard deviation per
-            coordinate; NaN when a block does not state it.
     """
 
     points: ControlPoints
     chips: ChipSource
     blocks: tuple[BlockUsed, ...]
-    frame_sigma_m: float
 
 
 FindPoints = Callable[[Array], ControlSet]
@@ -41,14 +37,10 @@ def points_of_block(folder: Path) -> FindPoints:
     """A source of the points of a block folder, which is checked completely first."""
     contents = check_block(folder)
     metadata = contents.document.metadata
-    figures = (figure.value for figure in metadata.accuracy if figure.name == "frame_sigma_m")
-    frame_sigma_m = next(figures, None)
 
     def find(outline: Array) -> ControlSet:
         block = BlockUsed(metadata.id, metadata.version)
-        return ControlSet(
-            contents.points, FolderChips(folder), (block,), _worst_sigma_m([frame_sigma_m])
-        )
+        return ControlSet(contents.points, FolderChips(folder), (block,))
 
     return find
 
@@ -60,12 +52,6 @@ def points_of_store(database: Database, storage: Storage) -> FindPoints:
         with database.snapshot() as connection:
             stored = control_points(connection, outline)
         blocks = tuple(BlockUsed(block.id, block.version) for block in stored.blocks)
-        frame_sigma_m = _worst_sigma_m([block.frame_sigma_m for block in stored.blocks])
-        return ControlSet(stored.points, open_chips(database, storage), blocks, frame_sigma_m)
+        return ControlSet(stored.points, open_chips(database, storage), blocks)
 
     return find
-
-
-def _worst_sigma_m(stated: Sequence[float | None]) -> float:
-    """The largest of the frame sigmas that blocks state; NaN when a block states none."""
-    return math.nan if None in stated or not stated else max(s for s in stated if s is not None)

@@ -1,5 +1,6 @@
 """Reference ortho-images with terrains, to register scenes on where there are no control points."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from services.registration.options import RegistrationOptions
 from services.registration.reference_points import ReferenceChips, reference_points
 from services.reports.report import BlockUsed
 from services.sensors.ortho import OrthoModel
-from services.types import Array, Progress
+from services.types import UNKNOWN_FRAME, Array, Frame, Progress
 
 LOCAL_SIGMA_PX = 0.3
 """Assumed local error of an ortho-image, independent between places: one sigma, in its own pixels."""
@@ -86,7 +87,7 @@ def register_on(
     points = reference_points(lon_lat_h, reference)
     chips = ReferenceChips(reference, lon_lat_h)
     used = BlockUsed(covering.name, "reference image")
-    return registration, ControlSet(points, chips, (used,), reference.frame_sigma_m)
+    return registration, ControlSet(points, chips, (used,))
 
 
 def read_reference(files: ReferenceFiles) -> Reference:
@@ -116,5 +117,5 @@ def read_reference(files: ReferenceFiles) -> Reference:
         sigma_m=LOCAL_SIGMA_PX * gsd_m,
         height_sigma_m=height_sigma_m,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
-        frame_sigma_m=float("nan") if files.sigma_m is None else files.sigma_m,
+        frame=UNKNOWN_FRAME if files.sigma_m is None else Frame.from_sigmas(files.sigma_m, math.nan),
     )

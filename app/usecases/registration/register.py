@@ -126,9 +126,7 @@ def run_registration(
 
     checks: tuple[Check, ...] = ()
     if check_points is not None and files.check_points is not None:
-        registration, check = _check(
-            registration, check_points, control, options, files.check_points.name
-        )
+        registration, check = _check(registration, check_points, options, files.check_points.name)
         checks = (check,)
 
     progress(0.9, "writing the report")
@@ -216,12 +214,7 @@ def _register(
         control = sources.find_points(outline)
         try:
             registration = register_scene(
-                scene,
-                control.points,
-                control.chips,
-                options,
-                progress=progress,
-                frame_sigma_m=control.frame_sigma_m,
+                scene, control.points, control.chips, options, progress=progress
             )
             return registration, control, None
         except CoverageError as error:
@@ -235,12 +228,11 @@ def _register(
 def _check(
     registration: Registration,
     points: CheckPoints,
-    control: ControlSet,
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:
     """The registration, qualified with check points too, and its accuracy at these points."""
-    checked = check_model(registration.model, registration.adjustment, points, control.frame_sigma_m)
+    checked = check_model(registration.model, registration.adjustment, points, registration.frame)
     limit = options.qualification.good_unit_weight
     qualification = with_check_points(registration.qualification, checked, limit)
     check = Check(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from services.types import Acquisition, Array
+from services.types import UNKNOWN_FRAME, Acquisition, Array, Frame
 
 NAME_PATTERN = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,99}")
 """Pattern of block names: names appear unquoted in file names, URLs and command lines."""
@@ -70,6 +70,7 @@ class BlockMetadata:
         epoch: decimal year of the coordinates, None when unknown.
         provenance: software, sources and options of the production.
         accuracy: accuracy figures with their references.
+        frame: how well the frame of the block is known on the Earth.
     """
 
     id: str
@@ -83,6 +84,7 @@ class BlockMetadata:
     provenance: Provenance
     epoch: float | None = None
     accuracy: tuple[AccuracyFigure, ...] = ()
+    frame: Frame = UNKNOWN_FRAME
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from services.formats.block.document import (
     Provenance,
     rectangle,
 )
+from services.formats.block.frame_json import format_frame, parse_frame
 from services.types import Acquisition, Array
 
 BLOCK_FORMAT = "amers-block/1"
@@ -70,6 +71,7 @@ def format_block_json(document: BlockDocument) -> str:
                 kind: [_accuracy_json(figure) for figure in metadata.accuracy if figure.kind == kind]
                 for kind in ("relative", "absolute")
             },
+            "amers:frame": format_frame(metadata.frame),
             "amers:provenance": {
                 "software": metadata.provenance.software,
                 "version": metadata.provenance.version,
@@ -192,6 +194,8 @@ def _parse_metadata(root: _Node) -> BlockMetadata:
             "dashes or underscores expected, at most 100 characters"
         )
     provenance = root.node("amers:provenance")
+    accuracy = _parse_accuracy(root.node("amers:accuracy"))
+    sigmas_m = [figure.value for figure in accuracy if figure.name == "frame_sigma_m"]
     return BlockMetadata(
         id=name,
         version=root.text("amers:version"),
@@ -208,7 +212,8 @@ def _parse_metadata(root: _Node) -> BlockMetadata:
             options=provenance.node("options").value,
         ),
         epoch=root.number_or_none("amers:epoch"),
-        accuracy=tuple(_parse_accuracy(root.node("amers:accuracy"))),
+        accuracy=tuple(accuracy),
+        frame=parse_frame(root.value.get("amers:frame"), next(iter(sigmas_m), None)),
     )
 
 

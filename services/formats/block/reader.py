@@ -95,6 +95,8 @@ def block_contents(document: BlockDocument, points: PointRows, views: ViewRows) 
         id=points.id,
         lon_lat_h=points.lon_lat_h,
         covariance_m2=covariance_from_sigmas(points.sigma_m, points.correlation),
+        block=np.zeros(len(points.id), dtype=np.int64),
+        frames=(document.metadata.frame,),
         saliency=points.saliency,
         health=np.ones(len(points.id)),
         views=Views(

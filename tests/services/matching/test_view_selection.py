@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.matching.view_selection import ViewDistanceScales, select_views, view_distances
-from services.types import Acquisition, ControlPoints, IntArray, Views
+from services.types import UNKNOWN_FRAME, Acquisition, ControlPoints, IntArray, Views
 
 SCENE = Acquisition(
     "scene",
@@ -33,6 +33,8 @@ def point_with_views(
         id=np.arange(2),
         lon_lat_h=np.zeros((2, 3)),
         covariance_m2=np.zeros((2, 3, 3)),
+        block=np.zeros(2, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
         saliency=np.ones(2),
         health=np.ones(2),
         views=Views(

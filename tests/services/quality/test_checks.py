@@ -7,6 +7,7 @@ from services.errors import CoverageError
 from services.quality.check_points import MARKING_SIGMA_PX, CheckPoints, check_model, with_check_points
 from services.quality.qualification import QualificationOptions, qualify
 from services.sensors.correction import CorrectedModel
+from services.types import UNKNOWN_FRAME, Frame
 from tests.services.conftest import GSD_M, SHAPE, FlatModel, Registered
 
 LIMIT = 3.0
@@ -23,9 +24,9 @@ def check_points(
     return CheckPoints(ground, marks, np.full((n, 3), np.nan), np.full(n, noise_px))
 
 
-def checked(scene: Registered, points: CheckPoints, frame_sigma_m: float = float("nan")):
+def checked(scene: Registered, points: CheckPoints, frame: Frame = UNKNOWN_FRAME):
     model = CorrectedModel(FlatModel(), scene.adjustment.correction)
-    return check_model(model, scene.adjustment, points, frame_sigma_m)
+    return check_model(model, scene.adjustment, points, frame)
 
 
 def test_honest_statements_predict_the_size_of_the_residuals(registered):
@@ -51,7 +52,7 @@ def test_the_accuracy_on_the_ground_is_that_of_the_marks_seen_through_the_model(
 def test_points_that_contradict_a_registration_take_its_verdict_of_good_away(registered):
     scene = registered()
     rng = np.random.default_rng(3)
-    good = qualify(scene.adjusted(), QualificationOptions(), rng, frame_sigma_m=float("nan"))
+    good = qualify(scene.adjusted(), QualificationOptions(), rng)
     assert good.verdict == "good"
     agreeing = with_check_points(good, checked(scene, check_points(scene, 40, 0.3)), LIMIT)
     assert agreeing.verdict == "good"
@@ -67,7 +68,7 @@ def test_what_points_and_their_frame_state_is_expected_of_them(registered):
     scene = registered()
     points = check_points(scene, 40, 0.3, (2.0, 0.0))
     strict = checked(scene, points).normalised.mean_square
-    in_a_frame_of_a_metre = checked(scene, points, frame_sigma_m=1.0).normalised.mean_square
+    in_a_frame_of_a_metre = checked(scene, points, Frame.from_sigmas(1.0, 1.0)).normalised.mean_square
     stated = CheckPoints(points.lon_lat_h, points.line_sample, np.ones((40, 3)), points.sigma_px)
     assert in_a_frame_of_a_metre < strict / 4.0
     assert checked(scene, stated).normalised.mean_square == pytest.approx(in_a_frame_of_a_metre)

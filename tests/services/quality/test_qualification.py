@@ -16,6 +16,7 @@ from services.quality.qualification import (
     second_consensus_share,
 )
 from services.quality.stability import predict_accuracy
+from services.types import Frame
 
 a_millionth_px = 1e-6
 DEFAULT = QualificationOptions()
@@ -24,7 +25,7 @@ DEFAULT = QualificationOptions()
 def qualified(scene, options=DEFAULT, refit=None):
     """The qualification of a synthetic registration."""
     rng = np.random.default_rng(3)
-    return qualify(scene.adjusted(refit), options, rng, frame_sigma_m=float("nan"))
+    return qualify(scene.adjusted(refit), options, rng)
 
 
 def failed(qualification):
@@ -133,7 +134,7 @@ def test_the_predicted_accuracy_is_honest_about_the_true_correction(registered):
     inside = []
     for seed in range(60):
         scene = registered(n=40, seed=seed, wrong=0)
-        predicted = predict_accuracy(scene.adjustment, scene.shape, scene.gsd_m, 7, float("nan"))
+        predicted = predict_accuracy(scene.adjusted(), 7)
         corner = np.array([[0.0, scene.shape[1] - 1.0]])
         error = scene.adjustment.correction.apply(corner) - scene.truth.apply(corner)
         inside.append(np.hypot(*error[0]) <= predicted.ce90_px[0, -1])
@@ -145,7 +146,9 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
     scene = registered()
     covariance = np.zeros((6, 6))
     covariance[0, 0] = covariance[3, 3] = 0.04
-    result = predict_accuracy(replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 5, 2.0)
+    adjustment = replace(scene.adjustment, covariance=covariance)
+    frame = Frame.from_sigmas(2.0, 2.0)
+    result = predict_accuracy(replace(scene, adjustment=adjustment, frame=frame).adjusted(), 5)
     assert result.std_line_px == pytest.approx(np.full((5, 5), 0.2))
     assert result.worst_px == pytest.approx(result.median_px)
     assert result.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
@@ -155,9 +158,8 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     scene = registered()
     covariance = np.diag([0.01, 0.03, 0.0, 0.01, 0.0, 0.0])
-    result = predict_accuracy(
-        replace(scene.adjustment, covariance=covariance), scene.shape, 0.5, 3, float("nan")
-    )
+    adjustment = replace(scene.adjustment, covariance=covariance)
+    result = predict_accuracy(replace(scene, adjustment=adjustment).adjusted(), 3)
     assert result.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
     assert result.std_line_px[1, 0] == pytest.approx(0.1)
     assert result.std_sample_px == pytest.approx(np.full((3, 3), 0.1))

@@ -23,8 +23,10 @@ from services.reports.report import (
     SceneRecord,
 )
 from services.sensors.correction import CorrectedModel
-from services.types import Acquisition, FloatImage, Measures, ViewMeasures
+from services.types import Acquisition, FloatImage, Frame, Measures, ViewMeasures
 from tests.services.conftest import FlatModel
+
+FRAME = Frame.from_sigmas(1.5, 2.5)
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,10 @@ def chip_pair(k: int) -> ChipPair:
 def material(registered) -> Callable[..., Material]:
     """Makes what a report is built from; takes what `register` takes, and `name`."""
 
-    def make(name: str = "IMG_PHR1A_201201", pairs: int = 16, **of_registration) -> Material:
-        scene = registered(**of_registration)
+    def make(
+        name: str = "IMG_PHR1A_201201", pairs: int = 16, frame: Frame = FRAME, **of_registration
+    ) -> Material:
+        scene = replace(registered(**of_registration), frame=frame)
         lines, samples = scene.shape
         corner = np.array([samples, -lines]) * scene.gsd_m / 111_320.0
         rng = np.random.default_rng(1)
@@ -105,7 +109,8 @@ def material(registered) -> Callable[..., Material]:
                 SearchStage("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
                 SearchStage("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
             ),
-            qualification=qualify(scene.adjusted(), QualificationOptions(), rng, frame_sigma_m=1.5),
+            frame=scene.frame,
+            qualification=qualify(scene.adjusted(), QualificationOptions(), rng),
         )
         return Material(
             registration=registration,

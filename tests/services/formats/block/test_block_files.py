@@ -21,7 +21,7 @@ from services.formats.block.hilbert import hilbert_order
 from services.formats.block.reader import FolderChips, read_block
 from services.formats.block.writer import write_block
 from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.types import ControlPoints, point_chips
+from services.types import ControlPoints, Frame, point_chips
 from tests.factories import MadeBlock, affine_model, control_points, make_block, metadata, noise_chips
 
 rounding = 1e-12
@@ -52,7 +52,7 @@ def test_a_block_reads_back_as_it_was_written(block):
     assert_same_points(read_block(block.folder).points, block.points)
     written, read = block.metadata, contents.document.metadata
     assert_array_equal(read.extent, written.extent)
-    assert replace(read, extent=written.extent) == written
+    assert replace(read, extent=written.extent, frame=written.frame) == written
     assert contents.document.counts.views == len(block.points.views.gsd_m)
     assert (contents.n_views == 3).all()
     assert contents.first_view[0] == np.datetime64("2023-03-01")
@@ -185,3 +185,50 @@ def block_text(tmp_path_factory) -> str:
 
 def test_a_document_reads_back_as_it_was_written(block_text):
     assert format_block_json(parse_block_json(block_text)) == block_text
+
+
+def test_a_block_states_its_frame(tmp_path):
+    covariance_m2 = np.array([[1.8, 0.2, 0.5], [0.2, 1.7, 0.0], [0.5, 0.0, 25.0]])
+    points, stated = control_points(3, np.random.default_rng(1)), Frame(covariance_m2)
+    write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
+    (frame,) = check_block(tmp_path / "block").points.frames
+    assert_array_equal(frame.covariance_m2, covariance_m2)
+
+
+def test_a_frame_is_unknown_where_nothing_or_null_is_stated(block):
+    text = (block.folder / "block.json").read_text()
+    document = json.loads(text)
+    assert document["amers:frame"] is None
+    assert np.isnan(parse_block_json(text).metadata.frame.covariance_m2).all()
+    del document["amers:frame"]
+    assert np.isnan(parse_block_json(json.dumps(document)).metadata.frame.covariance_m2).all()
+
+
+def test_a_block_that_states_a_sigma_only_leaves_the_height_of_its_frame_unknown(block):
+    document = json.loads((block.folder / "block.json").read_text())
+    figure = {"name": "frame_sigma_m", "value": 2.0, "count": 3, "against": "models"}
+    document["amers:accuracy"]["absolute"] = [figure]
+    del document["amers:frame"]
+    read = parse_block_json(json.dumps(document))
+    assert_array_equal(read.metadata.frame.covariance_m2, Frame.from_sigmas(2.0, np.nan).covariance_m2)
+    again = parse_block_json(format_block_json(read))
+    assert_array_equal(again.metadata.frame.covariance_m2, read.metadata.frame.covariance_m2)
+
+
+@pytest.mark.parametrize(
+    "covariance_m2",
+    [
+        [[1.0, 0.0], [0.0, 1.0]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]],
+        [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, None]],
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, "high"]],
+        7,
+    ],
+)
+def test_a_frame_that_is_no_covariance_is_refused(block, covariance_m2):
+    document = json.loads((block.folder / "block.json").read_text())
+    document["amers:frame"] = {"covariance_m2": covariance_m2}
+    with pytest.raises(FormatError, match="amers:frame"):
+        parse_block_json(json.dumps(document))
