@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
+from services.imagery.gaps import filled, lost_pixels
 from services.types import Array, FloatImage
 
 _POLE = np.sqrt(3.0) - 2.0
@@ -21,7 +22,7 @@ def resample(coefficients: FloatImage, line_sample: Array) -> FloatImage:
         line_sample: (..., 2) positions, pixels.
 
     Returns:
-        (...) float32; NaN beyond the image and beside missing pixels.
+        (...) float32; NaN beyond the image, NaN or +inf beside lost pixels.
     """
     flat = np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2)
     return np.asarray(_values(coefficients, flat).reshape(line_sample.shape[:-1]))
@@ -38,23 +39,16 @@ def spline_coefficients(pixels: FloatImage, blur_px: float = 0.0) -> FloatImage:
     the blur are combined in one filter.
 
     Args:
-        pixels: (lines, samples); NaN where there is no data.
+        pixels: (lines, samples); NaN where there is no data, +inf where saturated.
         blur_px: standard deviation of the Gaussian blur, pixels.
 
     Returns:
-        (lines, samples) float32; NaN within reach of the blur, at least two pixels, of missing ones.
+        (lines, samples) float32, small gaps bridged; NaN or +inf where most of the footprint of the
+        blur is lost, see `gaps`.
     """
-    kernel = _kernel(round(blur_px, 3))
-    missing = ~np.isfinite(pixels)
-    has_gaps = bool(missing.any())
-    if has_gaps:
-        pixels = np.where(missing, np.float32(_mean_of(pixels, missing)), pixels)
-    coefficients = cv2.sepFilter2D(pixels, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-    if has_gaps:
-        reach = 2 * max(2, round(3.0 * blur_px)) + 1
-        beside = cv2.dilate(missing.astype(np.uint8), np.ones((reach, reach), np.uint8))
-        coefficients[beside > 0] = np.nan
-    return np.asarray(coefficients)
+    if np.isfinite(pixels).all():
+        return _filtered(pixels, blur_px)
+    return _filtered(filled(pixels), blur_px) + lost_pixels(pixels, blur_px)
 
 
 def finite_bounds(line_sample: Array) -> tuple[Array, Array]:
@@ -62,8 +56,11 @@ def finite_bounds(line_sample: Array) -> tuple[Array, Array]:
     return _finite_bounds(np.ascontiguousarray(line_sample, dtype=np.float64).reshape(-1, 2))
 
 
-def _mean_of(pixels: FloatImage, missing: np.ndarray) -> float:
-    return 0.0 if missing.all() else float(pixels[~missing].mean())
+def _filtered(pixels: FloatImage, blur_px: float) -> FloatImage:
+    kernel = _kernel(round(blur_px, 3))
+    return np.asarray(
+        cv2.sepFilter2D(pixels, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    )
 
 
 @lru_cache(maxsize=256)
@@ -123,4 +120,19 @@ def _values(c: FloatImage, line_sample: Array) -> FloatImage:
             + u2 * (v0 * c[i + 1, j0] + v1 * c[i + 1, j] + v2 * c[i + 1, j + 1] + v3 * c[i + 1, j3])
             + u3 * (v0 * c[i3, j0] + v1 * c[i3, j] + v2 * c[i3, j + 1] + v3 * c[i3, j3])
         )
+        if out[k] != out[k]:
+            out[k] = _lost_value(c, (i0, i, i + 1, i3), (j0, j, j + 1, j3))
     return out
+
+
+@njit(cache=True)
+def _lost_value(c: FloatImage, rows: tuple[int, ...], columns: tuple[int, ...]) -> float:
+    """+inf where most of the lost coefficients among 16 are saturated, else NaN."""
+    excess = 0
+    for i in rows:
+        for j in columns:
+            if c[i, j] == np.inf:
+                excess += 1
+            elif c[i, j] != c[i, j]:
+                excess -= 1
+    return np.inf if excess > 0 else np.nan

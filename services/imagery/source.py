@@ -8,6 +8,7 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import lon_lat_h_from_east_north_up
+from services.imagery.gaps import LOST_SHARE, filled, lost_pixels
 from services.imagery.resampling import finite_bounds, resample, spline_coefficients
 from services.sensors.base import SensorModel
 from services.types import Array, FloatImage
@@ -47,7 +48,11 @@ class ImageSource(Protocol):
         ...
 
     def read(self, window: Window) -> FloatImage:
-        """Pixels of a window, (lines, samples) float32; NaN beyond the image and where nodata."""
+        """Pixels of a window, (lines, samples) float32.
+
+        NaN beyond the image and where there is no data, +inf where the image is saturated: brighter
+        than its sensor can tell.
+        """
         ...
 
 
@@ -56,7 +61,7 @@ class ArrayImage:
     """An image in memory.
 
     Attributes:
-        pixels: (lines, samples) float32; NaN where nodata.
+        pixels: (lines, samples) float32; NaN where nodata, +inf where saturated.
     """
 
     pixels: FloatImage
@@ -86,7 +91,7 @@ class ReducedImage:
     """A reduced image in memory.
 
     Attributes:
-        pixels: (lines, samples) float32, means over `factor` x `factor` pixels of the original.
+        pixels: (lines, samples) float32, see `block_means`.
         factor: 1 or more.
     """
 
@@ -119,7 +124,7 @@ class CachedImage:
         return self.source.shape
 
     def read(self, window: Window) -> FloatImage:
-        """Pixels of a window; NaN beyond the image and where nodata."""
+        """Pixels of a window; NaN beyond the image and where nodata, +inf where saturated."""
         return self.source.read(window)
 
     def means(self, window: Window, factor: int) -> FloatImage:
@@ -165,21 +170,41 @@ def reduce_image(source: ImageSource, factor: int, strip_pixels: int = 16_000_00
 
 
 def block_means(pixels: FloatImage, factor: int) -> FloatImage:
-    """Means over squares of `factor` x `factor` pixels; incomplete squares at the end are dropped."""
+    """Means over squares of `factor` x `factor` pixels; incomplete squares at the end are dropped.
+
+    Gaps in a square are filled from their neighbours. A square with more than half of its pixels lost is
+    NaN where most of these have no data, +inf where most are saturated.
+    """
     if factor == 1:
         return pixels
     lines, samples = pixels.shape[0] // factor, pixels.shape[1] // factor
     whole = np.ascontiguousarray(pixels[: lines * factor, : samples * factor])
-    return np.asarray(cv2.resize(whole, (samples, lines), interpolation=cv2.INTER_AREA))
+
+    def means_of(part: FloatImage) -> FloatImage:
+        return np.asarray(cv2.resize(part, (samples, lines), interpolation=cv2.INTER_AREA))
+
+    means = means_of(whole)
+    if np.isfinite(means).all():
+        return means
+    share = means_of((~np.isfinite(whole)).astype(np.float32))
+    saturated = means_of(np.isposinf(whole).astype(np.float32))
+    means = means_of(filled(whole))
+    means[share > LOST_SHARE] = np.nan
+    means[(share > LOST_SHARE) & (saturated > share / 2.0)] = np.inf
+    return means
 
 
 def low_pass(pixels: FloatImage, ratio: float) -> FloatImage:
-    """Pixels low-passed to the resolution of pixels `ratio` times larger; unchanged up to ratio 1."""
+    """Pixels low-passed to the resolution of pixels `ratio` times larger; unchanged up to ratio 1.
+
+    Small gaps are bridged, others are lost; see `gaps`.
+    """
     if ratio <= 1.0:
         return pixels
-    return np.asarray(
-        cv2.GaussianBlur(pixels, (0, 0), low_pass_sigma_px(ratio), borderType=cv2.BORDER_REFLECT)
-    )
+    sigma_px = low_pass_sigma_px(ratio)
+    if np.isfinite(pixels).all():
+        return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
+    return low_pass(filled(pixels), ratio) + lost_pixels(pixels, sigma_px)
 
 
 def low_pass_sigma_px(ratio: float) -> float:
@@ -283,7 +308,8 @@ def render_chip(
         size: side of the chip, an odd number of pixels.
 
     Returns:
-        (size, size) float32; NaN where the image has no data.
+        (size, size) float32; NaN where the image has no data, +inf where it is saturated, both in areas
+        only: single pixels are bridged.
     """
     positions = chip_positions(model, lon_lat_h, gsd_m, size)
     return sample_image(source, positions, gsd_m / image_gsd_m(model, lon_lat_h))
@@ -301,7 +327,8 @@ def sample_image(source: ImageSource | ReducedImage, line_sample: Array, ratio: 
         ratio: size of the pixels wanted over that of the original pixels; below 1 nothing is sharpened.
 
     Returns:
-        (rows, columns) float32; NaN beyond the image, beside nodata and where a position is NaN.
+        (rows, columns) float32; NaN beyond the image, in areas without data and where a position is
+        NaN; +inf in saturated areas. Gaps smaller than the footprint of a value are bridged.
     """
     if isinstance(source, ReducedImage):
         image: ImageSource = ArrayImage(source.pixels)

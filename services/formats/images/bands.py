@@ -1,4 +1,4 @@
-"""The bands of an image that are used, and their weights in one mixed band."""
+"""The bands of an image that are used, their weights in one mixed band, and codes among their pixels."""
 
 import math
 import re
@@ -23,6 +23,19 @@ class BandMix:
     bands: tuple[int, ...]
     weights: tuple[float, ...]
     reason: str
+
+
+@dataclass(frozen=True)
+class PixelCodes:
+    """Pixel values that stand for something else than a brightness; None where nothing is stated.
+
+    Attributes:
+        nodata: nothing was imaged there.
+        saturated: brighter than the sensor can tell.
+    """
+
+    nodata: int | None = None
+    saturated: int | None = None
 
 
 def one_band(band: int, reason: str = "as requested") -> BandMix:

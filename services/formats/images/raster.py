@@ -5,7 +5,7 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
-from services.formats.images.bands import BandMix, default_mix, one_band
+from services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
 from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
@@ -65,11 +65,13 @@ class RasterImage:
         path: of the file.
         dataset: the dataset that `open_raster` opened.
         mix: the bands and their weights.
+        codes: what the product says about its pixels, beside what the file says.
     """
 
     path: Path
     dataset: rasterio.DatasetReader
     mix: BandMix
+    codes: PixelCodes = field(default_factory=PixelCodes)
 
     @property
     def band(self) -> int:
@@ -82,7 +84,9 @@ class RasterImage:
         return self.dataset.height, self.dataset.width
 
     def read(self, window: Window) -> FloatImage:
-        """Pixels of a window, (lines, samples) float32; NaN outside the image and for nodata.
+        """Pixels of a window, (lines, samples) float32; see `ImageSource`.
+
+        A pixel of a mix has no data where one band has none, else it is saturated where one band is.
 
         Raises:
             FormatError: the file cannot be read there.
@@ -116,27 +120,33 @@ class RasterImage:
     def _fill_band(self, out: FloatImage, band: int, window: RasterWindow) -> None:
         flags = self.dataset.mask_flag_enums[band - 1]
         nodata = self.dataset.nodatavals[band - 1]
-        saturated = self._saturated(band)
         with as_format_error(self.path, "readable pixels"), rasterio.Env(**_CACHE):
             pixels = self.dataset.read(band, window=window)
             out[:] = pixels
+            for saturated in self.saturated_values(band):
+                if pixels.max() >= saturated:
+                    out[pixels == saturated] = np.inf
             if MaskFlags.nodata in flags:
                 out[pixels == nodata] = np.nan
             elif MaskFlags.all_valid not in flags:
                 out[self.dataset.read_masks(band, window=window) == 0] = np.nan
-            if saturated is not None:
-                out[pixels >= saturated] = np.nan
+            elif self.codes.nodata is not None:
+                out[pixels == self.codes.nodata] = np.nan
 
-    def _saturated(self, band: int) -> int | None:
-        """The pixel value that means "saturated"; None for 8 bits and for floating-point pixels.
+    def saturated_values(self, band: int) -> tuple[int, ...]:
+        """The values of a band that mean "saturated": the largest of its bits, and that of the product.
 
-        Producers stretch the contrast of 8-bit images for display, so that their largest value is valid.
+        None for floating-point pixels and for 8 bits: producers stretch the contrast of 8-bit images for
+        display, so that their largest value is valid. 12 bits in 16, when neither file nor product says
+        so, have a largest value that nobody states, and it counts as grey.
         """
         dtype = np.dtype(self.dataset.dtypes[band - 1])
         if dtype.kind not in "ui" or dtype.itemsize < 2:
-            return None
+            return ()
         bits = self.dataset.tags(band, ns="IMAGE_STRUCTURE").get("NBITS", "")
-        return int(2 ** int(bits) - 1) if bits.isdigit() else int(np.iinfo(dtype).max)
+        largest = int(2 ** int(bits) - 1) if bits.isdigit() else int(np.iinfo(dtype).max)
+        stated = self.codes.saturated
+        return (largest,) if stated in (None, largest) else (largest, stated)
 
 
 def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:

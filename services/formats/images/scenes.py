@@ -8,10 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from services.errors import FormatError
-from services.formats.images.bands import BandMix
+from services.formats.images.bands import BandMix, PixelCodes
 from services.formats.images.masks import apply_mask
 from services.formats.images.raster import RasterImage, map_grid_of, open_raster
-from services.formats.sensor_models.dimap import parse_dimap_acquisition, parse_imaging_time
+from services.formats.sensor_models.dimap import (
+    parse_dimap_acquisition,
+    parse_dimap_pixel_codes,
+    parse_imaging_time,
+)
 from services.formats.sensor_models.geom import parse_geom_acquisition
 from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
 from services.formats.sensor_models.rpc_text import rpb_satellite
@@ -92,15 +96,15 @@ def read_scene(
     """
     image = open_raster(path, bands)
     try:
-        source: ImageSource = image if mask is None else apply_mask(image, mask)
         grid = map_grid_of(image)
         if grid is not None and model_path is None and crop_origin is None and not has_rpc(image):
             acquisition = _ortho_acquisition(image)
             if sigma_m is None:
                 sigma_m = _ortho_sigma_m(path, acquisition.sensor)
-            return Scene(source, OrthoModel(grid), acquisition, sigma_m)
+            return Scene(_masked(image, mask), OrthoModel(grid), acquisition, sigma_m)
         delivered = model_of_image(image, model_path, crop_origin)
         acquisition = _acquisition(image, delivered)
+        source = _masked(replace(image, codes=_pixel_codes(delivered)), mask)
     except FormatError:
         image.close()
         raise
@@ -140,6 +144,18 @@ def prior_sigma_m(model: RpcModel, sensor: str) -> float:
         if sensor.startswith(start):
             return ce90_m * CE90_TO_SIGMA
     return UNKNOWN_SIGMA_M
+
+
+def _masked(image: RasterImage, mask: Path | None) -> ImageSource:
+    return image if mask is None else apply_mask(image, mask)
+
+
+def _pixel_codes(delivered: DeliveredModel) -> PixelCodes:
+    """The codes that the DIMAP document of the product states; none without such a document."""
+    product = delivered.path.with_name(_product_name(delivered.path))
+    if delivered.convention != "dimap" or not product.is_file():
+        return PixelCodes()
+    return parse_dimap_pixel_codes(read_text(product), product.name)
 
 
 def _acquisition(image: RasterImage, delivered: DeliveredModel) -> Acquisition:

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from services.errors import FormatError
+from services.formats.images.bands import PixelCodes
 from services.formats.sensor_models.rpc_text import rpc_from_numbers
 from services.formats.text_files import parse_number
 from services.sensors.rpc import RpcModel
@@ -143,6 +144,28 @@ def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> 
         sun_elevation_deg=_centre_angle(root, "SUN_ELEVATION"),
         sun_azimuth_deg=_centre_angle(root, "SUN_AZIMUTH"),
     )
+
+
+def parse_dimap_pixel_codes(text: str, source: str = "DIMAP") -> PixelCodes:
+    """What the document of a product says about its pixels; the document of its RPC says nothing.
+
+    Args:
+        text: contents of the file.
+        source: name of the file, for messages.
+
+    Raises:
+        FormatError: it is not an XML document.
+    """
+    values = {
+        special.findtext("SPECIAL_VALUE_TEXT", "").strip(): special.findtext("SPECIAL_VALUE_COUNT", "")
+        for special in _parse_xml(text, source).iter("Special_Value")
+    }
+
+    def code(name: str) -> int | None:
+        digits = re.fullmatch(r"\s*(\d{1,5})\s*", values.get(name, ""))
+        return None if digits is None else int(digits[1])
+
+    return PixelCodes(code("NODATA"), code("SATURATED"))
 
 
 def parse_imaging_time(date: str, time: str) -> datetime | None:

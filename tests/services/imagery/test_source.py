@@ -251,11 +251,14 @@ def test_a_reduction_consists_of_block_means_for_any_size_of_the_strips(
     np.testing.assert_allclose(reduced.pixels, means, rtol=0.0, atol=500.0 * a_float32)
 
 
-def test_a_block_with_a_missing_pixel_has_no_mean() -> None:
+def test_a_block_is_lost_when_more_than_half_of_it_is() -> None:
     pixels = np.ones((6, 6), dtype=np.float32)
-    pixels[3, 1] = np.nan
+    pixels[0, 0] = pixels[1, 1] = np.nan
+    pixels[2:4, 0:2] = [[np.nan, np.nan], [np.inf, 1.0]]
+    pixels[4:6, 4:6] = [[np.inf, np.nan], [np.inf, 1.0]]
     expected = np.ones((3, 3))
     expected[1, 0] = np.nan
+    expected[2, 2] = np.inf
     np.testing.assert_array_equal(block_means(pixels, 2), expected)
 
 

@@ -210,12 +210,63 @@ def test_the_default_of_a_colour_image_is_the_mean_of_its_colours(tmp_path: Path
     assert default_mix(("gray", "alpha")).bands == (1,)
 
 
-@pytest.mark.parametrize(("options", "white"), [({}, 65535), ({"NBITS": 12}, 4095)])
-def test_saturated_pixels_are_nan(tmp_path: Path, options: dict, white: int) -> None:
-    pixels = PIXELS[:1].copy()
+@pytest.mark.parametrize(
+    ("name", "options", "white"),
+    [
+        ("plain.tif", {}, 65535),
+        ("ten.tif", {"NBITS": 10}, 1023),
+        ("eleven.tif", {"NBITS": 11}, 2047),
+        ("twelve.tif", {"NBITS": 12}, 4095),
+        ("twelve.jp2", {"driver": "JP2OpenJPEG", "NBITS": 12, "QUALITY": 100, "REVERSIBLE": True}, 4095),
+        ("eleven.ntf", {"driver": "NITF", "ABPP": 11}, 2047),
+    ],
+)
+def test_saturated_pixels_are_infinite_and_nodata_nan(
+    tmp_path: Path, name: str, options: dict, white: int
+) -> None:
+    pixels = np.minimum(PIXELS[:1], white - 1)
     pixels[0, 3:5, 6:9] = white
-    read = read_scene(write(tmp_path / "a.tif", pixels, **options), sigma_m=1.0).image.read(ALL)
-    np.testing.assert_array_equal(np.isnan(read), pixels[0] == white)
+    pixels[0, 9, :5] = white - 1
+    profile = {"driver": "GTiff", "nodata": int(pixels[0, 20, 20])} | options
+    if profile["driver"] != "GTiff":
+        del profile["nodata"]
+    path = tmp_path / name
+    with rasterio.open(
+        path, "w", count=1, height=SHAPE[0], width=SHAPE[1], dtype="uint16", **profile
+    ) as file:
+        file.write(pixels)
+    read = open_raster(path).read(ALL)
+    np.testing.assert_array_equal(read == np.inf, pixels[0] == white)
+    np.testing.assert_array_equal(np.isnan(read), pixels[0] == profile.get("nodata", -1))
+    valid = np.isfinite(read)
+    np.testing.assert_array_equal(read[valid], pixels[0][valid])
+
+
+def test_a_largest_value_declared_as_nodata_is_nodata(tmp_path: Path) -> None:
+    pixels = PIXELS[:1].copy()
+    pixels[0, 3:5, 6:9] = 65535
+    read = open_raster(write(tmp_path / "a.tif", pixels, nodata=65535)).read(ALL)
+    np.testing.assert_array_equal(np.isnan(read), pixels[0] == 65535)
+    assert not (read == np.inf).any()
+
+
+def test_twelve_bits_in_sixteen_have_no_largest_value_unless_somebody_states_it(tmp_path: Path) -> None:
+    pixels = np.minimum(PIXELS[:1], 4095)
+    pixels[0, 3:5, 6:9] = 4095
+    assert np.isfinite(open_raster(write(tmp_path / "a.tif", pixels)).read(ALL)).all()
+
+
+def test_a_mix_is_saturated_where_one_band_is_and_without_data_where_one_has_none(
+    tmp_path: Path,
+) -> None:
+    pixels = PIXELS.copy()
+    pixels[0, 3, 4:7] = 65535
+    pixels[2, 3, 6:9] = int(PIXELS[2, 7, 9])
+    path = write(tmp_path / "a.tif", pixels, nodata=int(PIXELS[2, 7, 9]))
+    read = open_raster(path, parse_bands("1,3")).read(ALL)
+    void = (pixels[[0, 2]] == PIXELS[2, 7, 9]).any(axis=0)
+    np.testing.assert_array_equal(np.isnan(read), void)
+    np.testing.assert_array_equal(read == np.inf, (pixels[0] == 65535) & ~void)
 
 
 def test_the_largest_value_is_valid_in_eight_bits_and_in_floating_point(tmp_path: Path) -> None:

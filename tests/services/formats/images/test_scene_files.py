@@ -210,6 +210,30 @@ def test_the_sensor_is_read_from_the_product_document_beside_the_rpc(tmp_path: P
     assert read_scene(path).acquisition.sensor == "PHR1A"
 
 
+PRODUCT = """<Dimap_Document><Raster_Data><Raster_Display>
+<Special_Value><SPECIAL_VALUE_TEXT>NODATA</SPECIAL_VALUE_TEXT>
+<SPECIAL_VALUE_COUNT>{nodata}</SPECIAL_VALUE_COUNT></Special_Value>
+<Special_Value><SPECIAL_VALUE_TEXT>SATURATED</SPECIAL_VALUE_TEXT>
+<SPECIAL_VALUE_COUNT>{saturated}</SPECIAL_VALUE_COUNT></Special_Value>
+</Raster_Display></Raster_Data></Dimap_Document>"""
+
+
+def test_the_product_says_which_values_have_no_data_and_which_are_saturated(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "IMG_a.tif")
+    (tmp_path / "RPC_a.XML").write_text(format_dimap_rpc(V2, CROP))
+    plain = read_scene(path).image
+    pixels = plain.read(Window(0, 0, *plain.shape))
+    assert np.isfinite(pixels).all()
+    low, high = int(pixels.min()), int(pixels.max())
+    (tmp_path / "DIM_a.XML").write_text(PRODUCT.format(nodata=low, saturated=high))
+    stated = read_scene(path).image.read(Window(0, 0, *plain.shape))
+    np.testing.assert_array_equal(np.isnan(stated), pixels == low)
+    np.testing.assert_array_equal(stated == np.inf, pixels == high)
+    for odd in ("", "many", "-1", "4095.5", "9" * 30):
+        (tmp_path / "DIM_a.XML").write_text(PRODUCT.format(nodata=odd, saturated=odd))
+        np.testing.assert_array_equal(read_scene(path).image.read(Window(0, 0, *plain.shape)), pixels)
+
+
 @pytest.mark.parametrize(
     ("stated", "sensor", "sigma_m"),
     [
