@@ -1,7 +1,4 @@
-"""The command `amers`: noun, then verb. Each group of commands is one module, registered here by a line.
-
-Exit codes: 0 success, 2 unusable input, 3 the scene could not be registered, 1 any other failure.
-"""
+"""The command `amers`: noun, then verb. Each group of commands is one module, and one line here."""
 
 import gc
 import signal
@@ -15,13 +12,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
-from app.errors import AmersError, ComputationError
+from app.cli.exit_status import INTERRUPTED, exit_status
+from app.errors import AmersError
 
 OBJECTS_BEFORE_COLLECTION = 20_000
 """More than Python's 700: what is imported stays, and to look through it costs a tenth of the start."""
-EXIT_REFUSED = 2
-EXIT_NOT_REGISTERED = 3
-EXIT_INTERRUPTED = 130
 
 COMMANDS = {
     "block": "Blocks of control points: ingest, publish, withdraw, export.",
@@ -95,9 +90,9 @@ def main() -> None:
         app()
     except AmersError as error:
         typer.echo(f"amers: {error}", err=True)
-        sys.exit(EXIT_NOT_REGISTERED if isinstance(error, ComputationError) else EXIT_REFUSED)
+        sys.exit(exit_status(error))
     except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(INTERRUPTED)
 
 
 def _group(module: Any, name: str) -> Any:

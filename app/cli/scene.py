@@ -6,19 +6,20 @@ from typing import Annotated, Any
 
 import typer
 
+from app.cli.exit_status import SUCCESS
 from app.cli.output import AsJson, print_json, show, show_one
 from app.cli.progress import shown_progress
-from app.cli.remote import Service, ServiceFailure
 from app.cli.scene_registration import (
     Control,
     Outcome,
+    Remote,
     SceneRequest,
+    failure_text,
     images_of,
-    outcome_of,
-    register_many,
-    registrar,
+    register_scenes,
+    worst_status,
 )
-from app.errors import AmersError, ComputationError, InputError
+from app.errors import InputError
 from app.usecases.orthorectification import OrthoMap, run_orthorectification
 from app.usecases.registration.reference_source import ReferenceFiles
 from app.usecases.registration.register import SceneFiles
@@ -91,6 +92,7 @@ def register(
     """Refine the sensor models of scenes on control points; write report, points and refined models.
 
     Each of several scenes gets a folder in the output folder, and a failed one does not stop the others.
+    An older result in a folder is replaced as a whole; other files there are refused.
 
     The points come from the store unless --block, --reference or --server is given.
     """
@@ -111,23 +113,15 @@ def register(
         )
         for image in images
     ]
-    try:
-        if server is not None:
-            with Service(server, token or "") as service:
-                outcomes = [outcome_of(service.register, request) for request in requests]
-        elif is_one_scene:
-            with registrar(control) as register_one:
-                outcomes = [outcome_of(register_one, requests[0])]
-        else:
-            outcomes = register_many(requests, control, jobs)
-    except ServiceFailure as failure:
-        typer.echo(f"amers: {failure}", err=True)
-        raise typer.Exit(1) from failure
+    outcomes = register_scenes(requests, control, Remote(server, token or "") if server else None, jobs)
+    for outcome in outcomes:
+        if outcome["exit_status"] != SUCCESS:
+            typer.echo(f"amers: {failure_text(outcome)}", err=True)
     if is_one_scene:
         _show_one_scene(outcomes[0], as_json=as_json)
     else:
-        _show_scenes(requests, outcomes, as_json=as_json)
-    _raise_worst([outcome for outcome in outcomes if isinstance(outcome, AmersError)])
+        _show_scenes(outcomes, as_json=as_json)
+    raise typer.Exit(worst_status(outcomes))
 
 
 @app.command()
@@ -206,30 +200,22 @@ def _refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
 
 
 def _show_one_scene(outcome: Outcome, *, as_json: bool) -> None:
-    if isinstance(outcome, AmersError):
-        if as_json:
-            print_json([])
-    elif as_json:
+    if as_json:
         print_json(outcome)
     else:
         show_one({name: _rounded(value) for name, value in outcome.items()}, as_json=False)
 
 
-def _show_scenes(requests: list[SceneRequest], outcomes: list[Outcome], *, as_json: bool) -> None:
-    """Print a record for every scene, or a table of the figures that compare scenes."""
+def _show_scenes(outcomes: list[Outcome], *, as_json: bool) -> None:
+    """Print the outcome of every scene, or a table of the figures that compare scenes."""
     if as_json:
-        errors = {
-            k: {"scene": requests[k].files.image, "error": str(outcome)}
-            for k, outcome in enumerate(outcomes)
-            if isinstance(outcome, AmersError)
-        }
-        print_json([errors.get(k, outcome) for k, outcome in enumerate(outcomes)])
+        print_json(outcomes)
         return
     rows = []
-    for request, outcome in zip(requests, outcomes, strict=True):
-        figures = {} if isinstance(outcome, AmersError) else outcome
-        row = {"scene": request.files.image, "verdict": figures.get("verdict", "not registered")}
-        rows.append(row | {name: _rounded(figures.get(name)) for name in _TABLE})
+    for outcome in outcomes:
+        row = {"scene": outcome["scene"], "verdict": outcome["verdict"]}
+        row |= {name: _rounded(outcome.get(name)) for name in _TABLE}
+        rows.append(row | {"reason": outcome["reason"] if outcome["exit_status"] else None})
     show(rows, as_json=False)
 
 
@@ -239,12 +225,3 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, list):
         return ", ".join(f"{number:+.3f}" for number in value)
     return value
-
-
-def _raise_worst(errors: list[AmersError]) -> None:
-    """Print all errors but one, which is raised: an error of the input rather than of a computation."""
-    ordered = sorted(errors, key=lambda error: not isinstance(error, ComputationError))
-    for error in ordered[:-1]:
-        typer.echo(f"amers: {error}", err=True)
-    if ordered:
-        raise ordered[-1]

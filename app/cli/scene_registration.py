@@ -12,11 +12,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import typer
+
+from app.cli.exit_status import FAILURE, NOT_REGISTERED, SUCCESS, exit_status
 from app.cli.progress import shown_progress
+from app.cli.remote import Service, ServiceFailure
 from app.config import Settings, read_settings
 from app.db import engine
 from app.db.engine import Database
-from app.errors import AmersError, ComputationError, InputError
+from app.errors import AmersError, InputError
 from app.storage import open_storage
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_block, points_of_store
@@ -28,6 +32,7 @@ from app.usecases.registration.register import (
     record_registration,
     run_registration,
 )
+from app.usecases.registration.result_folder import older_result, replacing
 from app.usecases.uploads import IMAGE_SUFFIXES
 from app.worker.warm_process import WarmProcess, WarmServer
 from services.reports.document import report_document
@@ -35,8 +40,12 @@ from services.types import Progress, no_progress
 
 Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
 """Registers one scene into a folder and returns its report; the last argument copies the image too."""
-Outcome = dict[str, Any] | AmersError
-"""The figures to show of one registered scene, or the error that ended its registration."""
+Outcome = dict[str, Any]
+"""What became of one scene: `scene`, `verdict`, `reason`, `exit_status`; figures where there are any;
+and the folder `output` when this run has put its result there."""
+
+NO_VERDICT = "not registered"
+"""Verdict on a scene whose registration ended with an error."""
 
 _FUNCTION = "app.cli.scene_registration:register_in_process"
 _POLL_S = 1.0
@@ -53,6 +62,19 @@ class Control:
 
     block: Path | None
     reference: ReferenceFiles | None
+
+
+@dataclass(frozen=True)
+class Remote:
+    """A service that does the registration.
+
+    Attributes:
+        url: address of the service.
+        token: for it; "" for none.
+    """
+
+    url: str
+    token: str
 
 
 @dataclass(frozen=True)
@@ -88,26 +110,88 @@ def images_of(paths: Sequence[Path]) -> list[Path]:
     return images
 
 
+def register_scenes(
+    requests: Sequence[SceneRequest], control: Control, remote: Remote | None, jobs: int
+) -> list[Outcome]:
+    """The outcomes of all scenes, in their order. Results that will be replaced are named first.
+
+    Args:
+        requests: the scenes.
+        control: that they are registered on.
+        remote: the service that does the work; None for this machine.
+        jobs: number of processes at once.
+    """
+    outcomes: dict[int, Outcome] = {}
+    for number, request in enumerate(requests):
+        try:
+            older = older_result(request.folder)
+        except AmersError as error:
+            outcomes[number] = _failed_outcome(request, error)
+            continue
+        if older is not None:
+            typer.echo(
+                f"amers: {request.folder}: replaces the result of {older.scene} of "
+                f"{older.written_at:%Y-%m-%d %H:%M} UTC, verdict {older.verdict}",
+                err=True,
+            )
+    accepted = [number for number in range(len(requests)) if number not in outcomes]
+    outcomes |= zip(
+        accepted, _register_accepted([requests[k] for k in accepted], control, remote, jobs), strict=True
+    )
+    return [outcomes[number] for number in range(len(requests))]
+
+
+def _register_accepted(
+    requests: Sequence[SceneRequest], control: Control, remote: Remote | None, jobs: int
+) -> list[Outcome]:
+    """The outcomes of the scenes whose folders can be written."""
+    if not requests:
+        return []
+    try:
+        if remote is not None:
+            with Service(remote.url, remote.token) as service:
+                return [outcome_of(service.register, request) for request in requests]
+        if len(requests) == 1:
+            with registrar(control) as register_one:
+                return [outcome_of(register_one, requests[0])]
+        return register_many(requests, control, jobs)
+    except AmersError as error:
+        return [_failed_outcome(request, error) for request in requests]
+
+
 def outcome_of(
     register_one: Register, request: SceneRequest, progress: Progress | None = None
 ) -> Outcome:
     """The outcome of one scene; its progress is shown, unless it is received by `progress`."""
-    image, folder = request.files.image, request.folder
+    started = time.monotonic()
     try:
-        with ExitStack() as shown:
+        with ExitStack() as shown, replacing(request.folder) as new:
             receiver = progress or shown.enter_context(shown_progress())
-            report = register_one(request.files, folder, receiver, request.copy_image)
-    except AmersError as error:
-        return error
-    if report["verdict"] == "failed":
-        return ComputationError(
-            f"{image}: the registration has the verdict failed, do not use its model; see "
-            f"{folder / 'report.html'}"
-        )
+            report = register_one(request.files, new, receiver, request.copy_image)
+    except (AmersError, ServiceFailure) as error:
+        return _failed_outcome(request, error)
+    return {**_registered_outcome(request, report), "seconds": round(time.monotonic() - started, 2)}
+
+
+def _failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
+    """The outcome of a scene whose registration ended with an error."""
+    return {
+        "scene": request.files.image,
+        "verdict": NO_VERDICT,
+        "reason": str(error),
+        "exit_status": exit_status(error),
+    }
+
+
+def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome:
+    """The outcome of a scene with a report, by the verdict of the report."""
+    is_failed = report["verdict"] == "failed"
     counts, correction = report["point_counts"], report["correction"]
     return {
-        "scene": image,
+        "scene": request.files.image,
         "verdict": report["verdict"],
+        "reason": _do_not_use(request, report) if is_failed else report["verdict_explanation"],
+        "exit_status": NOT_REGISTERED if is_failed else SUCCESS,
         "visible": counts["visible"],
         "matched": counts["matched"],
         "active": counts["active"],
@@ -117,8 +201,34 @@ def outcome_of(
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
         "ce90_predicted_px": report["predicted"]["worst_px"],
         **_check_figures(report["checks"]),
-        "output": folder,
+        "output": request.folder,
     }
+
+
+def _do_not_use(request: SceneRequest, report: dict[str, Any]) -> str:
+    """Why a registration has the verdict failed: the criteria of a usable one that it does not meet."""
+    unmet = [
+        criterion["label"]
+        for criterion in report["criteria"]
+        if not criterion["met"] and criterion["needed_for"] == "usable"
+    ]
+    return (
+        f"the registration has the verdict failed ({'; '.join(unmet)}), do not use its model; see "
+        f"{request.folder / 'report.html'}"
+    )
+
+
+def worst_status(outcomes: Sequence[Outcome]) -> int:
+    """The exit status of a command with several scenes: the smallest one that is not success."""
+    return min(
+        (outcome["exit_status"] for outcome in outcomes if outcome["exit_status"]), default=SUCCESS
+    )
+
+
+def failure_text(outcome: Outcome) -> str:
+    """The reason of a failure, with the image that it is about."""
+    image, reason = str(outcome["scene"]), str(outcome["reason"])
+    return reason if image in reason else f"{image}: {reason}"
 
 
 def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
@@ -220,16 +330,11 @@ def register_in_process(arguments: list[str]) -> int:
     """Register the scene of a request, and write its outcome into a second file; returns 0."""
     request_file, outcome_file = map(Path, arguments)
     request, control = pickle.loads(request_file.read_bytes())
-    started = time.monotonic()
     try:
         with registrar(control) as register_one:
             outcome = outcome_of(register_one, request, no_progress)
     except AmersError as error:
-        outcome = error
-    if isinstance(outcome, AmersError):
-        outcome = {"error": str(outcome), "is_computation": isinstance(outcome, ComputationError)}
-    else:
-        outcome["seconds"] = round(time.monotonic() - started, 2)
+        outcome = _failed_outcome(request, error)
     part = outcome_file.with_suffix(".part")
     part.write_text(json.dumps(outcome, default=os.fspath))
     part.rename(outcome_file)
@@ -237,12 +342,14 @@ def register_in_process(arguments: list[str]) -> int:
 
 
 def _read_outcome(file: Path, request: SceneRequest, code: int) -> Outcome:
-    """The outcome that a process has written, or an error when it ended without one."""
-    image = request.files.image
-    if not file.exists():
-        return ComputationError(f"{image}: its process ended with code {code} and without an outcome")
-    outcome: dict[str, Any] = json.loads(file.read_text())
-    if "error" not in outcome:
+    """The outcome that a process has written, or a failure when it ended without one."""
+    if file.exists():
+        outcome: Outcome = json.loads(file.read_text())
         return outcome
-    message = outcome["error"] if str(image) in outcome["error"] else f"{image}: {outcome['error']}"
-    return ComputationError(message) if outcome["is_computation"] else InputError(message)
+    reason = f"its process ended with code {code} and without an outcome"
+    return {
+        "scene": request.files.image,
+        "verdict": NO_VERDICT,
+        "reason": reason,
+        "exit_status": FAILURE,
+    }

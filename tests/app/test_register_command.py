@@ -14,6 +14,7 @@ from jsonschema import validate
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
+from app.usecases.registration.result_folder import MANIFEST
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
@@ -89,7 +90,8 @@ def test_the_command_registers_straight_from_a_block_folder(
     output = json.loads(result.stdout)
     assert output["verdict"] in ("good", "usable")
     assert np.allclose(output["shift_px"], [14.0, -9.0], atol=A_TENTH_OF_A_PIXEL)
-    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged_RPC.TXT"}
+    assert (output["exit_status"], output["reason"] != "") == (0, True)
+    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"tagged_RPC.TXT", MANIFEST}
     assert_registered(folder, world)
     beside = read_rpc(world.tagged, folder / "tagged_RPC.TXT").model
     assert largest_error_px(beside, world.true_model) < A_TENTH_OF_A_PIXEL
@@ -181,10 +183,12 @@ def test_a_folder_of_scenes_is_registered_by_two_processes_and_a_bad_scene_stops
     assert "Traceback" not in result.stderr
     first, bad, last = json.loads(result.stdout)
     assert [Path(record["scene"]).name for record in (first, bad, last)] == ["a.tif", "b.tif", "c.tif"]
-    assert "truncated or damaged" in bad["error"]
+    assert "truncated or damaged" in bad["reason"]
+    assert (bad["verdict"], bad["exit_status"]) == ("not registered", 2)
     for record, name in ((first, "a"), (last, "c")):
         assert record["verdict"] in ("good", "usable")
         assert record["seconds"] > 0.0
+        assert record["exit_status"] == 0
         assert Path(record["output"]) == folder / name
         assert_registered(folder / name, world)
     table = amers(*command[:2], tmp_path / "c.tif", scenes / "a.tif", *command[4:], *options)
@@ -291,3 +295,84 @@ def test_a_service_uses_its_own_points_and_references(
     refused = amers(*scene, *words)
     assert (refused.returncode, message in refused.stderr) == (2, True), refused.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_an_older_result_is_named_and_replaced_as_a_whole(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    folder = tmp_path / "out"
+    control = ("--block", world.block, "--sigma-m", SIGMA_M, "-o", folder)
+    first = amers("scene", "register", world.tagged, *control, "--copy-image")
+    assert first.returncode == 0, first.stderr
+    assert "replaces" not in first.stderr
+    assert (folder / "tagged.tif").exists()
+    second = amers("scene", "register", world.image, "--model", world.rpc_text, *control)
+    assert second.returncode == 0, second.stderr
+    assert f"{folder}: replaces the result of tagged of 20" in second.stderr
+    verdict = next(line.split()[1] for line in first.stdout.splitlines() if line.startswith("verdict"))
+    assert second.stderr.index(f"verdict {verdict}") < second.stderr.index("100 %")
+    assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"scene_RPC.TXT", MANIFEST}
+    assert_registered(folder, world)
+
+
+def test_an_unusable_output_folder_is_refused_before_the_work_and_listed(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tagged").write_text("a file of the user")
+    (tmp_path / "other.tif").write_bytes(world.tagged.read_bytes())
+    control = ("--block", world.block, "--sigma-m", SIGMA_M, "--json")
+    refused = amers("scene", "register", world.tagged, *control, "-o", tmp_path / "out" / "tagged")
+    record = json.loads(refused.stdout)
+    assert (refused.returncode, record["exit_status"]) == (2, 2)
+    assert "is a file, a folder expected; name another folder with -o" in record["reason"]
+    assert record["reason"] in refused.stderr
+    assert "%" not in refused.stderr
+    scenes = (world.tagged, tmp_path / "other.tif")
+    both = amers("scene", "register", *scenes, *control, "-o", tmp_path / "out")
+    bad, good = json.loads(both.stdout)
+    assert (both.returncode, bad["exit_status"], good["exit_status"]) == (2, 2, 0)
+    assert (bad["verdict"], Path(bad["scene"])) == ("not registered", world.tagged)
+    assert (tmp_path / "out" / "tagged").read_text() == "a file of the user"
+    assert_registered(tmp_path / "out" / "other", world)
+
+
+def test_every_scene_is_listed_in_the_order_given_and_failures_are_printed(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    content = world.tagged.read_bytes()
+    scenes = [tmp_path / f"{name}.tif" for name in ("z", "half", "bare", "a")]
+    scenes[0].write_bytes(content)
+    scenes[1].write_bytes(content[:100_000])
+    scenes[2].write_bytes(world.image.read_bytes())
+    scenes[3].write_bytes(content)
+    control = ("--block", world.block, "--sigma-m", SIGMA_M, "-o", tmp_path / "out", "--jobs", 2)
+    listed = amers("scene", "register", *scenes, *control, "--json")
+    records = json.loads(listed.stdout)
+    assert [Path(record["scene"]) for record in records] == scenes
+    assert [record["exit_status"] for record in records] == [0, 2, 2, 0]
+    assert all(record["reason"] and record["verdict"] for record in records)
+    printed = amers("scene", "register", *scenes, *control)
+    rows = [line.split("\t") for line in printed.stdout.splitlines()]
+    assert [row[0] for row in rows] == [str(scene) for scene in scenes]
+    assert "no sensor model" in rows[2][-1]
+    assert "no sensor model" in printed.stderr
+    assert printed.returncode == listed.returncode == 2
+
+
+def test_a_single_scene_that_fails_is_listed_with_its_reason(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    failing = ("scene", "register", world.tagged, "--sigma-m", 0.1, "--block", world.block)
+    listed = amers(*failing, "-o", tmp_path / "out", "--json")
+    record = json.loads(listed.stdout)
+    assert (record["verdict"], record["exit_status"], listed.returncode) == ("not registered", 3, 3)
+    assert "found" in record["reason"]
+    printed = amers(*failing, "-o", tmp_path / "out")
+    assert "not registered" in printed.stdout
+    assert record["reason"] in printed.stderr
+    unreachable = ("--server", "http://127.0.0.1:1", "-o", tmp_path / "other", "--json")
+    gone = amers("scene", "register", world.tagged, *unreachable)
+    record = json.loads(gone.stdout)
+    assert (record["verdict"], record["exit_status"], gone.returncode) == ("not registered", 1, 1)
+    assert "127.0.0.1:1" in record["reason"]

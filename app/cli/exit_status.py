@@ -1,0 +1,25 @@
+"""Exit statuses of the commands.
+
+| status | meaning |
+|---|---|
+| 0 | success |
+| 1 | any other failure: a service does not answer, a process was killed, a bug |
+| 2 | the input or the installation cannot be used |
+| 3 | the scene could not be registered, or its registration has the verdict failed |
+| 130 | interrupted |
+"""
+
+from app.errors import AmersError, ComputationError
+
+SUCCESS = 0
+FAILURE = 1
+REFUSED = 2
+NOT_REGISTERED = 3
+INTERRUPTED = 130
+
+
+def exit_status(error: Exception) -> int:
+    """The exit status of a command that an error ended."""
+    if isinstance(error, ComputationError):
+        return NOT_REGISTERED
+    return REFUSED if isinstance(error, AmersError) else FAILURE
