@@ -39,7 +39,7 @@ from app.db.schema.base import Double
 from app.db.statements import HotStatement, hot, named
 from services.types import HEALTH_PRIOR_TRIES, Array, IntArray, Measures, ViewMeasures, health
 
-NOT_ATTRIBUTABLE = ("not_tried", "no_chip", "nodata", "cloud")
+NOT_ATTRIBUTABLE = ("not_tried", "no_chip", "nodata", "saturated", "cloud")
 """Reasons that are no fault of a point: the scene did not show it, or the point was not tried."""
 
 SUSPECT_HEALTH = 0.5

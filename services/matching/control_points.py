@@ -15,9 +15,11 @@ from services.matching.correlate import (
     Peak,
     PeakThresholds,
     find_chip,
+    rejected,
     sigma_per_coordinate,
 )
 from services.matching.least_squares import covariance_from_influence
+from services.matching.missing_pixels import missing_reason
 from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
 from services.matching.shadows import ShadowShift, shadow_shift
 from services.matching.systematic_error import common_covariance_px2
@@ -200,7 +202,7 @@ def match_points(
             continue
         patch = _predicted_patch(search, points.lon_lat_h[row])
         if not np.isfinite(patch).any():
-            matches[row] = _not_searched("nodata")
+            matches[row] = _not_searched(missing_reason(patch))
             continue
         views = view_rows - points.views.start[row]
         stored = point_chips(points, chips, row)
@@ -246,6 +248,9 @@ def _match_point(
         options: thresholds.
     """
     half_side = visible_half_side(patch, search.half_side, search.radius_px)
+    if half_side == 0:
+        peaks = [rejected(missing_reason(patch)) for _ in candidates]
+        return peaks, _combined(peaks, options.agreement_px), False
     patch = central_square(patch, half_side + search.radius_px)
     ratio = scene_gsd_m / search.gsd_m
     chips = [

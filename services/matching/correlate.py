@@ -7,16 +7,23 @@ import cv2
 import numpy as np
 
 from services.matching.least_squares import covariance_from_influence, fit_chip
+from services.matching.missing_pixels import fill_missing, missing_reason
 from services.matching.shadows import ShadowShift, shadow_weights
-from services.types import Array, FloatImage
+from services.types import Array, BoolArray, FloatImage
 
 FOUND = ""
 
 INTERPOLATION_SIGMA_PX = 0.003
 """Error that remains without any noise: that of the interpolation."""
 
+MAX_MISSING_SHARE = 0.5
+"""Largest share of a chip that is missing, in the chip or in the patch under it."""
+
 _BLOCKED = -1.0
-"""Score of positions where the patch lacks data under the chip."""
+"""Score of positions where more of the chip is missing."""
+
+_MIN_VARIANCE = 1e-5
+"""Smallest variance of the patch under a chip, over the mean square there: below it lies rounding."""
 
 _SUBPIXEL_LOSS = 0.1
 """Largest loss of score by a displacement of half a pixel; peaks less than this below `min_score` are
@@ -46,6 +53,7 @@ class CorrelationOptions:
         second_distance_px: smallest distance between the first and the second peak.
         min_contrast: smallest standard deviation over mean; below it a chip is flat.
         max_sigma_px: largest sigma along any direction, chip pixels; above it the position is ambiguous.
+        max_missing_share: largest share of a chip that is missing, in the chip or in the patch under it.
     """
 
     min_score: float = 0.8
@@ -53,6 +61,7 @@ class CorrelationOptions:
     second_distance_px: int = 6
     min_contrast: float = 0.01
     max_sigma_px: float = 1.0
+    max_missing_share: float = MAX_MISSING_SHARE
 
     @property
     def thresholds(self) -> PeakThresholds:
@@ -69,8 +78,8 @@ class Peak:
         score: normalised correlation at the peak.
         sigma_px: one standard deviation a coordinate, chip pixels.
         influence: (c, c, 2) of the squares of the chip on its position; see `least_squares.Fit`.
-        reason: `FOUND`, or why the peak is rejected: "flat", "nodata", "low_score", "border_peak",
-            "ambiguous".
+        reason: `FOUND`, or why the peak is rejected: "flat", "nodata", "saturated", "low_score",
+            "border_peak", "ambiguous".
     """
 
     row_col: Array
@@ -90,44 +99,49 @@ def find_chip(
 ) -> Peak:
     """Position of a chip in a larger patch of the same geometry.
 
-    Zero-mean normalised correlation in float32 finds the pixel, least squares the fraction.
+    Zero-mean normalised correlation finds the pixel, least squares the fraction, both over the pixels
+    that are valid in patch and chip.
 
     Args:
-        patch: (s + 2 r, s + 2 r); NaN where there is no data.
-        chip: (s, s); NaN where nodata.
+        patch: (s + 2 r, s + 2 r); NaN where there is no data, +inf where saturated.
+        chip: (s, s); the same.
         options: when a peak is accepted.
         thresholds: scores that replace those of the options, for images other than grey values.
         shadows: shift of the shadows between chip and patch; None when unknown.
     """
     thresholds = thresholds or options.thresholds
-    if not np.isfinite(chip).all():
-        return _rejected("nodata")
-    mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(chip))
+    valid, mask = np.isfinite(chip), None
+    if not valid.all():
+        if valid.mean() < 1.0 - options.max_missing_share:
+            return rejected(missing_reason(chip))
+        mask = valid.astype(np.uint8)
+    mean, spread = (float(value[0, 0]) for value in cv2.meanStdDev(chip, mask=mask))
     if spread < options.min_contrast * abs(mean) or spread == 0.0:
-        return _rejected("flat")
-    scores = correlation_map(patch, chip)
+        return rejected("flat")
+    scores = correlation_map(patch, chip, options.max_missing_share)
     if scores is None:
-        return _rejected("nodata")
+        return rejected(missing_reason(patch))
     row, col = (int(v) for v in np.unravel_index(int(np.argmax(scores)), scores.shape))
     score = float(scores[row, col])
     reason = _pixel_rejection(scores, (row, col), thresholds, options.second_distance_px)
     if reason:
-        return _rejected(reason, score)
-    weight = None if shadows is None else shadow_weights(chip, score, shadows)
+        return rejected(reason, score)
+    weight = None if shadows is None else shadow_weights(fill_missing(chip), score, shadows)
     fit = fit_chip(patch, chip, np.array([row, col], dtype=np.float64), weight)
     score = score if fit is None else max(score, fit.score)
     if score < thresholds.min_score:
-        return _rejected("low_score", score)
+        return rejected("low_score", score)
     if fit is None:
-        return _rejected("ambiguous", score)
+        return rejected("ambiguous", score)
     covariance = covariance_from_influence(fit.influence)
     if not math.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)) <= options.max_sigma_px:
-        return _rejected("ambiguous", score)
+        return rejected("ambiguous", score)
     centre = (np.array(patch.shape) - chip.shape[0]) / 2.0
     return Peak(fit.row_col - centre, score, sigma_per_coordinate(covariance), fit.influence, FOUND)
 
 
-def _rejected(reason: str, score: float = math.nan) -> Peak:
+def rejected(reason: str, score: float = math.nan) -> Peak:
+    """A peak that was not accepted, or not searched."""
     return Peak(np.full(2, np.nan), score, math.nan, np.zeros((0, 0, 2)), reason)
 
 
@@ -153,29 +167,62 @@ def sigma_per_coordinate(covariance: Array) -> float:
     return math.hypot(math.sqrt(np.trace(covariance) / 2.0), INTERPOLATION_SIGMA_PX)
 
 
-def correlation_map(patch: FloatImage, chip: FloatImage) -> FloatImage | None:
+def correlation_map(
+    patch: FloatImage, chip: FloatImage, max_missing_share: float = MAX_MISSING_SHARE
+) -> FloatImage | None:
     """Normalised correlation of a chip at every position of a patch that it fits in completely.
 
     Returns:
-        (2 r + 1, 2 r + 1), -1 where the patch lacks data under the chip; None when it does everywhere.
+        (2 r + 1, 2 r + 1), -1 where more than the largest share of the chip is missing; None when that
+        holds everywhere.
     """
-    missing = ~np.isfinite(patch)
-    if not missing.any():
+    seen, valid = np.isfinite(patch), np.isfinite(chip)
+    if seen.all() and valid.all():
         return np.asarray(cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED))
-    if missing.all():
+    if not (seen.any() and valid.any()):
         return None
-    filled = np.where(missing, np.float32(np.nanmean(patch)), patch)
-    scores = cv2.matchTemplate(filled, chip, cv2.TM_CCOEFF_NORMED)
-    count = cv2.integral(missing.astype(np.uint8))
-    lines, samples = chip.shape
-    covered = (
-        count[lines:, samples:]
-        - count[:-lines, samples:]
-        - count[lines:, :-samples]
-        + count[:-lines, :-samples]
-    )
-    blocked = covered > 0
+    scores, common = _masked_correlation(patch, seen, chip, valid)
+    blocked = common < (1.0 - max_missing_share) * chip.size - 0.5
     return None if blocked.all() else np.where(blocked, np.float32(_BLOCKED), scores)
+
+
+def _masked_correlation(
+    patch: FloatImage, seen: BoolArray, chip: FloatImage, valid: BoolArray
+) -> tuple[FloatImage, FloatImage]:
+    """Normalised correlation over the pixels valid in patch and chip, and the number of these.
+
+    Source: Padfield (2012), Masked object registration in the Fourier domain. The sums are those of
+    `cv2.matchTemplate`, after a mean is removed so that float32 is precise enough for them.
+    """
+    p = np.where(seen, patch - _mean_of(patch, seen), np.float32(0.0))
+    c = np.where(valid, chip - _mean_of(chip, valid), np.float32(0.0))
+    p_mask, c_mask = seen.astype(np.float32), valid.astype(np.float32)
+
+    def sums(image: FloatImage, template: FloatImage) -> Array:
+        if template is c_mask and valid.all():
+            return _sums_under(image, chip.shape)
+        return np.asarray(cv2.matchTemplate(image, template, cv2.TM_CCORR), dtype=np.float64)
+
+    n = np.maximum(sums(p_mask, c_mask), 1.0)
+    p_sum, p_square = sums(p, c_mask), sums(p * p, c_mask)
+    c_sum, c_square = sums(p_mask, c), sums(p_mask, c * c)
+    p_variance, c_variance = p_square - p_sum**2 / n, c_square - c_sum**2 / n
+    distinct = (p_variance > _MIN_VARIANCE * p_square) & (c_variance > _MIN_VARIANCE * c_square)
+    covariance = sums(p, c) - p_sum * c_sum / n
+    scores = covariance / np.sqrt(np.where(distinct, p_variance * c_variance, np.inf))
+    return np.clip(scores, -1.0, 1.0).astype(np.float32), n.astype(np.float32)
+
+
+def _mean_of(pixels: FloatImage, valid: BoolArray) -> np.float32:
+    return np.float32(pixels[valid].mean(dtype=np.float64))
+
+
+def _sums_under(image: FloatImage, shape: tuple[int, ...]) -> Array:
+    """Sums of an image over a window of a shape, at all positions."""
+    lines, samples = shape
+    total = cv2.integral(image, sdepth=cv2.CV_64F)
+    below = total[lines:] - total[:-lines]
+    return np.asarray(below[:, samples:] - below[:, :-samples])
 
 
 def _second_peak(scores: FloatImage, row: int, col: int, distance: int) -> float:

@@ -3,26 +3,23 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-from services.imagery.resampling import SPLINE_REACH_PX, spline_coefficients, spline_weights
-from services.types import Array, FloatImage
+from services.imagery.resampling import SPLINE_REACH_PX, resample, spline_coefficients
+from services.matching.least_squares_kernels import REACH_PX, add_bartlett_sums, fit_position
+from services.matching.missing_pixels import fill_missing
+from services.types import Array, BoolArray, FloatImage
 
-MAX_STEPS = 12
-STEP_PX = 2e-3
-"""A step shorter than this ends the iteration."""
+_ALL = np.zeros((0, 0), dtype=np.float32)
+"""The mask of pixels in use where all are."""
 
-REACH_PX = 1.5
-"""Largest distance of the fitted position from the start, along each axis."""
+_MAX_FILLS = 6
+"""Largest number of fits of a chip with missing pixels."""
 
-CELL_PX = 4
-"""Side of the squares of the chip in which influences are summed."""
+_FILLED_PX = 5e-3
+"""A new fill that moves the position by less ends these fits."""
 
 REACH_CELLS = 5
 """Distance in squares beyond which influences are uncorrelated; less in a small chip."""
-
-_SUMS = {"reassoc", "contract", "nsz", "arcp"}
-"""Fast-math flags that let the compiler vectorise sums; NaN and infinity keep their meaning."""
 
 
 @dataclass(frozen=True)
@@ -53,27 +50,75 @@ def fit_chip(
     Source: Gruen (1985), Adaptive least squares correlation; Baker and Matthews (2004), Lucas-Kanade 20
     years on, for the direction of the linearisation.
 
+    Pixels that are invalid, in the chip or in the patch under it, have no weight. Filled smoothly, they
+    serve the gradients and the interpolation beside them.
+
     Args:
-        patch: larger than the chip; NaN where there is no data.
-        chip: (s, s) without NaN.
+        patch: larger than the chip; NaN or +inf where it is invalid.
+        chip: (s, s); the same.
         start: (2,) row and column of the chip's first pixel in the patch, to about a pixel.
         weight: (s - 2, s - 2) of the chip's pixels without the outermost; None weights all alike.
 
     Returns:
-        None where the iteration leaves `REACH_PX` or the patch, or meets missing data.
+        None where the iteration leaves `REACH_PX` or the patch.
     """
     margin = SPLINE_REACH_PX + int(np.ceil(REACH_PX))
     first = np.maximum(np.floor(start).astype(int) - margin, 0)
     last = np.minimum(np.ceil(start).astype(int) + chip.shape[0] + margin, patch.shape)
-    coefficients = spline_coefficients(patch[first[0] : last[0], first[1] : last[1]])
-    if weight is None:
-        weight = np.ones((chip.shape[0] - 2, chip.shape[1] - 2), dtype=np.float32)
-    row, col, score, influence = _fit(
-        coefficients, chip, weight, float(start[0] - first[0]), float(start[1] - first[1])
-    )
-    if not np.isfinite(score):
-        return None
-    return Fit(first + np.array([row, col]), score, influence)
+    near = patch[first[0] : last[0], first[1] : last[1]]
+    if np.isfinite(near).all() and np.isfinite(chip).all():
+        if weight is None:
+            weight = np.ones((chip.shape[0] - 2, chip.shape[1] - 2), dtype=np.float32)
+        row_col, score, influence = fit_position(
+            spline_coefficients(near), chip, weight, _ALL, start - first
+        )
+    else:
+        row_col, score, influence = _fit_valid(near, chip, weight, start - first)
+    return Fit(first + row_col, score, influence) if np.isfinite(score) else None
+
+
+def _fit_valid(
+    patch: FloatImage, chip: FloatImage, weight: FloatImage | None, row_col: Array
+) -> tuple[Array, float, Array]:
+    """As `fit_position`, from a patch and over the pixels valid in patch and chip.
+
+    A missing pixel of the patch enters the interpolation beside it. There it has the value that the chip
+    predicts at the position found, which is then found again.
+    """
+    seen, valid = np.isfinite(patch), np.isfinite(chip)
+    chip, filled = fill_missing(chip), fill_missing(patch)
+    side = chip.shape[0] - 2
+    for _ in range(_MAX_FILLS):
+        used = np.zeros((side, side), dtype=np.float32)
+        i, j = np.rint(row_col).astype(int) + 1
+        under = seen[i : i + side, j : j + side]
+        used[: under.shape[0], : under.shape[1]] = under
+        used *= valid[1:-1, 1:-1]
+        weighted = used if weight is None else weight * used
+        found = fit_position(spline_coefficients(filled), chip, weighted, used, row_col)
+        moved_px = np.hypot(*(found[0] - row_col))
+        row_col = found[0]
+        if not np.isfinite(found[1]) or moved_px < _FILLED_PX or seen.all():
+            break
+        filled = _filled_by_chip(filled, seen, chip, row_col)
+    return found
+
+
+def _filled_by_chip(patch: FloatImage, seen: BoolArray, chip: FloatImage, row_col: Array) -> FloatImage:
+    """A patch whose missing pixels (not `seen`) have the values that a chip at a position predicts."""
+    lines, samples = patch.shape
+    grid = np.empty((lines, samples, 2))
+    grid[..., 0] = (np.arange(lines) - row_col[0])[:, None]
+    grid[..., 1] = np.arange(samples) - row_col[1]
+    predicted = resample(spline_coefficients(chip), grid)
+    under = np.isfinite(predicted)
+    common = under & seen
+    x, y = predicted[common].astype(np.float64), patch[common].astype(np.float64)
+    gain = (x - x.mean()) @ y / ((x - x.mean()) @ x)
+    filled = patch.copy()
+    missing = under & ~seen
+    filled[missing] = y.mean() + gain * (predicted[missing] - x.mean())
+    return filled
 
 
 def covariance_from_influence(influence: Array) -> Array:
@@ -91,223 +136,6 @@ def covariance_from_influence(influence: Array) -> Array:
     cells = len(influence)
     reach = min(REACH_CELLS, max(1, cells // 5))
     covariance = np.zeros((2, 2))
-    _bartlett(np.ascontiguousarray(influence), reach, covariance)
+    add_bartlett_sums(np.ascontiguousarray(influence), reach, covariance)
     # The constraint of a zero sum reduces the variance of the influences: this factor restores it.
     return covariance / (1.0 - (reach / cells) ** 2)
-
-
-@njit(cache=True, error_model="numpy")
-def _fit(
-    coefficients: FloatImage,
-    chip: FloatImage,
-    weight: FloatImage,
-    row: float,
-    col: float,
-) -> tuple[float, float, float, Array]:
-    """Row, column, score and influence of the fitted position; NaN scores where there is none."""
-    side = chip.shape[0] - 2
-    lines, samples = coefficients.shape
-    gradients, inverse = _design(chip, weight)
-    at = np.empty((side, side), dtype=np.float32)
-    failed = (np.nan, np.nan, np.nan, np.zeros((1, 1, 2)))
-    r, c = row, col
-    for _ in range(MAX_STEPS):
-        if r < 0.0 or c < 0.0 or r > lines - side - 3.0 or c > samples - side - 3.0:
-            return failed
-        _interpolated(coefficients, r + 1.0, c + 1.0, at, 0)
-        gain, by_row, by_col = _projected(at, chip, gradients, inverse)
-        if not gain > 0.0:
-            return failed
-        step_r, step_c = -by_row / gain, -by_col / gain
-        size = np.hypot(step_r, step_c)
-        if not np.isfinite(size):
-            return failed
-        scale = min(1.0, 0.7 / max(size, 1e-9))
-        r, c = r + scale * step_r, c + scale * step_c
-        if abs(r - row) > REACH_PX or abs(c - col) > REACH_PX:
-            return failed
-        if size < STEP_PX:
-            break
-    if r < 0.0 or c < 0.0 or r > lines - side - 3.0 or c > samples - side - 3.0:
-        return failed
-    score, influence = _influence(coefficients, chip, gradients, r, c)
-    return r, c, score, influence
-
-
-@njit(cache=True, fastmath=_SUMS)
-def _design(chip: FloatImage, weight: FloatImage) -> tuple[FloatImage, Array]:
-    """Weighted gradients (2, s, s) of the chip, orthogonal to gain and offset; inverse normal matrix.
-
-    A scalar product with them weights the other factor and removes its gain and offset.
-    """
-    side = chip.shape[0] - 2
-    gradients = np.empty((2, side, side), dtype=np.float32)
-    mean = np.zeros(3)
-    total = 0.0
-    for i in range(side):
-        for j in range(side):
-            w = weight[i, j]
-            gradients[0, i, j] = np.float32(0.5) * (chip[i + 2, j + 1] - chip[i, j + 1])
-            gradients[1, i, j] = np.float32(0.5) * (chip[i + 1, j + 2] - chip[i + 1, j])
-            total += w
-            mean[0] += w * chip[i + 1, j + 1]
-            mean[1] += w * gradients[0, i, j]
-            mean[2] += w * gradients[1, i, j]
-    mean /= total
-    own, across_r, across_c = 0.0, 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            value = chip[i + 1, j + 1] - mean[0]
-            weighted = weight[i, j] * value
-            own += weighted * value
-            across_r += weighted * gradients[0, i, j]
-            across_c += weighted * gradients[1, i, j]
-    rr, rc, cc = 0.0, 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            value = chip[i + 1, j + 1] - mean[0]
-            w = weight[i, j]
-            g = gradients[0, i, j] - mean[1] - across_r / own * value
-            h = gradients[1, i, j] - mean[2] - across_c / own * value
-            gradients[0, i, j] = w * g
-            gradients[1, i, j] = w * h
-            rr += w * g * g
-            rc += w * g * h
-            cc += w * h * h
-    determinant = rr * cc - rc * rc
-    inverse = np.array([[cc, -rc], [-rc, rr]]) / determinant
-    return gradients, inverse
-
-
-@njit(cache=True, fastmath=_SUMS)
-def _interpolated(
-    coefficients: FloatImage, row: float, col: float, out: FloatImage, derivative: int
-) -> None:
-    """Fill `out` with the patch from a position on, or with its derivative by row (1) or column (2)."""
-    i, j = int(row), int(col)
-    u, v = np.empty(4, np.float32), np.empty(4, np.float32)
-    _taps(row - i, u, derivative == 1)
-    _taps(col - j, v, derivative == 2)
-    side_r, side_c = out.shape
-    lines, samples = coefficients.shape
-    line = np.empty(side_c + 3, dtype=np.float32)
-    for k in range(side_r):
-        a, b = max(i + k - 1, 0), i + k
-        c, d = min(i + k + 1, lines - 1), min(i + k + 2, lines - 1)
-        first = max(j - 1, 0)
-        for m in range(side_c + 3):
-            n = min(first + m, samples - 1)
-            line[m] = (
-                u[0] * coefficients[a, n]
-                + u[1] * coefficients[b, n]
-                + u[2] * coefficients[c, n]
-                + u[3] * coefficients[d, n]
-            )
-        for m in range(side_c):
-            out[k, m] = v[0] * line[m] + v[1] * line[m + 1] + v[2] * line[m + 2] + v[3] * line[m + 3]
-
-
-@njit(cache=True)
-def _taps(t: float, out: FloatImage, derivative: bool) -> None:
-    """Fill `out` (4,) with the spline weights at a fraction `t`, or with their derivatives."""
-    if derivative:
-        s = 1.0 - t
-        out[0] = -0.5 * s * s
-        out[1] = t * (1.5 * t - 2.0)
-        out[2] = -s * (1.5 * s - 2.0)
-        out[3] = 0.5 * t * t
-    else:
-        out[0], out[1], out[2], out[3] = spline_weights(t)
-
-
-@njit(cache=True, fastmath=_SUMS)
-def _projected(
-    at: FloatImage, chip: FloatImage, gradients: FloatImage, inverse: Array
-) -> tuple[float, float, float]:
-    """Gain of the chip in a patch, and the components of the patch along the chip's gradients."""
-    side = at.shape[0]
-    mean, chip_mean = 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            mean += at[i, j]
-            chip_mean += chip[i + 1, j + 1]
-    mean, chip_mean = mean / side**2, chip_mean / side**2
-    product, square, by_r, by_c = 0.0, 0.0, 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            value, other = chip[i + 1, j + 1] - chip_mean, at[i, j] - mean
-            product += value * other
-            square += value * value
-            by_r += gradients[0, i, j] * other
-            by_c += gradients[1, i, j] * other
-    r = inverse[0, 0] * by_r + inverse[0, 1] * by_c
-    c = inverse[1, 0] * by_r + inverse[1, 1] * by_c
-    return product / square, r, c
-
-
-@njit(cache=True, fastmath=_SUMS)
-def _influence(
-    coefficients: FloatImage, chip: FloatImage, gradients: FloatImage, row: float, col: float
-) -> tuple[float, Array]:
-    """Correlation of chip and patch, and the influences (c, c, 2) of the squares of the chip."""
-    side = chip.shape[0] - 2
-    at = np.empty((side, side), dtype=np.float32)
-    down = np.empty((side, side), dtype=np.float32)
-    right = np.empty((side, side), dtype=np.float32)
-    _interpolated(coefficients, row + 1.0, col + 1.0, at, 0)
-    _interpolated(coefficients, row + 1.0, col + 1.0, down, 1)
-    _interpolated(coefficients, row + 1.0, col + 1.0, right, 2)
-    mean, chip_mean = 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            mean += at[i, j]
-            chip_mean += chip[i + 1, j + 1]
-    mean, chip_mean = mean / side**2, chip_mean / side**2
-    product, square, chip_square = 0.0, 0.0, 0.0
-    m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0
-    for i in range(side):
-        for j in range(side):
-            value, other = chip[i + 1, j + 1] - chip_mean, at[i, j] - mean
-            product += value * other
-            square += other * other
-            chip_square += value * value
-            m00 += gradients[0, i, j] * down[i, j]
-            m01 += gradients[0, i, j] * right[i, j]
-            m10 += gradients[1, i, j] * down[i, j]
-            m11 += gradients[1, i, j] * right[i, j]
-    score = product / np.sqrt(square * chip_square)
-    # Noise in the chip biases the regression gain low, noise in the patch biases its inverse low. The
-    # ratio of the spreads lies between the two.
-    gain = np.sqrt(square / chip_square)
-    determinant = m00 * m11 - m01 * m10
-    cells = -(-side // CELL_PX)
-    influence = np.zeros((cells, cells, 2))
-    for i in range(side):
-        for j in range(side):
-            left = at[i, j] - mean - gain * (chip[i + 1, j + 1] - chip_mean)
-            by_r, by_c = gradients[0, i, j] * left, gradients[1, i, j] * left
-            influence[i // CELL_PX, j // CELL_PX, 0] -= (m11 * by_r - m01 * by_c) / determinant
-            influence[i // CELL_PX, j // CELL_PX, 1] -= (m00 * by_c - m10 * by_r) / determinant
-    return score, influence
-
-
-@njit(cache=True, fastmath=_SUMS)
-def _bartlett(influence: Array, reach: int, covariance: Array) -> None:
-    """Fill `covariance` (2, 2) with the products of the sums over all windows `reach` cells wide.
-
-    Windows beyond the border count with the cells they contain. The result is the double sum over pairs
-    of cells with Bartlett weights.
-    """
-    cells = influence.shape[0]
-    for i in range(1 - reach, cells):
-        for j in range(1 - reach, cells):
-            by_r, by_c = 0.0, 0.0
-            for k in range(max(i, 0), min(i + reach, cells)):
-                for m in range(max(j, 0), min(j + reach, cells)):
-                    by_r += influence[k, m, 0]
-                    by_c += influence[k, m, 1]
-            covariance[0, 0] += by_r * by_r
-            covariance[0, 1] += by_r * by_c
-            covariance[1, 1] += by_c * by_c
-    covariance[1, 0] = covariance[0, 1]
-    covariance /= reach**2

@@ -14,6 +14,7 @@ REASON_LABELS = {
     "not_tried": "not tried: other points represent it",
     "no_chip": "no chip of this ground sampling",
     "nodata": "no data in the scene",
+    "saturated": "saturated in the scene",
     "flat": "no contrast to correlate",
     "low_score": "correlation too low",
     "cloud": "under a cloud",

@@ -221,10 +221,10 @@ def test_ground_that_a_scene_does_not_show_is_no_failure_of_a_point(
     connection: Connection, stored: Registration
 ) -> None:
     reason = stored.measures.reason.copy()
-    reason[:4] = "nodata", "cloud", "no_chip", "not_tried"
+    reason[:5] = "nodata", "saturated", "cloud", "no_chip", "not_tried"
     hidden = replace(stored, measures=replace(stored.measures, reason=reason))
     remembered(connection, hidden, "a")
-    assert set(counters(connection)) == set(stored.measures.point_id[4:].tolist())
+    assert set(counters(connection)) == set(stored.measures.point_id[5:].tolist())
 
 
 def test_a_view_counts_only_where_its_expected_position_is_known(
