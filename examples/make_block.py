@@ -31,7 +31,8 @@ def make_block(images: list[Path], folder: Path) -> None:
     print(f"{len(production.points)} points in {folder}")
     print(f"median distance between rays and tie points: {accuracy.before_px:.2f} px as delivered,")
     print(f"{accuracy.after_px:.2f} px after the adjustment of the images")
-    print(f"frame of the block on the Earth: {accuracy.frame_sigma_m:.1f} m (one sigma)")
+    frame = accuracy.frame
+    print(f"frame of the block on the Earth: {frame.sigma_m:.1f} m, height {frame.sigma_up_m:.1f} m")
 
 
 def draw_chips(block_folder: Path, picture: Path, count: int = 5) -> None:

@@ -96,6 +96,16 @@ class Frame:
         unknown = np.isnan(np.diagonal(known))
         return cls(np.where(unknown[:, None] | unknown[None, :], np.nan, np.nan_to_num(known)))
 
+    @property
+    def sigma_m(self) -> float:
+        """Horizontal standard deviation a coordinate, root mean square of both; NaN when unknown."""
+        return float(np.sqrt(np.trace(self.covariance_m2[:2, :2]) / 2.0))
+
+    @property
+    def sigma_up_m(self) -> float:
+        """Standard deviation of the height; NaN when unknown."""
+        return float(np.sqrt(self.covariance_m2[2, 2]))
+
 
 UNKNOWN_FRAME = Frame(np.full((3, 3), np.nan))
 

@@ -75,7 +75,8 @@ def run(
             "ray_residual_delivered_px": round(relative.before_px, 3),
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
-            "frame_sigma_m": round(relative.frame_sigma_m, 2),
+            "frame_sigma_m": round(relative.frame.sigma_m, 2),
+            "frame_sigma_up_m": round(relative.frame.sigma_up_m, 2),
         },
         as_json=as_json,
     )
@@ -123,6 +124,12 @@ def ortho(
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the image on the map, one sigma, metres.", min=0.01)
     ] = None,
+    frame_sigma_up_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Error that all the heights share, one sigma, metres; by default unknown.", min=0.01
+        ),
+    ] = None,
     bands: Annotated[str | None, typer.Option(help="Bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
     mask: Annotated[
         Path | None, typer.Option(help="Image of the same ground; no points where it is not 0.")
@@ -135,7 +142,9 @@ def ortho(
         fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points
     )
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
-    files = OrthoFiles(image, terrain, height_m, height_sigma_m, sigma_m, bands, mask)
+    files = OrthoFiles(
+        image, terrain, height_m, height_sigma_m, sigma_m, frame_sigma_up_m, bands=bands, mask=mask
+    )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
         production = run_ortho_production(files, output, identity, options, progress)

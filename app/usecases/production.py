@@ -1,5 +1,6 @@
 """Make a block of points: read images or an ortho-image, call the science, write the block folder."""
 
+import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -54,6 +55,8 @@ class OrthoFiles:
         flat_m: height of flat ground, metres above the ellipsoid.
         height_sigma_m: one standard deviation of the heights, metres; required with `flat_m`.
         sigma_m: accuracy of the image on the map, metres; by default that of its sensor.
+        frame_sigma_up_m: error that all the heights share, one standard deviation, metres; None when
+            unknown.
         bands: see `services.formats.images.bands.parse_bands`.
         mask: image of the same ground; points are avoided where it is not zero.
     """
@@ -63,6 +66,7 @@ class OrthoFiles:
     flat_m: float | None = None
     height_sigma_m: float | None = None
     sigma_m: float | None = None
+    frame_sigma_up_m: float | None = None
     bands: str | None = None
     mask: Path | None = None
 
@@ -146,6 +150,7 @@ def run_ortho_production(
 
 
 def _ground_heights(files: OrthoFiles) -> GroundHeights:
+    frame_sigma_m = math.nan if files.frame_sigma_up_m is None else files.frame_sigma_up_m
     if (files.terrain is None) == (files.flat_m is None):
         raise InputError(
             "heights of the ground: either a terrain (--dem) or one flat height (--height-m) is expected"
@@ -153,10 +158,10 @@ def _ground_heights(files: OrthoFiles) -> GroundHeights:
     if files.terrain is not None:
         terrain = read_terrain(files.terrain)
         sigma_m = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
-        return GroundHeights(terrain, 0.0, sigma_m)
+        return GroundHeights(terrain, 0.0, sigma_m, frame_sigma_m)
     if files.flat_m is None or files.height_sigma_m is None:
         raise InputError("one flat height: its standard deviation (--height-sigma-m) is missing")
-    return GroundHeights(None, files.flat_m, files.height_sigma_m)
+    return GroundHeights(None, files.flat_m, files.height_sigma_m, frame_sigma_m)
 
 
 def _refuse_existing(folder: Path) -> None:
@@ -200,7 +205,7 @@ def _production_metadata(
             AccuracyFigure(
                 "absolute",
                 "frame_sigma_m",
-                relative.frame_sigma_m,
+                relative.frame.sigma_m,
                 len(scenes),
                 "the stated accuracy of the images' models, not measured",
             ),

@@ -1,6 +1,5 @@
 """BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, measure on chips, select, cut."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -22,6 +21,7 @@ from services.matching.multi_image import (
 )
 from services.matching.predict import rank_in_group
 from services.matching.tie_points import FeatureOptions, find_tie_points
+from services.production.block_frame import block_frame
 from services.types import (
     Array,
     BoolArray,
@@ -82,15 +82,14 @@ class RelativeAccuracy:
         before_px: median distance between rays and tie points, with the models as delivered, pixels.
         after_px: the same with the adjusted models.
         refined_px: the same for the points of the block, measured on chips.
-        frame_sigma_m: accuracy of the frame of the block, from the stated accuracy of the models, one
-            standard deviation a coordinate on the ground.
+        frame: accuracy of the frame of the block on the Earth, from the stated accuracy of the models.
     """
 
     tie_points: int
     before_px: float
     after_px: float
     refined_px: float
-    frame_sigma_m: float
+    frame: Frame
 
 
 @dataclass(frozen=True)
@@ -159,8 +158,12 @@ def produce_points(
     )
     adjusted = _with_models(scenes, adjustment)
     rows, saliency = _select_points(adjusted, intersection, active, options)
-    frame_sigma_m = float(np.sum([scene.sigma_m**-2.0 for scene in scenes]) ** -0.5)
-    frame = Frame.from_sigmas(frame_sigma_m, math.nan)
+    frame = block_frame(
+        adjustment,
+        [scene.acquisition for scene in scenes],
+        _prior_sigma_px(scenes),
+        np.nanmedian(continuous(intersection.lon_lat_h), axis=0),
+    )
     views = _views(adjusted, intersection, rows, active, options)
     points = _control_points(intersection, rows, frame, saliency, views)
     relative_accuracy = RelativeAccuracy(
@@ -168,7 +171,7 @@ def produce_points(
         before_px=_median_px(before.residual_px),
         after_px=_median_px(tied.residual_px),
         refined_px=_median_px(adjustment.residual_px[adjustment.active]),
-        frame_sigma_m=frame_sigma_m,
+        frame=frame,
     )
     progress(1.0, f"{len(points)} points")
 
@@ -204,9 +207,13 @@ def _adjust(
 ) -> BlockAdjustment:
     """The block adjustment of scenes with their models as delivered."""
     models = [scene.model for scene in scenes]
-    sigma_px = np.array([scene.sigma_m / scene_gsd_m(scene) for scene in scenes])
     shapes = [scene.image.shape for scene in scenes]
-    return adjust_block(models, shapes, observations, sigma_px, options.block)
+    return adjust_block(models, shapes, observations, _prior_sigma_px(scenes), options.block)
+
+
+def _prior_sigma_px(scenes: Sequence[Scene]) -> Array:
+    """A priori standard deviation (n,) of the shift of each scene, pixels."""
+    return np.array([scene.sigma_m / scene_gsd_m(scene) for scene in scenes])
 
 
 def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:

@@ -64,11 +64,14 @@ class GroundHeights:
         terrain: a terrain model; None for flat ground.
         flat_m: height of flat ground, metres above the ellipsoid; not used with a terrain.
         sigma_m: of the heights, one standard deviation.
+        frame_sigma_m: of the error that all the heights share, such as that of their datum; NaN when
+            unknown.
     """
 
     terrain: Terrain | None
     flat_m: float
     sigma_m: float
+    frame_sigma_m: float = math.nan
 
     def at(self, lon_lat: Array) -> Array:
         """Heights (n,) at longitudes and latitudes (n, 2), metres; NaN where unknown."""
@@ -222,7 +225,7 @@ def _assembled(
         lon_lat_h=lon_lat_h,
         covariance_m2=np.tile(np.diag(variance_m2), (n, 1, 1)),
         block=np.zeros(n, dtype=np.int64),
-        frames=(Frame.from_sigmas(scene.sigma_m, math.nan),),
+        frames=(Frame.from_sigmas(scene.sigma_m, heights.frame_sigma_m),),
         saliency=np.array([saliency for _, saliency in corners]),
         health=np.ones(n),
         views=Views(

@@ -58,6 +58,14 @@ def chips_of(found: OrthoPoints) -> MemoryChips:
     return MemoryChips(np.concatenate([found.chips(row) for row in range(len(found.points))]))
 
 
+def test_the_frame_is_that_of_the_image_and_of_the_heights_as_stated() -> None:
+    unknown = made().points.frames[0]
+    assert unknown.sigma_m == ortho(land()).sigma_m
+    assert np.isnan(unknown.sigma_up_m)
+    stated = produce_ortho_points(ortho(land()), replace(FLAT, frame_sigma_m=2.5), OPTIONS)
+    assert stated.points.frames[0].sigma_up_m == 2.5
+
+
 def test_every_square_of_the_image_gets_a_point() -> None:
     seen = ortho(land()).model.project(made().points.lon_lat_h)
     assert len(made().points) >= 0.6 * OPTIONS.points  # those at the edges have no whole chip
