@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from services.conventions import MAX_ERROR_SIGMAS
-from services.types import Array, BoolArray
+from services.types import Array, BoolArray, IntArray
 
 MEDIAN_DISTANCE = float(np.sqrt(2.0 * np.log(2.0)))
 """Median distance from the centre of a circular normal distribution of unit sigma (1.177)."""
@@ -28,8 +28,8 @@ class Consensus:
 
     Attributes:
         inliers: (n,) members of the set.
-        displacement: (2,) their mean.
-        false_alarms: expected number of sets as large as this one in random displacements; far below 1
+        displacement: (2,) their mean; NaN without any.
+        false_alarms: expected number of sets with as many voters in random displacements; far below 1
             for a significant set.
     """
 
@@ -38,33 +38,106 @@ class Consensus:
     false_alarms: float
 
 
-def a_contrario_consensus(displacement: Array, tolerance: float, search_radius: float) -> Consensus:
-    """The largest set of displacements within a tolerance of a common centre, and its significance.
+@dataclass(frozen=True)
+class Voters:
+    """Where the chips lie whose displacements are compared.
 
-    The background model is a uniform distribution of random displacements over the search window.
+    Attributes:
+        position: (n, 2) centres of the chips.
+        apart: side of a chip, same unit: chips nearer to each other than this overlap.
+    """
+
+    position: Array
+    apart: float
+
+
+def a_contrario_consensus(
+    displacement: Array, tolerance: float, search: float | Array, voters: Voters | None = None
+) -> Consensus:
+    """The set of displacements within a tolerance of a common centre with most voters, and its
+    significance.
+
+    The background model is a uniform distribution of each displacement over the area of its search.
+    Chips that overlap show the same ground and err together, so those nearer than a chip count once: a
+    set has as many voters as it holds chips that lie apart. Where overlapping chips differ, each of
+    their displacements is a chance of its own for the voter they form.
 
     Source: Desolneux, Moisan and Morel (2000), Meaningful alignments: the number of false alarms.
 
     Args:
         displacement: (n, 2); rows with NaN do not take part.
         tolerance: radius within which two displacements agree, in the unit of the displacements.
-        search_radius: half side of the square search window, same unit.
+        search: half side of the square search window, same unit; or (n, 2, 2) the smallest and the
+            largest displacement that each could have.
+        voters: where the chips lie; None when they are independent.
     """
-    valid = np.isfinite(displacement).all(axis=1)
+    rows = np.flatnonzero(np.isfinite(displacement).all(axis=1))
     inliers = np.zeros(len(displacement), dtype=bool)
-    count = int(valid.sum())
-    if count == 0:
-        return Consensus(inliers, np.full(2, np.nan), np.inf)
-    tree = cKDTree(displacement[valid])
-    neighbours = tree.query_ball_point(displacement[valid], tolerance)
-    largest = max(neighbours, key=len)
-    centre = displacement[valid][largest].mean(axis=0)
-    members = tree.query_ball_point(centre, tolerance)
-    members = members if len(members) >= len(largest) else largest
-    inliers[np.flatnonzero(valid)[members]] = True
-    probability = min(1.0, np.pi * tolerance**2 / (2.0 * search_radius) ** 2)
-    false_alarms = count * float(bdtrc(len(members) - 2, count - 1, probability))
-    return Consensus(inliers, displacement[inliers].mean(axis=0), false_alarms)
+    if len(rows) == 0:
+        return Consensus(inliers, np.full(2, np.nan), 1.0)
+    valid = displacement[rows]
+    tree = cKDTree(valid)
+    best: list[int] = []
+    most = 0
+    for members in sorted(tree.query_ball_point(valid, tolerance), key=len, reverse=True):
+        if len(members) <= most:
+            break
+        count = _count_apart(rows[members], voters)
+        if count > most:
+            best, most = members, count
+    around = tree.query_ball_point(valid[best].mean(axis=0), tolerance)
+    if _count_apart(rows[around], voters) >= most:
+        best = around
+    inliers[rows[best]] = True
+    centre = valid[best].mean(axis=0)
+    tried = rows[_reaches(centre, tolerance, search, rows) | inliers[rows]]
+    trials, agreeing = _count_apart(tried, voters), _count_apart(rows[best], voters)
+    trials = max(trials, agreeing)
+    chance = _chance(tolerance, search, tried)[_distinct(displacement[tried], tolerance, tried, voters)]
+    probability = min(1.0, float(chance.sum()) / trials)
+    false_alarms = len(rows) * float(bdtrc(agreeing - 2, trials - 1, probability))
+    return Consensus(inliers, centre, false_alarms)
+
+
+def _chance(tolerance: float, search: float | Array, rows: IntArray) -> Array:
+    """Probability (k,) that a random displacement of each row lies within the tolerance of a place."""
+    area = np.pi * tolerance**2
+    if not isinstance(search, np.ndarray):
+        return np.full(len(rows), min(1.0, area / (2.0 * search) ** 2))
+    sides = np.maximum(search[rows, 1] - search[rows, 0], 0.0)
+    return np.asarray(area / np.maximum(sides.prod(axis=1), area))
+
+
+def _reaches(centre: Array, tolerance: float, search: float | Array, rows: IntArray) -> BoolArray:
+    """Which searches (k,) reach a displacement."""
+    if not isinstance(search, np.ndarray):
+        return np.ones(len(rows), dtype=bool)
+    low, high = search[rows, 0] - tolerance, search[rows, 1] + tolerance
+    return np.asarray(((centre >= low) & (centre <= high)).all(axis=1))
+
+
+def _distinct(displacement: Array, tolerance: float, rows: IntArray, voters: Voters | None) -> BoolArray:
+    """Which displacements (k, 2) differ from those before them that overlapping chips have."""
+    distinct = np.ones(len(rows), dtype=bool)
+    if voters is None:
+        return distinct
+    position = voters.position[rows]
+    for row in range(1, len(rows)):
+        near = np.hypot(*(position[:row] - position[row]).T) < voters.apart
+        near &= np.hypot(*(displacement[:row] - displacement[row]).T) <= tolerance
+        distinct[row] = not (near & distinct[:row]).any()
+    return distinct
+
+
+def _count_apart(rows: IntArray, voters: Voters | None) -> int:
+    """Number of chips of a maximal set that lie apart, taken in the order of their rows."""
+    if voters is None:
+        return len(rows)
+    taken: list[Array] = []
+    for position in voters.position[rows]:
+        if not taken or np.hypot(*(np.array(taken) - position).T).min() >= voters.apart:
+            taken.append(position)
+    return len(taken)
 
 
 def consensus_tolerance_px(sigma_px: float) -> float:

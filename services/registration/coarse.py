@@ -4,22 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.conventions import CHIP_CENTRE, MAX_ERROR_SIGMAS
-from services.errors import NoConsensus
+from services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import a_contrario_consensus
 from services.matching.control_points import ChipSearch, match_points
 from services.matching.correlate import PeakThresholds
 from services.matching.predict import spread_over_image
 from services.registration.chip_selection import has_chip, visibility_probability
 from services.registration.context import PointContext, Prediction
 from services.registration.search import (
-    FIRST_TOLERANCE_PX,
     Search,
-    SearchStage,
     adjust_search,
-    format_consensus,
+    check_consensus,
+    first_consensus,
+    largest_error_m,
     predict,
     search_radius_px,
     summarise,
@@ -35,12 +33,14 @@ class _Plan:
         gsd_m: ground sampling of the chips, as they are stored.
         reduction: factor by which the chips are reduced.
         radius_px: search radius, pixels of the reduced chips.
+        error_m: largest error that is expected.
         rows: the points to try.
     """
 
     gsd_m: float
     reduction: int
     radius_px: int
+    error_m: float
     rows: IntArray
 
     @property
@@ -55,7 +55,7 @@ def needs_coarse_search(context: PointContext, prediction: Prediction) -> bool:
     return bool(reach_px > context.options.coarse.max_fine_radius_px)
 
 
-def search_coarsely(context: PointContext, prediction: Prediction) -> tuple[Prediction, SearchStage]:
+def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction:
     """A better prediction of all points from few points searched far out, which must agree.
 
     Args:
@@ -63,7 +63,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> tuple[Pred
         prediction: of its points by the delivered model.
 
     Returns:
-        The prediction by the corrected model, and the summary of the search.
+        The prediction by the corrected model.
 
     Raises:
         NoConsensus: the points found agree no better than by chance.
@@ -82,20 +82,29 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> tuple[Pred
         thresholds=PeakThresholds(options.coarse.min_score, max_second=1.0),
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
-    consensus = a_contrario_consensus(
-        matches.displacement_m, FIRST_TOLERANCE_PX * level_m, _reach_m(scene, plan)
+    consensus = first_consensus(
+        scene,
+        prediction.model.project(points.lon_lat_h),
+        matches.line_sample,
+        level_m=level_m,
+        radius_m=radius_px * level_m,
+        side_m=CHIP_SIZE * plan.gsd_m,
     )
-    if consensus.false_alarms > options.coarse.max_false_alarms:
-        raise NoConsensus(
-            "the coarse search does not agree on one correction: "
-            + format_consensus(matches, consensus, level_m, radius_px, "points")
-        )
-    stage = summarise("coarse", level_m, radius_px, matches, consensus.inliers)
-    search = Search(points, plan.rows, matches, consensus.inliers, stage)
+    stage = summarise(
+        "coarse",
+        matches,
+        consensus.inliers,
+        level_m=level_m,
+        radius_m=radius_px * level_m,
+        needed_m=plan.error_m,
+    )
+    context.stages.append(stage)
+    check_consensus(stage, consensus, matches.reason, scene, options.coarse.max_false_alarms)
+    search = Search(points, plan.rows, matches, consensus.inliers)
     adjustment = adjust_search(scene, search, options.adjustment, min_points=min(3, stage.inliers))
     corrected = predict(scene, context.points, adjustment)
     uncertainty_m = np.hypot(corrected.uncertainty_m, level_m / 2.0)
-    return Prediction(corrected.model, uncertainty_m), stage
+    return Prediction(corrected.model, uncertainty_m)
 
 
 def _plan(context: PointContext, prediction: Prediction) -> _Plan:
@@ -105,23 +114,27 @@ def _plan(context: PointContext, prediction: Prediction) -> _Plan:
     where the radius would be too large.
     """
     scene, points, options = context.scene, context.points, context.options.coarse
+    size_m = np.array(scene.image.shape) * scene_gsd_m(scene)
     best: tuple[float, float, Array] | None = None
     for gsd_m in np.unique(points.views.gsd_m)[::-1]:
         probability = visibility_probability(scene, points, prediction, float(gsd_m))
         probability[~has_chip(points, float(gsd_m))] = 0.0
-        if best is None or probability.sum() > best[1]:
-            best = float(gsd_m), float(probability.sum()), probability
+        # Chips that overlap count as one voter: the scene must be large enough for many side by side.
+        side_by_side = float(np.prod(size_m / (CHIP_SIZE * gsd_m)))
+        count = min(float(probability.sum()), side_by_side)
+        if best is None or count > best[1]:
+            best = float(gsd_m), count, probability
         if best[1] >= options.enough:
             break
     assert best is not None
     gsd_m, _, probability = best
-    uncertainty_m = prediction.uncertainty_m
+    error_m = largest_error_m(prediction.uncertainty_m)
     reduction = 1
     while reduction < options.max_reduction and (
-        search_radius_px(uncertainty_m, gsd_m * reduction, 10**9) > options.max_search_px
+        search_radius_px(error_m, gsd_m * reduction) > options.max_search_px
     ):
         reduction += 1
-    radius_px = search_radius_px(uncertainty_m, gsd_m * reduction, options.max_search_px)
+    radius_px = min(search_radius_px(error_m, gsd_m * reduction), options.max_search_px)
     line_sample = prediction.model.project(points.lon_lat_h)
     rows = np.flatnonzero(probability > 0.0)
     preference = (points.saliency * points.health * probability)[rows]
@@ -131,20 +144,7 @@ def _plan(context: PointContext, prediction: Prediction) -> _Plan:
         )
     ]
     count = int(np.searchsorted(np.cumsum(probability[order]), options.points)) + 1
-    return _Plan(gsd_m, reduction, radius_px, np.sort(order[:count]))
-
-
-def _reach_m(scene: Scene, plan: _Plan) -> float:
-    """Half side of the square where a chip may be found: within the search radius and the scene."""
-    gsd_m = scene_gsd_m(scene)
-    room_m = [
-        min(
-            2.0 * plan.radius_px * plan.level_m,
-            max(size * gsd_m - CHIP_CENTRE * 2.0 * plan.gsd_m, 0.0),
-        )
-        for size in scene.image.shape
-    ]
-    return max(float(np.sqrt(room_m[0] * room_m[1])) / 2.0, plan.level_m)
+    return _Plan(gsd_m, reduction, radius_px, error_m, np.sort(order[:count]))
 
 
 def _image_for(scene: Scene, gsd_m: float, n_points: int, radius_px: int) -> ImageSource | ReducedImage:

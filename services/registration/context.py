@@ -13,6 +13,37 @@ from services.types import Array, ChipSource, ControlPoints, Progress, part_of
 
 
 @dataclass(frozen=True)
+class SearchStage:
+    """Summary of one search of the points through one model.
+
+    Attributes:
+        name: "far", "coarse" or "fine" on control points, "reference" on a reference image.
+        chip_gsd_m: ground sampling of the chips that were searched.
+        search_radius_m: search radius on the ground.
+        needed_radius_m: largest error that was expected; the search was limited where this is more than
+            the search radius.
+        tried, matched, inliers: numbers of points searched, found, and in agreement with each other.
+        at_border: number of points whose best peak lies at the border of the search.
+        displacement_rms_m: distance of the inliers from their expected positions, root mean square.
+    """
+
+    name: str
+    chip_gsd_m: float
+    search_radius_m: float
+    needed_radius_m: float
+    tried: int
+    matched: int
+    at_border: int
+    inliers: int
+    displacement_rms_m: float
+
+    @property
+    def limited(self) -> bool:
+        """Whether the search did not reach the largest error that was expected."""
+        return self.needed_radius_m > self.search_radius_m
+
+
+@dataclass(frozen=True)
 class RegistrationContext:
     """What a registration works on; every stage receives it.
 
@@ -20,11 +51,13 @@ class RegistrationContext:
         scene: as delivered.
         options: of all stages.
         progress: receives the fraction done and the work under way.
+        stages: summaries of the searches so far, in order, also of one that was refused.
     """
 
     scene: Scene
     options: RegistrationOptions
     progress: Progress
+    stages: list[SearchStage]
 
     @cached_property
     def gsd_m(self) -> float:

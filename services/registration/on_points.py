@@ -13,14 +13,15 @@ from services.quality.qualification import Qualification, qualify
 from services.quality.stability import AdjustedScene
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
-from services.registration.context import PointContext, Prediction, RegistrationContext
+from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
 from services.registration.search import (
     Search,
-    SearchStage,
     adjust_search,
+    check_inliers,
+    largest_error_m,
     predict,
     search_radius_px,
     select_inliers,
@@ -91,37 +92,39 @@ def register_scene(
         scene=scene,
         options=options,
         progress=progress,
+        stages=[],
         points=points,
         chips=chips,
         image=CachedImage(scene.image),
         fine_gsd_m=fine_gsd_m(scene, points, prediction),
     )
-    stages: list[SearchStage] = []
     if needs_coarse_search(context, prediction):
-        prediction, stage = search_coarsely(context.part(0.0, 0.3), prediction)
-        stages.append(stage)
+        prediction = search_coarsely(context.part(0.0, 0.3), prediction)
     for part in context.parts(0.3, 0.6, options.fine_stages):
         rows = points_to_try(scene, points, prediction, options.max_points)
         search = _match(part, prediction, rows)
         adjustment = adjust_search(scene, search, options.adjustment)
         prediction = predict(scene, points, adjustment)
-        stages.append(search.stage)
-    return build_registration(context, points, search, adjustment, tuple(stages))
+    return build_registration(context, points, search, adjustment)
 
 
 def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
     """A search of some of the points with the fine chips, within the error of their prediction."""
     options, gsd_m = context.options, context.fine_gsd_m
     points = context.points.take(rows)
-    radius_px = search_radius_px(prediction.uncertainty_m[rows], gsd_m, options.coarse.max_search_px)
+    error_m = largest_error_m(prediction.uncertainty_m[rows])
+    radius_px = min(search_radius_px(error_m, gsd_m), options.coarse.max_search_px)
     chip_search = ChipSearch(
         context.image, prediction.model, context.scene.acquisition, gsd_m, radius_px
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
-    min_points = options.adjustment.min_points
-    inliers = select_inliers(prediction.model, points, matches, radius_px * gsd_m, min_points)
-    stage = summarise("fine", gsd_m, radius_px, matches, inliers)
-    return Search(points, rows, matches, inliers, stage)
+    inliers, tolerance_px = select_inliers(prediction.model, points, matches)
+    stage = summarise(
+        "fine", matches, inliers, level_m=gsd_m, radius_m=radius_px * gsd_m, needed_m=error_m
+    )
+    context.stages.append(stage)
+    check_inliers(stage, tolerance_px, matches.reason, context.scene, options.adjustment.min_points)
+    return Search(points, rows, matches, inliers)
 
 
 def build_registration(
@@ -129,7 +132,6 @@ def build_registration(
     points: ControlPoints,
     search: Search,
     adjustment: SceneAdjustment,
-    stages: tuple[SearchStage, ...],
 ) -> Registration:
     """The registration that the last search and its adjustment give, with its quality.
 
@@ -138,7 +140,6 @@ def build_registration(
         points: all points that the scene may show.
         search: the last search of a part of them.
         adjustment: on this search.
-        stages: summaries of all searches, in order.
     """
     context.progress(0.95, "qualifying the result")
     scene, options = context.scene, context.options
@@ -156,4 +157,4 @@ def build_registration(
     view_measures = search.matches.view_measures
     views = replace(view_measures, point=search.rows[view_measures.point])
     context.progress(1.0, "registered")
-    return Registration(model, adjustment, measures, views, stages, frame, qualification)
+    return Registration(model, adjustment, measures, views, tuple(context.stages), frame, qualification)

@@ -1,6 +1,6 @@
 """SCENE AND REFERENCE IMAGE IN -> REGISTERED MODEL OUT, without control points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,27 +9,27 @@ from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import ComputationError, CoverageError, NoConsensus
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
-from services.matching.consensus import a_contrario_consensus
-from services.matching.control_points import PointMatches
 from services.matching.predict import in_image
 from services.matching.reference_image import Places, Reference, match_places, visible_places
 from services.quality.stability import image_places
 from services.registration.context import RegistrationContext
 from services.registration.on_points import Registration, build_registration
-from services.registration.options import ReferenceOptions, RegistrationOptions
+from services.registration.options import RegistrationOptions
 from services.registration.reference_points import reference_points
 from services.registration.search import (
-    FIRST_TOLERANCE_PX,
     Search,
-    SearchStage,
     adjust_search,
-    format_consensus,
+    check_consensus,
+    check_inliers,
+    first_consensus,
+    largest_error_m,
     predict,
+    search_radius_px,
     select_inliers,
     summarise,
 )
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.types import Array, BoolArray, Progress, no_progress
+from services.types import Array, Progress, no_progress
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class _Level:
     Attributes:
         model: of the scene, as corrected so far.
         factor: pixels of the scene to one of the level.
-        radius_px: search radius, pixels of the level.
+        error_m: largest error of the model that is expected.
         is_first: whether nothing was searched before: the model may be far off.
     """
 
     model: CorrectedModel
     factor: int
-    radius_px: int
+    error_m: float
     is_first: bool
 
 
@@ -98,33 +98,30 @@ def register_on_reference(
         scene=scene,
         options=options,
         progress=progress,
+        stages=[],
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )
     level = _first_level(context)
-    stages: list[SearchStage] = []
     while level.is_first or level.factor > context.finest_factor:
-        part = context.part(min(0.1 * len(stages), 0.4), 0.1)
-        search, adjustment = _search_few_places(part, level)
+        part = context.part(min(0.1 * len(context.stages), 0.4), 0.1)
+        level, search, adjustment = _search_at_level(part, level)
         level = _next_level(context, level, search, adjustment)
-        stages.append(search.stage)
     for part in context.parts(0.5, 0.45, options.reference.fine_stages):
         before = level.model.correction
         search, adjustment = _search(part, level, options.reference.places, earlier_places)
         level = _next_level(context, level, search, adjustment)
-        stages.append(search.stage)
         displacement_px = _largest_displacement_px(before, level.model.correction, scene.image.shape)
         if displacement_px <= options.reference.settled_px * context.finest_factor:
             break
-    return build_registration(context, search.points, search, adjustment, tuple(stages))
+    return build_registration(context, search.points, search, adjustment)
 
 
 def _first_level(context: _ReferenceContext) -> _Level:
     """The level at which the error of the delivered model is searched."""
-    sigma_px = context.scene.sigma_m / context.gsd_m
-    factor = _factor(context, MAX_ERROR_SIGMAS * sigma_px)
+    error_m = MAX_ERROR_SIGMAS * context.scene.sigma_m
     model = CorrectedModel(context.scene.model, no_correction(context.scene.image.shape))
-    return _Level(model, factor, _radius_px(sigma_px, factor), is_first=True)
+    return _Level(model, _factor(context, error_m), error_m, is_first=True)
 
 
 def _next_level(
@@ -132,23 +129,44 @@ def _next_level(
 ) -> _Level:
     """The level and the radius at which the remaining error of the refined model is searched."""
     prediction = predict(context.scene, search.points, adjustment)
-    reach_px = MAX_ERROR_SIGMAS * float(np.percentile(prediction.uncertainty_m, 95)) / context.gsd_m
-    factor = max(context.finest_factor, min(-(-level.factor // 2), _factor(context, reach_px)))
-    radius_px = _radius_px(reach_px / MAX_ERROR_SIGMAS, factor)
-    return _Level(prediction.model, factor, radius_px, is_first=False)
+    error_m = largest_error_m(prediction.uncertainty_m)
+    factor = max(context.finest_factor, min(-(-level.factor // 2), _factor(context, error_m)))
+    return _Level(prediction.model, factor, error_m, is_first=False)
+
+
+def _search_at_level(
+    context: _ReferenceContext, level: _Level
+) -> tuple[_Level, Search, SceneAdjustment]:
+    """A search on the way to the finest level; a first one that is not significant is made finer.
+
+    Smaller windows are more of them side by side, so that fewer have to be shown. The first level is
+    halved as long as its radius is at most four times the usual one.
+    """
+    options = context.options.reference
+    while True:
+        try:
+            return level, *_search_few_places(context, level)
+        except NoConsensus:
+            finer = level.factor // 2
+            radius_px = level.error_m / (max(finer, 1) * context.gsd_m)
+            farthest_px = 4 * options.first_radius_px
+            if not level.is_first or finer < context.finest_factor or radius_px > farthest_px:
+                raise
+            level = replace(level, factor=finer)
 
 
 def _search_few_places(context: _ReferenceContext, level: _Level) -> tuple[Search, SceneAdjustment]:
     """A search on the way to the finest level: of few places as long as these agree, else of all."""
-    options = context.options.reference
+    options, before = context.options.reference, len(context.stages)
     if options.leading_places < options.places:
         try:
             search, adjustment = _search(context, level, options.leading_places)
         except (CoverageError, ComputationError):
             pass
         else:
-            if search.stage.inliers >= options.leading_places / 4.0:
+            if context.stages[-1].inliers >= options.leading_places / 4.0:
                 return search, adjustment
+        del context.stages[before:]
     return _search(context, level, options.places)
 
 
@@ -159,17 +177,37 @@ def _search(
     scene, options = context.scene, context.options
     matching = options.reference.matching
     places = _places(context, level, count, earlier_places)
-    image = _image_at(scene, level, len(places.cell), matching.window_px)
-    matches = match_places(image, places, level.radius_px, matching, context.progress)
-    points = reference_points(places.lon_lat_h, context.reference)
     level_m = level.factor * context.gsd_m
+    radius_px = search_radius_px(level.error_m, level_m)
+    image = _image_at(scene, level.factor, len(places.cell), matching.window_px + 2 * radius_px)
+    matches = match_places(image, places, radius_px, matching, context.progress)
+    points = reference_points(places.lon_lat_h, context.reference)
     if level.is_first:
-        inliers = _first_inliers(matches, level_m, level.radius_px, options.reference)
+        consensus = first_consensus(
+            scene,
+            places.line_sample,
+            matches.line_sample,
+            level_m=level_m,
+            radius_m=radius_px * level_m,
+            side_m=matching.window_px * level_m,
+        )
+        inliers = consensus.inliers
     else:
-        min_points = options.adjustment.min_points
-        inliers = select_inliers(level.model, points, matches, level.radius_px * level_m, min_points)
-    stage = summarise("reference", level_m, level.radius_px, matches, inliers)
-    search = Search(points, np.arange(len(points)), matches, inliers, stage)
+        inliers, tolerance_px = select_inliers(level.model, points, matches)
+    stage = summarise(
+        "reference",
+        matches,
+        inliers,
+        level_m=level_m,
+        radius_m=radius_px * level_m,
+        needed_m=level.error_m,
+    )
+    context.stages.append(stage)
+    if level.is_first:
+        check_consensus(stage, consensus, matches.reason, scene, options.reference.max_false_alarms)
+    else:
+        check_inliers(stage, tolerance_px, matches.reason, scene, options.adjustment.min_points)
+    search = Search(points, np.arange(len(points)), matches, inliers)
     return search, adjust_search(scene, search, options.adjustment)
 
 
@@ -193,22 +231,17 @@ def _finest_factor(scene: Scene, reference: Reference) -> int:
     return max(1, int(reference_gsd_m / scene_gsd_m(scene)))
 
 
-def _factor(context: _ReferenceContext, reach_px: float) -> int:
-    """The level at which a reach in pixels of the scene is searched within the first radius.
+def _factor(context: _ReferenceContext, error_m: float) -> int:
+    """The level at which an error is searched within the first radius.
 
     The scene must still hold enough whole windows of the level; a scene too small for that is searched
     further out at a finer level.
     """
     options = context.options.reference
-    wanted = int(np.ceil(reach_px / options.first_radius_px))
-    per_side = np.sqrt(options.enough) * options.matching.window_px / 2.0
+    wanted = int(np.ceil(error_m / context.gsd_m / options.first_radius_px))
+    per_side = np.sqrt(options.enough) * options.matching.window_px
     largest = int(min(context.scene.image.shape) / per_side)
     return max(context.finest_factor, min(wanted, largest))
-
-
-def _radius_px(sigma_px: float, factor: int) -> int:
-    """Search radius that holds the largest error, pixels of the level."""
-    return max(4, int(np.ceil(MAX_ERROR_SIGMAS * sigma_px / factor)) + 2)
 
 
 def _places(
@@ -247,29 +280,9 @@ def _with_earlier(grid: Array, earlier: Array, side: Array, size: Array, margin:
     return np.concatenate([earlier[first], grid[free]])
 
 
-def _image_at(scene: Scene, level: _Level, n_places: int, window_px: int) -> ImageSource | ReducedImage:
-    """The scene, or a reduction of it when the windows of the places hold more pixels than the scene."""
-    window = ((window_px + 2 * level.radius_px) * level.factor) ** 2
+def _image_at(scene: Scene, factor: int, n_places: int, patch_px: int) -> ImageSource | ReducedImage:
+    """The scene, or a reduction of it when the patches of the places hold more pixels than the scene."""
     lines, samples = scene.image.shape
-    if level.factor > 1 and n_places * window > lines * samples:
-        return reduce_image(scene.image, level.factor)
+    if factor > 1 and n_places * (patch_px * factor) ** 2 > lines * samples:
+        return reduce_image(scene.image, factor)
     return scene.image
-
-
-def _first_inliers(
-    matches: PointMatches, level_m: float, radius_px: int, options: ReferenceOptions
-) -> BoolArray:
-    """Places whose displacements agree beyond chance.
-
-    Raises:
-        NoConsensus: they agree no better than by chance.
-    """
-    consensus = a_contrario_consensus(
-        matches.displacement_m, FIRST_TOLERANCE_PX * level_m, radius_px * level_m
-    )
-    if consensus.false_alarms > options.max_false_alarms:
-        raise NoConsensus(
-            "the reference does not agree with the scene on one correction: "
-            + format_consensus(matches, consensus, level_m, radius_px, "places")
-        )
-    return consensus.inliers

@@ -17,8 +17,8 @@ class CoarseOptions:
         max_fine_radius_px: a search radius up to this many pixels of the fine chips needs no coarse
             search.
         points: number of points to try that the scene is expected to show whole, wherever it lies.
-        enough: number of chips of one ground sampling that the scene should show whole for that ground
-            sampling to be used.
+        enough: number of chips of one ground sampling that the scene should show whole, and number of
+            them that must fit into it side by side, for that ground sampling to be used.
         min_score: normalised correlation below which a chip is not found; the consensus of many points
             decides which of these matches are right.
         max_search_px: largest search radius, pixels; to search further, the chips are reduced.
@@ -53,7 +53,7 @@ class ReferenceOptions:
         fine_stages: largest number of searches at the finest level, each through the last model.
         settled_px: a search at the finest level that moves every corner of the image by at most this
             many pixels of the level is the last.
-        enough: smallest number of whole windows that the scene must hold at a level.
+        enough: smallest number of windows side by side that the scene must hold at a level.
         max_false_alarms: a first consensus with more expected false alarms than this is refused.
         matching: how places are searched.
     """

@@ -14,38 +14,23 @@ from services.adjustment.image_correction import (
 )
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import NoConsensus, NotEnoughPoints
-from services.imagery.scene import Scene, scene_centre
+from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import image_gsds_m
-from services.matching.consensus import Consensus, consensus_tolerance_px, robust_affine_inliers
+from services.matching.consensus import (
+    Consensus,
+    Voters,
+    a_contrario_consensus,
+    consensus_tolerance_px,
+    robust_affine_inliers,
+)
 from services.matching.control_points import PointMatches
-from services.registration.context import Prediction
+from services.registration.context import Prediction, SearchStage
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
 """Displacements of a first search agree within this many pixels of the chips that are searched."""
-
-
-@dataclass(frozen=True)
-class SearchStage:
-    """Summary of one search of the points through one model.
-
-    Attributes:
-        name: "coarse" or "fine" on control points, "reference" on a reference image.
-        chip_gsd_m: ground sampling of the chips that were searched.
-        search_radius_m: search radius on the ground.
-        tried, matched, inliers: numbers of points searched, found, and in agreement with each other.
-        displacement_rms_m: distance of the inliers from their expected positions, root mean square.
-    """
-
-    name: str
-    chip_gsd_m: float
-    search_radius_m: float
-    tried: int
-    matched: int
-    inliers: int
-    displacement_rms_m: float
 
 
 @dataclass(frozen=True)
@@ -57,20 +42,22 @@ class Search:
         rows: (k,) their rows among all visible points of the registration, ascending.
         matches: of the points tried.
         inliers: (k,) points that agree on one displacement of the image.
-        stage: summary of the search.
     """
 
     points: ControlPoints
     rows: IntArray
     matches: PointMatches
     inliers: BoolArray
-    stage: SearchStage
 
 
-def search_radius_px(uncertainty_m: Array, gsd_m: float, largest: int) -> int:
-    """Search radius that holds the largest expected error of nearly all points, pixels of the chips."""
-    reach = MAX_ERROR_SIGMAS * np.percentile(uncertainty_m, 95) / gsd_m
-    return int(np.clip(np.ceil(reach) + 2, 4, largest))
+def largest_error_m(uncertainty_m: Array) -> float:
+    """Largest expected error of 95 % of points, from the standard deviations (n,) of their positions."""
+    return MAX_ERROR_SIGMAS * float(np.percentile(uncertainty_m, 95))
+
+
+def search_radius_px(error_m: float, gsd_m: float) -> int:
+    """Search radius that holds an error, pixels of a ground sampling."""
+    return max(4, math.ceil(error_m / gsd_m) + 2)
 
 
 def adjust_search(
@@ -104,44 +91,55 @@ def adjust_search(
 
 
 def select_inliers(
-    model: SensorModel,
-    points: ControlPoints,
-    matches: PointMatches,
-    radius_m: float,
-    min_points: int,
-) -> BoolArray:
-    """Points (k,) whose matches agree on one affine displacement.
+    model: SensorModel, points: ControlPoints, matches: PointMatches
+) -> tuple[BoolArray, float]:
+    """Points (n,) whose matches agree on one affine displacement, and the tolerance, pixels.
 
     Args:
         model: that predicted the points.
         points: those that were tried.
         matches: of these points.
-        radius_m: search radius, for the message.
+    """
+    matched = matches.reason == ""
+    if not matched.any():
+        return matched, consensus_tolerance_px(0.0)
+    predicted = model.project(points.lon_lat_h)
+    sigma_px = float(np.median(_point_sigma_px(model, points, matches)[matched]))
+    displacement_px = matches.line_sample - predicted
+    inliers, scale = robust_affine_inliers(predicted, displacement_px, matched, sigma_px)
+    return inliers, consensus_tolerance_px(scale * sigma_px)
+
+
+def check_inliers(
+    stage: SearchStage, tolerance_px: float, reason: np.ndarray, scene: Scene, min_points: int
+) -> None:
+    """Refuse a search of whose points too few agree.
+
+    Args:
+        stage: summary of the search.
+        tolerance_px: within which its inliers agree.
+        reason: (k,) why points were not found.
+        scene: that was searched.
         min_points: smallest number of inliers.
 
     Raises:
         NotEnoughPoints: fewer points were found than are needed.
         NoConsensus: fewer of the points found agree than are needed.
     """
-    predicted = model.project(points.lon_lat_h)
-    matched = matches.reason == ""
-    if matched.sum() < min_points:
+    if stage.matched < min_points:
         raise NotEnoughPoints(
-            int(matched.sum()),
+            stage.matched,
             min_points,
-            f"{len(points)} tried within {radius_m:.1f} m, {format_reasons(matches.reason)}",
+            f"{stage.tried} tried within {stage.search_radius_m:.1f} m, {format_reasons(reason)}; "
+            + next_step(stage, scene.sigma_m),
         )
-    sigma_px = float(np.median(_point_sigma_px(model, points, matches)[matched]))
-    displacement_px = matches.line_sample - predicted
-    inliers, scale = robust_affine_inliers(predicted, displacement_px, matched, sigma_px)
-    tolerance_px = consensus_tolerance_px(scale * sigma_px)
-    if inliers.sum() < min_points:
+    if stage.inliers < min_points:
+        agreeing = f"only {stage.inliers}" if stage.inliers > 1 else "no two"
         raise NoConsensus(
-            f"{int(matched.sum())} points found of {len(points)} tried, but only {int(inliers.sum())} "
-            f"agree within {tolerance_px:.1f} px, {min_points} needed: check that the points show the "
-            "ground of the scene, or state a larger sigma_m when the model may be further off"
+            f"{stage.matched} points found of {stage.tried} tried within {stage.search_radius_m:.1f} m, "
+            f"but {agreeing} of them agree within {tolerance_px:.1f} px, {min_points} needed; "
+            + next_step(stage, scene.sigma_m)
         )
-    return inliers
 
 
 def _point_sigma_px(model: SensorModel, points: ControlPoints, matches: PointMatches) -> Array:
@@ -168,19 +166,117 @@ def predict(scene: Scene, points: ControlPoints, adjustment: SceneAdjustment) ->
 
 
 def summarise(
-    name: str, gsd_m: float, radius_px: int, matches: PointMatches, inliers: BoolArray
+    name: str,
+    matches: PointMatches,
+    inliers: BoolArray,
+    *,
+    level_m: float,
+    radius_m: float,
+    needed_m: float,
 ) -> SearchStage:
-    """The summary of a search with chips of a ground sampling."""
+    """The summary of a search; see `SearchStage`."""
     displacement_m = matches.displacement_m[inliers]
     rms_m = float(np.sqrt((displacement_m**2).sum(axis=1).mean())) if len(displacement_m) else math.nan
     return SearchStage(
         name=name,
-        chip_gsd_m=gsd_m,
-        search_radius_m=radius_px * gsd_m,
+        chip_gsd_m=level_m,
+        search_radius_m=radius_m,
+        needed_radius_m=needed_m,
         tried=len(matches.reason),
         matched=int((matches.reason == "").sum()),
+        at_border=int((matches.reason == "border_peak").sum()),
         inliers=int(inliers.sum()),
         displacement_rms_m=rms_m,
+    )
+
+
+def first_consensus(
+    scene: Scene, predicted: Array, measured: Array, *, level_m: float, radius_m: float, side_m: float
+) -> Consensus:
+    """The displacements of a first search that agree, and whether beyond chance.
+
+    Displacements are compared in the image: a model that is off by a constant angle moves all points by
+    the same pixels, but neither by the same metres (a wide scene is oblique at one side) nor in the same
+    direction from north (meridians converge).
+
+    Args:
+        scene: that was searched.
+        predicted, measured: (n, 2) pixels of the scene; NaN where not found.
+        level_m: ground sampling of what was searched.
+        radius_m: search radius.
+        side_m: side of the chips.
+    """
+    gsd_m = scene_gsd_m(scene)
+    last = np.array(scene.image.shape) - 1.0
+    margin, radius = side_m / 2.0 / gsd_m, radius_m / gsd_m
+    low = np.maximum(margin - predicted, -radius)
+    high = np.minimum(last - margin - predicted, radius)
+    return a_contrario_consensus(
+        measured - predicted,
+        FIRST_TOLERANCE_PX * level_m / gsd_m,
+        np.stack([low, high], axis=1),
+        Voters(predicted, side_m / gsd_m),
+    )
+
+
+def check_consensus(
+    stage: SearchStage, consensus: Consensus, reason: np.ndarray, scene: Scene, max_false_alarms: float
+) -> None:
+    """Refuse a first search whose matches agree no better than by chance.
+
+    Args:
+        stage: summary of the search.
+        consensus: of its displacements.
+        reason: (k,) why points were not found.
+        scene: that was searched.
+        max_false_alarms: largest number of false alarms that is accepted.
+
+    Raises:
+        NoConsensus: with the numbers of the search and the next step.
+    """
+    if stage.inliers >= 2 and consensus.false_alarms <= max_false_alarms:
+        return
+    agreement = "no two of them agree"
+    if stage.inliers >= 2:
+        agreement = (
+            f"{stage.inliers} of them within {FIRST_TOLERANCE_PX * stage.chip_gsd_m:g} m of each other, "
+            f"which chance explains ({consensus.false_alarms:.2g} such groups expected, at most "
+            f"{max_false_alarms:g} accepted)"
+        )
+    who, noun = f"the {stage.name} search does not agree on", "points"
+    if stage.name == "reference":
+        who, noun = "the reference does not agree with the scene on", "places"
+    raise NoConsensus(
+        f"{who} one correction: {stage.tried} {noun} tried within {stage.search_radius_m:.0f} m, "
+        f"{stage.matched} found, {agreement}; {format_reasons(reason)}; "
+        + next_step(stage, scene.sigma_m)
+    )
+
+
+def next_step(stage: SearchStage, sigma_m: float) -> str:
+    """What to try after a search that was refused, with the option written out.
+
+    Args:
+        stage: summary of the search.
+        sigma_m: stated accuracy of the scene, which set the radius of the first search.
+    """
+    larger_m = float(f"{2.0 * sigma_m:.2g}")
+    option = f"--sigma-m {larger_m:g}"
+    if stage.limited:
+        smaller_m = float(f"{stage.search_radius_m / MAX_ERROR_SIGMAS:.2g}")
+        return (
+            f"the search reached {stage.search_radius_m:.0f} m of the {stage.needed_radius_m:.0f} m "
+            "that the accuracy of the model asks for: give points with coarser chips, or, where the "
+            f"error is known to be smaller, try --sigma-m {smaller_m:g}"
+        )
+    if stage.at_border > stage.tried / 2.0:
+        return (
+            f"{stage.at_border} best peaks lie at the border of the search: the model is probably "
+            f"further off, try {option}"
+        )
+    return (
+        "check that the points show the ground of the scene; when the model may be further off, "
+        f"try {option}"
     )
 
 
@@ -188,24 +284,3 @@ def format_reasons(reason: np.ndarray) -> str:
     """Numbers of points that were not found, by reason: "22 low_score, 16 nodata"."""
     counted = Counter(str(r) for r in reason if r)
     return ", ".join(f"{count} {name}" for name, count in counted.most_common()) or "none rejected"
-
-
-def format_consensus(
-    matches: PointMatches, consensus: Consensus, gsd_m: float, radius_px: int, noun: str
-) -> str:
-    """The numbers of a first search whose matches do not agree, for a message.
-
-    Args:
-        matches: of the search.
-        consensus: of their displacements.
-        gsd_m: ground sampling of the chips that were searched.
-        radius_px: search radius.
-        noun: what was searched: "points" or "places".
-    """
-    return (
-        f"{len(matches.reason)} {noun} tried within {radius_px * gsd_m:.0f} m, "
-        f"{int((matches.reason == '').sum())} found, {int(consensus.inliers.sum())} of them within "
-        f"{FIRST_TOLERANCE_PX * gsd_m:g} m of each other (expected by chance: "
-        f"{consensus.false_alarms:.2g} such groups); {format_reasons(matches.reason)}; when the model "
-        "may be further off, state a larger sigma_m"
-    )

@@ -14,8 +14,8 @@ from services.quality.accuracy import Accuracy, NormalisedError
 from services.quality.criteria import Criterion, Verdict
 from services.quality.qualification import Coverage, GroundResiduals, PointCounts
 from services.quality.stability import ImageResiduals, PredictedAccuracy, Stability
+from services.registration.context import SearchStage
 from services.registration.options import RegistrationOptions
-from services.registration.search import SearchStage
 from services.reports.figure_data import FigureData
 from services.reports.reasons import ReasonCount
 from services.types import Acquisition, Array

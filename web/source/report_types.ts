@@ -275,8 +275,10 @@ export interface SearchStage {
   name: string;
   chip_gsd_m: number | null;
   search_radius_m: number | null;
+  needed_radius_m: number | null;
   tried: number;
   matched: number;
+  at_border: number;
   inliers: number;
   displacement_rms_m: number | null;
 }

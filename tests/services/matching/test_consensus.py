@@ -1,15 +1,17 @@
 """Consistent measures are separated from outliers, and random agreement is not significant."""
 
+import cv2
 import numpy as np
 import pytest
 
 from services.matching.consensus import (
     Consensus,
+    Voters,
     a_contrario_consensus,
     affine_inliers,
     robust_affine_inliers,
 )
-from services.types import Array
+from services.types import Array, FloatImage
 
 REACH_M = 60.0
 TOLERANCE_M = 3.0
@@ -94,7 +96,7 @@ def test_no_displacement_and_a_single_one_are_not_significant(count: int) -> Non
     if count:
         consensus = a_contrario_consensus(np.array([[1.0, 2.0], [np.nan, np.nan]]), TOLERANCE_M, REACH_M)
     assert consensus.inliers.sum() == count
-    assert consensus.false_alarms >= 1.0
+    assert 1.0 <= consensus.false_alarms < np.inf
 
 
 def field(rng: np.random.Generator, count: int, right: int) -> tuple[Array, Array, Array]:
@@ -152,3 +154,76 @@ def test_five_candidates_are_returned_unchanged() -> None:
     position, measured, _ = field(np.random.default_rng(0), 10, 0)
     candidates = np.arange(10) < 5
     np.testing.assert_array_equal(affine_inliers(position, measured, candidates, 1.0), candidates)
+
+
+CHIP_PX, RADIUS_PX = 25, 40
+
+
+def texture(rng: np.random.Generator, size: int) -> FloatImage:
+    """A random image whose amplitudes fall with frequency as those of land do."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.fftfreq(size)[None, :])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.fft2(rng.standard_normal((size, size))) / frequency**1.5
+    return np.asarray(np.fft.ifft2(spectrum).real, dtype=np.float32)
+
+
+def correlated(ground: FloatImage, scene: FloatImage, step_px: int, a_side: int) -> tuple[Array, Array]:
+    """Positions and displacements of a square grid of chips of the ground, as found in a scene."""
+    position, displacement = [], []
+    for row, col in np.ndindex(a_side, a_side):
+        top, left = RADIUS_PX + step_px * row, RADIUS_PX + step_px * col
+        chip = ground[top : top + CHIP_PX, left : left + CHIP_PX]
+        reach = CHIP_PX + 2 * RADIUS_PX
+        patch = scene[top - RADIUS_PX :, left - RADIUS_PX :][:reach, :reach]
+        scores = cv2.matchTemplate(patch.copy(), chip.copy(), cv2.TM_CCOEFF_NORMED)
+        best = np.unravel_index(int(scores.argmax()), scores.shape)
+        position.append([top, left])
+        displacement.append(np.array(best) - RADIUS_PX if scores.max() >= 0.5 else [np.nan, np.nan])
+    return np.array(position, dtype=np.float64), np.array(displacement, dtype=np.float64)
+
+
+@pytest.mark.parametrize("step_px", [4, 12, 18, 25])
+def test_overlapping_chips_of_unrelated_ground_are_not_significant(step_px: int) -> None:
+    """Counted singly, 64 chips 4 px apart are "significant" in nearly every pair of textures."""
+    rng, singly, apart = np.random.default_rng(step_px), [], []
+    for _ in range(40):
+        ground, scene = texture(rng, 288), texture(rng, 288)
+        position, displacement = correlated(ground, scene, step_px, 8)
+        voters = Voters(position, float(CHIP_PX))
+        singly.append(a_contrario_consensus(displacement, 3.0, float(RADIUS_PX)).false_alarms)
+        apart.append(a_contrario_consensus(displacement, 3.0, float(RADIUS_PX), voters).false_alarms)
+    assert np.mean(np.array(apart) < 0.1) <= 0.1
+    assert np.mean(np.array(apart) < 1e-2) <= 0.025
+    assert min(apart) > 1e-4
+    if step_px == 4:
+        assert np.mean(np.array(singly) < 1e-4) > 0.5
+
+
+@pytest.mark.parametrize(("step_px", "in_common"), [(12, 0.5), (18, 0.5), (25, 0.4)])
+def test_overlapping_chips_of_the_same_ground_are_significant(step_px: int, in_common: float) -> None:
+    rng, accepted = np.random.default_rng(step_px), []
+    for _ in range(20):
+        ground, other = texture(rng, 288), texture(rng, 288)
+        scene = (in_common * ground + (1.0 - in_common) * other).astype(np.float32)
+        position, displacement = correlated(ground, scene, step_px, 8)
+        voters = Voters(position, float(CHIP_PX))
+        consensus = a_contrario_consensus(displacement, 3.0, float(RADIUS_PX), voters)
+        accepted.append(consensus.false_alarms < 1e-4 and np.hypot(*consensus.displacement) < 3.0)
+    assert np.mean(accepted) >= 0.9
+
+
+def test_displacements_that_a_search_could_not_reach_do_not_weigh_against_a_consensus() -> None:
+    """A small scene shows few of the chips tried; the others cannot agree with those."""
+    rng = np.random.default_rng(3)
+    predicted = rng.uniform(-5000.0, 5000.0, (2000, 2))
+    low, high = -predicted, 1000.0 - predicted
+    displacement = rng.uniform(low, high)
+    truth = np.array([1800.0, -2400.0])
+    shown = ((truth > low) & (truth < high)).all(axis=1)
+    displacement[np.flatnonzero(shown)[::2]] = truth
+    search = np.stack([low, high], axis=1)
+    consensus = a_contrario_consensus(displacement, 24.0, search)
+    np.testing.assert_allclose(consensus.displacement, truth, atol=24.0)
+    assert consensus.false_alarms < 1e-6
+    random = a_contrario_consensus(rng.uniform(low, high), 24.0, search)
+    assert random.false_alarms > 1e-3

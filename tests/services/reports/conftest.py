@@ -9,9 +9,9 @@ import pytest
 
 from services.quality.accuracy import accuracy
 from services.quality.qualification import QualificationOptions, qualify
+from services.registration.context import SearchStage
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
-from services.registration.search import SearchStage
 from services.reports.build import build_report
 from services.reports.figure_data import ChipPair, FigureData, Quicklook
 from services.reports.report import (
@@ -106,8 +106,8 @@ def material(registered) -> Callable[..., Material]:
             measures=scene.measures,
             views=ViewMeasures(none, none, np.empty(0), none.astype(bool), none.astype(str)),
             search_stages=(
-                SearchStage("coarse", 2.0, 60.0, 50, 44, 41, 31.0),
-                SearchStage("fine", 0.5, 6.0, len(scene.measures.score), 52, 48, 0.4),
+                SearchStage("coarse", 2.0, 60.0, 56.0, 50, 44, 2, 41, 31.0),
+                SearchStage("fine", 0.5, 6.0, 5.0, len(scene.measures.score), 52, 0, 48, 0.4),
             ),
             frame=scene.frame,
             qualification=qualify(scene.adjusted(), QualificationOptions(), rng),

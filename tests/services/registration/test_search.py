@@ -1,0 +1,113 @@
+"""First searches compare displacements in one frame, and say what to do next when they are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.errors import NoConsensus
+from services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.matching.consensus import Consensus
+from services.registration.context import SearchStage
+from services.registration.search import check_consensus, first_consensus
+from services.sensors.base import SensorModel
+from services.simulation.orbit import pushbroom_over
+from services.types import Acquisition, Array
+
+LINES, GSD_M = 5000, 20.0
+SHIFT_PX = np.array([180.0, -165.0])
+"""4.9 km."""
+LEVEL_M = 20.0
+forty_metres = 40.0
+of_three_level_pixels = 3.0 * LEVEL_M
+
+
+def wide_scene(lat_deg: float, incidence_deg: float) -> Scene:
+    """A scene 100 km wide of which only the geometry counts."""
+    model = pushbroom_over(
+        np.array([20.0, lat_deg, 100.0]),
+        (LINES, LINES),
+        GSD_M,
+        (incidence_deg, 100.0),
+        (0.0, 1000.0),
+        jitter_px=0.0,
+        rng=np.random.default_rng(0),
+    )
+    blank = ArrayImage(np.zeros((LINES, LINES), dtype=np.float32))
+    return Scene(blank, model, Acquisition("wide"), 1667.0)
+
+
+def spread_positions() -> Array:
+    return np.random.default_rng(1).uniform(700.0, LINES - 700.0, (60, 2))
+
+
+def east_north_m(model: SensorModel, start: Array, end: Array) -> Array:
+    """Displacements (n, 2) on the ground, each in the frame of its own start."""
+    height_m = np.full(len(start), 100.0)
+    origin, moved = (model.locate(position, height_m) for position in (start, end))
+    ecef = ecef_from_lon_lat_h(moved) - ecef_from_lon_lat_h(origin)
+    return np.array([d @ ecef_from_east_north_up(o) for d, o in zip(ecef, origin, strict=True)])[:, :2]
+
+
+@pytest.mark.parametrize(("lat_deg", "incidence_deg"), [(75.0, 5.0), (45.0, 30.0), (0.0, 5.0)])
+def test_a_shift_of_the_image_is_one_consensus_wherever_the_scene_lies(
+    lat_deg: float, incidence_deg: float
+) -> None:
+    scene = wide_scene(lat_deg, incidence_deg)
+    predicted = spread_positions()
+    measured = predicted + SHIFT_PX + np.random.default_rng(2).normal(0.0, 0.3, predicted.shape)
+    consensus = first_consensus(
+        scene, predicted, measured, level_m=LEVEL_M, radius_m=5_000.0, side_m=2_020.0
+    )
+    assert consensus.inliers.all()
+    assert consensus.false_alarms < 1e-12
+    ground_m = east_north_m(scene.model, predicted, measured)
+    spread_m = np.hypot(*(ground_m - ground_m.mean(axis=0)).T).max()
+    if lat_deg == 75.0 or incidence_deg == 30.0:
+        assert spread_m > of_three_level_pixels  # East and north would lose points.
+
+
+def stage(**changes: object) -> SearchStage:
+    base = SearchStage("coarse", 20.0, 300.0, 300.0, 60, 12, 5, 4, 100.0)
+    return replace(base, **changes)  # type: ignore[arg-type]
+
+
+def refusal(of: SearchStage, false_alarms: float = 0.8) -> str:
+    scene = wide_scene(0.0, 5.0)
+    consensus = Consensus(np.ones(of.inliers, dtype=bool), np.zeros(2), false_alarms)
+    reason = np.array(
+        ["low_score"] * (of.tried - of.matched - of.at_border) + ["border_peak"] * of.at_border
+    )
+    with pytest.raises(NoConsensus) as refused:
+        check_consensus(of, consensus, reason, replace(scene, sigma_m=100.0), 1e-4)
+    message = str(refused.value)
+    assert "inf" not in message
+    assert "nan" not in message
+    return message
+
+
+def test_a_refusal_counts_and_writes_out_the_next_option() -> None:
+    message = refusal(stage())
+    assert "60 points tried within 300 m, 12 found, 4 of them within 60 m of each other" in message
+    assert "which chance explains (0.8 such groups expected" in message
+    assert "--sigma-m 200" in message
+
+
+@pytest.mark.parametrize("inliers", [0, 1])
+def test_points_of_which_no_two_agree_are_refused_in_words(inliers: int) -> None:
+    message = refusal(stage(inliers=inliers, displacement_rms_m=float("nan")), 1.0)
+    assert "no two of them agree" in message
+
+
+def test_peaks_at_the_border_ask_for_a_larger_sigma() -> None:
+    message = refusal(stage(at_border=40, matched=10))
+    assert "40 best peaks lie at the border of the search" in message
+    assert "try --sigma-m 200" in message
+
+
+def test_a_limited_search_says_how_far_it_reached() -> None:
+    limited = stage(needed_radius_m=5_000.0, search_radius_m=3_200.0)
+    assert limited.limited
+    assert "reached 3200 m of the 5000 m" in refusal(limited)
