@@ -6,6 +6,7 @@ from datetime import timedelta
 import numpy as np
 
 from services.adjustment.bundle import BlockAdjustment
+from services.geodesy import continuous
 from services.types import Acquisition, Array, BoolArray, Frame
 
 _LONGEST_PASS = timedelta(minutes=20)
@@ -13,10 +14,7 @@ _LONGEST_PASS = timedelta(minutes=20)
 
 
 def block_frame(
-    adjustment: BlockAdjustment,
-    acquisitions: Sequence[Acquisition],
-    sigma_px: Array,
-    lon_lat_h: Array,
+    adjustment: BlockAdjustment, acquisitions: Sequence[Acquisition], sigma_px: Array
 ) -> Frame:
     """How well the frame of a block is known, by the a priori accuracy of its images.
 
@@ -33,9 +31,10 @@ def block_frame(
         adjustment: of the block.
         acquisitions: of its n images.
         sigma_px: (n,) a priori standard deviation of the shift of each image, pixels.
-        lon_lat_h: (3,) a point in the middle of the block.
     """
-    derivative = np.concatenate([m.project_derivative(lon_lat_h[None, :])[0] for m in adjustment.models])
+    intersected = np.isfinite(adjustment.lon_lat_h).all(axis=1)
+    middle = np.median(continuous(adjustment.lon_lat_h[intersected]), axis=0)[None, :]
+    derivative = np.concatenate([model.project_derivative(middle)[0] for model in adjustment.models])
     # Weighted by the a priori sigmas, as the adjustment weights the shifts.
     scale = np.repeat(sigma_px, 2)
     inverse = np.linalg.pinv(derivative / scale[:, None]) / scale

@@ -158,12 +158,8 @@ def produce_points(
     )
     adjusted = _with_models(scenes, adjustment)
     rows, saliency = _select_points(adjusted, intersection, active, options)
-    frame = block_frame(
-        adjustment,
-        [scene.acquisition for scene in scenes],
-        _prior_sigma_px(scenes),
-        np.nanmedian(continuous(intersection.lon_lat_h), axis=0),
-    )
+    acquisitions = [scene.acquisition for scene in scenes]
+    frame = block_frame(adjustment, acquisitions, _prior_sigma_px(scenes))
     views = _views(adjusted, intersection, rows, active, options)
     points = _control_points(intersection, rows, frame, saliency, views)
     relative_accuracy = RelativeAccuracy(

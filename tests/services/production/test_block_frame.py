@@ -1,6 +1,7 @@
 """The frame of a block: known from the models of its images, weaker in height, weaker within a pass."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 
@@ -80,7 +81,7 @@ def frame_covariance_m2(acquisitions: Sequence[Acquisition]) -> Array:
     count = len(acquisitions)
     adjustment = adjusted(np.zeros((count, 2)), np.random.default_rng(6))
     sigma_px = np.full(count, SIGMA_M / GSD_M)
-    return block_frame(adjustment, acquisitions, sigma_px, ground()[0]).covariance_m2
+    return block_frame(adjustment, acquisitions, sigma_px).covariance_m2
 
 
 def frame_sigmas_m(acquisitions: Sequence[Acquisition]) -> Array:
@@ -132,6 +133,15 @@ def test_the_frame_of_a_pass_covers_errors_that_its_images_share_or_not(shared: 
     assert (mean_square < 1.5).all()
     held = mean_square[:2] if shared else mean_square[2:]
     assert (held > 0.6).all()
+
+
+def test_points_that_are_not_intersected_do_not_matter() -> None:
+    adjustment = adjusted(np.zeros((5, 2)), np.random.default_rng(6))
+    without = adjustment.lon_lat_h.copy()
+    without[[0, 7]] = np.nan
+    acquisitions, sigma_px = acquired(5, three_days), np.full(5, SIGMA_M / GSD_M)
+    frame = block_frame(replace(adjustment, lon_lat_h=without), acquisitions, sigma_px)
+    np.testing.assert_allclose([frame.sigma_m, frame.sigma_up_m], ring_m[1:], rtol=a_percent)
 
 
 def test_images_are_of_one_pass_unless_their_platforms_or_times_differ() -> None:
