@@ -210,7 +210,10 @@ def run_orthorectification(
         limits.check(scene, grid, len(bands) * np.dtype(dtype).itemsize)
     counter = _DataPixels()
     windows = counter.count(orthorectify(bands, scene.model, ground, grid, options, progress=progress))
-    error_px = write_cog(output, grid, windows, bands=len(bands), dtype=dtype, nodata=nodata)
+    saturated = next(reversed(raster.saturated_values(1)), None)
+    error_px = write_cog(
+        output, grid, windows, bands=len(bands), dtype=dtype, nodata=nodata, saturated=saturated
+    )
     raster.close()
     lines, samples = grid.shape
     return Orthorectified(
@@ -250,7 +253,7 @@ class _DataPixels:
 
     def count(self, windows: Iterator[OrthoWindow]) -> Iterator[OrthoWindow]:
         for window in windows:
-            self.pixels += int(np.isfinite(window.pixels).sum())
+            self.pixels += int((~np.isnan(window.pixels)).sum())
             yield window
 
 

@@ -135,9 +135,8 @@ def record_places(
     if not references.lock_reference(connection, covering.id):
         return
     measures = registration.measures
-    is_tried = np.isfinite(measures.lon_lat_h).all(axis=1) & (
-        ~np.isin(measures.reason, ["nodata", "saturated"])
-    )
+    is_tried = np.isfinite(measures.lon_lat_h).all(axis=1)
+    is_tried &= ~np.isin(measures.reason, ("nodata", "saturated"))
     earlier = references.places_inside(connection, covering.id, outline, worthwhile=False)
     apart_m = ReferenceMatchingOptions().window_px / 2.0 * covering.gsd_m
     place = ecef_from_lon_lat_h(measures.lon_lat_h[is_tried])

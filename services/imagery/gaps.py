@@ -54,11 +54,6 @@ def lost_pixels(pixels: FloatImage, footprint_px: float = 0.0) -> FloatImage:
     return lost
 
 
-def mostly_saturated(pixels: FloatImage) -> bool:
-    """Whether most of the pixels that are lost are saturated."""
-    return bool(2 * np.isposinf(pixels).sum() > (~np.isfinite(pixels)).sum())
-
-
 def _blurred(where: BoolArray, sigma_px: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma_px))
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
+from services.imagery.gaps import bridged
 from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.matching.chip_extent import central_square, visible_half_side
 from services.matching.correlate import (
@@ -285,9 +286,9 @@ def _assembled(
     displacement_m = np.column_stack([row_col[:, 1] * level_m, -row_col[:, 0] * level_m])
     sigma_m = np.array([match.combination.sigma_px for match in matches]) * level_m
     reason = np.array([match.combination.reason for match in matches], dtype="<U16")
-    # A point beyond the border of the scene is missing, whatever the brightness around it.
+    # A point beyond the border of the scene, or in a saturated area, has its own reason.
     clouded = cloud_mask([match.statistics for match in matches], reason == FOUND)
-    reason[clouded & (reason != "nodata")] = "cloud"
+    reason[clouded & ~np.isin(reason, ("nodata", "saturated"))] = "cloud"
     measured = move_metres(points.lon_lat_h, np.column_stack([displacement_m, np.zeros(n)]))
     return PointMatches(
         line_sample=search.model.project(measured),
@@ -364,7 +365,7 @@ def _at_scene_resolution(chip: ChipArray, ratio: float, reduction: int) -> Float
         ratio: ground sampling of the scene over that of the chip.
         reduction: every so many pixels one is kept, the centre among them.
     """
-    smooth = low_pass(chip_pixels(chip), max(ratio, float(reduction)))
+    smooth = low_pass(bridged(chip_pixels(chip)), max(ratio, float(reduction)))
     first = CHIP_CENTRE % reduction
     return np.ascontiguousarray(smooth[first::reduction, first::reduction])
 

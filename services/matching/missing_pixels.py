@@ -3,13 +3,13 @@
 import cv2
 import numpy as np
 
-from services.types import FloatImage
+from services.types import Array, FloatImage
 
 _FILL_SIDES = (3, 7, 15, 31)
 """Sides of the squares whose valid pixels fill a missing one: the smallest that has any."""
 
 
-def missing_reason(pixels: FloatImage) -> str:
+def missing_reason(pixels: FloatImage | Array) -> str:
     """Why most invalid pixels are invalid: "saturated" (+inf) or "nodata" (NaN)."""
     saturated = int(np.isposinf(pixels).sum())
     return "saturated" if 2 * saturated > int((~np.isfinite(pixels)).sum()) else "nodata"

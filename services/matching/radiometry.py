@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from services.imagery.gaps import LOST_SHARE
+from services.matching.missing_pixels import missing_reason
 from services.types import Array, BoolArray, FloatImage
 
 MIN_FOUND = 5
@@ -46,22 +48,43 @@ def patch_statistics(pixels: FloatImage) -> Array:
     """Brightness and roughness of the squares of a patch.
 
     Args:
-        pixels: (r, c); NaN where there is no data.
+        pixels: (r, c); NaN where there is no data, +inf where saturated.
 
     Returns:
-        (squares, 2): mean, and mean absolute difference of neighbours; NaN where a square has missing
-        pixels.
+        (squares, 2): mean, and mean absolute difference of neighbours, of the valid pixels. Where more
+        than half of a square is lost, +inf and 0 when most of that is saturated, else NaN.
     """
     rows, columns = (size // CELL_PX for size in pixels.shape)
     inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
     squares = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
     cells = squares.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
-    roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
+    statistics = _mean_and_roughness(cells)
+    for cell in np.flatnonzero(~np.isfinite(statistics).all(axis=1)):
+        statistics[cell] = _of_damaged_square(cells[cell])
+    return statistics
+
+
+def _mean_and_roughness(cells: Array) -> Array:
+    """Mean and mean absolute difference of neighbours (n, 2) of squares (n, r, c)."""
+    with np.errstate(invalid="ignore"):
+        roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
     return np.column_stack([cells.mean(axis=(1, 2)), roughness])
+
+
+def _of_damaged_square(cell: Array) -> tuple[float, float]:
+    """Mean and roughness of the valid pixels of a square (r, c) with lost ones."""
+    valid = np.isfinite(cell)
+    if valid.mean() < 1.0 - LOST_SHARE:
+        return (np.inf, 0.0) if missing_reason(cell) == "saturated" else (np.nan, np.nan)
+    both = valid[:, 1:] & valid[:, :-1]
+    steps = np.abs(cell[:, 1:][both] - cell[:, :-1][both])
+    return float(cell[valid].mean()), float(steps.mean()) if len(steps) else np.nan
 
 
 def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:
     """Which points (n,) clouds hide: not found, and much of their surroundings is bright and smooth.
+
+    A saturated square is both.
 
     Args:
         statistics: (squares, 2) around each of n points, see `patch_statistics`.
@@ -71,10 +94,13 @@ def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:
     if found.sum() < MIN_FOUND:
         return hidden
     ground = np.concatenate([of_point for of_point, seen in zip(statistics, found, strict=True) if seen])
-    min_brightness = np.nanquantile(ground[:, 0], CLOUD_BRIGHTNESS)
-    median_roughness = np.nanmedian(ground[:, 1])
+    ground = ground[np.isfinite(ground).all(axis=1)]
+    if not len(ground):
+        return hidden
+    min_brightness = np.quantile(ground[:, 0], CLOUD_BRIGHTNESS)
+    median_roughness = np.median(ground[:, 1])
     for row in np.flatnonzero(~found).tolist():
-        squares = statistics[row][np.isfinite(statistics[row]).all(axis=1)]
+        squares = statistics[row][~np.isnan(statistics[row]).any(axis=1)]
         cloud = (squares[:, 0] > min_brightness) & (squares[:, 1] < CLOUD_ROUGHNESS * median_roughness)
         hidden[row] = len(squares) > 0 and cloud.mean() >= CLOUD_SHARE
     return hidden

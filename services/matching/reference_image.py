@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from services.errors import InputError
+from services.imagery.gaps import bridged
 from services.imagery.source import (
     ArrayImage,
     ImageSource,
@@ -208,10 +209,10 @@ def locate_on_terrain(model: SensorModel, line_sample: Array, terrain: Terrain |
 def _level_patch(
     image: ImageSource | ReducedImage, cell: IntArray, half: int, factor: int
 ) -> FloatImage:
-    """Pixels (2 half + 1, 2 half + 1) of a level around one of its pixels."""
+    """Pixels (2 half + 1, 2 half + 1) of a level around one of its pixels, small gaps bridged."""
     line, sample = (int(v) - half for v in cell)
     size = 2 * half + 1
     if isinstance(image, ReducedImage):
-        return ArrayImage(image.pixels).read(Window(line, sample, size, size))
+        return bridged(ArrayImage(image.pixels).read(Window(line, sample, size, size)))
     window = Window(line * factor, sample * factor, size * factor, size * factor)
-    return block_means(image.read(window), factor)
+    return bridged(block_means(image.read(window), factor))

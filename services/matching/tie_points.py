@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from services.conventions import MAX_ERROR_SIGMAS
+from services.imagery.gaps import bridged, filled
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window
 from services.sensors.base import SensorModel
@@ -107,15 +108,15 @@ def find_features(image: ImageSource, options: FeatureOptions) -> Features:
 
 
 def _tile_features(pixels: FloatImage, count: int, largest_px: float) -> Features:
-    """SIFT features of one tile, away from missing pixels."""
-    missing = ~np.isfinite(pixels)
-    if missing.all():
+    """SIFT features of one tile, away from areas without data and saturated ones."""
+    valid = np.isfinite(pixels)
+    if not valid.any():
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
-    low, high = np.percentile(pixels[~missing], [0.5, 99.5])
-    stretched = np.clip((pixels - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0)
-    mask = cv2.erode((~missing).astype(np.uint8) * 255, np.ones((9, 9), np.uint8))
+    low, high = np.percentile(pixels[valid], [0.5, 99.5])
+    mask = cv2.erode(np.isfinite(bridged(pixels)).astype(np.uint8) * 255, np.ones((9, 9), np.uint8))
     sift = cv2.SIFT.create(nfeatures=max(count, 50), contrastThreshold=0.01)
-    image8 = np.where(missing, 0.0, stretched).astype(np.uint8)
+    stretched = (filled(pixels) - low) / max(high - low, 1e-6) * 255.0
+    image8 = np.clip(stretched, 0.0, 255.0).astype(np.uint8)
     sharp = [keypoint for keypoint in sift.detect(image8, mask) if keypoint.size <= largest_px]
     keypoints, descriptor = sift.compute(image8, sharp)
     if descriptor is None:

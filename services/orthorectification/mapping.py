@@ -27,6 +27,8 @@ _WORST_HEIGHT = math.sqrt(1.0 / 3.0)
 _OCCLUSION_M = 0.1
 """Ground that rises above a line of sight by more than this occludes the ground behind it."""
 _MAX_STEPS = 4096
+_ROUNDING_NODES = 1e-6
+"""Positions in the terrain that differ by less are the same."""
 
 
 @dataclass(frozen=True)
@@ -245,16 +247,27 @@ def _error_px(model: SensorModel, terrain: Terrain, grid: MapGrid, table: _Table
 
 
 @njit(inline="always", error_model="numpy")
+def _at_node(position: float) -> float:
+    """A position along an axis of a grid, or its node where it differs by rounding alone."""
+    node = np.floor(position + 0.5)
+    return node if abs(position - node) < _ROUNDING_NODES else position
+
+
+@njit(inline="always", error_model="numpy")
 def _height(heights: FloatImage, line: float, sample: float) -> float:
-    """Bilinear height; constant for half a node beyond the grid, NaN farther out and beside voids."""
+    """Bilinear height; constant for half a node beyond the grid, NaN farther out and beside voids.
+
+    A void with zero weight does not count: a node has its height, whatever lies beside it.
+    """
     lines, samples = heights.shape
     if not (-0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5):
         return np.nan
-    line = min(max(line, 0.0), lines - 1.0)
-    sample = min(max(sample, 0.0), samples - 1.0)
-    i, j = min(int(line), max(lines - 2, 0)), min(int(sample), max(samples - 2, 0))
-    i1, j1 = min(i + 1, lines - 1), min(j + 1, samples - 1)
+    line = _at_node(min(max(line, 0.0), lines - 1.0))
+    sample = _at_node(min(max(sample, 0.0), samples - 1.0))
+    i, j = int(line), int(sample)
     fi, fj = line - i, sample - j
+    i1 = i + 1 if fi > 0.0 else i
+    j1 = j + 1 if fj > 0.0 else j
     a, b = float(heights[i, j]), float(heights[i, j1])
     c, d = float(heights[i1, j]), float(heights[i1, j1])
     top = a + fj * (b - a)

@@ -10,6 +10,7 @@ from numba import njit
 
 from services.errors import CoverageError, InputError
 from services.geodesy import metres_per_degree
+from services.imagery.gaps import LOST_SHARE
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, Window, block_means, low_pass
 from services.map_grid import MapGrid, check_map_code, utm_of, xy_of_lon_lat
@@ -25,8 +26,8 @@ _MAX_MAP_PIXELS = 40_000_000_000
 _KERNEL_REACH_PX = 3
 _INTERVALS = 16
 """Intervals along each side of an image between the positions that are located for its map."""
-_RATIO_STEP = 8
-"""Map pixels between those whose size in the image is computed."""
+_FINER = 1.1
+"""Largest ratio of a map pixel to an image pixel without low-pass: they are nearly of the same size."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class OrthoWindow:
 
     Attributes:
         window: of the map.
-        pixels: (bands, lines, samples) float32; NaN where the scene has no data.
+        pixels: (bands, lines, samples) float32; NaN where the scene has no data, +inf where it is
+            saturated.
         error_px: largest error of the positions where they were checked, pixels of the scene.
     """
 
@@ -132,6 +134,8 @@ class _Task:
         terrain: the ground.
         grid: the map.
         options: of the rectification.
+        ratio: image pixels per map pixel along a side, in the middle of the image; 1 for finer maps. One
+            for all windows, so that the image does not depend on them.
     """
 
     images: Sequence[ImageSource]
@@ -139,6 +143,7 @@ class _Task:
     terrain: Terrain
     grid: MapGrid
     options: OrthoOptions
+    ratio: float
 
 
 def orthorectify(
@@ -166,7 +171,7 @@ def orthorectify(
     Raises:
         ComputationError: positions exceed the tolerance.
     """
-    task = _Task(images, model, terrain, grid, options)
+    task = _Task(images, model, terrain, grid, options, _ratio(model, grid, images[0].shape))
     lines, samples = grid.shape
     side = options.window_px
     for line in range(0, lines, side):
@@ -193,9 +198,7 @@ def _rectified(task: _Task, window: Window) -> OrthoWindow:
     if task.options.hide:
         hidden = occluded_ground(task.model, task.terrain, task.grid, window, mapping.height_m)
         line_sample[hidden] = np.nan
-    pixels = np.stack(
-        [_sampled(image, line_sample, first, size, task.options.kernel) for image in task.images]
-    )
+    pixels = np.stack([_sampled(task, image, line_sample, first, size) for image in task.images])
     return OrthoWindow(window, pixels, mapping.error_px)
 
 
@@ -214,36 +217,36 @@ def _divided(task: _Task, window: Window) -> OrthoWindow:
     return OrthoWindow(window, pixels, error_px)
 
 
-def _ratio(line_sample: Array) -> float:
-    """Image pixels per map pixel along a side, the median over a window."""
-    every = slice(None, -1, _RATIO_STEP), slice(1, None, _RATIO_STEP)
-    corner = line_sample[every[0], every[0]]
-    along, down = line_sample[every[0], every[1]] - corner, line_sample[every[1], every[0]] - corner
-    area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0])
-    area = area[np.isfinite(area)]
-    return math.sqrt(float(np.median(area))) if len(area) else 1.0
+def _ratio(model: SensorModel, grid: MapGrid, shape: tuple[int, int]) -> float:
+    """Image pixels per map pixel along a side, in the middle of the image; 1 where the map is finer."""
+    middle = (np.array([shape], dtype=np.float64) - 1.0) / 2.0
+    height_m = sum(model.height_range_m) / 2.0
+    lon_lat = model.locate(middle, np.array([height_m]))[:, :2]
+    corners = grid.line_sample(lon_lat) + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    seen = model.project(np.column_stack([grid.lon_lat(corners), np.full(3, height_m)]))
+    ratio = math.sqrt(abs(float(np.linalg.det(seen[1:] - seen[0]))))
+    return ratio if ratio > _FINER else 1.0
 
 
 def _sampled(
-    image: ImageSource, line_sample: Array, first: IntArray, size: IntArray, kernel: str
+    task: _Task, image: ImageSource, line_sample: Array, first: IntArray, size: IntArray
 ) -> FloatImage:
     """Values (lines, samples) of an image at positions (lines, samples, 2).
 
     Args:
-        image: one band.
+        task: of the ortho-image.
+        image: one of its bands.
         line_sample: positions; NaN where there is no value.
         first, size: (2,) of the window of the image that contains the positions, pixels.
-        kernel: see `OrthoOptions`.
     """
-    # Pixels of nearly the same size need no low-pass.
-    ratio = _ratio(line_sample)
-    ratio = ratio if ratio > 1.1 else 1.0
+    ratio = task.ratio
     factor = max(1, int(ratio / 2.0))
     margin = _KERNEL_REACH_PX * factor + int(2.0 * ratio)
     begin = first - margin
     lines, samples = (int(count) for count in size + 2 * margin)
-    # The kernels extend the image by the pixels of its border.
-    low = np.clip(begin, 0, np.array(image.shape) - 1)
+    # The kernels extend the image by the pixels of its border. Squares begin at multiples of the factor
+    # in every window, so that the image does not depend on its windows.
+    low = np.clip(begin, 0, np.array(image.shape) - 1) // factor * factor
     high = np.clip(begin + [lines, samples], 1, np.array(image.shape))
     whole = (high - low) // factor * factor
     whole = np.where(whole == 0, high - low, whole) if factor > 1 else high - low
@@ -251,7 +254,7 @@ def _sampled(
     factor = factor if min(pixels.shape) >= factor else 1
     pixels = np.ascontiguousarray(low_pass(block_means(pixels, factor), ratio / factor))
     origin = (float(low[0]), float(low[1]))
-    return _resampled(pixels, line_sample, origin, factor, kernel == "cubic")
+    return _resampled(pixels, line_sample, origin, factor, task.options.kernel == "cubic")
 
 
 @njit(cache=True)
@@ -308,7 +311,7 @@ def _resampled(
     factor: int,
     cubic: bool,
 ) -> FloatImage:
-    """Values (lines, samples) at positions of the image; bilinear beside missing pixels.
+    """Values (lines, samples) at positions of the image; bilinear beside lost pixels.
 
     Args:
         pixels: means over squares of `factor` pixels of the image.
@@ -339,11 +342,31 @@ def _resampled(
                 c = _weighted(pixels, i + 1, j, weights)
                 d = _weighted(pixels, i + 2, j, weights)
                 value = u0 * a + u1 * b + u2 * c + u3 * d
-                if value == value:
+                if np.isfinite(value):
                     out[r, s] = value
                     continue
-            out[r, s] = _bilinear(pixels, line, sample)
+            value = _bilinear(pixels, line, sample)
+            out[r, s] = value if np.isfinite(value) else _beside_lost(pixels, line, sample)
     return out
+
+
+@njit(error_model="numpy")
+def _beside_lost(pixels: FloatImage, line: float, sample: float) -> float:
+    """Bilinear value of the valid pixels of four; the kind of the lost ones where these weigh more."""
+    lines, samples = pixels.shape
+    i, j = int(line), int(sample)
+    total, weight, excess = 0.0, 0.0, 0.0
+    for k in range(i, min(i + 2, lines)):
+        for m in range(j, min(j + 2, samples)):
+            w = (1.0 - abs(line - k)) * (1.0 - abs(sample - m))
+            if np.isfinite(pixels[k, m]):
+                total += w * pixels[k, m]
+                weight += w
+            else:
+                excess += w if pixels[k, m] == np.inf else -w
+    if weight >= 1.0 - LOST_SHARE:
+        return total / weight
+    return np.inf if excess > 0.0 else np.nan
 
 
 def _grid_over(shape: tuple[int, int]) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around
+from services.imagery.gaps import bridged, filled
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import Window, block_means, render_chip
 from services.matching.multi_image import chip_inside, chip_saliency, stored_chip
@@ -191,13 +192,13 @@ def _best_corner(
 
 
 def _corners(pixels: FloatImage, count: int) -> Array:
-    """The strongest corners (n, 2), row and column, away from missing pixels."""
-    missing = ~np.isfinite(pixels)
-    if missing.all() or min(pixels.shape) < 8:
+    """The strongest corners (n, 2), row and column, away from areas without data and saturated ones."""
+    if not np.isfinite(pixels).any() or min(pixels.shape) < 8:
         return np.empty((0, 2))
-    filled = np.where(missing, np.float32(pixels[~missing].mean()), pixels)
-    mask = cv2.erode((~missing).astype(np.uint8), np.ones((9, 9), np.uint8))
-    col_row = cv2.goodFeaturesToTrack(filled, count, 0.01, _CORNER_DISTANCE_PX, mask=mask, blockSize=7)
+    mask = cv2.erode(np.isfinite(bridged(pixels)).astype(np.uint8), np.ones((9, 9), np.uint8))
+    col_row = cv2.goodFeaturesToTrack(
+        filled(pixels), count, 0.01, _CORNER_DISTANCE_PX, mask=mask, blockSize=7
+    )
     return np.empty((0, 2)) if col_row is None else col_row.reshape(-1, 2)[:, ::-1].astype(np.float64)
 
 

@@ -46,11 +46,15 @@ def image_panel(report: RegistrationReport, darkness: float, above: float, below
 
 
 def _draw_quicklook(panel: Panel, quicklook: Quicklook, darkness: float) -> None:
-    """Draw the reduced scene, stretched and darkened; nothing where there is no data."""
-    opaque = np.isfinite(quicklook.pixels) & (quicklook.pixels != 0.0)
+    """Draw the reduced scene, stretched and darkened; nothing where there is no data.
+
+    Saturated pixels are as bright as the brightest one.
+    """
+    opaque = ~np.isnan(quicklook.pixels) & (quicklook.pixels != 0.0)
     if not opaque.any():
         return
-    pixels = np.where(opaque, quicklook.pixels, np.float32(0.0))
+    brightest = np.max(quicklook.pixels, initial=0.0, where=np.isfinite(quicklook.pixels))
+    pixels = np.minimum(np.where(opaque, quicklook.pixels, np.float32(0.0)), np.float32(brightest))
     largest = max(pixels.shape)
     if largest > _IMAGE_PX:
         size = [max(1, round(side * _IMAGE_PX / largest)) for side in pixels.shape[::-1]]

@@ -20,7 +20,7 @@ class Quicklook:
     """The scene, reduced to a size that fits a page.
 
     Attributes:
-        pixels: (h, w); NaN or 0 where there is no data.
+        pixels: (h, w); NaN or 0 where there is no data, +inf where saturated.
         reduction: pixels of the scene for one of the quicklook.
     """
 

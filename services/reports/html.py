@@ -97,10 +97,13 @@ def choose_pairs(gallery: tuple[ChipPair, ...]) -> tuple[GalleryGroup, ...]:
 
 
 def chip_uri(chip: ChipArray) -> str:
-    """A chip as an image inside the page, stretched from its 1st to its 99th percentile."""
+    """A chip as an image inside the page, stretched from its 1st to its 99th percentile.
+
+    Nodata is black and saturated pixels are white.
+    """
     values = chip.astype(np.float32)
     valid = np.isfinite(values) & (values != 0.0)
-    grey = np.zeros(values.shape, dtype=np.uint8)
+    grey = np.where(np.isposinf(values), 255, 0).astype(np.uint8)
     if valid.any():
         low, high = np.percentile(values[valid], [1.0, 99.0])
         stretched = (values[valid] - low) / max(float(high - low), 1e-6) * 255.0

@@ -87,11 +87,12 @@ def write_cog(
     bands: int,
     dtype: str,
     nodata: float,
+    saturated: int | None = None,
 ) -> float:
     """Write an ortho-image as a cloud-optimised GeoTIFF with overviews, window by window.
 
-    Integer pixels are rounded and clipped to the range of their type; a valid pixel never has the value
-    `nodata`.
+    Integer pixels are rounded and clipped to the range of their type; a valid pixel never has the values
+    `nodata` and `saturated`.
 
     Args:
         path: the file; an existing one is replaced when the new one is complete.
@@ -100,6 +101,7 @@ def write_cog(
         bands: number of bands.
         dtype: type of the pixels: uint8, uint16, int16 or float32.
         nodata: value of pixels outside the scene.
+        saturated: value of saturated pixels; by default the largest of the type.
 
     Returns:
         The largest `error_px` of the windows, in pixels.
@@ -127,7 +129,7 @@ def write_cog(
                 for ortho in windows:
                     w = ortho.window
                     target = RasterWindow(w.sample, w.line, w.samples, w.lines)
-                    file.write(_encoded(ortho.pixels, np.dtype(dtype), nodata), window=target)
+                    file.write(_encoded(ortho.pixels, np.dtype(dtype), nodata, saturated), window=target)
                     error_px = max(error_px, ortho.error_px)
             predictor = "FLOATING_POINT" if dtype == "float32" else "STANDARD"
             rasterio.shutil.copy(
@@ -147,13 +149,19 @@ def write_cog(
     return error_px
 
 
-def _encoded(pixels: FloatImage, dtype: np.dtype[Any], nodata: float) -> np.ndarray:
-    """Pixels in the type of the file, with `nodata` for NaN."""
+def _encoded(
+    pixels: FloatImage, dtype: np.dtype[Any], nodata: float, saturated: int | None
+) -> np.ndarray:
+    """Pixels in the type of the file, with `nodata` for NaN and `saturated` for +inf."""
     missing = np.isnan(pixels)
     if dtype.kind == "f":
-        return np.where(missing, nodata, pixels).astype(dtype)
+        brightest = np.inf if saturated is None else float(saturated)
+        return np.where(missing, nodata, np.where(np.isposinf(pixels), brightest, pixels)).astype(dtype)
     limits = np.iinfo(dtype)
     rounded = np.clip(np.rint(np.where(missing, 0.0, pixels)), limits.min, limits.max)
+    if saturated is not None:
+        rounded[rounded == saturated] = saturated - 1.0
+        rounded[np.isposinf(pixels)] = saturated
     neighbour = nodata + 1.0 if nodata < limits.max else nodata - 1.0
     rounded[rounded == nodata] = neighbour
     return np.where(missing, nodata, rounded).astype(dtype)

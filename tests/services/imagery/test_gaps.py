@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.imagery.gaps import bridged, filled, lost_pixels, mostly_saturated
+from services.imagery.gaps import bridged, filled, lost_pixels
 from services.imagery.resampling import resample, spline_coefficients
 from services.imagery.source import ArrayImage, block_means, low_pass, sample_image
 from services.types import FloatImage
@@ -61,9 +61,6 @@ def test_an_area_has_the_kind_of_most_of_its_pixels() -> None:
     lost = lost_pixels(pixels, 2.0)
     assert (lost[25, 22:38] == np.inf).all()
     assert np.isnan(lost[65, 22:38]).all()
-    assert mostly_saturated(pixels[10:40])
-    assert not mostly_saturated(pixels[50:80])
-    assert not mostly_saturated(ground())
 
 
 def test_all_pixels_lost_are_filled_with_zeros() -> None:

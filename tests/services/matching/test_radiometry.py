@@ -72,10 +72,23 @@ def test_no_cloud_is_reported_where_too_few_points_were_found() -> None:
     assert not cloud_mask(statistics, np.arange(40) < 4).any()
 
 
-def test_squares_with_missing_pixels_have_no_statistics() -> None:
-    pixels = np.tile(np.array([[1.0, 3.0]], dtype=np.float32), (20, 13))
-    pixels[15, 15] = np.nan
+def test_squares_have_the_statistics_of_their_valid_pixels() -> None:
+    pixels = np.tile(np.array([[1.0, 3.0]], dtype=np.float32), (20, 22))
+    pixels[15, 14:16] = pixels[2, 22:24] = np.nan
+    pixels[3, 26:28] = np.inf
+    pixels[10:16, 20:30] = np.nan
+    pixels[10:16, 30:40] = np.inf
     statistics = patch_statistics(pixels)
-    assert statistics.shape == (4, 2)
-    np.testing.assert_allclose(statistics[:3], [[2.0, 2.0]] * 3)
-    assert np.isnan(statistics[3]).all()
+    assert statistics.shape == (8, 2)
+    np.testing.assert_allclose(statistics[:6], [[2.0, 2.0]] * 6)
+    assert np.isnan(statistics[6]).all()
+    assert list(statistics[7]) == [np.inf, 0.0]
+
+
+def test_saturated_surroundings_of_a_missing_point_are_a_cloud() -> None:
+    statistics, kinds = ground_and_clouds(np.random.default_rng(0))
+    statistics[kinds["cloud"]][:] = [np.inf, 0.0]
+    # The brightest ground found may be saturated too, and says nothing about the rest.
+    statistics[0][:2] = [np.inf, 0.0]
+    hidden = cloud_mask(statistics, np.arange(40) < 20)
+    assert list(np.flatnonzero(hidden)) == [kinds["cloud"], kinds["part of a cloud"]]

@@ -1,9 +1,11 @@
 """The page: whole, closed to the network, safe with hostile names, and sound on poor registrations."""
 
+import base64
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import cv2
 import numpy as np
 import pytest
 
@@ -238,9 +240,45 @@ def test_an_empty_gallery_takes_no_room(material):
     assert "Chips and the scene" not in page(material(pairs=0))
 
 
-@pytest.mark.parametrize("chip", [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan)])
+@pytest.mark.parametrize(
+    "chip",
+    [np.zeros((101, 101), np.uint8), np.full((101, 101), np.nan), np.full((101, 101), np.inf)],
+)
 def test_a_chip_without_data_is_still_an_image(chip):
     assert chip_uri(chip).startswith("data:image/png;base64,")
+
+
+def shown(uri: str) -> np.ndarray:
+    """The grey values of an image inside a page."""
+    encoded = base64.b64decode(uri.partition(",")[2])
+    return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def test_saturated_pixels_of_a_chip_are_white_and_change_nothing_else():
+    chip = np.random.default_rng(2).uniform(100.0, 200.0, (101, 101)).astype(np.float32)
+    damaged = chip.copy()
+    damaged[30:33, 40:45] = np.inf
+    grey, plain = shown(chip_uri(damaged)), shown(chip_uri(chip))
+    lost = damaged == np.inf
+    assert (grey[lost] == 255).all()
+    assert np.abs(grey[~lost].astype(int) - plain[~lost]).max() <= 1
+
+
+def test_saturated_pixels_of_a_quicklook_are_as_bright_as_the_brightest(material):
+    made = material()
+    pixels = np.full((20, 25), 500.0, dtype=np.float32)
+    pixels[:, :12] = 300.0
+    pixels[3:6, 4:8] = np.inf
+    pixels[10:12, 20:] = np.nan
+    quicklook = Quicklook(pixels, 200.0)
+    markup = page(replace(made, figure_data=replace(made.figure_data, quicklook=quicklook)))
+    uri = re.search(r'href="(data:image/png;base64,[^"]+)"', markup)
+    assert uri is not None
+    picture = shown(uri[1])
+    brightness, opacity = picture[..., 0], picture[..., 3]
+    assert brightness[3:6, 4:8].min() == brightness.max()
+    assert (opacity[10:12, 20:] == 0).all()
+    assert (opacity == 0).sum() == 10
 
 
 @pytest.mark.parametrize(

@@ -290,6 +290,13 @@ def test_pixels_that_a_mask_excludes_are_nan(tmp_path: Path, factor: int) -> Non
     np.testing.assert_array_equal(np.isnan(part[5:, :67]), hidden[:15, 33:])
 
 
+def test_a_mask_of_sixteen_bits_may_use_its_largest_value(tmp_path: Path) -> None:
+    cloud = np.random.default_rng(2).random((1, *SHAPE)) < 0.3
+    mask = write(tmp_path / "mask.tif", np.where(cloud, 65535, 0).astype(np.uint16))
+    image = read_scene(write(tmp_path / "a.tif"), sigma_m=1.0, mask=mask).image
+    np.testing.assert_array_equal(np.isnan(image.read(ALL)), cloud[0])
+
+
 def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     mask = write(tmp_path / "mask.tif", np.ones((1, 80, 80), np.uint8))
     with pytest.raises(FormatError, match=r"mask\.tif.*80 x 80"):
