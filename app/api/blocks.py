@@ -1,6 +1,6 @@
 """Blocks: the quality of each, and the life of a block for administrators."""
 
-from typing import Annotated
+from typing import Annotated, Any
 from uuid import UUID
 
 from fastapi import APIRouter, Header, Request, Response
@@ -29,6 +29,7 @@ from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.lifecycle import Published
 from app.usecases.jobs import JobRequest
 from app.usecases.scenes import SentFile
+from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import quality_document
 
 router = APIRouter(tags=["blocks"], route_class=CallerRoute)
@@ -101,7 +102,8 @@ def quality(*, reference: str, database: DatabaseDep, caller: PointsReader) -> B
     with database.reading() as connection:
         report = lifecycle.block_report(connection, _visible_block(connection, reference, caller))
     accuracy = [AccuracyRecord.model_validate(figure) for figure in report.accuracy]
-    return BlockQuality(**quality_document(report.quality), accuracy=accuracy)
+    stated: dict[str, Any] = accuracy_document(report.stated)
+    return BlockQuality(**stated, **quality_document(report.quality), accuracy=accuracy)
 
 
 @router.post("/blocks/{reference}/publish")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, Row, print_json, show, show_one
+from app.cli.output import AsJson, Row, accuracy_rows, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
 from app.config import read_settings
@@ -19,6 +19,7 @@ from app.usecases.blocks import lifecycle
 from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.blocks.lifecycle import Published
 from app.usecases.damage import open_chips
+from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import BlockQuality, Distribution, quality_document
 
 app = typer.Typer(no_args_is_help=True)
@@ -47,9 +48,12 @@ def ingest(
         if publish:
             block = lifecycle.publish_block(connection, str(block.number)).block
     if as_json:
-        print_json({"block": _record(block), "quality": quality_document(ingested.quality)})
+        record = {**_record(block), **accuracy_document(ingested.stated)}
+        print_json({"block": record, "quality": quality_document(ingested.quality)})
         return
-    show_one({**_record(block), **_figures(ingested.quality)}, as_json=False)
+    show_one(
+        {**_record(block), **accuracy_rows(ingested.stated), **_figures(ingested.quality)}, as_json=False
+    )
 
 
 @app.command("list")
@@ -65,7 +69,9 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
     """Show one block."""
     with transaction() as connection:
         block = lifecycle.find_block(connection, reference)
-    show_one(_record(block), as_json=as_json)
+        stated = lifecycle.block_report(connection, block).stated
+    accuracy = accuracy_document(stated) if as_json else accuracy_rows(stated)
+    show_one({**_record(block), **accuracy}, as_json=as_json)
 
 
 @app.command()
@@ -75,13 +81,15 @@ def quality(reference: Reference, as_json: AsJson = False) -> None:
         report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
     if as_json:
         accuracy = [vars(figure) for figure in report.accuracy]
-        print_json({**quality_document(report.quality), "accuracy": accuracy})
+        stated = accuracy_document(report.stated)
+        print_json({**stated, **quality_document(report.quality), "accuracy": accuracy})
         return
     accuracy_lines = {
         f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
         for figure in report.accuracy
     }
-    show_one({**_figures(report.quality), **accuracy_lines}, as_json=False)
+    rows = {**accuracy_rows(report.stated), **_figures(report.quality), **accuracy_lines}
+    show_one(rows, as_json=False)
 
 
 @app.command()

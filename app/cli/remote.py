@@ -113,7 +113,8 @@ class Service:
     def _download(self, job_id: str, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         results = self._request("GET", f"jobs/{job_id}/results").json()
-        for name in (name for name, value in results.items() if isinstance(value, dict)):
+        files = (name for name, value in results.items() if isinstance(value, dict) and "href" in value)
+        for name in files:
             if Path(name).name != name:
                 raise ServiceFailure(f"the service names a result {name!r}, which is not a file name")
             with self._http.stream("GET", f"jobs/{job_id}/results/{name}") as reply:

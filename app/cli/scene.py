@@ -25,11 +25,14 @@ from app.usecases.registration.reference_source import ReferenceFiles
 from app.usecases.registration.register import SceneFiles
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
+from services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
 
 app = typer.Typer(no_args_is_help=True)
 
-_TABLE = ("active", "shift_m", "residual_rms_px", "ce90_predicted_px", "check_ce90_m", "seconds")
+_TABLE = ("active", "shift_m", "residual_rms_px", "check_ce90_m", "seconds")
 """Figures of a scene in the table of many scenes."""
+_STATED = ("relative_to_control_points", "on_the_earth")
+"""The two accuracies of an outcome."""
 
 
 @app.command()
@@ -203,7 +206,7 @@ def _show_one_scene(outcome: Outcome, *, as_json: bool) -> None:
     if as_json:
         print_json(outcome)
     else:
-        show_one({name: _rounded(value) for name, value in outcome.items()}, as_json=False)
+        show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
 
 
 def _show_scenes(outcomes: list[Outcome], *, as_json: bool) -> None:
@@ -213,10 +216,24 @@ def _show_scenes(outcomes: list[Outcome], *, as_json: bool) -> None:
         return
     rows = []
     for outcome in outcomes:
-        row = {"scene": outcome["scene"], "verdict": outcome["verdict"]}
-        row |= {name: _rounded(outcome.get(name)) for name in _TABLE}
+        row = _verdict_rows(outcome) | _other_rows(outcome, _TABLE)
         rows.append(row | {"reason": outcome["reason"] if outcome["exit_status"] else None})
     show(rows, as_json=False)
+
+
+def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
+    """Scene, verdict and the accuracy it speaks of, and the two accuracies, for people."""
+    scope = outcome.get("verdict_scope")
+    verdict = f"{outcome['verdict']}, {scope}" if scope else outcome["verdict"]
+    rows = {"scene": outcome["scene"], "verdict": verdict, RELATIVE: None, ON_THE_EARTH: None}
+    stated = (outcome.get(name) for name in _STATED)
+    return rows | {one["label"]: one["words"] for one in stated if one}
+
+
+def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
+    """The other figures of an outcome, for people."""
+    shown = {"scene", "verdict", "verdict_scope", *_STATED}
+    return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
 
 
 def _rounded(value: Any) -> Any:

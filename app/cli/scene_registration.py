@@ -190,6 +190,9 @@ def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcom
     return {
         "scene": request.files.image,
         "verdict": report["verdict"],
+        "verdict_scope": report["verdict_scope"],
+        "relative_to_control_points": report["relative_to_control_points"],
+        "on_the_earth": report["on_the_earth"],
         "reason": _do_not_use(request, report) if is_failed else report["verdict_explanation"],
         "exit_status": NOT_REGISTERED if is_failed else SUCCESS,
         "visible": counts["visible"],
@@ -199,7 +202,6 @@ def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcom
         "shift_px": correction["shift_px"],
         "shift_m": correction["shift_m"],
         "residual_rms_px": report["image_residuals_px"]["xy"]["rms"],
-        "ce90_predicted_px": report["predicted"]["worst_px"],
         **_check_figures(report["checks"]),
         "output": request.folder,
     }
@@ -208,7 +210,7 @@ def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcom
 def _do_not_use(request: SceneRequest, report: dict[str, Any]) -> str:
     """Why a registration has the verdict failed: the criteria of a usable one that it does not meet."""
     unmet = [
-        criterion["label"]
+        f"{criterion['label']} {criterion['note']}".rstrip()
         for criterion in report["criteria"]
         if not criterion["met"] and criterion["needed_for"] == "usable"
     ]

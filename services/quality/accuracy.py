@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import bdtr, erf, gammaincinv
+from scipy.special import bdtr, erf, gammaincinv, ndtri
 
 from services.types import Array
 
@@ -20,6 +20,8 @@ NORMALISED_CONFIDENCE = 0.95
 
 CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
 """CE90 of a circular normal law of unit sigma (2.1460)."""
+LINEAR_LE90 = float(ndtri(0.95))
+"""LE90 of a normal law of unit sigma (1.6449)."""
 
 
 @dataclass(frozen=True)

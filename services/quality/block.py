@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
 from services.quality.density import DensityCells, density_cells, share_reaching
-from services.types import Array, ControlPoints, IntArray
+from services.types import Array, ControlPoints, Frame, IntArray
 
 HALF_PER_KM2 = 0.5
 QUARTER_PER_KM2 = 0.25
@@ -86,6 +87,11 @@ def distribution(values: Array | IntArray) -> Distribution:
         p90=float(np.quantile(values, 0.9)),
         maximum=float(values.max()),
     )
+
+
+def block_accuracy(quality: BlockQuality, frame: Frame) -> AccuracyStatement:
+    """The accuracy of the median point of a block, in its frame and on the Earth."""
+    return points_accuracy(quality.sigma_horizontal_m.median, quality.sigma_up_m.median, frame)
 
 
 def quality_document(quality: BlockQuality) -> dict[str, Any]:

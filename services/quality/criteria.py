@@ -10,7 +10,7 @@ VERDICT_EXPLANATIONS: dict[Verdict, str] = {
     "good": "Every criterion is met.",
     "usable": "Fit for use. Every criterion of a usable registration is met, but not every criterion of "
     "a good one.",
-    "failed": "Not fit for use. A criterion that every registration must meet is not met.",
+    "failed": "Not fit for use. A criterion that a usable registration must meet is not met.",
 }
 """What each verdict means, for people."""
 
@@ -30,6 +30,7 @@ class Criterion:
         needed_for: "good" or "usable": the best verdict that is impossible without this criterion.
         met: whether the value meets the limit; a value that could not be computed never does.
         calculation: how the value is calculated, for people.
+        note: why there is no value, for people; "" where there is one.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Criterion:
     needed_for: Grade
     met: bool
     calculation: str
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,23 +74,30 @@ _DESCRIPTIONS = {
         "px",
         2,
         "Standard deviation of the active residuals (n - 1 in the denominator), the larger of x and y, "
-        "without the part that chance and the stated accuracy of the points explain.",
+        "without the part that chance and the accuracy of the points explain: as stated, at most what "
+        "separates neighbouring points.",
     ),
     "displacement_px": _Description(
         "Displacement with fewer points",
         "px",
         2,
         "The adjustment is repeated on random parts of the active points. Displacement of the four "
-        "corners and the centre: median over the draws, largest of the five places. Points coarser than "
-        "the pixels of the scene raise the limit.",
+        "corners and the centre: median over the draws, largest of the five places.",
     ),
     "predicted_ce90_px": _Description(
         "Predicted CE90, worst place",
         "px",
         2,
         "The covariance of the correction is propagated to a grid over the image. Radius that holds "
-        "90 % of its normal law, largest of the grid. Points coarser than the pixels of the scene raise "
-        "the limit.",
+        "90 % of its normal law, largest of the grid.",
+    ),
+    "ce90_on_earth_m": _Description(
+        "CE90 on the Earth, worst place",
+        "m",
+        2,
+        "The covariance of the correction, and that of the frame of the control points through the "
+        "derivative of the model, on the ground at its true height. Radius that holds 90 % of the "
+        "normal law, largest of the grid. The option max_ce90_on_earth_m sets the limit.",
     ),
     "unit_weight": _Description(
         "Standard deviation of unit weight",
@@ -148,3 +157,9 @@ def verdict_of(criteria: tuple[Criterion, ...]) -> Verdict:
     if "usable" in impossible:
         return "failed"
     return "usable" if "good" in impossible else "good"
+
+
+def verdict_scope(criteria: tuple[Criterion, ...]) -> str:
+    """The accuracy that a verdict speaks of: that of every place which states both."""
+    on_the_earth = any(criterion.name == "ce90_on_earth_m" for criterion in criteria)
+    return f"relative to the control points{' and on the Earth' if on_the_earth else ''}"

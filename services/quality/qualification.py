@@ -1,22 +1,24 @@
 """How good a registration is: figures first, then a verdict that follows from thresholds alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
-from services.quality.accuracy import Statistics, normal_ce90, statistics
+from services.quality.accuracy import Statistics, statistics
+from services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
 from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
+from services.quality.frames import why_unknown
+from services.quality.predicted import PredictedAccuracy, predict_accuracy
 from services.quality.stability import (
     AdjustedScene,
     ImageResiduals,
-    PredictedAccuracy,
     Stability,
     measure_stability,
-    predict_accuracy,
     residuals_in_image,
 )
-from services.types import Array, Measures
+from services.types import Array, Frame, Measures
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,15 @@ class QualificationOptions:
         good_coverage_percent: smallest coverage of the image by active points.
         good_active_of_matched: smallest ratio of active to matched points.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate, without the part that chance and the stated accuracy of the points
-            explain.
+            of the worse coordinate, without the part that chance and the accuracy of the points explain.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
+        good_displacement_m: displacements up to this are good where the pixels are finer (SRP: corners
+            within 0.3 m).
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
-        good_displacement_of_points, usable_displacement_of_points, good_ce90_of_points,
-            usable_ce90_of_points: the limits of displacement and CE90 as shares of the CE90 of the
-            points, where these allow more than the limits in pixels. Points coarser than the pixels
-            still make a model several times better than they are (SRP: corners within 0.3 m with points
-            of 3 m).
+        good_ce90_m: a predicted CE90 up to this is good where the pixels are finer (SRP: 0.4 m).
+        max_ce90_on_earth_m: largest CE90 on the Earth, with the frame of the control points, of a usable
+            registration; None sets no limit.
         good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
         good_second_consensus_share: largest group of deactivated points that agree on another
             displacement, as a share of the active points. A scene has one displacement, not two.
@@ -57,17 +58,16 @@ class QualificationOptions:
     good_active_of_matched: float = 0.5
     good_residual_std_px: float = 1.0
     good_displacement_px: float = 0.5
-    good_displacement_of_points: float = 0.1
+    good_displacement_m: float = 0.3
     good_ce90_px: float = 1.0
-    good_ce90_of_points: float = 0.25
+    good_ce90_m: float = 0.4
+    max_ce90_on_earth_m: float | None = None
     good_unit_weight: float = 3.0
     good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
-    usable_displacement_of_points: float = 0.3
     usable_ce90_px: float = 3.0
-    usable_ce90_of_points: float = 0.5
     coverage_cells: int = 5
     grid: int = 7
     draws: int = 10
@@ -138,6 +138,7 @@ class Qualification:
         image_residuals_px, ground_residuals_m: of the active points.
         stability: the adjustment repeated without a part of its points.
         predicted: accuracy by the covariance of the correction.
+        accuracy: as every place states it.
         coverage: of the image by active points.
     """
 
@@ -148,6 +149,7 @@ class Qualification:
     ground_residuals_m: GroundResiduals
     stability: Stability
     predicted: PredictedAccuracy
+    accuracy: AccuracyStatement
     coverage: Coverage
 
 
@@ -171,14 +173,15 @@ def qualify(
         active_points=point_counts.active,
         active_of_matched=point_counts.active_of_matched,
         coverage_percent=coverage.percent,
-        residual_std_px=unexplained_px(residuals, adjustment.point_sigma_px),
+        residual_std_px=unexplained_px(measures, adjustment.point_sigma_px),
         displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
         predicted_ce90_px=predicted.worst_px,
-        points_ce90_px=float(normal_ce90(np.diag(adjustment.point_sigma_px**2)[None])[0]),
         unit_weight=adjustment.sigma0,
         second_consensus_share=second_consensus_share(measures),
     )
-    criteria = _criteria(figures, options)
+    criteria = _criteria(figures, options, scene.gsd_m)
+    if options.max_ce90_on_earth_m is not None:
+        criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)
     return Qualification(
         verdict=verdict_of(criteria),
         criteria=criteria,
@@ -187,6 +190,7 @@ def qualify(
         ground_residuals_m=_residuals_on_ground(measures.residual_m[measures.active]),
         stability=stability,
         predicted=predicted,
+        accuracy=scene_accuracy(predicted.worst_m, predicted.on_the_earth_worst_m, scene.frame),
         coverage=coverage,
     )
 
@@ -205,21 +209,28 @@ def count_points(measures: Measures) -> PointCounts:
     )
 
 
-def unexplained_px(residuals: ImageResiduals, point_sigma_px: Array) -> float:
+def unexplained_px(measures: Measures, point_sigma_px: Array) -> float:
     """Standard deviation of the worse coordinate without the part that the points' accuracy explains.
 
     Points of 3 m do not make a scene of 0.5 m pixels bad: many of them still determine its model well.
-    The variance of n residuals has a relative standard deviation of sqrt(2 / n); chance explains two of
-    these.
+    Errors of points are independent, so that they also separate neighbours; what neighbours share is an
+    error of the model, whatever sigmas the points state. The explained variance is therefore the stated
+    one, at most that between neighbours. The variance of n residuals has a relative standard deviation
+    of sqrt(2 / n); chance explains two of these.
 
     Args:
-        residuals: of the active points.
-        point_sigma_px: (2,) line and sample.
+        measures: of the scene; the active points count.
+        point_sigma_px: (2,) line and sample, of the points as stated.
     """
-    variance = np.array([residuals.y.std, residuals.x.std]) ** 2
-    chance = 1.0 + 2.0 * np.sqrt(2.0 / max(residuals.x.n, 1))
-    unexplained = np.maximum(variance - chance * point_sigma_px**2, 0.0)
-    return float(np.sqrt(unexplained.max()))
+    residual = measures.residual_px[measures.active]
+    if len(residual) < 2:
+        return float("nan")
+    line_sample = measures.line_sample[measures.active]
+    _, nearest = KDTree(line_sample).query(line_sample, k=2)
+    between_neighbours = ((residual - residual[nearest[:, 1]]) ** 2).mean(axis=0) / 2.0
+    chance = 1.0 + 2.0 * np.sqrt(2.0 / len(residual))
+    explained = chance * np.minimum(point_sigma_px**2, between_neighbours)
+    return float(np.sqrt(np.maximum(residual.var(axis=0, ddof=1) - explained, 0.0).max()))
 
 
 def second_consensus_share(measures: Measures) -> float:
@@ -254,11 +265,7 @@ def image_coverage(line_sample: Array, shape: tuple[int, int], cells: int) -> Co
 
 @dataclass(frozen=True)
 class _Figures:
-    """The figures that have limits; each bears the name of its criterion.
-
-    Attributes:
-        points_ce90_px: CE90 of the points' own accuracy; it raises the limits of displacement and CE90.
-    """
+    """The figures that have limits; each bears the name of its criterion."""
 
     active_points: int
     active_of_matched: float
@@ -266,20 +273,22 @@ class _Figures:
     residual_std_px: float
     displacement_px: float
     predicted_ce90_px: float
-    points_ce90_px: float
     unit_weight: float
     second_consensus_share: float
 
 
-def _criteria(figures: _Figures, options: QualificationOptions) -> tuple[Criterion, ...]:
+def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Criterion:
+    """The criterion on the Earth, which a user asks for; a frame that nobody stated does not meet it."""
+    criterion = at_most("ce90_on_earth_m", predicted.on_the_earth_worst_m, limit_m, "usable")
+    unknown = "" if np.isfinite(criterion.value) else f"unknown: {why_unknown(frame)}"
+    return replace(criterion, note=unknown)
+
+
+def _criteria(figures: _Figures, options: QualificationOptions, gsd_m: float) -> tuple[Criterion, ...]:
     """The figures compared with the thresholds."""
     f, o = figures, options
-    good_ce90_px = max(o.good_ce90_px, o.good_ce90_of_points * f.points_ce90_px)
-    usable_ce90_px = max(o.usable_ce90_px, o.usable_ce90_of_points * f.points_ce90_px)
-    good_displacement_px = max(o.good_displacement_px, o.good_displacement_of_points * f.points_ce90_px)
-    usable_displacement_px = max(
-        o.usable_displacement_px, o.usable_displacement_of_points * f.points_ce90_px
-    )
+    good_ce90_px = max(o.good_ce90_px, o.good_ce90_m / gsd_m)
+    good_displacement_px = max(o.good_displacement_px, o.good_displacement_m / gsd_m)
     return (
         at_least("active_points", f.active_points, o.good_active_points, "good"),
         at_least("coverage_percent", f.coverage_percent, o.good_coverage_percent, "good"),
@@ -289,8 +298,8 @@ def _criteria(figures: _Figures, options: QualificationOptions) -> tuple[Criteri
         at_most("predicted_ce90_px", f.predicted_ce90_px, good_ce90_px, "good"),
         at_least("active_points", f.active_points, o.usable_active_points, "usable"),
         at_most("residual_std_px", f.residual_std_px, o.usable_residual_std_px, "usable"),
-        at_most("displacement_px", f.displacement_px, usable_displacement_px, "usable"),
-        at_most("predicted_ce90_px", f.predicted_ce90_px, usable_ce90_px, "usable"),
+        at_most("displacement_px", f.displacement_px, o.usable_displacement_px, "usable"),
+        at_most("predicted_ce90_px", f.predicted_ce90_px, o.usable_ce90_px, "usable"),
         at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"),
         at_most(
             "second_consensus_share",

@@ -1,4 +1,4 @@
-"""How reliable a correction is: repeated with fewer points, and by its own covariance."""
+"""How stable a correction is: repeated with fewer points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
-from services.quality.accuracy import Statistics, normal_ce90, statistics
+from services.quality.accuracy import Statistics, statistics
+from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, Frame, Measures
 
 PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
@@ -18,6 +19,7 @@ class AdjustedScene:
     """A scene after its final adjustment.
 
     Attributes:
+        model: of the scene, with the correction of the adjustment.
         measures: all n points that the scene could show, with their final residuals.
         adjustment: of all active points.
         shape: lines and samples of the image.
@@ -26,6 +28,7 @@ class AdjustedScene:
         refit: repeats the adjustment on the measures of a mask (n,).
     """
 
+    model: SensorModel
     measures: Measures
     adjustment: SceneAdjustment
     shape: tuple[int, int]
@@ -93,30 +96,6 @@ class Stability:
     held_out_px: ImageResiduals
     held_out_m: ImageResiduals
     note: str
-
-
-@dataclass(frozen=True)
-class PredictedAccuracy:
-    """Accuracy all over the image, predicted by the covariance of the correction.
-
-    It covers the random part of the measures. An error that all points of a block share is not part of
-    it: that is `frame_ce90_m`.
-
-    Attributes:
-        std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner.
-        ce90_px: (g, g) by the normal law.
-        worst_px, median_px, worst_m, median_m: of `ce90_px` over the image.
-        frame_ce90_m: of the frame of the points' blocks, by the normal law; NaN when unknown.
-    """
-
-    std_line_px: Array
-    std_sample_px: Array
-    ce90_px: Array
-    worst_px: float
-    median_px: float
-    worst_m: float
-    median_m: float
-    frame_ce90_m: float
 
 
 def residuals_in_image(residual: Array) -> ImageResiduals:
@@ -197,30 +176,3 @@ def _why_no_stability(active: int, held_count: int) -> str:
     if held_count == 0:
         return f"{active} active points leave none to hold out"
     return f"{active - held_count} of {active} active points gave no solution in any draw"
-
-
-def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
-    """The covariance of the correction, propagated to a grid over the image.
-
-    Args:
-        scene: after its final adjustment.
-        grid: nodes along each side.
-    """
-    shape, gsd_m = scene.shape, scene.gsd_m
-    line, sample = np.meshgrid(
-        np.linspace(0.0, shape[0] - 1.0, grid), np.linspace(0.0, shape[1] - 1.0, grid), indexing="ij"
-    )
-    covariance = scene.adjustment.covariance_at(np.column_stack([line.ravel(), sample.ravel()]))
-    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
-    ce90 = normal_ce90(covariance)
-    worst, median = float(ce90.max()), float(np.median(ce90))
-    return PredictedAccuracy(
-        std_line_px=std[..., 0],
-        std_sample_px=std[..., 1],
-        ce90_px=ce90.reshape(grid, grid),
-        worst_px=worst,
-        median_px=median,
-        worst_m=worst * gsd_m,
-        median_m=median * gsd_m,
-        frame_ce90_m=float(normal_ce90(scene.frame.covariance_m2[None, :2, :2])[0]),
-    )

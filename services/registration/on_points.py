@@ -150,10 +150,10 @@ def build_registration(
         return adjust_search(scene, search, repetition, usable=used[search.rows])
 
     frame = shared_frame(points, measures.active)
-    adjusted = AdjustedScene(measures, adjustment, scene.image.shape, context.gsd_m, frame, refit)
+    model = CorrectedModel(scene.model, adjustment.correction)
+    adjusted = AdjustedScene(model, measures, adjustment, scene.image.shape, context.gsd_m, frame, refit)
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)
-    model = CorrectedModel(scene.model, adjustment.correction)
     view_measures = search.matches.view_measures
     views = replace(view_measures, point=search.rows[view_measures.point])
     context.progress(1.0, "registered")

@@ -4,7 +4,7 @@ import numpy as np
 
 from services.adjustment.image_correction import Order, SceneAdjustment
 from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
-from services.quality.criteria import VERDICT_EXPLANATIONS
+from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.reports.figure_data import FigureData
@@ -46,7 +46,10 @@ def build_report(
         format=REPORT_FORMAT,
         run=run,
         verdict=qualification.verdict,
+        verdict_scope=verdict_scope(qualification.criteria),
         verdict_explanation=VERDICT_EXPLANATIONS[qualification.verdict],
+        relative_to_control_points=qualification.accuracy.relative_to_control_points,
+        on_the_earth=qualification.accuracy.on_the_earth,
         criteria=qualification.criteria,
         scene=scene,
         correction=_correction_record(registration.adjustment, run.options, scene.gsd_m),

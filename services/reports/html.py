@@ -14,7 +14,15 @@ from markupsafe import Markup
 from services.quality.criteria import Criterion
 from services.reports.figure_data import ChipPair
 from services.reports.figures import FIGURES, figure_markup
-from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
+from services.reports.numbers import (
+    ABSENT,
+    criterion_limit,
+    criterion_value,
+    metres,
+    number,
+    percent,
+    quantile,
+)
 from services.reports.published import published_tables
 from services.reports.report import RegistrationReport
 from services.types import Array, ChipArray
@@ -61,6 +69,7 @@ def page_template() -> Template:
     environment.filters.update(
         number=number,
         angle=lambda value: ABSENT if value != value else f"{value:.1f}°",
+        metres=metres,
         percent=percent,
         quantile=quantile,
         criterion_value=criterion_value,

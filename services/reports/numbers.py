@@ -14,6 +14,11 @@ def number(value: float, decimals: int = 2, unit: str = "") -> str:
     return f"{without_minus_zero:.{decimals}f} {unit}".rstrip()
 
 
+def metres(value_m: float) -> str:
+    """A length; "unknown" for NaN."""
+    return "unknown" if value_m != value_m else number(value_m, 2, "m")
+
+
 def percent(ratio: float) -> str:
     """A ratio in percent."""
     return number(100.0 * ratio, 0, "%")

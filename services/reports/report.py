@@ -11,16 +11,18 @@ from datetime import datetime
 from typing import Literal
 
 from services.quality.accuracy import Accuracy, NormalisedError
+from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
 from services.quality.criteria import Criterion, Verdict
+from services.quality.predicted import PredictedAccuracy
 from services.quality.qualification import Coverage, GroundResiduals, PointCounts
-from services.quality.stability import ImageResiduals, PredictedAccuracy, Stability
+from services.quality.stability import ImageResiduals, Stability
 from services.registration.context import SearchStage
 from services.registration.options import RegistrationOptions
 from services.reports.figure_data import FigureData
 from services.reports.reasons import ReasonCount
 from services.types import Acquisition, Array
 
-REPORT_FORMAT = "amers-registration-report/2"
+REPORT_FORMAT = "amers-registration-report/3"
 NOT_IN_JSON = {"json": False}
 """Metadata of a field that report.json leaves out."""
 
@@ -173,7 +175,11 @@ class RegistrationReport:
         format: of the document, with its version.
         run: how and when the registration was run.
         verdict: "good", "usable" or "failed"; follows from the criteria alone.
+        verdict_scope: the accuracy that the verdict speaks of, "relative to the control points" or
+            "relative to the control points and on the Earth".
         verdict_explanation: what the verdict means, for people.
+        relative_to_control_points: accuracy without the frame of the control points.
+        on_the_earth: accuracy with it, unknown where nobody stated it.
         criteria: every figure that has a limit.
         scene: what was registered.
         correction: of the model of the scene.
@@ -193,7 +199,10 @@ class RegistrationReport:
     format: str
     run: RunRecord
     verdict: Verdict
+    verdict_scope: str
     verdict_explanation: str
+    relative_to_control_points: StatedAccuracy
+    on_the_earth: StatedAccuracy
     criteria: tuple[Criterion, ...]
     scene: SceneRecord
     correction: CorrectionRecord
@@ -208,3 +217,13 @@ class RegistrationReport:
     coverage: Coverage
     checks: tuple[Check, ...]
     figure_data: FigureData = field(metadata=NOT_IN_JSON)
+
+    @property
+    def verdict_line(self) -> str:
+        """The verdict and the accuracy that it speaks of."""
+        return f"Verdict: {self.verdict}, {self.verdict_scope}"
+
+    @property
+    def accuracy_lines(self) -> tuple[str, str]:
+        """The two accuracies, as every place states them."""
+        return AccuracyStatement(self.relative_to_control_points, self.on_the_earth).lines

@@ -18,7 +18,8 @@ _WIDTH = 100
 def report_tables(report: RegistrationReport) -> RenderableType:
     """All tables of a report, to print on a rich console."""
     tables: list[RenderableType] = [
-        Text.assemble(f"{report.scene.name}: ", (report.verdict, "bold")),
+        Text(f"Registration of {report.scene.name}", style="bold"),
+        Text("\n".join([report.verdict_line, *report.accuracy_lines])),
         point_count_table(report),
         residual_table(report),
         stability_table(report),
@@ -108,7 +109,13 @@ def criteria_table(report: RegistrationReport) -> Table:
         for criterion in report.criteria
     ]
     columns = ["Criterion", "Value", "Limit", "Needed for", "Met"]
-    return _table("Criteria", columns, rows, f"Verdict: {report.verdict}")
+    return _table("Criteria", columns, rows, _criteria_caption(report))
+
+
+def _criteria_caption(report: RegistrationReport) -> str:
+    """The verdict, and why criteria have no value."""
+    notes = [f"{c.label}: {c.note}" for c in report.criteria if c.note]
+    return escape("\n".join([report.verdict_line, *notes]))
 
 
 def check_table(checks: Sequence[Check]) -> Table:

@@ -57,13 +57,29 @@ class Registered:
 
     def adjusted(self, refit: Callable[[BoolArray], SceneAdjustment] | None = None) -> AdjustedScene:
         """The adjusted scene, with its own function that repeats the adjustment or another one."""
+        model = CorrectedModel(FlatModel(), self.adjustment.correction)
         return AdjustedScene(
-            self.measures, self.adjustment, self.shape, self.gsd_m, self.frame, refit or self.refit
+            model,
+            self.measures,
+            self.adjustment,
+            self.shape,
+            self.gsd_m,
+            self.frame,
+            refit or self.refit,
         )
 
 
 def register(
-    n: int = 60, noise_px: float = 0.2, lost: int = 8, wrong: int = 4, extent: float = 1.0, seed: int = 0
+    n: int = 60,
+    noise_px: float = 0.2,
+    lost: int = 8,
+    wrong: int = 4,
+    extent: float = 1.0,
+    seed: int = 0,
+    *,
+    points_px: float = 0.0,
+    stated_px: float | None = None,
+    bend_px: float = 0.0,
 ) -> Registered:
     """A simulated registration on n visible points.
 
@@ -72,6 +88,9 @@ def register(
         noise_px: noise of the measures.
         extent: share of each side of the image that has points.
         seed: seed of the random numbers.
+        points_px: errors of the points, as the image shows them.
+        stated_px: their stated standard deviation; by default the true one.
+        bend_px: largest error of the model along the lines that no correction removes.
     """
     rng = np.random.default_rng(seed)
     model, frame = FlatModel(), no_correction(SHAPE)
@@ -79,14 +98,18 @@ def register(
     predicted = rng.uniform(0.0, 1.0, (n, 2)) * (np.array(SHAPE) - 1.0) * extent
     lon_lat_h = model.locate(predicted, np.zeros(n))
     observed = truth.apply(predicted) + rng.normal(0.0, noise_px, (n, 2))
+    observed += np.random.default_rng(seed + 1).normal(0.0, points_px, (n, 2))
+    observed[:, 1] += bend_px * np.sin(2.0 * np.pi * predicted[:, 0] / SHAPE[0])
     observed[:lost] = np.nan
     observed[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(
         6.0, 15.0, (wrong, 2)
     )
 
+    sigma_m = GSD_M * (points_px if stated_px is None else stated_px)
+
     def refit(usable: BoolArray) -> SceneAdjustment:
         observations = ControlObservations(
-            lon_lat_h, observed, np.full(n, noise_px), np.zeros((n, 3, 3)), usable
+            lon_lat_h, observed, np.full(n, noise_px), np.tile(sigma_m**2 * np.eye(3), (n, 1, 1)), usable
         )
         return adjust_scene(model, SHAPE, observations, AdjustmentOptions(order="drift"))
 

@@ -49,6 +49,8 @@ export interface BlockPage {
 }
 
 export interface BlockQuality {
+  relative_to_control_points: StatedAccuracy;
+  on_the_earth: StatedAccuracy;
   points: number;
   area_km2: number;
   points_per_km2: number;
@@ -553,6 +555,13 @@ export interface StacItems {
   numberMatched: number;
   numberReturned: number;
   links: Link[];
+}
+
+export interface StatedAccuracy {
+  label: string;
+  ce90_m: number | null;
+  le90_m: number | null;
+  words: string;
 }
 
 export interface StatusInfo {

@@ -2,7 +2,7 @@
 
 import { type Block, type FeaturePage, get, post } from "./api";
 import type { BlockQuality, StatusInfo } from "./api_types";
-import { badge, facts, figure, fill, h, plural, problem, when } from "./elements";
+import { accuracy, badge, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { announce, go, type Place, type ShowView } from "./place";
 import { send } from "./upload";
 
@@ -47,6 +47,7 @@ export const showBlock: ShowView = async (place, number) => {
     h("p", {}, badge(properties.state), " ", h("span", { class: "quiet" }, `since ${when(properties.state_changed_at)}`)),
     scopes.includes("admin") ? h("p", {}, act) : null,
     message,
+    accuracy(quality),
     facts({
       Name: `${properties.id}, version ${properties.version}`,
       Points: figure(properties.n_points),

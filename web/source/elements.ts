@@ -30,6 +30,16 @@ export function facts(rows: Record<string, Child>): HTMLElement {
   return h("dl", { class: "facts" }, ...shown.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
 }
 
+/** The two accuracies that every place states, in their words and order; earlier reports have none. */
+export function accuracy({ relative_to_control_points: relative, on_the_earth: earth }: Stated): HTMLElement | null {
+  return relative && earth ? facts({ [relative.label]: relative.words, [earth.label]: earth.words }) : null;
+}
+
+interface Stated {
+  relative_to_control_points?: { label: string; words: string };
+  on_the_earth?: { label: string; words: string };
+}
+
 /** A state as a word; its colour repeats the word and adds nothing. */
 export function badge(state: string): HTMLElement {
   return h("span", { class: `badge ${state.replace(/\W/g, "-")}` }, state);

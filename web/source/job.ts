@@ -3,7 +3,7 @@
 import type { FeatureCollection, Point, Polygon, Position } from "geojson";
 import { blobUrl, call, get } from "./api";
 import type { ResultFile, StatusInfo } from "./api_types";
-import { badge, facts, figure, fill, h, problem, when } from "./elements";
+import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
 import type { Criterion, Report } from "./report_types";
 import { type PointResultProperties, residualVectors } from "./residuals";
@@ -113,16 +113,18 @@ function blockLink({ number }: Record<string, unknown>): HTMLElement | null {
   return h("p", {}, h("a", { class: "button strong", href: `#/block/${number}` }, "See the block"));
 }
 
-function summary(report: Report, exaggeration: number): HTMLElement[] {
+function summary(report: Report, exaggeration: number): (HTMLElement | null)[] {
   const { point_counts: counts, image_residuals_px: px, ground_residuals_m: ground, predicted } = report;
   return [
-    h("p", {}, badge(report.verdict), " ", report.verdict_explanation),
+    h("p", {}, badge(report.verdict), ` Verdict: ${[report.verdict, report.verdict_scope].filter(Boolean).join(", ")}`),
+    accuracy(report),
+    h("p", {}, report.verdict_explanation),
     h("p", { class: "quiet" }, report.correction.words.join("; ")),
     facts({
       "Points visible, matched, active": `${figure(counts.visible)}, ${figure(counts.matched)}, ${figure(counts.active)}`,
       "Residual in the image, rms": `${figure(px.xy.rms, "px")} (x ${figure(px.x.rms)}, y ${figure(px.y.rms)})`,
       "Residual on the ground, rms": figure(ground.horizontal.rms, "m"),
-      "Predicted CE90, worst place": `${figure(predicted.worst_px, "px")}, ${figure(predicted.worst_m, "m")}`,
+      "Predicted CE90 relative to the control points, worst place": figure(predicted.worst_px, "px"),
     }),
     h("p", { class: "legend-line" }, h("span", { class: "swatch vector", "aria-hidden": "true" }), `Residuals on the map, drawn ${figure(exaggeration)} times longer; grey: not used.`),
     h("h2", {}, "Criteria"),

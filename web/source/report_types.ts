@@ -73,6 +73,7 @@ export interface CorrelationOptions {
   second_distance_px: number;
   min_contrast: number | null;
   max_sigma_px: number | null;
+  max_missing_share: number | null;
 }
 
 export interface Coverage {
@@ -92,6 +93,7 @@ export interface Criterion {
   needed_for: "good" | "usable";
   met: boolean;
   calculation: string;
+  note: string;
 }
 
 export interface Displacement {
@@ -156,7 +158,8 @@ export interface PredictedAccuracy {
   median_px: number | null;
   worst_m: number | null;
   median_m: number | null;
-  frame_ce90_m: number | null;
+  on_the_earth_worst_m: number | null;
+  on_the_earth_median_m: number | null;
 }
 
 export interface QualificationOptions {
@@ -165,17 +168,16 @@ export interface QualificationOptions {
   good_active_of_matched: number | null;
   good_residual_std_px: number | null;
   good_displacement_px: number | null;
-  good_displacement_of_points: number | null;
+  good_displacement_m: number | null;
   good_ce90_px: number | null;
-  good_ce90_of_points: number | null;
+  good_ce90_m: number | null;
+  max_ce90_on_earth_m: number | null | null;
   good_unit_weight: number | null;
   good_second_consensus_share: number | null;
   usable_active_points: number;
   usable_residual_std_px: number | null;
   usable_displacement_px: number | null;
-  usable_displacement_of_points: number | null;
   usable_ce90_px: number | null;
-  usable_ce90_of_points: number | null;
   coverage_cells: number;
   grid: number;
   draws: number;
@@ -232,10 +234,13 @@ export interface RegistrationOptions {
 }
 
 export interface Report {
-  format: "amers-registration-report/2";
+  format: "amers-registration-report/3";
   run: RunRecord;
   verdict: "good" | "usable" | "failed";
+  verdict_scope: string;
   verdict_explanation: string;
+  relative_to_control_points: StatedAccuracy;
+  on_the_earth: StatedAccuracy;
   criteria: Criterion[];
   scene: SceneRecord;
   correction: CorrectionRecord;
@@ -292,6 +297,13 @@ export interface Stability {
   held_out_px: ImageResiduals;
   held_out_m: ImageResiduals;
   note: string;
+}
+
+export interface StatedAccuracy {
+  label: string;
+  ce90_m: number | null;
+  le90_m: number | null;
+  words: string;
 }
 
 export interface Statistics {

@@ -67,14 +67,28 @@ class AccuracyRecord(Reply):
     against: str
 
 
+class StatedAccuracy(Reply):
+    """Accuracy against one reference; null where it is unknown, and `words` say why."""
+
+    label: str
+    ce90_m: float | None
+    le90_m: float | None
+    words: str
+
+
 class BlockQuality(Reply):
     """The quality of a block, from its points and views.
+
+    `relative_to_control_points` and `on_the_earth` are of its median point, without and with the frame
+    of the block.
 
     `share_reaching_half` and `share_reaching_quarter` are the parts of the area where the density
     reaches 1 point for 2 km2 and for 4 km2. Each of `cells` is a list of west and south in degrees,
     area in km2, number of points.
     """
 
+    relative_to_control_points: StatedAccuracy
+    on_the_earth: StatedAccuracy
     points: Count
     area_km2: float
     points_per_km2: float

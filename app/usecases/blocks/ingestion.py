@@ -18,6 +18,7 @@ from app.usecases.processes import Commit, Process, Work
 from services.errors import FormatError
 from services.formats.archives import ArchiveLimits, Member, check_archive, unpack_archive
 from services.formats.block.document_json import BLOCK_JSON
+from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import quality_document
 
 UNPACKED_TIMES = 4
@@ -75,6 +76,7 @@ def _run(work: Work) -> Commit:
             "version": block.version,
             "state": block.state,
             "points": block.n_points,
+            **accuracy_document(ingested.stated),
             "quality": {name: value for name, value in figures.items() if name != "cells"},
         }
 
@@ -133,6 +135,11 @@ INGEST_BLOCK = Process(
         "version": {"type": "string", "title": "Version"},
         "state": {"enum": ["staged", "published"], "title": "State after the ingestion"},
         "points": {"type": "integer", "title": "Points loaded"},
+        "relative_to_control_points": {"type": "object", "title": "CE90, LE90 of the median point"},
+        "on_the_earth": {
+            "type": "object",
+            "title": "The same with the frame of the block",
+        },
         "quality": {"type": "object", "title": "Density, views per point and stated precision"},
     },
 )

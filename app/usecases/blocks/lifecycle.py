@@ -21,7 +21,8 @@ from services.formats.block.document_json import BLOCK_JSON, parse_block_json
 from services.formats.block.reader import BlockContents, block_member
 from services.formats.chips.checksums import ChipHasher
 from services.formats.chips.npy_files import read_chip_file
-from services.quality.block import BlockQuality, block_quality
+from services.quality.accuracy_statement import AccuracyStatement
+from services.quality.block import BlockQuality, block_accuracy, block_quality
 from services.types import Progress, no_progress, part_of
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
@@ -35,10 +36,11 @@ PARALLEL_COPIES = 4
 
 @dataclass(frozen=True)
 class Ingested:
-    """A block that was ingested, and the quality figures of its points."""
+    """A block that was ingested, the quality figures of its points, and its accuracy."""
 
     block: Block
     quality: BlockQuality
+    stated: AccuracyStatement
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,12 @@ class BlockReport:
 
     Attributes:
         quality: figures computed from its points.
+        stated: its accuracy, as every place states it.
         accuracy: figures that its producer states, each with what it was measured against.
     """
 
     quality: BlockQuality
+    stated: AccuracyStatement
     accuracy: tuple[AccuracyFigure, ...]
 
 
@@ -115,7 +119,7 @@ def ingest_block(
             )
         files = _store_chips(storage, folder, contents, part_of(progress, 0.1, 0.5))
         load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
-    return Ingested(block, quality)
+    return Ingested(block, quality, block_accuracy(quality, metadata.frame))
 
 
 def publish_block(connection: Connection, reference: str) -> Published:
@@ -223,7 +227,8 @@ def list_blocks(
 def block_report(connection: Connection, block: Block) -> BlockReport:
     """The quality of a block: figures of its points, and the accuracy that its producer states."""
     document = parse_block_json(blocks.find_document(connection, block.number))
-    return BlockReport(blocks.find_quality(connection, block.number), document.metadata.accuracy)
+    quality, metadata = blocks.find_quality(connection, block.number), document.metadata
+    return BlockReport(quality, block_accuracy(quality, metadata.frame), metadata.accuracy)
 
 
 def folder_to_ingest(allowed: Path | None, name: str) -> Path:

@@ -27,6 +27,7 @@ from app.usecases.scenes import local_image, stored_keys
 from services.formats.gcp.marked_points import check_heights
 from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
+from services.quality.accuracy_statement import accuracy_document
 from services.registration.options import RegistrationOptions
 from services.reports.report import Method as ReportedMethod
 
@@ -101,6 +102,8 @@ def _run(work: Work) -> Commit:
         scenes.describe(connection, scene.id, acquisition, shape, gsd_m)
         return {
             "verdict": registered.report.verdict,
+            "verdict_scope": registered.report.verdict_scope,
+            **accuracy_document(registered.registration.qualification.accuracy),
             "method": registered.report.run.method,
             "files": keys,
         }
@@ -146,6 +149,9 @@ REGISTER_SCENE = Process(
     run=_run,
     values={
         "verdict": {"enum": ["good", "usable", "failed"], "title": "Verdict on the registration"},
+        "verdict_scope": {"type": "string", "title": "Accuracy that the verdict speaks of"},
+        "relative_to_control_points": {"type": "object", "title": "CE90 without the points' frame"},
+        "on_the_earth": {"type": "object", "title": "CE90 and LE90 with it, null when unknown"},
         "method": {"enum": list(get_args(ReportedMethod)), "title": "Control that was used"},
     },
 )

@@ -7,16 +7,18 @@ import pytest
 
 from services.errors import NotEnoughPoints
 from services.quality.accuracy import CIRCULAR_CE90
-from services.quality.criteria import verdict_of
+from services.quality.criteria import verdict_of, verdict_scope
+from services.quality.predicted import predict_accuracy
 from services.quality.qualification import (
     QualificationOptions,
     count_points,
     image_coverage,
     qualify,
     second_consensus_share,
+    unexplained_px,
 )
-from services.quality.stability import predict_accuracy
 from services.types import Frame
+from tests.services.conftest import GSD_M
 
 a_millionth_px = 1e-6
 DEFAULT = QualificationOptions()
@@ -152,7 +154,9 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
     assert result.std_line_px == pytest.approx(np.full((5, 5), 0.2))
     assert result.worst_px == pytest.approx(result.median_px)
     assert result.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
-    assert result.frame_ce90_m == pytest.approx(2.0 * 2.1460, rel=1e-3)
+    on_the_earth_m = np.hypot(2.0, 0.5 * 0.2) * 2.1460
+    assert result.on_the_earth_worst_m == pytest.approx(on_the_earth_m, rel=1e-3)
+    assert result.on_the_earth_median_m == pytest.approx(on_the_earth_m, rel=1e-3)
 
 
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
@@ -163,7 +167,7 @@ def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     assert result.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
     assert result.std_line_px[1, 0] == pytest.approx(0.1)
     assert result.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
-    assert np.isnan(result.frame_ce90_m)
+    assert np.isnan(result.on_the_earth_worst_m)
 
 
 def test_coverage_is_the_share_of_cells_with_an_active_point():
@@ -191,21 +195,55 @@ def test_coverage_is_the_share_of_cells_with_an_active_point():
     ],
 )
 def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
-    result = qualified(registered(), replace(DEFAULT, **{field: limit}))
+    in_pixels = replace(DEFAULT, good_displacement_m=0.0, good_ce90_m=0.0)
+    result = qualified(registered(), replace(in_pixels, **{field: limit}))
     assert failed(result) == {lost}
     assert result.verdict == ("usable" if lost[1] == "good" else "failed")
 
 
-def test_points_coarser_than_the_pixels_allow_a_share_of_their_own_accuracy(registered):
-    """Residuals of 3 px from points of 3 px are no fault of the model; from points of 1 px they are."""
-    scene = registered(n=400, noise_px=3.0)
-    for sigma_px, lost in ((3.0, set()), (1.0, {"residual_std_px"})):
-        adjustment = replace(scene.adjustment, point_sigma_px=np.full(2, sigma_px))
-        criteria = qualified(replace(scene, adjustment=adjustment)).criteria
-        assert lost == {c.name for c in criteria if not c.met and c.name == "residual_std_px"}
-        limit = {c.needed_for: c.limit for c in criteria if c.name == "predicted_ce90_px"}
-        assert limit["good"] == pytest.approx(max(1.0, 0.25 * CIRCULAR_CE90 * sigma_px))
-        assert limit["usable"] == pytest.approx(max(3.0, 0.5 * CIRCULAR_CE90 * sigma_px))
+def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
+    """SRP: scenes of 0.5 m on points of 3 m CE90: corners within 0.3 m, CE90 of 0.4 m."""
+    points_px = 3.0 / CIRCULAR_CE90 / GSD_M
+    result = qualified(registered(n=500, lost=0, wrong=0, points_px=points_px))
+    assert result.image_residuals_px.x.std == pytest.approx(points_px, rel=0.2)
+    assert max(place.median_m for place in result.stability.displacements) < 0.3
+    assert result.predicted.worst_m < 0.5
+    assert result.verdict == "good"
+
+
+@pytest.mark.parametrize("stated_px", [0.2, 1.0, 2.0, 3.0, 6.0, 20.0])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("error", [{"bend_px": 2.6}, {"points_px": 2.6}])
+def test_points_that_state_large_sigmas_hide_no_error(registered, error, seed, stated_px):
+    """20 points with errors of 2.6 px, of the model or of their own, never make a good registration."""
+    scene = registered(n=20, lost=0, wrong=0, seed=seed, stated_px=stated_px, **error)
+    assert qualified(scene, replace(DEFAULT, good_coverage_percent=0.0)).verdict != "good"
+
+
+def test_stated_sigmas_of_the_points_move_no_limit(registered):
+    scene = registered(n=100)
+
+    def limits(stated_px):
+        adjustment = replace(scene.adjustment, point_sigma_px=np.full(2, stated_px))
+        return [c.limit for c in qualified(replace(scene, adjustment=adjustment)).criteria]
+
+    assert limits(0.0) == limits(30.0)
+
+
+@pytest.mark.parametrize("stated_px", [0.1, 2.0, 30.0])
+def test_an_error_of_the_model_is_no_scatter_of_points(registered, stated_px):
+    """Neighbours share an error of the model, but not the errors of points."""
+    measures = registered(n=300, lost=0, wrong=0).measures
+    measures = replace(measures, active=np.ones(300, dtype=bool))
+    amplitude_px = 2.6
+    wave_px = amplitude_px * np.sin(measures.line_sample / 500.0)
+    scatter_px = np.random.default_rng(1).normal(0.0, amplitude_px, (300, 2))
+    shared = unexplained_px(replace(measures, residual_px=wave_px), np.full(2, stated_px))
+    scattered = unexplained_px(replace(measures, residual_px=scatter_px), np.full(2, stated_px))
+    assert shared > 1.5
+    explained_px = min(stated_px, amplitude_px)
+    unexplained = max(amplitude_px**2 - (1.0 + 2.0 * np.sqrt(2.0 / 300)) * explained_px**2, 0.0)
+    assert scattered == pytest.approx(np.sqrt(unexplained), abs=0.5)
 
 
 def test_two_consensuses_of_many_points_are_not_good(registered):
@@ -260,3 +298,24 @@ def test_the_verdict_is_recomputed_from_the_criteria_alone(registered):
 def test_the_same_seed_gives_the_same_figures(registered):
     first, second = qualified(registered()), qualified(registered())
     assert first.stability == second.stability
+
+
+def test_a_limit_on_the_earth_counts_when_the_user_sets_one(registered):
+    scene = replace(registered(), frame=Frame.from_sigmas(10.0, 10.0))
+    without = qualified(scene)
+    assert without.verdict == "good"
+    assert verdict_scope(without.criteria) == "relative to the control points"
+    for limit_m, verdict in ((30.0, "good"), (20.0, "failed")):
+        limited = qualified(scene, replace(DEFAULT, max_ce90_on_earth_m=limit_m))
+        assert limited.verdict == verdict
+        assert verdict_scope(limited.criteria) == "relative to the control points and on the Earth"
+        (criterion,) = [c for c in limited.criteria if c.name == "ce90_on_earth_m"]
+        assert criterion.value == pytest.approx(without.predicted.on_the_earth_worst_m)
+        assert criterion.note == ""
+
+
+def test_a_frame_that_nobody_stated_does_not_meet_a_limit_on_the_earth(registered):
+    result = qualified(registered(), replace(DEFAULT, max_ce90_on_earth_m=1000.0))
+    assert result.verdict == "failed"
+    (criterion,) = [c for c in result.criteria if not c.met]
+    assert criterion.note == "unknown: nobody stated the frame of the control points"

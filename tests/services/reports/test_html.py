@@ -116,7 +116,10 @@ def test_the_page_shows_the_figures_of_the_report(material):
     for shown in (
         str(report.point_counts.active),
         f"{report.coverage.percent:.0f} %",
-        f"{report.predicted.worst_m:.2f} m",
+        f"{report.predicted.worst_px:.2f} px",
+        report.verdict_line,
+        report.relative_to_control_points.words,
+        report.on_the_earth.words,
         f"{report.image_residuals_px.x.std:.3f}",
         "calanques, version 1",
     ):
@@ -148,7 +151,7 @@ def test_hostile_names_are_shown_and_not_run(material):
 def test_a_page_is_made_of_any_registration(material, poor):
     parsed = Page(page(poor(material())))
     assert "Registration report" in parsed.texts
-    assert [name for name, _ in parsed.attributes].count("aria-label") == len(FIGURES) + 2
+    assert [name for name, _ in parsed.attributes].count("aria-label") == len(FIGURES) + 3
 
 
 def test_a_page_of_thousands_of_points_stays_light(material):

@@ -60,8 +60,9 @@ def test_an_unmet_criterion_stands_out_with_its_value_and_limit(material):
 
 def test_names_with_brackets_are_shown_as_they_are(report):
     scene = replace(report.scene, name="[bold]x[/bold]")
-    assert "[bold]x[/bold]: good" in format_tables(replace(report, scene=scene))
-    assert row(format_tables(replace(report, scene=scene)), "[bold]x[/bold]")[1] == "60"
+    text = format_tables(replace(report, scene=scene))
+    assert "Registration of [bold]x[/bold]\nVerdict: good, relative" in text
+    assert row(text, "[bold]x[/bold]")[1] == "60"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,119 @@
+"""The statement of accuracy that every report, command, page and document makes, in the same words.
+
+Two figures, in this order: relative to the control points, and on the Earth. The second includes the
+frame of the control points, an error that all of them share and that no registration on them can show.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from services.quality.accuracy import CIRCULAR_CE90, LINEAR_LE90, normal_ce90
+from services.quality.frames import frame_le90_m, why_unknown
+from services.types import Frame
+
+RELATIVE = "Relative to the control points"
+ON_THE_EARTH = "On the Earth"
+_WORST_PLACE = "worst place of the image"
+
+
+@dataclass(frozen=True)
+class StatedAccuracy:
+    """Accuracy against one reference.
+
+    Attributes:
+        label: the reference, "Relative to the control points" or "On the Earth".
+        ce90_m: horizontal, of the normal law; null when unknown.
+        le90_m: of the height, of the normal law; null when unknown or when there are no heights.
+        words: both figures as text, with what is unknown and why.
+    """
+
+    label: str
+    ce90_m: float
+    le90_m: float
+    words: str
+
+
+@dataclass(frozen=True)
+class AccuracyStatement:
+    """The accuracy of a registered scene or of control points.
+
+    Attributes:
+        relative_to_control_points: without the frame of the control points.
+        on_the_earth: with it.
+    """
+
+    relative_to_control_points: StatedAccuracy
+    on_the_earth: StatedAccuracy
+
+    @property
+    def lines(self) -> tuple[str, str]:
+        """The two figures as text, each with its label."""
+        relative, earth = self.relative_to_control_points, self.on_the_earth
+        return f"{relative.label}: {relative.words}", f"{earth.label}: {earth.words}"
+
+
+def scene_accuracy(relative_m: float, on_the_earth_m: float, frame: Frame) -> AccuracyStatement:
+    """The statement for a registered scene.
+
+    CE90 is that of the ground where the model puts a pixel, when the true height of the ground is known.
+    A scene gives no heights. Heights that several scenes registered on the same points give have the
+    error of the frame in any case: its LE90 is stated on the Earth.
+
+    Args:
+        relative_m: CE90 at the worst place of the image, relative to the control points.
+        on_the_earth_m: the same with the frame of the control points; NaN when unknown.
+        frame: of the control points.
+    """
+    le90_m = frame_le90_m(frame)
+    height = f"LE90 of the control points' frame {_metres(le90_m)}"
+    return AccuracyStatement(
+        StatedAccuracy(RELATIVE, relative_m, np.nan, f"CE90 {_metres(relative_m)} ({_WORST_PLACE})"),
+        StatedAccuracy(
+            ON_THE_EARTH,
+            on_the_earth_m,
+            le90_m,
+            _with_reason(f"CE90 {_metres(on_the_earth_m)} ({_WORST_PLACE}), {height}", frame),
+        ),
+    )
+
+
+def points_accuracy(
+    sigma_horizontal_m: float, sigma_up_m: float, frame: Frame, of: str = "median of the points"
+) -> AccuracyStatement:
+    """The statement for control points.
+
+    Args:
+        sigma_horizontal_m, sigma_up_m: of a point in the frame of its block, one standard deviation a
+            coordinate.
+        frame: of the block.
+        of: which point that is.
+    """
+    horizontal_m2 = frame.covariance_m2[:2, :2] + sigma_horizontal_m**2 * np.eye(2)
+    up_m2 = frame.covariance_m2[2, 2] + sigma_up_m**2
+    relative = CIRCULAR_CE90 * sigma_horizontal_m, LINEAR_LE90 * sigma_up_m
+    earth = float(normal_ce90(horizontal_m2[None])[0]), LINEAR_LE90 * float(np.sqrt(up_m2))
+    relative_words, earth_words = (
+        f"CE90 {_metres(ce90_m)}, LE90 {_metres(le90_m)} ({of})" for ce90_m, le90_m in (relative, earth)
+    )
+    return AccuracyStatement(
+        StatedAccuracy(RELATIVE, *relative, relative_words),
+        StatedAccuracy(ON_THE_EARTH, *earth, _with_reason(earth_words, frame)),
+    )
+
+
+def accuracy_document(statement: AccuracyStatement) -> dict[str, dict[str, str | float | None]]:
+    """The statement as JSON values, null where a figure is unknown: members of many documents."""
+    return {
+        name: {key: None if value != value else value for key, value in asdict(stated).items()}
+        for name, stated in vars(statement).items()
+    }
+
+
+def _with_reason(words: str, frame: Frame) -> str:
+    reason = why_unknown(frame)
+    return f"{words}: {reason}" if reason else words
+
+
+def _metres(value_m: float) -> str:
+    return f"{value_m:.2f} m" if np.isfinite(value_m) else "unknown"

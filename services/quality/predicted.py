@@ -1,0 +1,85 @@
+"""Accuracy all over the image, predicted by the covariance of the correction and the frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.quality.accuracy import normal_ce90
+from services.quality.frames import frame_on_ground
+from services.quality.stability import AdjustedScene
+from services.types import Array
+
+
+@dataclass(frozen=True)
+class PredictedAccuracy:
+    """Accuracy all over the image, by the normal law.
+
+    Relative to the control points it is the covariance of the correction. On the Earth it includes the
+    frame of the control points, an error that all of them share. Metres are on the ground, at its true
+    height.
+
+    Attributes:
+        std_line_px, std_sample_px: (g, g) on a regular grid from corner to corner, relative to the
+            control points.
+        ce90_px: (g, g) relative to the control points.
+        worst_px, median_px: of `ce90_px` over the image.
+        worst_m, median_m: CE90 on the ground, relative to the control points, over the image.
+        on_the_earth_worst_m, on_the_earth_median_m: the same with the frame; NaN when unknown.
+    """
+
+    std_line_px: Array
+    std_sample_px: Array
+    ce90_px: Array
+    worst_px: float
+    median_px: float
+    worst_m: float
+    median_m: float
+    on_the_earth_worst_m: float
+    on_the_earth_median_m: float
+
+
+def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
+    """The covariance of the correction, propagated to a grid over the image.
+
+    Args:
+        scene: after its final adjustment.
+        grid: nodes along each side.
+    """
+    line, sample = np.meshgrid(
+        *(np.linspace(0.0, size - 1.0, grid) for size in scene.shape), indexing="ij"
+    )
+    line_sample = np.column_stack([line.ravel(), sample.ravel()])
+    covariance = scene.adjustment.covariance_at(line_sample)
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(grid, grid, 2)
+    ce90_px = normal_ce90(covariance)
+    derivative = _derivative(scene, line_sample)
+    to_ground = np.linalg.inv(derivative[:, :, :2])
+    relative = to_ground @ covariance @ to_ground.transpose(0, 2, 1)
+    relative_m = normal_ce90(relative)
+    on_the_earth_m = normal_ce90(relative + frame_on_ground(scene.frame, derivative))
+    return PredictedAccuracy(
+        std_line_px=std[..., 0],
+        std_sample_px=std[..., 1],
+        ce90_px=ce90_px.reshape(grid, grid),
+        worst_px=float(ce90_px.max()),
+        median_px=float(np.median(ce90_px)),
+        worst_m=float(relative_m.max()),
+        median_m=float(np.median(relative_m)),
+        on_the_earth_worst_m=float(on_the_earth_m.max()),
+        on_the_earth_median_m=float(np.median(on_the_earth_m)),
+    )
+
+
+def _derivative(scene: AdjustedScene, line_sample: Array) -> Array:
+    """Derivatives (n, 2, 3) of the model at image positions (n, 2), at the middle height of the points.
+
+    Where the model reaches no ground, those of its middle stand in.
+    """
+    points = scene.measures.lon_lat_h
+    height_m = np.full(len(line_sample), np.median(points[:, 2]))
+    derivative = scene.model.project_derivative(scene.model.locate(line_sample, height_m))
+    beyond = np.asarray(~np.isfinite(derivative).all(axis=(1, 2)))
+    if beyond.any():
+        middle = scene.model.project_derivative(points).mean(axis=0)
+        derivative = np.where(beyond[:, None, None], middle, derivative)
+    return np.asarray(derivative)
