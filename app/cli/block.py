@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, Row, accuracy_rows, print_json, show, show_one
+from app.cli.output import AsJson, Row, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
 from app.config import read_settings
@@ -51,9 +51,7 @@ def ingest(
         record = {**_record(block), **accuracy_document(ingested.stated)}
         print_json({"block": record, "quality": quality_document(ingested.quality)})
         return
-    show_one(
-        {**_record(block), **accuracy_rows(ingested.stated), **_figures(ingested.quality)}, as_json=False
-    )
+    show_one({**_record(block), **ingested.stated.words, **_figures(ingested.quality)}, as_json=False)
 
 
 @app.command("list")
@@ -70,7 +68,7 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
     with transaction() as connection:
         block = lifecycle.find_block(connection, reference)
         stated = lifecycle.block_report(connection, block).stated
-    accuracy = accuracy_document(stated) if as_json else accuracy_rows(stated)
+    accuracy = accuracy_document(stated) if as_json else stated.words
     show_one({**_record(block), **accuracy}, as_json=as_json)
 
 
@@ -88,7 +86,7 @@ def quality(reference: Reference, as_json: AsJson = False) -> None:
         f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
         for figure in report.accuracy
     }
-    rows = {**accuracy_rows(report.stated), **_figures(report.quality), **accuracy_lines}
+    rows = {**report.stated.words, **_figures(report.quality), **accuracy_lines}
     show_one(rows, as_json=False)
 
 

@@ -13,8 +13,6 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from services.quality.accuracy_statement import AccuracyStatement
-
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 Row = Mapping[str, object]
@@ -47,12 +45,6 @@ def show_one(record: Row, *, as_json: bool) -> None:
 def print_json(value: object) -> None:
     """Print a value as JSON; dataclasses become objects, times ISO 8601."""
     typer.echo(json.dumps(value, indent=2, default=_as_json, allow_nan=False))
-
-
-def accuracy_rows(statement: AccuracyStatement) -> Row:
-    """The two accuracies as rows for people."""
-    stated = (statement.relative_to_control_points, statement.on_the_earth)
-    return {one.label: one.words for one in stated}
 
 
 def as_text(value: object) -> str:

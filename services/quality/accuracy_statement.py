@@ -47,10 +47,14 @@ class AccuracyStatement:
     on_the_earth: StatedAccuracy
 
     @property
-    def lines(self) -> tuple[str, str]:
+    def words(self) -> dict[str, str]:
+        """The two figures as text, by their labels."""
+        return {one.label: one.words for one in (self.relative_to_control_points, self.on_the_earth)}
+
+    @property
+    def lines(self) -> tuple[str, ...]:
         """The two figures as text, each with its label."""
-        relative, earth = self.relative_to_control_points, self.on_the_earth
-        return f"{relative.label}: {relative.words}", f"{earth.label}: {earth.words}"
+        return tuple(f"{label}: {words}" for label, words in self.words.items())
 
 
 def scene_accuracy(relative_m: float, on_the_earth_m: float, frame: Frame) -> AccuracyStatement:

@@ -224,6 +224,6 @@ class RegistrationReport:
         return f"Verdict: {self.verdict}, {self.verdict_scope}"
 
     @property
-    def accuracy_lines(self) -> tuple[str, str]:
+    def accuracy_lines(self) -> tuple[str, ...]:
         """The two accuracies, as every place states them."""
         return AccuracyStatement(self.relative_to_control_points, self.on_the_earth).lines
