@@ -111,6 +111,22 @@ UNKNOWN_FRAME = Frame(np.full((3, 3), np.nan))
 
 
 @dataclass(frozen=True)
+class SurfaceHeights:
+    """The surface at the centres of the chips of n points: a statement for elevation models.
+
+    The height of a point itself is that of the content of its chip, which registration searches.
+
+    Attributes:
+        height_m: (n,) above the ellipsoid, in the frame of the point's block, where the line of sight of
+            the point's steepest view meets the surface; NaN when unknown.
+        sigma_m: (n,) one standard deviation; NaN when unknown.
+    """
+
+    height_m: Array
+    sigma_m: Array
+
+
+@dataclass(frozen=True)
 class ControlPoints:
     """n control points, their views and the positions of their chips in files.
 
@@ -127,6 +143,7 @@ class ControlPoints:
         chip_file: (n,) int64, rows of `chip_files`.
         chip_row: (n,) int64, row of the first chip of the point in its file; the others follow it.
         chip_files: names of the files in their `ChipSource`.
+        surface: heights of the surface at the points; None when nobody stated them.
     """
 
     id: IntArray
@@ -140,6 +157,7 @@ class ControlPoints:
     chip_file: IntArray
     chip_row: IntArray
     chip_files: tuple[str, ...]
+    surface: SurfaceHeights | None = None
 
     def __len__(self) -> int:
         return len(self.id)
@@ -170,6 +188,9 @@ class ControlPoints:
             chip_file=self.chip_file[rows],
             chip_row=self.chip_row[rows],
             chip_files=self.chip_files,
+            surface=None
+            if self.surface is None
+            else SurfaceHeights(self.surface.height_m[rows], self.surface.sigma_m[rows]),
         )
 
 

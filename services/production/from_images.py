@@ -20,6 +20,7 @@ from services.matching.multi_image import (
     stored_chip,
 )
 from services.matching.predict import rank_in_group
+from services.matching.surface_heights import surface_height
 from services.matching.tie_points import FeatureOptions, find_tie_points
 from services.production.block_frame import block_frame
 from services.types import (
@@ -31,6 +32,7 @@ from services.types import (
     IntArray,
     Observations,
     Progress,
+    SurfaceHeights,
     Views,
     no_progress,
     part_of,
@@ -162,6 +164,7 @@ def produce_points(
     frame = block_frame(adjustment, acquisitions, _prior_sigma_px(scenes))
     views = _views(adjusted, intersection, rows, active, options)
     points = _control_points(intersection, rows, frame, saliency, views)
+    points = replace(points, surface=_surface_heights(adjusted, points, options.fine_gsd_m))
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
         before_px=_median_px(before.residual_px),
@@ -320,6 +323,18 @@ def _control_points(
         chip_row=views.start[:-1].copy(),
         chip_files=("chips",),
     )
+
+
+def _surface_heights(scenes: Sequence[Scene], points: ControlPoints, gsd_m: float) -> SurfaceHeights:
+    """The surface at the centres of the fine chips, each in its steepest view."""
+    views = points.views
+    above_m, sigma_m = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    for row, ground in enumerate(points.lon_lat_h):
+        of_point = np.arange(*views.start[row : row + 2])
+        of_point = of_point[views.gsd_m[of_point] == gsd_m]
+        steepest_first = views.image[of_point[np.argsort(views.incidence_deg[of_point])]]
+        above_m[row], sigma_m[row] = surface_height([scenes[i] for i in steepest_first], ground, gsd_m)
+    return SurfaceHeights(points.lon_lat_h[:, 2] + above_m, sigma_m)
 
 
 def _views(

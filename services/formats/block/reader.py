@@ -111,6 +111,7 @@ def block_contents(document: BlockDocument, points: PointRows, views: ViewRows) 
         chip_file=points.chip_file,
         chip_row=points.chip_row,
         chip_files=points.chip_files,
+        surface=points.surface,
     )
     return BlockContents(
         document, control_points, points.n_views, points.typology, points.first_view, points.last_view

@@ -82,6 +82,16 @@ def _check_covariances(report: ProblemReport, points: PointRows) -> None:
     for column, name in enumerate(("sigma_east_m", "sigma_north_m", "sigma_up_m")):
         values = points.sigma_m[:, column]
         report.rows((POINTS_PARQUET, name), ~in_range[:, column], values, expected)
+    if points.surface is not None:
+        height_m, sigma_m = points.surface.height_m, points.surface.sigma_m
+        unknown = np.isnan(height_m) & np.isnan(sigma_m)
+        stated = np.isfinite(height_m) & (sigma_m >= SMALLEST_SIGMA_M) & (sigma_m <= LARGEST_SIGMA_M)
+        report.rows(
+            (POINTS_PARQUET, "surface_sigma_m"),
+            ~(unknown | stated),
+            sigma_m,
+            f"{expected} with a finite surface_height_m, or null in both",
+        )
     possible = np.abs(points.correlation) <= 1.0
     for column, name in enumerate(("corr_east_north", "corr_east_up", "corr_north_up")):
         values = points.correlation[:, column]

@@ -12,7 +12,7 @@ import pyproj
 import shapely
 
 from services.errors import FormatError
-from services.types import Acquisition, Array, IntArray
+from services.types import Acquisition, Array, IntArray, SurfaceHeights
 
 POINTS_PARQUET = "points.parquet"
 VIEWS_PARQUET = "views.parquet"
@@ -38,6 +38,11 @@ POINTS_SCHEMA = pa.schema(
         pa.field("chip_count", pa.int16(), nullable=False),
     ]
 )
+
+SURFACE_SCHEMA = pa.schema(
+    [pa.field("surface_height_m", pa.float64()), pa.field("surface_sigma_m", pa.float64())]
+)
+"""Columns of `points.parquet` that a block has only where its producer states the surface."""
 
 VIEWS_SCHEMA = pa.schema(
     [
@@ -73,6 +78,7 @@ class PointRows:
         chip_file: (n,) int64, rows of `chip_files`.
         chip_row, chip_count: (n,) int64, first row and number of the point's chips in its file.
         chip_files: paths in the block.
+        surface: heights of the surface, NaN where unknown; None without these columns.
     """
 
     id: IntArray
@@ -88,6 +94,7 @@ class PointRows:
     chip_row: IntArray
     chip_count: IntArray
     chip_files: tuple[str, ...]
+    surface: SurfaceHeights | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +156,14 @@ def write_points(path: Path, rows: PointRows) -> None:
     }
     columns |= {name: rows.sigma_m[:, i] for i, name in enumerate(_SIGMAS)}
     columns |= {name: rows.correlation[:, i] for i, name in enumerate(_CORRELATIONS)}
+    schema = POINTS_SCHEMA
+    if rows.surface is not None:
+        schema = pa.unify_schemas([POINTS_SCHEMA, SURFACE_SCHEMA])
+        known = (rows.surface.height_m, rows.surface.sigma_m)
+        columns |= {
+            name: pa.array(values, from_pandas=True)  # NaN becomes null
+            for name, values in zip(SURFACE_SCHEMA.names, known, strict=True)
+        }
     low, high = rows.lon_lat_h.min(axis=0), rows.lon_lat_h.max(axis=0)
     geo = {
         "version": "1.1.0",
@@ -162,7 +177,7 @@ def write_points(path: Path, rows: PointRows) -> None:
             }
         },
     }
-    schema = POINTS_SCHEMA.with_metadata({"geo": json.dumps(geo)})
+    schema = schema.with_metadata({"geo": json.dumps(geo)})
     arrays = [pa.array(columns[field.name], field.type) for field in schema]
     pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path, compression="zstd")
 
@@ -198,7 +213,7 @@ def read_points(path: Path) -> PointRows:
     Raises:
         FormatError: the file is not Parquet, or a column is missing, has another type or is null.
     """
-    table = _read_table(path, POINTS_SCHEMA)
+    table = _read_table(path, POINTS_SCHEMA, SURFACE_SCHEMA)
     try:
         geometry = shapely.from_wkb(table["geometry"].to_numpy())
     except shapely.errors.ShapelyError as error:
@@ -228,6 +243,7 @@ def read_points(path: Path) -> PointRows:
         chip_row=table["chip_row"].to_numpy(),
         chip_count=table["chip_count"].to_numpy().astype(np.int64),
         chip_files=chip_files,
+        surface=_surface(table),
     )
 
 
@@ -254,9 +270,19 @@ def read_views(path: Path) -> ViewRows:
     )
 
 
-def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
+def _surface(table: pa.Table) -> SurfaceHeights | None:
+    """The heights of the surface; None where the table has none."""
+    if not set(SURFACE_SCHEMA.names) <= set(table.column_names):
+        return None
+    return SurfaceHeights(*(table[name].to_numpy() for name in SURFACE_SCHEMA.names))
+
+
+def _read_table(path: Path, schema: pa.Schema, optional: pa.Schema | None = None) -> pa.Table:
+    """The columns of a schema, and those of an optional one if the file has them all."""
     try:
         with pq.ParquetFile(path, memory_map=False) as file:
+            if optional is not None and set(optional.names) <= set(file.schema_arrow.names):
+                schema = pa.unify_schemas([schema, optional])
             _check_schema(path.name, file.schema_arrow, schema)
             table = file.read(columns=schema.names)
         # A file may declare text that is not UTF-8, or offsets beyond its buffers.

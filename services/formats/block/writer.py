@@ -208,6 +208,7 @@ def _write_tables(folder: Path, points: ControlPoints, layout: _ChipLayout, typo
         chip_row=layout.row,
         chip_count=count,
         chip_files=layout.names,
+        surface=points.surface,
     )
     write_points(folder / POINTS_PARQUET, rows)
     view_rows = ViewRows(

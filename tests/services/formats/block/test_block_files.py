@@ -21,7 +21,7 @@ from services.formats.block.hilbert import hilbert_order
 from services.formats.block.reader import FolderChips, read_block
 from services.formats.block.writer import write_block
 from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.types import ControlPoints, Frame, point_chips
+from services.types import ControlPoints, Frame, SurfaceHeights, point_chips
 from tests.factories import MadeBlock, affine_model, control_points, make_block, metadata, noise_chips
 
 rounding = 1e-12
@@ -58,6 +58,32 @@ def test_a_block_reads_back_as_it_was_written(block):
     assert contents.first_view[0] == np.datetime64("2023-03-01")
     assert contents.last_view[0] == np.datetime64("2023-06-09")
     assert set(contents.typology) == {"crossroads", "building corner", 'a "rare" kind', None}
+
+
+def test_heights_of_the_surface_read_back_and_may_be_unknown(tmp_path):
+    made = make_block(tmp_path / "plain")
+    assert read_block(made.folder).points.surface is None
+    height_m = np.linspace(100.0, 120.0, len(made.points))
+    sigma_m = np.linspace(0.2, 3.0, len(made.points))
+    height_m[1] = sigma_m[1] = np.nan
+    points = replace(made.points, surface=SurfaceHeights(height_m, sigma_m))
+    chips = noise_chips(points)
+    write_block(tmp_path / "stated", metadata("stated"), points, chips, {})
+    order = hilbert_order(points.lon_lat_h[:, :2])
+    surface = check_block(tmp_path / "stated").points.surface
+    assert_array_equal(surface.height_m, height_m[order])
+    assert_array_equal(surface.sigma_m, sigma_m[order])
+    stored = pq.read_table(tmp_path / "stated" / "points.parquet")
+    assert stored["surface_height_m"].null_count == stored["surface_sigma_m"].null_count == 1
+
+
+def test_a_height_of_the_surface_without_a_sigma_is_refused(tmp_path):
+    made = make_block(tmp_path / "plain")
+    height_m = np.full(len(made.points), 100.0)
+    points = replace(made.points, surface=SurfaceHeights(height_m, np.full(len(height_m), np.nan)))
+    write_block(tmp_path / "half", metadata("half"), points, noise_chips(points), {})
+    with pytest.raises(FormatError, match="surface_sigma_m"):
+        check_block(tmp_path / "half")
 
 
 def test_chips_of_a_folder_are_identical_to_those_written(block):
