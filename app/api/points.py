@@ -33,6 +33,7 @@ from services.formats.chips.images import (
     format_chips_npz,
     format_sheet_png,
 )
+from services.quality.accuracy_statement import accuracy_document
 
 router = APIRouter(prefix="/collections/points/items", tags=["points"], route_class=CallerRoute)
 
@@ -46,6 +47,7 @@ NOT_PROPERTIES = {
     "chip_key",
     "chip_row",
     "chip_count",
+    "frame",
     "history",
 }
 
@@ -144,7 +146,8 @@ def _feature(point: PointDetail, url: str) -> dict[str, Any]:
         "type": "Feature",
         "id": point.id,
         "geometry": {"type": "Point", "coordinates": [point.lon_deg, point.lat_deg, point.height_m]},
-        "properties": {k: v for k, v in members.items() if k not in NOT_PROPERTIES},
+        "properties": {k: v for k, v in members.items() if k not in NOT_PROPERTIES}
+        | accuracy_document(points.point_accuracy(point)),
         "links": [
             {"rel": "self", "href": url, "type": GEOJSON},
             {"rel": "collection", "href": url.rsplit("/items/", 1)[0], "type": JSON},

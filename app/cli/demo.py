@@ -14,6 +14,7 @@ from app.cli.progress import shown_progress
 from app.config import Settings
 from app.errors import InputError
 from app.usecases.demo import DemoOptions, DemoOutcome, run_demo
+from services.quality.criteria import verdict_scope
 from services.types import Array
 
 MARK = ".amers-demo"
@@ -62,7 +63,8 @@ def _private_store() -> Iterator[Settings]:
 
 
 def _record(outcome: DemoOutcome) -> Row:
-    counts = outcome.registration.qualification.point_counts
+    qualification = outcome.registration.qualification
+    counts = qualification.point_counts
     return {
         "points produced": outcome.counts.produced,
         "points ingested": outcome.counts.ingested,
@@ -77,7 +79,9 @@ def _record(outcome: DemoOutcome) -> Row:
         "CE90 registered, in the block's frame (px)": round(outcome.in_frame_px.value, 3),
         "CE90 registered, on the Earth (m)": round(outcome.absolute_m.value, 2),
         "error of the block's frame, east, north, up (m)": _metres(outcome.frame_error_m),
-        "verdict": outcome.registration.qualification.verdict,
+        "verdict": qualification.verdict,
+        "verdict speaks of the accuracy": verdict_scope(qualification.criteria),
+        **qualification.accuracy.words,
         "report": str(outcome.report.absolute()),
     }
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, show_one
+from app.cli.output import AsJson, Row, show_one
 from app.cli.progress import shown_progress
 from app.errors import InputError
 from app.usecases.production import (
@@ -17,6 +17,9 @@ from app.usecases.production import (
 from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
+from services.quality.accuracy_statement import accuracy_document
+from services.quality.block import produced_accuracy
+from services.types import ControlPoints
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -75,8 +78,7 @@ def run(
             "ray_residual_delivered_px": round(relative.before_px, 3),
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
-            "frame_sigma_m": round(relative.frame.sigma_m, 2),
-            "frame_sigma_up_m": round(relative.frame.sigma_up_m, 2),
+            **_accuracy(production.points, as_json=as_json),
         },
         as_json=as_json,
     )
@@ -154,9 +156,16 @@ def ortho(
             "points": len(production.points),
             "views": int(production.points.views.start[-1]),
             "chip_gsds_m": list(production.gsds_m),
+            **_accuracy(production.points, as_json=as_json),
         },
         as_json=as_json,
     )
+
+
+def _accuracy(points: ControlPoints, *, as_json: bool) -> Row:
+    """The accuracy of new points, as every place states it."""
+    stated = produced_accuracy(points)
+    return accuracy_document(stated) if as_json else stated.words
 
 
 def _pair(text: str) -> tuple[float, float]:

@@ -9,12 +9,15 @@ from sqlalchemy import BigInteger, ColumnElement, bindparam, func, null, select
 from sqlalchemy.dialects.postgresql import aggregate_order_by
 from sqlalchemy.types import NullType
 
+from app.db.blocks import FRAME, FRAME_SIGMA_M
 from app.db.constants import text_constant
 from app.db.engine import Connection, driver
 from app.db.history import PointHistory, outcome_columns
 from app.db.rows import columns_of
 from app.db.schema import block, chip_file, image, point, point_history, view
 from app.db.statements import HotStatement, hot
+from services.formats.block.frame_json import parse_frame
+from services.types import Frame
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class PointDetail:
 
     Attributes:
         chip_key: key of its chips in the storage; `chip_row` is the first, `chip_count` their number.
+        frame: of its block, on the Earth.
         history: how registrations fared with it.
     """
 
@@ -58,6 +62,7 @@ class PointDetail:
     last_view: date | None
     block: str
     block_version: str
+    frame: Frame
     chip_key: str
     chip_row: int
     chip_count: int
@@ -77,6 +82,7 @@ def find_point(connection: Connection, point_id: int) -> PointDetail | None:
         return None
     values = dict(zip(DETAIL_FIELDS, row, strict=False))
     values["views"] = tuple(map(_view, values["views"]))
+    values["frame"] = parse_frame(*values["frame"])
     values["history"] = PointHistory(values["id"], *row[len(DETAIL_FIELDS) :])
     return PointDetail(**values)
 
@@ -122,6 +128,7 @@ def _point_statement() -> HotStatement:
         height_m=func.st_z(point.c.geom),
         block=block.c.id,
         block_version=block.c.version,
+        frame=func.json_build_array(FRAME, FRAME_SIGMA_M),
         chip_key=chip_file.c.storage_key,
         views=views,
         history=null(),

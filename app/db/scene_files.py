@@ -1,6 +1,7 @@
 """The files of scenes that callers can get: image, models, results of the last registration."""
 
 from dataclasses import dataclass
+from typing import Any
 from uuid import UUID
 
 from app.db.engine import Connection
@@ -19,6 +20,8 @@ class SceneFiles:
         models: names of the files beside it.
         job_id: the last job that registered the scene and whose files are still there.
         results: names of the files of that job.
+        accuracy: what the report of the last registration states, by the names of its members, None in
+            reports without them; None without a registration.
     """
 
     scene_id: UUID
@@ -26,6 +29,7 @@ class SceneFiles:
     models: list[str]
     job_id: UUID | None
     results: list[str]
+    accuracy: dict[str, Any] | None
 
 
 def read_scene_files(connection: Connection, scene_ids: list[UUID]) -> dict[UUID, SceneFiles]:

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from services.quality.accuracy import CIRCULAR_CE90, LINEAR_LE90, normal_ce90
+from services.quality.accuracy import LINEAR_LE90, normal_ce90
 from services.quality.frames import frame_le90_m, why_unknown
-from services.types import Frame
+from services.types import Array, Frame
 
 RELATIVE = "Relative to the control points"
 ON_THE_EARTH = "On the Earth"
@@ -82,28 +82,27 @@ def scene_accuracy(relative_m: float, on_the_earth_m: float, frame: Frame) -> Ac
     )
 
 
-def points_accuracy(
-    sigma_horizontal_m: float, sigma_up_m: float, frame: Frame, of: str = "median of the points"
-) -> AccuracyStatement:
+def points_accuracy(covariance_m2: Array, frame: Frame, of: str) -> AccuracyStatement:
     """The statement for control points.
 
     Args:
-        sigma_horizontal_m, sigma_up_m: of a point in the frame of its block, one standard deviation a
-            coordinate.
+        covariance_m2: (3, 3) of east, north, up of a point in the frame of its block.
         frame: of the block.
-        of: which point that is.
+        of: which point that is, for people.
     """
-    horizontal_m2 = frame.covariance_m2[:2, :2] + sigma_horizontal_m**2 * np.eye(2)
-    up_m2 = frame.covariance_m2[2, 2] + sigma_up_m**2
-    relative = CIRCULAR_CE90 * sigma_horizontal_m, LINEAR_LE90 * sigma_up_m
-    earth = float(normal_ce90(horizontal_m2[None])[0]), LINEAR_LE90 * float(np.sqrt(up_m2))
-    relative_words, earth_words = (
-        f"CE90 {_metres(ce90_m)}, LE90 {_metres(le90_m)} ({of})" for ce90_m, le90_m in (relative, earth)
-    )
+    relative, relative_words = _point_figures(covariance_m2, of)
+    earth, earth_words = _point_figures(covariance_m2 + frame.covariance_m2, of)
     return AccuracyStatement(
         StatedAccuracy(RELATIVE, *relative, relative_words),
         StatedAccuracy(ON_THE_EARTH, *earth, _with_reason(earth_words, frame)),
     )
+
+
+def _point_figures(covariance_m2: Array, of: str) -> tuple[tuple[float, float], str]:
+    """CE90 and LE90 of a covariance (3, 3), and their words."""
+    ce90_m = float(normal_ce90(covariance_m2[None, :2, :2])[0])
+    le90_m = LINEAR_LE90 * float(np.sqrt(covariance_m2[2, 2]))
+    return (ce90_m, le90_m), f"CE90 {_metres(ce90_m)}, LE90 {_metres(le90_m)} ({of})"
 
 
 def accuracy_document(statement: AccuracyStatement) -> dict[str, dict[str, str | float | None]]:

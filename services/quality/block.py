@@ -63,7 +63,7 @@ def block_quality(points: ControlPoints, images_per_point: IntArray, outline: Ar
     """
     cells = density_cells(points.lon_lat_h[:, :2], outline)
     area_km2 = float(cells.area_km2.sum())
-    variance = np.diagonal(points.covariance_m2, axis1=1, axis2=2)
+    horizontal_m, up_m = _sigmas_m(points)
     return BlockQuality(
         points=len(points),
         area_km2=area_km2,
@@ -72,8 +72,8 @@ def block_quality(points: ControlPoints, images_per_point: IntArray, outline: Ar
         share_reaching_quarter=share_reaching(cells, QUARTER_PER_KM2),
         images_per_point=distribution(images_per_point),
         views_per_point=distribution(np.diff(points.views.start)),
-        sigma_horizontal_m=distribution(np.sqrt(variance[:, :2].mean(axis=1))),
-        sigma_up_m=distribution(np.sqrt(variance[:, 2])),
+        sigma_horizontal_m=distribution(horizontal_m),
+        sigma_up_m=distribution(up_m),
         cells=cells,
     )
 
@@ -91,7 +91,24 @@ def distribution(values: Array | IntArray) -> Distribution:
 
 def block_accuracy(quality: BlockQuality, frame: Frame) -> AccuracyStatement:
     """The accuracy of the median point of a block, in its frame and on the Earth."""
-    return points_accuracy(quality.sigma_horizontal_m.median, quality.sigma_up_m.median, frame)
+    return _median_accuracy(quality.sigma_horizontal_m.median, quality.sigma_up_m.median, frame)
+
+
+def produced_accuracy(points: ControlPoints) -> AccuracyStatement:
+    """The accuracy of the median of new points of one block, in its frame and on the Earth."""
+    horizontal_m, up_m = _sigmas_m(points)
+    return _median_accuracy(float(np.median(horizontal_m)), float(np.median(up_m)), points.frames[0])
+
+
+def _median_accuracy(horizontal_m: float, up_m: float, frame: Frame) -> AccuracyStatement:
+    covariance_m2 = np.diag(np.array([horizontal_m, horizontal_m, up_m]) ** 2)
+    return points_accuracy(covariance_m2, frame, "median of the points")
+
+
+def _sigmas_m(points: ControlPoints) -> tuple[Array, Array]:
+    """Stated standard deviations (n,) of points: horizontal, a coordinate, and up."""
+    variance = np.diagonal(points.covariance_m2, axis1=1, axis2=2)
+    return np.sqrt(variance[:, :2].mean(axis=1)), np.sqrt(variance[:, 2])
 
 
 def quality_document(quality: BlockQuality) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.rpc_text import format_rpc_text
 from services.imagery.source import ArrayImage, render_chip
 from services.sensors.rpc import RpcModel
-from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Views
+from services.types import UNKNOWN_FRAME, Array, ChipArray, ControlPoints, FloatImage, Frame, Views
 from tests.factories import images, metadata
 
 CENTRE = np.array([5.25, 43.25])
@@ -47,13 +47,18 @@ class FlatWorld:
     true_model: RpcModel
 
 
-def make_flat_world(folder: Path, size: int = 1200, points: int = 40, seed: int = 5) -> FlatWorld:
-    """Write a block and a scene of `size` x `size` pixels that share a piece of ground."""
+def make_flat_world(
+    folder: Path, size: int = 1200, points: int = 40, seed: int = 5, frame: Frame = UNKNOWN_FRAME
+) -> FlatWorld:
+    """Write a block and a scene of `size` x `size` pixels that share a piece of ground.
+
+    The block states its frame on the Earth, or none.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     truth, ground = _model(size), _texture(size, rng)
     seen = [_seen(ground, rng) for _ in range(VIEWS + 1)]
-    _write_block(folder / "block", truth, seen[:VIEWS], points, rng)
+    _write_block(folder / "block", truth, seen[:VIEWS], points, rng, frame)
     delivered = replace(truth, image_offset=truth.image_offset - SHIFT_PX)
     image, tagged = folder / "scene.tif", folder / "tagged.tif"
     for path, model in ((image, None), (tagged, delivered)):
@@ -105,7 +110,12 @@ def _seen(ground: FloatImage, rng: np.random.Generator) -> FloatImage:
 
 
 def _write_block(
-    folder: Path, model: RpcModel, seen: list[FloatImage], count: int, rng: np.random.Generator
+    folder: Path,
+    model: RpcModel,
+    seen: list[FloatImage],
+    count: int,
+    rng: np.random.Generator,
+    frame: Frame,
 ) -> None:
     size = seen[0].shape[0]
     margin = 50 * GSDS_M[-1] / GSD_M + 20
@@ -122,7 +132,7 @@ def _write_block(
 
     low, high = points.lon_lat_h[:, :2].min(axis=0) - 1e-4, points.lon_lat_h[:, :2].max(axis=0) + 1e-4
     block_metadata = metadata("flat", "1", (low[0], low[1], high[0], high[1]), GSDS_M)
-    write_block(folder, block_metadata, points, chips, {})
+    write_block(folder, replace(block_metadata, frame=frame), points, chips, {})
 
 
 def _control_points(lon_lat_h: Array, count: int) -> ControlPoints:

@@ -104,6 +104,9 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     results = client.get(f"/jobs/{ended_job['jobID']}/results", headers=me).json()
     assert results.pop("verdict") in ("good", "usable")
     assert results.pop("method") == "control points"
+    assert results.pop("verdict_scope") == "relative to the control points"
+    assert results.pop("relative_to_control_points")["ce90_m"] < 0.5
+    assert results.pop("on_the_earth")["ce90_m"] is None
     assert set(results) == COMMON_FILES | {"scene_RPC.TXT", "scene.tif"}
     folder = tmp_path / "downloaded"
     folder.mkdir()

@@ -166,7 +166,9 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
 
     expect(page.get_by_role("link", name="Open the report")).to_be_visible()
     report = report_of(page, service, secret)
-    figures = page.locator("dl.facts").inner_text()
+    figures = page.locator("dl.facts").last.inner_text()
+    assert_accuracy_shown(page, report)
+    expect(page.get_by_text(f"Verdict: {report['verdict']}, {report['verdict_scope']}")).to_be_visible()
     found = report["point_counts"]
     assert f"{found['visible']}, {found['matched']}, {found['active']}" in figures
     assert page.locator(".badge").first.inner_text() == report["verdict"]
@@ -181,6 +183,14 @@ def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world
     opened.value.wait_for_load_state()
     expect(opened.value.locator("body")).to_contain_text(report["verdict"])
     opened.value.screenshot(path=ARTEFACTS / "report-page.png")
+
+
+def assert_accuracy_shown(page: Page, document: dict) -> None:
+    """Check that the first facts of a page are the two accuracies of a document, in their order."""
+    stated = [document["relative_to_control_points"], document["on_the_earth"]]
+    shown = page.locator("dl.facts").first
+    assert shown.locator("dt").all_inner_texts() == [one["label"] for one in stated]
+    assert shown.locator("dd").all_inner_texts() == [one["words"] for one in stated]
 
 
 def test_an_upload_resumes_where_it_stopped_when_the_page_is_opened_again(

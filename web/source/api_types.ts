@@ -372,6 +372,8 @@ export interface PointProperties {
   corr_east_north: number;
   corr_east_up: number;
   corr_north_up: number;
+  relative_to_control_points: StatedAccuracy;
+  on_the_earth: StatedAccuracy;
   n_views: number;
   saliency: number;
   typology: string | null;

@@ -44,6 +44,7 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
   const point = await get<PointWithViews>(`collections/points/items/${encodeURIComponent(id)}`, signal);
   const [lon, lat, height] = point.geometry.coordinates;
   const { properties } = point;
+  const { relative_to_control_points: relative, on_the_earth: earth } = properties;
   const chips = h("ul", { class: "chips", "aria-label": "Chips" });
   fill(
     panel,
@@ -57,6 +58,8 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
         .map((sigma) => figure(sigma))
         .join(", ")
         .concat("\u00a0m"),
+      [relative.label]: relative.words,
+      [earth.label]: earth.words,
       Saliency: figure(properties.saliency),
       Block: properties.block,
     }),

@@ -64,3 +64,12 @@ class Problem(Reply):
 
 
 Count = Annotated[int, Field(ge=0)]
+
+
+class StatedAccuracy(Reply):
+    """Accuracy against one reference; null where it is unknown, and `words` say why."""
+
+    label: str
+    ce90_m: float | None
+    le90_m: float | None
+    words: str

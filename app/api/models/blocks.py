@@ -4,7 +4,7 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from app.api.models.base import Count, Reply
+from app.api.models.base import Count, Reply, StatedAccuracy
 from app.db.schema import BlockState
 
 
@@ -65,15 +65,6 @@ class AccuracyRecord(Reply):
     value: float
     count: Count
     against: str
-
-
-class StatedAccuracy(Reply):
-    """Accuracy against one reference; null where it is unknown, and `words` say why."""
-
-    label: str
-    ce90_m: float | None
-    le90_m: float | None
-    words: str
 
 
 class BlockQuality(Reply):

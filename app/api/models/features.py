@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from app.api.models.base import Count, JsonObject, Link, Missing, Reply
+from app.api.models.base import Count, JsonObject, Link, Missing, Reply, StatedAccuracy
 
 PointGeometry = Annotated[
     JsonObject,
@@ -73,6 +73,8 @@ class PointProperties(PointHistoryProperties):
     corr_east_north: float
     corr_east_up: float
     corr_north_up: float
+    relative_to_control_points: StatedAccuracy
+    on_the_earth: StatedAccuracy
     n_views: Count
     saliency: float
     typology: str | None

@@ -19,9 +19,11 @@ from app.db.points import POINTS
 from app.errors import InvalidParameter, NotFound
 from app.usecases.features.items import everything_in
 from app.usecases.features.query import MOST_FEATURES, FeatureFilter, condition_of
+from services.formats.block.tables import covariance_from_sigmas
 from services.formats.chips.images import LabelledChips
 from services.formats.chips.stacks import stream_chips_npz
 from services.formats.chips.tiff_pages import stream_chips_tiff
+from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
 from services.types import Acquisition, ChipSource, ControlPoints
 
 StackFormat = Literal["npz", "tif"]
@@ -113,6 +115,13 @@ def find_point(connection: Connection, point_id: int) -> PointDetail:
     if point is None:
         raise NotFound(f"no point {point_id}")
     return point
+
+
+def point_accuracy(point: PointDetail) -> AccuracyStatement:
+    """The accuracy of one point, in the frame of its block and on the Earth."""
+    sigma_m = np.array([[point.sigma_east_m, point.sigma_north_m, point.sigma_up_m]])
+    correlation = np.array([[point.corr_east_north, point.corr_east_up, point.corr_north_up]])
+    return points_accuracy(covariance_from_sigmas(sigma_m, correlation)[0], point.frame, "this point")
 
 
 def read_chips(chips: ChipSource, point: PointDetail) -> LabelledChips:

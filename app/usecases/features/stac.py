@@ -67,7 +67,7 @@ def _item(feature: Item, files: SceneFiles, base: str) -> Item:
         "id": feature["id"],
         "geometry": feature["geometry"],
         **({} if box is None else {"bbox": box}),
-        "properties": _properties(feature["properties"]),
+        "properties": _properties(feature["properties"]) | _accuracy(files),
         "collection": COLLECTION,
         "assets": _assets(files, base),
         "links": [
@@ -85,6 +85,13 @@ def _properties(columns: dict[str, Any]) -> dict[str, Any]:
     properties = {name: value for name, value in columns.items() if value is not None}
     shape = [columns["amers:lines"], columns["amers:samples"]]
     return {**properties, "proj:code": None, **({} if None in shape else {"proj:shape": shape})}
+
+
+def _accuracy(files: SceneFiles) -> dict[str, Any]:
+    """The accuracy that the last registration states, as in its report; unknown figures are null."""
+    return {
+        f"amers:{name}": stated for name, stated in (files.accuracy or {}).items() if stated is not None
+    }
 
 
 def _bbox(geometry: dict[str, Any] | None) -> list[float] | None:

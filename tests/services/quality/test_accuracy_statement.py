@@ -10,6 +10,7 @@ from services.types import UNKNOWN_FRAME, Frame
 
 a_percent = 0.01
 TILTED = Frame(np.array([[1.8, 0.3, 0.9], [0.3, 1.7, -2.0], [0.9, -2.0, 25.0]]))
+MEDIAN_M2 = np.diag([0.2, 0.2, 0.5]) ** 2
 OBLIQUE = np.array([[[0.1, -1.9, 0.3], [2.0, 0.2, -1.1]]])
 """Pixels per metre east, north, up, of a view 30 degrees off the vertical."""
 
@@ -39,7 +40,7 @@ def test_the_words_state_both_accuracies_in_their_order():
         "Relative to the control points: CE90 0.11 m (worst place of the image)",
         "On the Earth: CE90 3.20 m (worst place of the image), LE90 of the control points' frame 8.22 m",
     )
-    assert points_accuracy(0.2, 0.5, Frame.from_sigmas(1.5, 5.0)).lines == (
+    assert points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, 5.0), "median of the points").lines == (
         "Relative to the control points: CE90 0.43 m, LE90 0.82 m (median of the points)",
         "On the Earth: CE90 3.25 m, LE90 8.27 m (median of the points)",
     )
@@ -53,7 +54,7 @@ def test_the_words_say_what_is_unknown_and_why():
     )
     no_height = scene_accuracy(0.11, np.nan, Frame.from_sigmas(1.5, np.nan)).lines[1]
     assert no_height.endswith("unknown: nobody stated the height of the control points' frame")
-    block = points_accuracy(0.2, 0.5, Frame.from_sigmas(1.5, np.nan))
+    block = points_accuracy(MEDIAN_M2, Frame.from_sigmas(1.5, np.nan), "median of the points")
     assert block.lines[1] == (
         "On the Earth: CE90 3.25 m, LE90 unknown (median of the points): nobody stated the height of "
         "the control points' frame"

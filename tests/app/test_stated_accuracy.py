@@ -1,0 +1,166 @@
+"""Every place that states an accuracy states two: relative to the control points, and on the Earth."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.storage import Storage
+from services.types import UNKNOWN_FRAME, Frame
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
+from tests.app.worker_processes import ended, running_worker
+
+pytestmark = pytest.mark.long
+
+RELATIVE = "Relative to the control points"
+ON_THE_EARTH = "On the Earth"
+SCOPE = "relative to the control points"
+STATED = Frame.from_sigmas(1.5, 5.0)
+EARTH_LE90_M = 8.22
+a_centimetre = 0.01
+
+Bearer = Callable[[str], dict[str, str]]
+Document = dict[str, Any]
+
+
+@pytest.fixture(scope="module", params=[STATED, UNKNOWN_FRAME], ids=["stated", "unknown"])
+def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    """A block that states its frame, or none, and a scene to register on it."""
+    return make_flat_world(tmp_path_factory.mktemp("world"), frame=request.param)
+
+
+@pytest.fixture
+def is_known(request: pytest.FixtureRequest, world: FlatWorld) -> bool:
+    document = json.loads((world.block / "block.json").read_text())
+    return document["amers:frame"] is not None
+
+
+@pytest.fixture
+def published(world: FlatWorld, dsn: str, storage: Storage) -> None:
+    publish_world(dsn, storage, world)
+
+
+@pytest.fixture
+def amers(settings: Settings) -> Callable[..., str]:
+    """Runs the command `amers` on the installation of the test; returns what it prints."""
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+
+    def run(*arguments: object) -> str:
+        command = [sys.executable, "-m", "app.cli.main", *map(str, arguments)]
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=240, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def assert_stated(document: Document, is_known: bool, prefix: str = "") -> tuple[str, str]:
+    """Check the two accuracies of a JSON document; returns their words."""
+    relative = document[f"{prefix}relative_to_control_points"]
+    earth = document[f"{prefix}on_the_earth"]
+    assert (relative["label"], earth["label"]) == (RELATIVE, ON_THE_EARTH)
+    assert f"CE90 {relative['ce90_m']:.2f} m" in relative["words"]
+    if is_known:
+        assert earth["ce90_m"] > 2.146 * 1.5 - a_centimetre
+        assert earth["le90_m"] >= EARTH_LE90_M
+        assert f"CE90 {earth['ce90_m']:.2f} m" in earth["words"]
+        assert f"{earth['le90_m']:.2f} m" in earth["words"]
+        assert "unknown" not in earth["words"]
+    else:
+        assert (earth["ce90_m"], earth["le90_m"]) == (None, None)
+        assert "CE90 unknown" in earth["words"]
+        assert earth["words"].endswith("nobody stated the frame of the control points")
+    return relative["words"], earth["words"]
+
+
+def assert_shown(text: str, words: tuple[str, str]) -> None:
+    """Check that a text for people has both accuracies with their labels, in their order."""
+    flat = " ".join(text.split())
+    places = [flat.index(part) for part in (RELATIVE, words[0], ON_THE_EARTH, words[1])]
+    assert places == sorted(places), text
+
+
+def test_everything_about_a_registered_scene_states_both(
+    client: TestClient,
+    bearer: Bearer,
+    settings: Settings,
+    published: None,
+    world: FlatWorld,
+    is_known: bool,
+    tmp_path: Path,
+):
+    me = bearer("register")
+    image = world.tagged.read_bytes()
+    scene = client.post(f"/scenes?name=a.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()["id"]
+    execution = "/processes/register-scene/execution"
+    reply = client.post(execution, json={"inputs": {"scene": scene}}, headers=me)
+    with running_worker(settings, tmp_path / "log"):
+        job = ended(client, reply.headers["location"], me)
+    assert job["status"] == "successful", job
+    results = client.get(f"/jobs/{job['jobID']}/results", headers=me).json()
+    words = assert_stated(results, is_known)
+    assert results["verdict_scope"] == SCOPE
+
+    texts = {
+        name: client.get(results[name]["href"], headers=me).text
+        for name in ("report.json", "report.html", "report.txt")
+    }
+    report = json.loads(texts["report.json"])
+    assert assert_stated(report, is_known) == words
+    assert report["verdict_scope"] == SCOPE
+    verdict_line = f"Verdict: {report['verdict']}, {SCOPE}"
+    for name in ("report.html", "report.txt"):
+        text = " ".join(unescape(texts[name]).split())
+        assert verdict_line in text
+        headline = text[text.index(verdict_line) :]
+        assert_shown(headline, words)
+
+    item = client.get(f"/collections/scenes/items/{scene}", headers=me).json()["properties"]
+    assert assert_stated(item, is_known, "amers:") == words
+    assert item["amers:verdict_scope"] == SCOPE
+    (found,) = client.get("/search?collections=scenes", headers=me).json()["features"]
+    assert assert_stated(found["properties"], is_known, "amers:") == words
+
+
+def test_everything_about_a_block_and_its_points_states_both(
+    client: TestClient, bearer: Bearer, published: None, is_known: bool, amers: Callable[..., str]
+):
+    me = bearer("read")
+    words = assert_stated(client.get("/blocks/flat/quality", headers=me).json(), is_known)
+    for command in ("show", "quality"):
+        assert assert_stated(json.loads(amers("block", command, "flat", "--json")), is_known) == words
+        assert_shown(amers("block", command, "flat"), words)
+    (point,) = client.get("/collections/points/items?limit=1", headers=me).json()["features"]
+    item = client.get(f"/collections/points/items/{point['id']}", headers=me).json()
+    assert_stated(item["properties"], is_known)
+
+
+def test_the_command_that_registers_states_both(
+    world: FlatWorld, is_known: bool, amers: Callable[..., str], tmp_path: Path
+):
+    command = ("scene", "register", world.tagged, "--block", world.block, "--sigma-m", SIGMA_M)
+    output = json.loads(amers(*command, "-o", tmp_path / "out", "--json"))
+    words = assert_stated(output, is_known)
+    text = amers(*command, "-o", tmp_path / "out")
+    assert_shown(text, words)
+    assert f"{output['verdict']}, {SCOPE}" in text
+    several = tmp_path / "several"
+    several.mkdir()
+    for name in ("a.tif", "b.tif"):
+        (several / name).write_bytes(world.tagged.read_bytes())
+    table = amers("scene", "register", several, *command[3:], "-o", tmp_path / "outs")
+    assert table.count(words[0]) == table.count(words[1]) == 2
