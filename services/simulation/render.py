@@ -151,7 +151,15 @@ def ray_setup(
     )
 
 
-def ray_nodes(world: World, model: SensorModel, setup: RaySetup, lines: range, nodes: range) -> RayNodes:
+def ray_nodes(
+    world: World,
+    model: SensorModel,
+    setup: RaySetup,
+    lines: range,
+    nodes: range,
+    *,
+    shift_px: tuple[float, float] = (0.0, 0.0),
+) -> RayNodes:
     """Lines of sight of some lines, and of a quarter line before and after them, at some nodes.
 
     Args:
@@ -160,9 +168,10 @@ def ray_nodes(world: World, model: SensorModel, setup: RaySetup, lines: range, n
         setup: both heights.
         lines: consecutive lines.
         nodes: consecutive nodes, one for every `NODE_SPACING`-th sample from sample -0.5 on.
+        shift_px: added to lines and samples.
     """
-    line = lines.start + np.arange(-1.0, len(lines) + 1.0)
-    sample = -0.5 + NODE_SPACING * np.arange(nodes.start, nodes.stop)
+    line = lines.start + np.arange(-1.0, len(lines) + 1.0) + shift_px[0]
+    sample = -0.5 + NODE_SPACING * np.arange(nodes.start, nodes.stop) + shift_px[1]
     image = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def at(height_m: float) -> Array:

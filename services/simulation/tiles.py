@@ -1,8 +1,10 @@
 """Images of a world that are rendered where they are read, for scenes too large to render whole."""
 
+import math
 from collections import OrderedDict
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -16,6 +18,7 @@ from services.simulation.conditions import (
     seen_through,
     under_clouds,
 )
+from services.simulation.detectors import PERFECT, Detectors
 from services.simulation.land import NO_ROOF
 from services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
 from services.simulation.rays import RayNodes, intersect_surface
@@ -94,7 +97,12 @@ class TiledView:
     """
 
     def __init__(
-        self, world: World, geometry: ViewGeometry, seed: int, conditions: Conditions = CLEAR
+        self,
+        world: World,
+        geometry: ViewGeometry,
+        seed: int,
+        conditions: Conditions = CLEAR,
+        detectors: Detectors = PERFECT,
     ) -> None:
         """Prepare an image.
 
@@ -103,6 +111,7 @@ class TiledView:
             geometry: geometry of the image.
             seed: seed of clouds and noise.
             conditions: conditions of the acquisition.
+            detectors: what the sensor model does not know of them.
 
         Raises:
             InputError: slopes are so steep that the terrain would occlude itself.
@@ -113,6 +122,7 @@ class TiledView:
         self._world = world
         self._geometry = geometry
         self._conditions = conditions
+        self._detectors = detectors
         self._seed = seed
         self._setup = ray_setup(world, plan.incidence_deg, *sun)
         self._light = LightOnDemand(world, day, plan.gsd_m / world.posting_m)
@@ -148,15 +158,19 @@ class TiledView:
     def _row_of_tiles(self, row: int, first: int, last: int) -> Iterator[tuple[int, Pixels]]:
         """Yield columns and pixels of neighbouring tiles, rendering those that are missing."""
         missing = [c for c in range(first, last + 1) if (row, c) not in self._tiles]
-        if missing:
+        if missing and self._detectors.are_perfect:
             rays = self._rays(row, range(missing[0], missing[-1] + 2))
         for column in range(first, last + 1):
             pixels = self._tiles.pop((row, column), None)
             if pixels is None:
-                at = column - missing[0]
-                of_tile = np.s_[:, :, at : at + 2]
-                tile_rays = rays._replace(low=rays.low[of_tile], high=rays.high[of_tile])
-                pixels = self._render(row, column, tile_rays)
+                if self._detectors.are_perfect:
+                    at = column - missing[0]
+                    of_tile = np.s_[:, :, at : at + 2]
+                    tile_rays = rays._replace(low=rays.low[of_tile], high=rays.high[of_tile])
+                    light = self._light_along(tile_rays, self._tile_shape(row, column))
+                else:
+                    light = self._light_of_detectors(row, column)
+                pixels = self._render(row, column, light)
             self._tiles[row, column] = pixels
             yield column, pixels
         while len(self._tiles) > _CACHED_TILES:
@@ -167,13 +181,36 @@ class TiledView:
         lines = range(row * TILE_PX, min((row + 1) * TILE_PX, self.shape[0]))
         return ray_nodes(self._world, self._geometry.true_model, self._setup, lines, nodes)
 
-    def _render(self, row: int, column: int, rays: RayNodes) -> Pixels:
-        """Pixels of one tile."""
-        line = np.arange(row * TILE_PX, min((row + 1) * TILE_PX, self.shape[0]), dtype=np.float64)
-        sample = np.arange(
-            column * TILE_PX, min((column + 1) * TILE_PX, self.shape[1]), dtype=np.float64
+    def _tile_shape(self, row: int, column: int) -> tuple[int, int]:
+        lines, samples = self.shape
+        return min(TILE_PX, lines - row * TILE_PX), min(TILE_PX, samples - column * TILE_PX)
+
+    def _light_of_detectors(self, row: int, column: int) -> FloatImage:
+        """Light of a tile as its detectors see it: out of place, and blurred."""
+        lines, samples = self._tile_shape(row, column)
+        margin = math.ceil(3.0 * max(self._detectors.blur_px))
+        step = self._detectors.step_of(column, self.shape[1]) - [0.0, float(margin)]
+        first = row * TILE_PX - margin
+        rays = ray_nodes(
+            self._world,
+            self._geometry.true_model,
+            self._setup,
+            range(first, first + lines + 2 * margin),
+            range(column, column + 2 + math.ceil(2 * margin / TILE_PX)),
+            shift_px=(float(step[0]), float(step[1])),
         )
-        light = self._light_along(rays, (len(line), len(sample)))
+        light = self._light_along(rays, (lines + 2 * margin, samples + 2 * margin))
+        if margin == 0:
+            return light
+        along_lines, along_samples = self._detectors.blur_px
+        blurred = cv2.GaussianBlur(light, (0, 0), sigmaX=along_samples, sigmaY=along_lines)
+        return np.ascontiguousarray(blurred[margin : margin + lines, margin : margin + samples])
+
+    def _render(self, row: int, column: int, light: FloatImage) -> Pixels:
+        """Pixels of one tile."""
+        lines, samples = light.shape
+        line = np.arange(lines, dtype=np.float64) + row * TILE_PX
+        sample = np.arange(samples, dtype=np.float64) + column * TILE_PX
         if self._conditions.inverted:
             light = inverted(light)
         if self._clouds is not None:

@@ -1,7 +1,7 @@
 """A simulated piece of ground, exactly known: heights, buildings and land cover."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -152,6 +152,19 @@ def make_world(
         albedo=cover.albedo,
         parcel=cover.parcel,
     )
+
+
+def with_smoother_terrain(world: World, spacing_m: float) -> World:
+    """The world with a terrain that is bicubic between means over squares of `spacing_m`.
+
+    It is what another terrain of the same ground differs by: ridges and valleys between the nodes.
+    """
+    rows, columns = world.terrain_m.shape
+    per_node = max(2.0, spacing_m / world.posting_m)
+    nodes = max(8, round(columns / per_node)), max(8, round(rows / per_node))
+    coarse = cv2.resize(world.terrain_m, nodes, interpolation=cv2.INTER_AREA)
+    terrain = cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
+    return replace(world, terrain_m=np.asarray(terrain, dtype=np.float32))
 
 
 def natural_noise(rng: np.random.Generator, n: int, exponent: float, shortest: float) -> FloatImage:
