@@ -6,24 +6,24 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from benchmarks._point_errors import BlockErrors, spoil
 from benchmarks._trials import Trial
-from benchmarks._worlds import FINE_GSD_M, Block, Place, world_of
+from benchmarks._worlds import Block, Place, world_of
 from services.errors import AmersError
-from services.geodesy import move_metres
 from services.imagery.scene import Scene
-from services.quality.accuracy import CIRCULAR_CE90, accuracy, normalised_error
+from services.imagery.source import ImageSource
+from services.quality.accuracy import accuracy, normal_ce90, normalised_error
 from services.registration.on_points import Registration, register_scene
 from services.registration.options import RegistrationOptions
 from services.simulation.conditions import Conditions
+from services.simulation.defects import Damage, DamagedImage
+from services.simulation.detectors import Detectors
 from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
-from services.simulation.world import World
-from services.types import Array, ControlPoints, Frame
+from services.simulation.world import World, with_smoother_terrain
+from services.types import Array, ControlPoints
 
-FRAME_SIGMA_M = 0.5
-LE90_OF_CE90 = 5.0 / 3.0
-"""Ratio of the points: 5 m to 3 m in SRP."""
 WRONG = 3.0
 """A result is wrong when its CE90 exceeds the predicted CE90 this many times."""
 
@@ -43,6 +43,8 @@ class Outcome:
         normalised: mean square of true errors over stated deviations, over the image.
         displacement_m: stability test, largest of the medians of the corners and the centre.
         cpu_s: of the registration, with the rendering of the pixels that it reads.
+        ground_predicted_m: CE90 on the Earth as stated, with the frame of the blocks; median.
+        ground_normalised: as `normalised`, on the Earth.
     """
 
     verdict: str
@@ -59,6 +61,8 @@ class Outcome:
     normalised: float
     displacement_m: float
     cpu_s: float
+    ground_predicted_m: float = float("nan")
+    ground_normalised: float = float("nan")
 
     @property
     def delivered(self) -> bool:
@@ -70,21 +74,43 @@ class Outcome:
         """Whether the true error is more than `WRONG` times the predicted one."""
         return not self.ce90_m <= WRONG * self.predicted_m
 
+    @property
+    def wrong_on_earth(self) -> bool:
+        """Whether the true error on the Earth is more than `WRONG` times the predicted one."""
+        return not self.ground_ce90_m <= WRONG * self.ground_predicted_m
+
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene and points with errors, and the truth."""
+    """A scene and points with errors, and the truth.
+
+    Attributes:
+        scene, points: what a registration gets.
+        world: what the scene shows.
+        geometry, detectors: the truth about its image.
+        errors: of the blocks of the points.
+    """
 
     scene: Scene
     points: ControlPoints
+    world: World
     geometry: ViewGeometry
-    frame_shift_m: Array
+    detectors: Detectors
+    errors: BlockErrors
+
+    def shown(self, line_sample: Array) -> Array:
+        """The ground (n, 3) that pixels (n, 2) show."""
+        seen = self.detectors.seen(line_sample, self.scene.image.shape[1])
+        return surface_seen(self.world, self.geometry.true_model, seen)
 
 
 def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
-    """The scene of a trial, with errors in its model and in the points."""
+    """The scene of a trial, with errors in its model, in its pixels and in the points."""
     world = world_of(place)
+    if trial.terrain_m > 0.0:
+        world = with_smoother_terrain(world, trial.terrain_m)
     rng = np.random.default_rng([seed, trial.number, 1])
+    more = np.random.default_rng([seed, trial.number, 2])
     lon, lat = world.centre_lon_lat.tolist()
     plan = ViewPlan(
         f"scene_{trial.number}",
@@ -101,36 +127,16 @@ def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
     error_px[:, 1:] = trial.drift_px * rng.uniform(-1.0, 1.0, (2, 2))
     geometry = plan_geometry(world, plan, rng, error_m, error_px)
     conditions = Conditions(trial.haze, trial.cloud_cover, trial.inverted, trial.season, trial.noise)
-    image = TiledView(world, geometry, int(rng.integers(2**31)), conditions)
+    steps = more.uniform(-1.0, 1.0, (trial.parts, 2)) * trial.seam_px
+    detectors = Detectors(steps - steps.mean(axis=0), (trial.smear_px, trial.blur_px))
+    image: ImageSource = TiledView(world, geometry, int(rng.integers(2**31)), conditions, detectors)
+    if trial.bits != 12 or trial.damaged > 0.0:
+        damage = Damage(trial.bits, trial.damaged, trial.missing, trial.patch_px, trial.brightest)
+        image = DamagedImage(image, damage, trial.number)
     scene = Scene(image, geometry.delivered, geometry.acquisition, trial.sigma_m)
-    shift_m = np.append(rng.normal(0.0, FRAME_SIGMA_M, 2), 0.0)
-    return Prepared(scene, _spoiled(block.points, trial, shift_m, rng), geometry, shift_m)
-
-
-def _spoiled(
-    points: ControlPoints, trial: Trial, shift_m: Array, rng: np.random.Generator
-) -> ControlPoints:
-    """Points with the errors of a trial: a common shift, noise, moved points, vanished chips."""
-    n = len(points)
-    sigma_m = trial.point_ce90_m * np.array(
-        [1.0 / CIRCULAR_CE90, 1.0 / CIRCULAR_CE90, LE90_OF_CE90 / 1.6449]
-    )
-    offset_m = shift_m + trial.understated * sigma_m * rng.standard_normal((n, 3))
-    order = rng.permutation(n)
-    moved, vanished = np.split(order, [round(trial.moved * n)])
-    vanished = vanished[: round(trial.vanished * n)]
-    far_m = rng.uniform(2.0, 20.0, len(moved)) * max(FINE_GSD_M, trial.gsd_m)
-    towards = rng.uniform(0.0, 2.0 * np.pi, len(moved))
-    offset_m[moved, :2] += far_m[:, None] * np.column_stack([np.sin(towards), np.cos(towards)])
-    chip_row = points.chip_row.copy()
-    chip_row[vanished] = np.roll(chip_row[vanished], 1)
-    return replace(
-        points,
-        lon_lat_h=move_metres(points.lon_lat_h, offset_m),
-        covariance_m2=points.covariance_m2 + np.diag(sigma_m**2),
-        frames=(Frame.from_sigmas(FRAME_SIGMA_M, 0.0),),
-        chip_row=chip_row,
-    )
+    side_m = trial.gsd_m * place.lines
+    points, errors = spoil(block.points, trial, world.centre_lon_lat, side_m, rng=rng, more=more)
+    return Prepared(scene, points, world, geometry, detectors, errors)
 
 
 def attempt(
@@ -138,7 +144,6 @@ def attempt(
 ) -> Outcome:
     """The outcome of registering the scene of a trial."""
     prepared = prepare(place, trial, block, seed)
-    world = world_of(place)
     start_s = time.process_time()
     try:
         registration = register_scene(
@@ -148,32 +153,37 @@ def attempt(
             options,
         )
     except AmersError as error:
-        nan = float("nan")
         cpu_s = time.process_time() - start_s
-        return Outcome("refused", str(error), 0, 0, 0, "", nan, nan, nan, nan, nan, nan, nan, cpu_s)
-    return _judged(world, prepared, registration, time.process_time() - start_s)
+        return Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
+    return _judged(prepared, registration, time.process_time() - start_s)
 
 
-def _judged(world: World, prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:
+def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:
     """The errors of a registration against the true sensor, on a grid over the whole image."""
     shape = prepared.scene.image.shape
     axes = [np.linspace(0.0, size - 1.0, 12) for size in shape]
     line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    shown = surface_seen(world, prepared.geometry.true_model, line_sample)
-    in_frame = move_metres(shown, np.broadcast_to(prepared.frame_shift_m, shown.shape))
+    shown = prepared.shown(line_sample)
+    measures, points = registration.measures, prepared.points
+    blocks = points.block[measures.point_id[measures.active]]
+    shares = np.bincount(blocks, minlength=len(points.frames)).astype(np.float64)
+    in_frame = prepared.errors.in_frame(shown, shares)
 
     def error_px(ground: Array) -> Array:
         return np.asarray(registration.model.project(ground) - line_sample)
 
-    inverse = np.linalg.inv(registration.model.project_derivative(shown)[:, :, :2])
+    derivative = registration.model.project_derivative(shown)
+    inverse = np.linalg.inv(derivative[:, :, :2])
 
     def ce90_m(error: Array) -> float:
         return accuracy((inverse @ error[:, :, None])[:, :, 0]).ce90_m.value
 
-    error = error_px(in_frame)
-    before = prepared.scene.model.project(shown) - line_sample
+    error, on_earth = error_px(in_frame), error_px(shown)
+    covariance = registration.adjustment.covariance_at(line_sample)
+    frame = derivative @ registration.frame.covariance_m2 @ derivative.transpose(0, 2, 1)
+    both = covariance + frame
+    predicted_on_earth_m = normal_ce90(inverse @ both @ inverse.transpose(0, 2, 1))
     quality = registration.qualification
-    honest = normalised_error(error, registration.adjustment.covariance_at(line_sample))
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
         verdict=quality.verdict,
@@ -182,12 +192,14 @@ def _judged(world: World, prepared: Prepared, registration: Registration, cpu_s:
         matched=quality.point_counts.matched,
         active=quality.point_counts.active,
         order=registration.adjustment.order,
-        ce90_before_m=ce90_m(before),
+        ce90_before_m=ce90_m(prepared.scene.model.project(shown) - line_sample),
         ce90_m=ce90_m(error),
-        ground_ce90_m=ce90_m(error_px(shown)),
+        ground_ce90_m=ce90_m(on_earth),
         predicted_m=quality.predicted.median_m,
         predicted_worst_m=quality.predicted.worst_m,
-        normalised=honest.mean_square,
+        normalised=normalised_error(error, covariance).mean_square,
         displacement_m=max(moved_m, default=float("nan")),
         cpu_s=cpu_s,
+        ground_predicted_m=float(np.median(predicted_on_earth_m)),
+        ground_normalised=normalised_error(on_earth, both).mean_square,
     )

@@ -1,11 +1,17 @@
 """What is done to each scene of a campaign: everything follows from its number and the seed."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks._worlds import FINE_GSD_M, NOMINAL, PLACES, Place, largest_incidence_deg
+from benchmarks._worlds import (
+    FINE_GSD_M,
+    NOMINAL,
+    PLACES,
+    Place,
+    largest_incidence_deg,
+    smallest_hill_m,
+)
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,16 @@ class Trial:
         understated: how many times larger the errors of the points are.
         relief_m, patterned_share: of the world, for the tables.
         chip_ratio: ground sampling of the scene over that of the finest chips.
+
+        frame_sigma_m, frame_up_m: of the offset of each block, a horizontal coordinate and the height.
+        blocks: side by side in the scene, each with its own offset.
+        correlated, correlation: share of the points' variance that neighbours have in common, and over
+            which share of the scene's side.
+        warped: distortion of the blocks, in strips of `_point_errors.STRIP_WARP_M`.
+        bits, damaged, missing, patch_px, brightest: of the pixels; see `simulation.defects.Damage`.
+        blur_px, smear_px: sigma of the blur along samples and along lines.
+        seam_px, parts: largest displacement of the parts of the detectors, and their number.
+        terrain_m: spacing of the terrain that the scene is taken of; 0 for that of the chips.
     """
 
     number: int
@@ -49,6 +65,22 @@ class Trial:
     relief_m: float
     patterned_share: float
     chip_ratio: float
+    frame_sigma_m: float = 0.5
+    frame_up_m: float = 0.0
+    blocks: int = 1
+    correlated: float = 0.0
+    correlation: float = 0.0
+    warped: float = 0.0
+    bits: int = 12
+    damaged: float = 0.0
+    missing: float = 0.0
+    patch_px: int = 1
+    brightest: bool = False
+    blur_px: float = 0.0
+    smear_px: float = 0.0
+    seam_px: float = 0.0
+    parts: int = 1
+    terrain_m: float = 0.0
 
 
 def draw_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
@@ -111,6 +143,62 @@ def nominal_trial(seed: int, number: int, place: Place = NOMINAL) -> Trial:
     )
 
 
-def in_order_of_places(numbers: Iterable[int], places: tuple[Place, ...]) -> list[int]:
-    """Numbers of trials so that a world is made once."""
-    return sorted(numbers, key=lambda number: (number % len(places), number))
+def damaged_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
+    """The trial of a number on damaged pixels: few or many, single or in squares, or the brightest."""
+    rng = np.random.default_rng([seed, number, 3])
+    pattern = rng.choice(["single", "squares", "brightest"], p=[0.4, 0.4, 0.2])
+    side_px = _log_uniform(rng, 3.0, 64.0)
+    share = _log_uniform(rng, 1e-5, 0.05)
+    return replace(
+        draw_trial(seed, number, places),
+        bits=int(rng.choice([8, 10, 11, 12, 16])),
+        damaged=share,
+        missing=float(rng.choice([0.0, 1.0, rng.uniform()])),
+        patch_px=round(side_px) if pattern == "squares" else 1,
+        brightest=bool(pattern == "brightest"),
+    )
+
+
+def intact_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
+    """The same scene as `damaged_trial` in the same bits, with all its pixels."""
+    return replace(damaged_trial(seed, number, places), damaged=0.0)
+
+
+def points_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
+    """The trial of a number on points whose errors are not independent, as large as declared."""
+    rng = np.random.default_rng([seed, number, 4])
+    return replace(
+        draw_trial(seed, number, places),
+        understated=1.0,
+        frame_sigma_m=_log_uniform(rng, 0.3, 3.0),
+        frame_up_m=_log_uniform(rng, 0.5, 5.0),
+        blocks=int(rng.choice([1, 2, 3], p=[0.4, 0.4, 0.2])),
+        correlated=_perhaps(rng, 0.6, 0.3, 1.0),
+        correlation=float(rng.uniform(0.05, 0.2)),
+        warped=_perhaps(rng, 0.5, 0.3, 1.0),
+    )
+
+
+def sensor_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:
+    """The trial of a number with a blur, seams between detectors and another terrain."""
+    rng = np.random.default_rng([seed, number, 5])
+    trial = draw_trial(seed, number, places)
+    place = places[number % len(places)]
+    return replace(
+        trial,
+        blur_px=float(rng.uniform(0.3, 1.0)),
+        smear_px=float(rng.uniform(0.3, 1.2)),
+        seam_px=_perhaps(rng, 0.7, 0.1, 1.0),
+        parts=int(rng.integers(2, 9)),
+        terrain_m=_perhaps(rng, 0.7, 0.05, 0.25) * smallest_hill_m(place),
+    )
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _perhaps(rng: np.random.Generator, chance: float, low: float, high: float) -> float:
+    """A uniform number with some chance, else 0."""
+    value = float(rng.uniform(low, high))
+    return value if rng.uniform() < chance else 0.0

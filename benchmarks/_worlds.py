@@ -98,12 +98,13 @@ def world_of(place: Place) -> World:
         place.posting_m,
         place.relief_m,
         lowest_m=150.0,
-        smallest_hill_m=_hill_m(place),
+        smallest_hill_m=smallest_hill_m(place),
         patterned_share=place.patterned_share,
     )
 
 
-def _hill_m(place: Place) -> float:
+def smallest_hill_m(place: Place) -> float:
+    """Wavelength of the smallest hills of a place."""
     return max(350.0, 0.03 * place.size_m, 0.5 * place.relief_m)
 
 

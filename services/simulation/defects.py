@@ -1,4 +1,4 @@
-"""Pixels as archives hold them: quantised, some of them missing, some brighter than the sensor can tell."""
+"""Pixels as archives hold them: quantised, some missing, some brighter than the sensor can tell."""
 
 from dataclasses import dataclass
 
@@ -39,8 +39,8 @@ class Damage:
                 raise InputError(f"{name}: {getattr(self, name)} given, 0 to 1 expected")
         if not 8 <= self.bits <= 16 or self.patch_px < 1:
             raise InputError(
-                f"{self.bits} bits and squares of {self.patch_px} px given, 8 to 16 bits and squares of 1 "
-                "px or more expected"
+                f"{self.bits} bits and squares of {self.patch_px} px given, 8 to 16 bits and squares of "
+                "1 px or more expected"
             )
 
 
@@ -86,9 +86,12 @@ class DamagedImage:
     def _brightest(self) -> float:
         """The value that a share of the pixels exceed, from windows all over the image."""
         corner = [
-            np.linspace(0, max(size - _SAMPLED_PX, 0), _SAMPLED_WINDOWS).astype(int) for size in self.shape
+            np.linspace(0, max(size - _SAMPLED_PX, 0), _SAMPLED_WINDOWS).astype(int)
+            for size in self.shape
         ]
-        windows = [Window(int(i), int(j), _SAMPLED_PX, _SAMPLED_PX) for i in corner[0] for j in corner[1]]
+        windows = [
+            Window(int(i), int(j), _SAMPLED_PX, _SAMPLED_PX) for i in corner[0] for j in corner[1]
+        ]
         values = np.concatenate([self._image.read(window).ravel() for window in windows])
         return float(np.nanquantile(values, 1.0 - self._damage.share))
 
