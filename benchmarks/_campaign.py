@@ -12,7 +12,7 @@ from benchmarks._worlds import Block, Place, world_of
 from services.errors import AmersError
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource
-from services.quality.accuracy import accuracy, normal_ce90, normalised_error
+from services.quality.accuracy import accuracy, normalised_error
 from services.registration.on_points import Registration, register_scene
 from services.registration.options import RegistrationOptions
 from services.simulation.conditions import Conditions
@@ -182,7 +182,6 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
     covariance = registration.adjustment.covariance_at(line_sample)
     frame = derivative @ registration.frame.covariance_m2 @ derivative.transpose(0, 2, 1)
     both = covariance + frame
-    predicted_on_earth_m = normal_ce90(inverse @ both @ inverse.transpose(0, 2, 1))
     quality = registration.qualification
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
@@ -200,6 +199,6 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
         normalised=normalised_error(error, covariance).mean_square,
         displacement_m=max(moved_m, default=float("nan")),
         cpu_s=cpu_s,
-        ground_predicted_m=float(np.median(predicted_on_earth_m)),
+        ground_predicted_m=quality.predicted.on_the_earth_median_m,
         ground_normalised=normalised_error(on_earth, both).mean_square,
     )

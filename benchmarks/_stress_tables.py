@@ -12,8 +12,8 @@ from benchmarks._families import Result
 
 NORMALISED = (0.7, 1.5)
 """Mean squares of normalised errors that are honest."""
-NOMINAL_BEFORE_M = 0.44
-"""Median CE90 as predicted in nominal conditions, 21 November 2026, commit d09c026."""
+NOMINAL_BEFORE_M = 0.425
+"""Median CE90 in nominal conditions, 21 November 2026, commit d09c026."""
 NOMINAL_TOLERANCE = 0.05
 SLIGHT_DAMAGE = 0.01
 """Share of damaged pixels up to which they must not matter."""
@@ -134,13 +134,13 @@ def acceptance(
                 )
             )
     if nominal:
-        predicted_m = summary(nominal)["predicted_m"]
-        median_m = predicted_m[0] if predicted_m else float("inf")
+        figures = summary(nominal)
+        median_m = figures["ce90_m"][0] if figures["ce90_m"] else float("inf")
         lines.append(
             (
-                f"nominal CE90 within {NOMINAL_TOLERANCE:.0%} of {NOMINAL_BEFORE_M:g} m",
+                f"nominal CE90 at most {NOMINAL_TOLERANCE:.0%} above {NOMINAL_BEFORE_M:g} m",
                 median_m <= (1.0 + NOMINAL_TOLERANCE) * NOMINAL_BEFORE_M,
-                f"{_listed(predicted_m)} m predicted, {_listed(summary(nominal)['ce90_m'])} m true",
+                f"{_listed(figures['ce90_m'])} m true, {_listed(figures['predicted_m'])} m predicted",
             )
         )
     return lines
