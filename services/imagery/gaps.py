@@ -54,6 +54,12 @@ def lost_pixels(pixels: FloatImage, footprint_px: float = 0.0) -> FloatImage:
     return lost
 
 
+def missing_reason(pixels: FloatImage | Array) -> str:
+    """Why most invalid pixels are invalid: "saturated" (+inf) or "nodata" (NaN)."""
+    saturated = int(np.isposinf(pixels).sum())
+    return "saturated" if 2 * saturated > int((~np.isfinite(pixels)).sum()) else "nodata"
+
+
 def _blurred(where: BoolArray, sigma_px: float) -> FloatImage:
     return np.asarray(cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma_px))
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from services.imagery.gaps import filled, missing_reason
 from services.matching.least_squares import covariance_from_influence, fit_chip
-from services.matching.missing_pixels import fill_missing, missing_reason
 from services.matching.shadows import ShadowShift, shadow_weights
 from services.types import Array, BoolArray, FloatImage
 
@@ -126,7 +126,7 @@ def find_chip(
     reason = _pixel_rejection(scores, (row, col), thresholds, options.second_distance_px)
     if reason:
         return rejected(reason, score)
-    weight = None if shadows is None else shadow_weights(fill_missing(chip), score, shadows)
+    weight = None if shadows is None else shadow_weights(filled(chip), score, shadows)
     fit = fit_chip(patch, chip, np.array([row, col], dtype=np.float64), weight)
     score = score if fit is None else max(score, fit.score)
     if score < thresholds.min_score:

@@ -1,12 +1,18 @@
 """Least-squares matching: the position of a chip in a patch to a fraction of a pixel, with its noise."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from services.imagery.gaps import filled
 from services.imagery.resampling import SPLINE_REACH_PX, resample, spline_coefficients
-from services.matching.least_squares_kernels import REACH_PX, add_bartlett_sums, fit_position
-from services.matching.missing_pixels import fill_missing
+from services.matching.least_squares_kernels import (
+    REACH_PX,
+    add_bartlett_sums,
+    fit_position,
+    neighbour_correlation,
+)
 from services.types import Array, BoolArray, FloatImage
 
 _ALL = np.zeros((0, 0), dtype=np.float32)
@@ -19,7 +25,13 @@ _FILLED_PX = 5e-3
 """A new fill that moves the position by less ends these fits."""
 
 REACH_CELLS = 5
-"""Distance in squares beyond which influences are uncorrelated; less in a small chip."""
+"""Smallest distance in squares beyond which influences are uncorrelated; a fifth of a small chip."""
+
+_REACH_SPANS = 2.5
+"""The same distance in spans of the correlation between squares."""
+
+_MIN_FREEDOM = 0.2
+"""Smallest share of independent squares that the fit leaves."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,7 @@ def _fit_valid(
     predicts at the position found, which is then found again.
     """
     seen, valid = np.isfinite(patch), np.isfinite(chip)
-    chip, filled = fill_missing(chip), fill_missing(patch)
+    chip, whole = filled(chip), filled(patch)
     side = chip.shape[0] - 2
     for _ in range(_MAX_FILLS):
         used = np.zeros((side, side), dtype=np.float32)
@@ -95,12 +107,12 @@ def _fit_valid(
         used[: under.shape[0], : under.shape[1]] = under
         used *= valid[1:-1, 1:-1]
         weighted = used if weight is None else weight * used
-        found = fit_position(spline_coefficients(filled), chip, weighted, used, row_col)
+        found = fit_position(spline_coefficients(whole), chip, weighted, used, row_col)
         moved_px = np.hypot(*(found[0] - row_col))
         row_col = found[0]
         if not np.isfinite(found[1]) or moved_px < _FILLED_PX or seen.all():
             break
-        filled = _filled_by_chip(filled, seen, chip, row_col)
+        whole = _filled_by_chip(whole, seen, chip, row_col)
     return found
 
 
@@ -115,10 +127,10 @@ def _filled_by_chip(patch: FloatImage, seen: BoolArray, chip: FloatImage, row_co
     common = under & seen
     x, y = predicted[common].astype(np.float64), patch[common].astype(np.float64)
     gain = (x - x.mean()) @ y / ((x - x.mean()) @ x)
-    filled = patch.copy()
+    whole = patch.copy()
     missing = under & ~seen
-    filled[missing] = y.mean() + gain * (predicted[missing] - x.mean())
-    return filled
+    whole[missing] = y.mean() + gain * (predicted[missing] - x.mean())
+    return whole
 
 
 def covariance_from_influence(influence: Array) -> Array:
@@ -126,16 +138,25 @@ def covariance_from_influence(influence: Array) -> Array:
 
     The residuals between chip and patch are rarely white: they are correlated over short distances and
     concentrated at shadows and roofs. So the products of neighbouring squares count, with Bartlett
-    weights that fall to zero at a fixed distance (a sandwich estimator).
+    weights that fall to zero at a distance (a sandwich estimator). The distance follows from the
+    correlation between neighbouring squares, which also gives the number of independent squares: of
+    these, the two displacements, the gain and the offset of the fit take four.
 
     Source: Newey and West (1987), in two dimensions as in Conley (1999).
 
     Args:
         influence: (c, c, 2) with a sum of zero.
     """
-    cells = len(influence)
-    reach = min(REACH_CELLS, max(1, cells // 5))
+    influence = np.ascontiguousarray(influence)
+    used, correlation = neighbour_correlation(influence)
+    if used == 0:
+        return np.zeros((2, 2))
+    side = math.sqrt(used)
+    correlation = min(max(correlation, 0.0), 0.9)
+    span = (1.0 + correlation) / (1.0 - correlation)
+    reach = max(1, min(REACH_CELLS, int(side) // 5), min(int(side) // 2, math.ceil(_REACH_SPANS * span)))
     covariance = np.zeros((2, 2))
-    add_bartlett_sums(np.ascontiguousarray(influence), reach, covariance)
+    add_bartlett_sums(influence, reach, covariance)
     # The constraint of a zero sum reduces the variance of the influences: this factor restores it.
-    return covariance / (1.0 - (reach / cells) ** 2)
+    covariance /= 1.0 - reach**2 / max(used, reach**2 + 1)
+    return covariance / max(_MIN_FREEDOM, 1.0 - 4.0 * span**2 / used)

@@ -42,6 +42,7 @@ def fit_position(
     gradients, inverse = _design(chip, weight)
     centred = chip[1:-1, 1:-1].copy()
     _centre(centred, used)
+    square = _projected(centred, centred, gradients, inverse)[0]
     at = np.empty((side, side), dtype=np.float32)
     failed = (start, np.nan, np.zeros((1, 1, 2)))
     row, col = start
@@ -51,7 +52,8 @@ def fit_position(
             return failed
         _interpolated(coefficients, r + 1.0, c + 1.0, at, 0)
         _centre(at, used)
-        gain, by_row, by_col = _projected(at, centred, gradients, inverse)
+        product, by_row, by_col = _projected(at, centred, gradients, inverse)
+        gain = product / square
         if not gain > 0.0:
             return failed
         step_r, step_c = -by_row / gain, -by_col / gain
@@ -183,19 +185,18 @@ def _taps(t: float, out: FloatImage, derivative: bool) -> None:
 def _projected(
     at: FloatImage, chip: FloatImage, gradients: FloatImage, inverse: Array
 ) -> tuple[float, float, float]:
-    """Gain of the chip in a patch, and the components of the patch along the chip's gradients."""
+    """Scalar product of chip and patch, and the components of the patch along the chip's gradients."""
     side = at.shape[0]
-    product, square, by_r, by_c = 0.0, 0.0, 0.0, 0.0
+    product, by_r, by_c = 0.0, 0.0, 0.0
     for i in range(side):
         for j in range(side):
-            value, other = chip[i, j], at[i, j]
-            product += value * other
-            square += value * value
+            other = at[i, j]
+            product += chip[i, j] * other
             by_r += gradients[0, i, j] * other
             by_c += gradients[1, i, j] * other
     r = inverse[0, 0] * by_r + inverse[0, 1] * by_c
     c = inverse[1, 0] * by_r + inverse[1, 1] * by_c
-    return product / square, r, c
+    return product, r, c
 
 
 @njit(cache=True, fastmath=_SUMS)
@@ -252,15 +253,47 @@ def add_bartlett_sums(influence: Array, reach: int, covariance: Array) -> None:
     of cells with Bartlett weights.
     """
     cells = influence.shape[0]
+    total = np.zeros((2, cells + 1, cells + 1))
+    for k in range(2):
+        for i in range(cells):
+            line = 0.0
+            for j in range(cells):
+                line += influence[i, j, k]
+                total[k, i + 1, j + 1] = total[k, i, j + 1] + line
     for i in range(1 - reach, cells):
+        a, b = max(i, 0), min(i + reach, cells)
         for j in range(1 - reach, cells):
-            by_r, by_c = 0.0, 0.0
-            for k in range(max(i, 0), min(i + reach, cells)):
-                for m in range(max(j, 0), min(j + reach, cells)):
-                    by_r += influence[k, m, 0]
-                    by_c += influence[k, m, 1]
+            c, d = max(j, 0), min(j + reach, cells)
+            by_r = total[0, b, d] - total[0, a, d] - total[0, b, c] + total[0, a, c]
+            by_c = total[1, b, d] - total[1, a, d] - total[1, b, c] + total[1, a, c]
             covariance[0, 0] += by_r * by_r
             covariance[0, 1] += by_r * by_c
             covariance[1, 1] += by_c * by_c
     covariance[1, 0] = covariance[0, 1]
     covariance /= reach**2
+
+
+@njit(cache=True, error_model="numpy")
+def neighbour_correlation(influence: Array) -> tuple[int, float]:
+    """Number of cells in use, and the correlation of neighbouring ones (`influence` (c, c, 2)).
+
+    The constraint of a zero sum makes independent cells slightly negatively correlated, which is undone.
+    """
+    cells = influence.shape[0]
+    used, pairs, square, product = 0, 0, 0.0, 0.0
+    for i in range(cells):
+        for j in range(cells):
+            r, c = influence[i, j]
+            if r == 0.0 and c == 0.0:
+                continue
+            used += 1
+            square += r * r + c * c
+            for k, m in ((i + 1, j), (i, j + 1)):
+                if k < cells and m < cells:
+                    other_r, other_c = influence[k, m]
+                    if other_r != 0.0 or other_c != 0.0:
+                        pairs += 1
+                        product += r * other_r + c * other_c
+    if pairs == 0:
+        return used, 0.0
+    return used, (product / pairs) / (square / used) + 1.0 / used

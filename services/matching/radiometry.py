@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from services.imagery.gaps import LOST_SHARE
-from services.matching.missing_pixels import missing_reason
+from services.imagery.gaps import LOST_SHARE, missing_reason
 from services.types import Array, BoolArray, FloatImage
 
 MIN_FOUND = 5

@@ -18,12 +18,12 @@ SIDE = 101
 PERIOD = 128
 
 
-def chip_of(ground: Array) -> FloatImage:
-    return as_pixels(ground[RADIUS_PX : RADIUS_PX + SIDE, RADIUS_PX : RADIUS_PX + SIDE])
+def chip_of(ground: Array, side: int = SIDE) -> FloatImage:
+    return as_pixels(ground[RADIUS_PX : RADIUS_PX + side, RADIUS_PX : RADIUS_PX + side])
 
 
-def patch_of(ground: Array) -> FloatImage:
-    side = SIDE + 2 * RADIUS_PX
+def patch_of(ground: Array, side: int = SIDE) -> FloatImage:
+    side += 2 * RADIUS_PX
     return as_pixels(ground[:side, :side])
 
 
@@ -41,7 +41,13 @@ class Trials:
         return float(((self.error_px / self.sigma_px[:, None]) ** 2).mean())
 
 
-def trials(smoothness_px: float, noise: float, noise_smoothness_px: float | None, seed: int) -> Trials:
+def trials(
+    smoothness_px: float,
+    noise: float,
+    noise_smoothness_px: float | None,
+    seed: int,
+    side: int = SIDE,
+) -> Trials:
     """Search 100 chips; noise without smoothness is white."""
     rng = np.random.default_rng(seed)
     error, sigma, lost = [], [], 0
@@ -53,7 +59,8 @@ def trials(smoothness_px: float, noise: float, noise_smoothness_px: float | None
             if noise_smoothness_px is None
             else texture(rng, PERIOD, noise_smoothness_px)
         )
-        peak = find_chip(patch_of(moved(ground, *shift) + noise * other), chip_of(ground), OPTIONS)
+        patch, chip = patch_of(moved(ground, *shift) + noise * other, side), chip_of(ground, side)
+        peak = find_chip(patch, chip, OPTIONS)
         if peak.reason == FOUND:
             error.append(peak.row_col - shift)
             sigma.append(peak.sigma_px)
@@ -98,6 +105,17 @@ def test_the_stated_sigma_is_honest_for_any_smoothness_of_the_noise(
     outcome = trials(smoothness_px, noise, noise_smoothness_px, 4)
     assert outcome.lost == 0
     assert 0.7 < outcome.normalised_square < 1.5
+
+
+@pytest.mark.parametrize("smoothness_px", [1.0, 2.5, 4.0])
+@pytest.mark.parametrize("side", [41, SIDE])
+def test_the_stated_sigma_is_honest_where_noise_is_smooth_over_several_squares(
+    side: int, smoothness_px: float
+) -> None:
+    for noise_smoothness_px in (None, smoothness_px):
+        outcome = trials(smoothness_px, 0.3, noise_smoothness_px, 8, side)
+        assert outcome.lost <= 2
+        assert 0.7 < outcome.normalised_square < 1.5
 
 
 @pytest.mark.parametrize("smoothness_px", [1.0, 2.5])

@@ -6,8 +6,13 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
-from services.matching.missing_pixels import fill_missing, missing_reason
+from services.imagery.gaps import missing_reason
+from services.matching.correlate import (
+    FOUND,
+    CorrelationOptions,
+    correlation_map,
+    find_chip,
+)
 from services.types import Array, BoolArray, FloatImage
 from tests.services.textures import as_pixels, moved, texture
 
@@ -18,7 +23,6 @@ CHIPS = 100
 a_millipixel = 1e-3
 a_twentieth_of_a_pixel = 0.05
 four_standard_errors = 4.0
-a_step_of_the_plane = 1.0
 
 Kind = Literal["scattered", "patches"]
 Where = Literal["patch", "chip", "both"]
@@ -215,15 +219,3 @@ def test_saturated_impulses_do_not_move_a_chip() -> None:
     assert damaged.reason == FOUND
     np.testing.assert_allclose(damaged.row_col, whole.row_col, atol=a_millipixel)
     assert damaged.sigma_px == pytest.approx(whole.sigma_px, rel=0.01)
-
-
-def test_a_fill_keeps_valid_pixels_and_continues_those_beside_a_gap() -> None:
-    plane = np.add.outer(np.arange(40.0), np.arange(40.0)).astype(np.float32)
-    pixels = plane.copy()
-    pixels[10, 12], pixels[20:22, 20:22] = np.nan, np.inf
-    filled = fill_missing(pixels)
-    valid = np.isfinite(pixels)
-    np.testing.assert_allclose(filled[valid], plane[valid])
-    np.testing.assert_allclose(filled[~valid], plane[~valid], atol=a_step_of_the_plane)
-    assert fill_missing(plane) is plane
-    assert (fill_missing(np.full((3, 3), np.nan, dtype=np.float32)) == 0.0).all()
