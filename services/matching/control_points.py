@@ -7,7 +7,7 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
-from services.imagery.gaps import bridged
+from services.imagery.gaps import bridged, missing_reason
 from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.matching.chip_extent import central_square, visible_half_side
 from services.matching.correlate import (
@@ -17,13 +17,16 @@ from services.matching.correlate import (
     PeakThresholds,
     find_chip,
     rejected,
-    sigma_per_coordinate,
 )
-from services.matching.least_squares import covariance_from_influence
-from services.matching.missing_pixels import missing_reason
 from services.matching.radiometry import cloud_mask, gradient_image, patch_statistics
 from services.matching.shadows import ShadowShift, shadow_shift
 from services.matching.systematic_error import common_covariance_px2
+from services.matching.view_combination import (
+    ViewCombination,
+    combine_views,
+    combined_sigmas_px,
+    no_measure,
+)
 from services.matching.view_selection import ViewDistanceScales, select_views
 from services.sensors.base import SensorModel
 from services.types import (
@@ -130,23 +133,6 @@ class ChipSearch:
 
 
 @dataclass(frozen=True)
-class _Combination:
-    """The measures of one point by several views, combined.
-
-    Attributes:
-        row_col: (2,) displacement, pixels of the reduced chips; NaN where the views give no measure.
-        sigma_px: one standard deviation a coordinate, same unit.
-        agreeing: (views,) which views the measure comes from.
-        reason: `FOUND`, or why there is no measure.
-    """
-
-    row_col: Array
-    sigma_px: float
-    agreeing: BoolArray
-    reason: str
-
-
-@dataclass(frozen=True)
 class _PointMatch:
     """The match of one point.
 
@@ -159,7 +145,7 @@ class _PointMatch:
         statistics: (squares, 2) of the scene around the point, see `patch_statistics`.
     """
 
-    combination: _Combination
+    combination: ViewCombination
     views: IntArray
     peaks: list[Peak]
     by_gradient: bool
@@ -220,8 +206,9 @@ def match_points(
 
 
 def _not_searched(reason: str) -> _PointMatch:
-    nowhere = _Combination(np.full(2, np.nan), np.nan, np.zeros(0, dtype=bool), reason)
-    return _PointMatch(nowhere, np.zeros(0, dtype=np.int64), [], False, np.nan, np.empty((0, 2)))
+    return _PointMatch(
+        no_measure(0, reason), np.zeros(0, dtype=np.int64), [], False, np.nan, np.empty((0, 2))
+    )
 
 
 def _predicted_patch(search: ChipSearch, lon_lat_h: Array) -> FloatImage:
@@ -236,7 +223,7 @@ def _match_point(
     candidates: list[tuple[ChipArray, ShadowShift | None]],
     scene_gsd_m: float,
     options: MatchingOptions,
-) -> tuple[list[Peak], _Combination, bool]:
+) -> tuple[list[Peak], ViewCombination, bool]:
     """The peaks of the views of a point in a patch, combined, and whether gradients were used.
 
     Grey values are correlated first. Gradients replace them where the score alone is too low.
@@ -251,7 +238,7 @@ def _match_point(
     half_side = visible_half_side(patch, search.half_side, search.radius_px)
     if half_side == 0:
         peaks = [rejected(missing_reason(patch)) for _ in candidates]
-        return peaks, _combined(peaks, options.agreement_px), False
+        return peaks, combine_views(peaks, options.agreement_px), False
     patch = central_square(patch, half_side + search.radius_px)
     ratio = scene_gsd_m / search.gsd_m
     chips = [
@@ -263,7 +250,7 @@ def _match_point(
         find_chip(patch, chip, options.correlation, thresholds=thresholds, shadows=shift)
         for chip, (_, shift) in zip(chips, candidates, strict=True)
     ]
-    combination = _combined(peaks, options.agreement_px)
+    combination = combine_views(peaks, options.agreement_px)
     if combination.reason == "low_score":
         patch = gradient_image(patch)
         thresholds = PeakThresholds(options.min_gradient_score, thresholds.max_second)
@@ -271,7 +258,7 @@ def _match_point(
             find_chip(patch, gradient_image(chip), options.correlation, thresholds=thresholds)
             for chip in chips
         ]
-        gradient_combination = _combined(gradient_peaks, options.agreement_px)
+        gradient_combination = combine_views(gradient_peaks, options.agreement_px)
         if gradient_combination.reason == FOUND:
             return gradient_peaks, gradient_combination, True
     return peaks, combination, False
@@ -284,7 +271,7 @@ def _assembled(
     level_m, n = search.level_m, len(points)
     row_col = np.array([match.combination.row_col for match in matches]).reshape(-1, 2)
     displacement_m = np.column_stack([row_col[:, 1] * level_m, -row_col[:, 0] * level_m])
-    sigma_m = np.array([match.combination.sigma_px for match in matches]) * level_m
+    sigma_m = combined_sigmas_px([match.combination for match in matches]) * level_m
     reason = np.array([match.combination.reason for match in matches], dtype="<U16")
     # A point beyond the border of the scene, or in a saturated area, has its own reason.
     clouded = cloud_mask([match.statistics for match in matches], reason == FOUND)
@@ -313,13 +300,13 @@ def _common_covariance_px2(
     """Covariance (2, 2), east and north, of the error that all measures share, reduced chip pixels."""
     view_row: list[int] = []
     offset: list[Array] = []
-    agreeing: list[bool] = []
+    weight: list[float] = []
     for row in order:
         match = matches[row]
-        for view, peak, agrees in zip(match.views, match.peaks, match.combination.agreeing, strict=True):
+        for view, peak, share in zip(match.views, match.peaks, match.combination.weight, strict=True):
             view_row.append(points.views.start[row] + view)
             offset.append((peak.row_col - match.combination.row_col)[::-1] * [1.0, -1.0])
-            agreeing.append(agrees)
+            weight.append(share)
     offsets = np.array(offset).reshape(-1, 2)
     measured = np.isfinite(offsets).all(axis=1)
     return common_covariance_px2(
@@ -327,7 +314,7 @@ def _common_covariance_px2(
         points.views,
         np.array(view_row, dtype=np.int64)[measured],
         offsets[measured],
-        np.array(agreeing, dtype=bool)[measured],
+        np.array(weight)[measured],
     )
 
 
@@ -374,41 +361,3 @@ def _tile_order(line_sample: Array) -> Sequence[int]:
     """Rows of positions in the order of the image tiles they fall in."""
     tile = np.nan_to_num(line_sample // TILE_PX, nan=-1.0)
     return [int(row) for row in np.lexsort((tile[:, 1], tile[:, 0]))]
-
-
-def _combined(peaks: list[Peak], agreement_px: float) -> _Combination:
-    """One measure from the peaks of the views of a point."""
-    nowhere, nobody = np.full(2, np.nan), np.zeros(len(peaks), dtype=bool)
-    accepted = np.array([peak.reason == FOUND for peak in peaks])
-    if not accepted.any():
-        best = max(peaks, key=lambda peak: -1.0 if np.isnan(peak.score) else peak.score)
-        return _Combination(nowhere, np.nan, nobody, best.reason)
-    row_col = np.array([peak.row_col for peak in peaks])[accepted]
-    near = np.hypot(*(row_col - np.median(row_col, axis=0)).T) <= agreement_px
-    if 2 * near.sum() <= len(row_col) and len(row_col) > 1:
-        return _Combination(nowhere, np.nan, nobody, "views_disagree")
-    agreeing = nobody.copy()
-    agreeing[np.flatnonzero(accepted)[near]] = True
-    mean, sigma_px = _weighted_mean(
-        [peak for peak, agrees in zip(peaks, agreeing, strict=True) if agrees]
-    )
-    return _Combination(mean, sigma_px, agreeing, FOUND)
-
-
-def _weighted_mean(peaks: list[Peak]) -> tuple[Array, float]:
-    """The weighted mean (2,) of the measures of one point, and its sigma per coordinate.
-
-    The views of a point share the noise and the shadows of the scene. So their influences are averaged
-    square by square, which keeps what they have in common. The scatter beyond it is added.
-    """
-    weight = np.array([peak.sigma_px for peak in peaks]) ** -2.0
-    weight /= weight.sum()
-    row_col = np.array([peak.row_col for peak in peaks])
-    mean = weight @ row_col
-    influences = np.stack([peak.influence for peak in peaks])
-    common = np.tensordot(weight, influences, axes=1)
-    own = sum(np.trace(covariance_from_influence(each - common)) for each in influences)
-    scatter = float(((row_col - mean) ** 2).sum())
-    excess = max(0.0, scatter - own) / (2.0 * len(peaks) ** 2)
-    common_sigma_px = sigma_per_coordinate(covariance_from_influence(common))
-    return mean, float(np.hypot(common_sigma_px, np.sqrt(excess)))

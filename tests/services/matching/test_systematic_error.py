@@ -11,9 +11,12 @@ from services.matching.systematic_error import (
     SHADOW_SIGMA_PX,
     common_covariance_px2,
 )
-from services.types import Acquisition, Array, Views
+from services.types import Acquisition, Array, BoolArray, Views
 
 NORTH, EAST, SOUTH = 0.0, 90.0, 180.0
+NINETY_PERCENT = 2.0 * np.log(10.0)
+"""Square of the radius of the 90 % region of the plane, in units of sigma."""
+
 LIKE_THE_SCENE = Acquisition("scene", "", None, 20.0, NORTH, 60.0, SOUTH)
 
 
@@ -33,7 +36,7 @@ def common(image: Acquisition, offset: Array | None = None) -> Array:
     views = views_of(image)
     n = len(views.gsd_m)
     offset = np.zeros((n, 2)) if offset is None else offset
-    return common_covariance_px2(LIKE_THE_SCENE, views, np.arange(n), offset, np.ones(n, dtype=bool))
+    return common_covariance_px2(LIKE_THE_SCENE, views, np.arange(n), offset, np.ones(n))
 
 
 def test_views_taken_like_the_scene_have_the_smallest_error_of_a_single_image() -> None:
@@ -58,20 +61,64 @@ def test_an_unknown_sun_adds_an_error_in_all_directions() -> None:
     assert added_px2[0, 0] == added_px2[1, 1] > 0.0
 
 
-def test_offsets_between_images_show_how_well_their_mean_is_known() -> None:
-    views = replace(
-        views_of(LIKE_THE_SCENE), image=np.arange(20) % 2, images=(LIKE_THE_SCENE, LIKE_THE_SCENE)
+def seen_views(seen: BoolArray) -> tuple[Views, Array]:
+    """A view of each point (n,) by each image (k,) that sees it, and its weight in the point."""
+    point, image = np.nonzero(seen)
+    views = Views(
+        np.concatenate([[0], np.cumsum(seen.sum(axis=1))]),
+        np.full(len(point), 2.0),
+        image,
+        np.full(len(point), 20.0),
+        np.full(len(point), NORTH),
+        np.ones(len(point)),
+        (LIKE_THE_SCENE,) * seen.shape[1],
     )
-    offset = np.where((np.arange(20) % 2 == 0)[:, None], [0.3, 0.0], [-0.3, 0.0])
-    covariance_px2 = common_covariance_px2(
-        LIKE_THE_SCENE, views, np.arange(20), offset, np.ones(20, dtype=bool)
-    )
-    # Two means, each 0.3 px from their mean: a variance of 2 * 0.3^2 over two coordinates and two means.
-    assert covariance_px2[0, 0] == pytest.approx(COMMON_SIGMA_PX**2 + 0.3**2 / 2.0)
+    return views, 1.0 / seen.sum(axis=1)[point]
+
+
+def stated_and_true_px(seen: BoolArray, image_offset: Array) -> tuple[Array, Array]:
+    """Stated covariance (2, 2) and true error (2,) of a mean of points; offsets (k, 2) of images."""
+    views, weight = seen_views(seen)
+    point = np.nonzero(seen)[0]
+    measure = np.zeros((len(seen), 2))
+    np.add.at(measure, point, weight[:, None] * image_offset[views.image])
+    offset = image_offset[views.image] - measure[point]
+    stated = common_covariance_px2(LIKE_THE_SCENE, views, np.arange(len(point)), offset, weight)
+    return stated, measure.mean(axis=0)
+
+
+@pytest.mark.parametrize("dominant", [False, True])
+@pytest.mark.parametrize("images", [2, 3, 4, 6])
+def test_the_stated_error_covers_the_offsets_of_images_of_any_share(images: int, dominant: bool) -> None:
+    rng = np.random.default_rng(7)
+    chance = np.full(images, 0.3 if dominant else 1.0)
+    chance[0] = 1.0
+    for offset_px in (0.1, 0.15):
+        squares = []
+        for _ in range(600):
+            seen = rng.random((60, images)) < chance
+            stated, error_px = stated_and_true_px(seen, offset_px * rng.standard_normal((images, 2)))
+            squares.append(error_px @ np.linalg.solve(stated, error_px))
+        assert np.mean(squares) / 2.0 < 1.5
+        # The floor of the stated error makes small offsets of many images safe.
+        assert (np.array(squares) < NINETY_PERCENT).mean() > 0.85
+
+
+def test_an_image_that_dominates_leaves_more_of_its_offset_than_images_of_equal_shares() -> None:
+    both = np.ones((20, 2), dtype=bool)
+    one_dominates = both.copy()
+    one_dominates[5:, 1] = False
+    apart_px = np.array([[0.3, 0.0], [-0.3, 0.0]])
+    even, _ = stated_and_true_px(both, apart_px)
+    uneven, _ = stated_and_true_px(one_dominates, apart_px)
+    # The mean of two images alike has half the variance of an image, which two offsets hardly show.
+    half_px2 = 0.3**2 / 2.0
+    assert half_px2 < even[0, 0] < 2.0 * half_px2
+    assert uneven[0, 0] > 1.5 * even[0, 0]
 
 
 def test_without_a_measure_the_error_is_the_smallest() -> None:
     empty = common_covariance_px2(
-        LIKE_THE_SCENE, views_of(LIKE_THE_SCENE), np.arange(0), np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        LIKE_THE_SCENE, views_of(LIKE_THE_SCENE), np.arange(0), np.zeros((0, 2)), np.zeros(0)
     )
     np.testing.assert_allclose(empty, COMMON_SIGMA_PX**2 * np.eye(2))

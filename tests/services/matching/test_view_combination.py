@@ -1,0 +1,86 @@
+"""The sigma of a point that several views measure covers its error, for any number of views."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.matching.correlate import FOUND, Peak, rejected, sigma_per_coordinate
+from services.matching.least_squares import covariance_from_influence
+from services.matching.view_combination import ViewCombination, combine_views, combined_sigmas_px
+from services.types import Array, IntArray
+
+CELLS = 25
+AGREEMENT_PX = 0.7
+NOISE_PX = 0.05
+NINETY_PERCENT = 2.0 * np.log(10.0)
+"""Square of the radius of the 90 % region of the plane, in units of sigma."""
+
+
+def noise(rng: np.random.Generator, sigma_px: float) -> Array:
+    """Shifts (c, c, 2) of a position by the noise in the squares of a chip."""
+    return sigma_px / CELLS * rng.standard_normal((CELLS, CELLS, 2))
+
+
+def peaks_of_a_point(rng: np.random.Generator, views: int, tau_px: float) -> list[Peak]:
+    """Views of a place at zero: noise of the scene, noise of each chip, an error of each view."""
+    scene = noise(rng, NOISE_PX)
+    peaks = []
+    for _ in range(views):
+        shifts = scene + noise(rng, NOISE_PX * rng.uniform(0.5, 1.5))
+        residuals = shifts - shifts.mean(axis=(0, 1))
+        row_col = shifts.sum(axis=(0, 1)) + tau_px * rng.standard_normal(2)
+        sigma_px = sigma_per_coordinate(covariance_from_influence(residuals))
+        peaks.append(Peak(row_col, 0.9, sigma_px, residuals, FOUND))
+    return peaks
+
+
+def combinations(views: IntArray, tau_px: float, seed: int) -> list[ViewCombination]:
+    rng = np.random.default_rng(seed)
+    return [combine_views(peaks_of_a_point(rng, int(k), tau_px), AGREEMENT_PX) for k in views]
+
+
+def normalised_squares(points: list[ViewCombination]) -> Array:
+    """Square of the distance from the truth in units of sigma (n,): 2 on average for honest sigmas."""
+    error_px = np.array([point.row_col for point in points])
+    return np.asarray((error_px**2).sum(axis=1) / combined_sigmas_px(points) ** 2)
+
+
+@pytest.mark.parametrize("tau_px", [0.0, 0.05, 0.15])
+@pytest.mark.parametrize("views", [1, 2, 3, 4, 6])
+def test_ninety_percent_of_the_points_lie_in_their_region(views: int, tau_px: float) -> None:
+    # Points of other numbers of views belong to the same search, as they do in a scene.
+    counts = np.concatenate([np.full(400, views), np.tile([2, 3, 4], 60)])
+    squares = normalised_squares(combinations(counts, tau_px, 1))[:400]
+    assert 0.7 < squares.mean() / 2.0 < 1.5
+    assert 0.85 < (squares < NINETY_PERCENT).mean() < 0.95
+
+
+def test_the_sigma_of_a_single_view_grows_with_the_scatter_of_other_points() -> None:
+    single = combinations(np.array([1]), 0.0, 2)
+    calm, restless = (combinations(np.full(50, 3), tau_px, 3) for tau_px in (0.0, 0.2))
+    alone_px, with_calm_px, with_restless_px = (
+        float(combined_sigmas_px(single + others)[0]) for others in ([], calm, restless)
+    )
+    assert with_calm_px == pytest.approx(alone_px, rel=0.1)
+    assert with_restless_px == pytest.approx(np.hypot(alone_px, 0.2), rel=0.15)
+
+
+def test_a_point_without_a_measure_has_no_sigma_and_does_not_count() -> None:
+    points = combinations(np.full(5, 3), 0.1, 4)
+    lost = combine_views([rejected("low_score", 0.3), rejected("flat")], AGREEMENT_PX)
+    assert lost.reason == "low_score"
+    assert not lost.agreeing.any()
+    sigma_px = combined_sigmas_px([*points, lost])
+    assert np.isnan(sigma_px[-1])
+    np.testing.assert_array_equal(sigma_px[:-1], combined_sigmas_px(points))
+
+
+def test_views_that_disagree_give_no_measure_and_a_minority_no_weight() -> None:
+    rng = np.random.default_rng(0)
+    peaks = peaks_of_a_point(rng, 3, 0.0)
+    peaks[1] = replace(peaks[1], row_col=peaks[1].row_col + 3.0)
+    two_of_three = combine_views(peaks, AGREEMENT_PX)
+    assert two_of_three.agreeing.tolist() == [True, False, True]
+    assert two_of_three.weight.sum() == pytest.approx(1.0)
+    assert combine_views(peaks[:2], AGREEMENT_PX).reason == "views_disagree"
