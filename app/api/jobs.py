@@ -14,9 +14,10 @@ from app.api.routes import CallerRoute
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.schema import JobState
 from app.errors import NoSuchJob
-from app.usecases import jobs
+from app.usecases import jobs, results
 from app.usecases.features.query import parse_interval
 from app.usecases.processes import results_folder
+from app.usecases.registration.deliverables import media_type
 from app.usecases.results import delete_files
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)
@@ -145,6 +146,11 @@ def status_info(request: Request, job: Job) -> StatusInfo:
     ]
     if job.state == "successful" and job.results_removed_at is None:
         links.append(Link(rel=RESULTS, href=f"{here}/results", type=JSON))
+    if job.state == "failed":
+        links += [
+            Link(rel="related", href=f"{here}/results/{name}", type=media_type(name), title=name)
+            for name in results.kept_files(job)
+        ]
     if "scene" in job.inputs:
         scene = f"{request.base_url}scenes/{job.inputs['scene']}"
         links.append(Link(rel="related", href=scene, type=JSON, title="scene"))
@@ -162,5 +168,6 @@ def status_info(request: Request, job: Job) -> StatusInfo:
         updated=job.updated_at,
         error=JobError.model_validate(job.error) if job.error else None,
         priority=job.priority or None,
+        verdict=(job.results or {}).get("verdict"),
         links=links,
     )

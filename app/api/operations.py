@@ -73,6 +73,14 @@ class _InstallationCollector(Collector):
         for (kind, state), number in store.jobs.items():
             jobs.add_metric((kind, state), number)
         yield jobs
+        registrations = GaugeMetricFamily(
+            "amers_registration_jobs",
+            "Registration jobs by verdict on their result.",
+            labels=("verdict",),
+        )
+        for verdict, number in store.registrations.items():
+            registrations.add_metric((verdict,), number)
+        yield registrations
         blocks = GaugeMetricFamily("amers_blocks", "Blocks by state.", labels=("state",))
         for state, number in store.blocks.items():
             blocks.add_metric((state,), number)

@@ -90,6 +90,17 @@ def report_schema() -> JSONResponse:
     return JSONResponse(document.report_schema(), media_type=SCHEMA_JSON)
 
 
+@router.get(
+    "/schemas/failure.json",
+    dependencies=[Public],
+    response_class=Response,
+    responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
+)
+def failure_schema() -> JSONResponse:
+    """Return the JSON Schema of the `report.json` of a registration that failed."""
+    return JSONResponse(document.failure_schema(), media_type=SCHEMA_JSON)
+
+
 def _result_file(here: str, file: results.ResultFile) -> ResultFile:
     return ResultFile(href=f"{here}/results/{file.name}", type=file.media_type, title=file.name)
 

@@ -14,12 +14,12 @@ from app.errors import AmersError, ComputationError
 SUCCESS = 0
 FAILURE = 1
 REFUSED = 2
-NOT_REGISTERED = 3
+NO_RESULT = 3
 INTERRUPTED = 130
 
 
 def exit_status(error: Exception) -> int:
     """The exit status of a command that an error ended."""
     if isinstance(error, ComputationError):
-        return NOT_REGISTERED
+        return NO_RESULT
     return REFUSED if isinstance(error, AmersError) else FAILURE

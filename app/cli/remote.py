@@ -27,6 +27,10 @@ class ServiceFailure(RuntimeError):
     """The service does not answer, or not as expected."""
 
 
+class NothingDone(InputError):
+    """The service refuses a request: nothing was registered."""
+
+
 class Service:
     """A service that registers scenes."""
 
@@ -77,6 +81,7 @@ class Service:
         job = self._request("POST", execution, json={"inputs": inputs}).json()
         job = self._wait(job, progress)
         if job["status"] != "successful":
+            self._download_report(job, folder)
             raise _failure(job)
         self._download(job["jobID"], folder)
         report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
@@ -111,18 +116,28 @@ class Service:
         return job
 
     def _download(self, job_id: str, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        """Download all files of the results of a job."""
         results = self._request("GET", f"jobs/{job_id}/results").json()
-        files = (name for name, value in results.items() if isinstance(value, dict) and "href" in value)
-        for name in files:
-            if Path(name).name != name:
-                raise ServiceFailure(f"the service names a result {name!r}, which is not a file name")
-            with self._http.stream("GET", f"jobs/{job_id}/results/{name}") as reply:
-                if reply.is_error:
-                    raise ServiceFailure(f"{reply.url}: {reply.status_code} {reply.reason_phrase}")
-                with (folder / name).open("wb") as file:
-                    for chunk in reply.iter_bytes(CHUNK_BYTES):
-                        file.write(chunk)
+        for name in (k for k, value in results.items() if isinstance(value, dict) and "href" in value):
+            self._download_file(job_id, name, folder)
+
+    def _download_report(self, job: dict[str, Any], folder: Path) -> None:
+        """Download the report of a failed job, where there is one."""
+        results = f"jobs/{job['jobID']}/results/"
+        for link in job["links"]:
+            if results in link["href"]:
+                self._download_file(job["jobID"], str(link["title"]), folder)
+
+    def _download_file(self, job_id: str, name: str, folder: Path) -> None:
+        if Path(name).name != name:
+            raise ServiceFailure(f"the service names a result {name!r}, which is not a file name")
+        folder.mkdir(parents=True, exist_ok=True)
+        with self._http.stream("GET", f"jobs/{job_id}/results/{name}") as reply:
+            if reply.is_error:
+                raise ServiceFailure(f"{reply.url}: {reply.status_code} {reply.reason_phrase}")
+            with (folder / name).open("wb") as file:
+                for chunk in reply.iter_bytes(CHUNK_BYTES):
+                    file.write(chunk)
 
     def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
         """The reply to a request; error replies raise."""
@@ -131,7 +146,7 @@ class Service:
         except httpx.HTTPError as error:
             raise ServiceFailure(f"{self._http.base_url}: {error}") from error
         if reply.is_client_error:
-            raise InputError(f"{self._http.base_url}: {_detail(reply)}")
+            raise NothingDone(f"{self._http.base_url}: {_detail(reply)}")
         if reply.is_error:
             raise ServiceFailure(f"{self._http.base_url}: {reply.status_code} {_detail(reply)}")
         return reply

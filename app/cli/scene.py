@@ -1,5 +1,6 @@
 """`amers scene`: register and orthorectify scenes."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -108,14 +109,13 @@ def register(
         raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     control = Control(block, None if reference is None else ReferenceFiles(reference, terrain))
-    requests = [
-        SceneRequest(
-            SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights),
-            output if is_one_scene else output / image.stem,
-            copy_image,
+    requests = []
+    for image in images:
+        files = SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights)
+        folder = output if is_one_scene else output / image.stem
+        requests.append(
+            SceneRequest(files, folder, copy_image, _command_for(files, control, folder, server))
         )
-        for image in images
-    ]
     outcomes = register_scenes(requests, control, Remote(server, token or "") if server else None, jobs)
     for outcome in outcomes:
         if outcome["exit_status"] != SUCCESS:
@@ -176,6 +176,28 @@ def ortho(
             progress=progress,
         )
     show_one(asdict(orthorectified), as_json=as_json)
+
+
+def _command_for(files: SceneFiles, control: Control, folder: Path, server: str | None) -> str:
+    """The command that registers a scene again, without the accuracy of its model."""
+    reference = control.reference
+    terrain = None if reference is None else reference.terrain
+    options = {
+        "--model": files.model,
+        "--bands": files.bands,
+        "--mask": files.mask,
+        "--check-points": files.check_points,
+        "--check-heights": files.check_heights,
+        "--block": control.block,
+        "--reference": None if reference is None else reference.image,
+        "--dem": None if terrain is None else terrain.dem,
+        "--vertical": None if terrain is None else terrain.vertical,
+        "--geoid": None if terrain is None else terrain.geoid,
+        "--server": server,
+        "-o": folder,
+    }
+    words = [str(word) for name, value in options.items() if value is not None for word in (name, value)]
+    return shlex.join(["amers", "scene", "register", str(files.image), *words])
 
 
 def _refuse_contradictions(

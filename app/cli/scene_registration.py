@@ -14,19 +14,21 @@ from typing import Any
 
 import typer
 
-from app.cli.exit_status import FAILURE, NOT_REGISTERED, SUCCESS, exit_status
+from app.cli.exit_status import FAILURE, NO_RESULT, SUCCESS, exit_status
 from app.cli.progress import shown_progress
-from app.cli.remote import Service, ServiceFailure
+from app.cli.remote import NothingDone, Service, ServiceFailure
 from app.config import Settings, read_settings
 from app.db import engine
 from app.db.engine import Database
-from app.errors import AmersError, InputError
+from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_block, points_of_store
+from app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
 from app.usecases.registration.reference_source import ReferenceFiles, given_reference
 from app.usecases.registration.register import (
     ControlSources,
+    RegisteredScene,
     SceneFiles,
     image_key,
     record_registration,
@@ -35,17 +37,16 @@ from app.usecases.registration.register import (
 from app.usecases.registration.result_folder import older_result, replacing
 from app.usecases.uploads import IMAGE_SUFFIXES
 from app.worker.warm_process import WarmProcess, WarmServer
+from services.registration.options import RegistrationOptions
 from services.reports.document import report_document
+from services.reports.failure import NOT_REGISTERED
 from services.types import Progress, no_progress
 
-Register = Callable[[SceneFiles, Path, Progress, bool], dict[str, Any]]
-"""Registers one scene into a folder and returns its report; the last argument copies the image too."""
+Register = Callable[["SceneRequest", Path, Progress], dict[str, Any]]
+"""Registers the scene of a request into a folder and returns its report."""
 Outcome = dict[str, Any]
 """What became of one scene: `scene`, `verdict`, `reason`, `exit_status`; figures where there are any;
 and the folder `output` when this run has put its result there."""
-
-NO_VERDICT = "not registered"
-"""Verdict on a scene whose registration ended with an error."""
 
 _FUNCTION = "app.cli.scene_registration:register_in_process"
 _POLL_S = 1.0
@@ -85,11 +86,13 @@ class SceneRequest:
         files: of the scene.
         folder: for its outputs.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
+        command: that repeats the registration, without the accuracy of the model.
     """
 
     files: SceneFiles
     folder: Path
     copy_image: bool
+    command: str
 
 
 def images_of(paths: Sequence[Path]) -> list[Path]:
@@ -150,7 +153,7 @@ def _register_accepted(
     try:
         if remote is not None:
             with Service(remote.url, remote.token) as service:
-                return [outcome_of(service.register, request) for request in requests]
+                return [outcome_of(_on_service(service), request) for request in requests]
         if len(requests) == 1:
             with registrar(control) as register_one:
                 return [outcome_of(register_one, requests[0])]
@@ -167,17 +170,33 @@ def outcome_of(
     try:
         with ExitStack() as shown, replacing(request.folder) as new:
             receiver = progress or shown.enter_context(shown_progress())
-            report = register_one(request.files, new, receiver, request.copy_image)
+            try:
+                outcome = _registered_outcome(request, register_one(request, new, receiver))
+            except (InputError, ComputationError) as error:
+                if isinstance(error, NothingDone):
+                    raise
+                _keep_only_failure(request, new, error)
+                outcome = {**_failed_outcome(request, error), "output": request.folder}
     except (AmersError, ServiceFailure) as error:
         return _failed_outcome(request, error)
-    return {**_registered_outcome(request, report), "seconds": round(time.monotonic() - started, 2)}
+    return {**outcome, "seconds": round(time.monotonic() - started, 2)}
+
+
+def _keep_only_failure(request: SceneRequest, new: Path, error: AmersError) -> None:
+    """Leave nothing but the report of a failure in a new folder."""
+    for path in new.iterdir():
+        if path.name not in FAILURE_OUTPUTS:
+            path.unlink()
+    if not (new / "report.json").exists():
+        attempt = Attempt(request.files.image, request.command, RegistrationOptions())
+        write_failure(new, attempt, error)
 
 
 def _failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
     """The outcome of a scene whose registration ended with an error."""
     return {
         "scene": request.files.image,
-        "verdict": NO_VERDICT,
+        "verdict": NOT_REGISTERED,
         "reason": str(error),
         "exit_status": exit_status(error),
     }
@@ -194,7 +213,7 @@ def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcom
         "relative_to_control_points": report["relative_to_control_points"],
         "on_the_earth": report["on_the_earth"],
         "reason": _do_not_use(request, report) if is_failed else report["verdict_explanation"],
-        "exit_status": NOT_REGISTERED if is_failed else SUCCESS,
+        "exit_status": NO_RESULT if is_failed else SUCCESS,
         "visible": counts["visible"],
         "matched": counts["matched"],
         "active": counts["active"],
@@ -259,13 +278,24 @@ def _on_files(control: Control) -> Register:
         find_reference=None if control.reference is None else given_reference(control.reference),
     )
 
-    def register_one(
-        files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
-    ) -> dict[str, Any]:
-        registered = run_registration(files, sources, folder, copy_image=copy_image, progress=progress)
+    def register_one(request: SceneRequest, folder: Path, progress: Progress) -> dict[str, Any]:
+        registered = _run(request, sources, folder, progress)
         return report_document(registered.report)
 
     return register_one
+
+
+def _run(
+    request: SceneRequest, sources: ControlSources, folder: Path, progress: Progress
+) -> RegisteredScene:
+    return run_registration(
+        request.files,
+        sources,
+        folder,
+        copy_image=request.copy_image,
+        progress=progress,
+        command=request.command,
+    )
 
 
 def _on_store(database: Database, settings: Settings) -> Register:
@@ -273,15 +303,20 @@ def _on_store(database: Database, settings: Settings) -> Register:
     storage = open_storage(settings)
     sources = ControlSources(points_of_store(database, storage), references_of_store(database, settings))
 
-    def register_one(
-        files: SceneFiles, folder: Path, progress: Progress, copy_image: bool
-    ) -> dict[str, Any]:
-        registered = run_registration(files, sources, folder, copy_image=copy_image, progress=progress)
+    def register_one(request: SceneRequest, folder: Path, progress: Progress) -> dict[str, Any]:
+        registered = _run(request, sources, folder, progress)
         with database.transaction() as connection:
-            record_registration(connection, registered, image_key(files.image))
+            record_registration(connection, registered, image_key(request.files.image))
         return report_document(registered.report)
 
     return register_one
+
+
+def _on_service(service: Service) -> Register:
+    """A function that lets a service register scenes."""
+    return lambda request, folder, progress: service.register(
+        request.files, folder, progress, request.copy_image
+    )
 
 
 def register_many(requests: Sequence[SceneRequest], control: Control, jobs: int) -> list[Outcome]:
@@ -351,7 +386,7 @@ def _read_outcome(file: Path, request: SceneRequest, code: int) -> Outcome:
     reason = f"its process ended with code {code} and without an outcome"
     return {
         "scene": request.files.image,
-        "verdict": NO_VERDICT,
+        "verdict": NOT_REGISTERED,
         "reason": reason,
         "exit_status": FAILURE,
     }

@@ -17,6 +17,7 @@ class Gauges:
 
     Attributes:
         jobs: kind and state to number.
+        registrations: verdict on the result of a registration job to number of these jobs.
         oldest_waiting_s: how long the oldest job waits for a worker; 0 when none does.
         queue: entries of the queue that no worker has taken.
         blocks: state to number.
@@ -26,6 +27,7 @@ class Gauges:
     """
 
     jobs: dict[tuple[str, str], int]
+    registrations: dict[str, int]
     oldest_waiting_s: float
     queue: int
     blocks: dict[str, int]
@@ -37,9 +39,12 @@ class Gauges:
 def read_gauges(connection: Connection) -> Gauges:
     """The figures of this moment."""
     jobs = select(job.c.kind, job.c.state, func.count().label("n")).group_by(job.c.kind, job.c.state)
+    verdict = job.c.results["verdict"].astext.label("verdict")
+    verdicts = select(verdict, func.count().label("n")).where(verdict.is_not(None)).group_by(verdict)
     blocks = select(block.c.state, func.count().label("n")).group_by(block.c.state)
     return Gauges(
         jobs={(row.kind, row.state): row.n for row in connection.execute(jobs)},
+        registrations={row.verdict: row.n for row in connection.execute(verdicts)},
         blocks={row.state: row.n for row in connection.execute(blocks)},
         **connection.execute(INSTALLATION).one()._mapping,
     )

@@ -30,7 +30,7 @@ from app.usecases.blocks.export import EXPORT_BLOCK
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.damage import report_damage
 from app.usecases.orthorectification import ORTHORECTIFY
-from app.usecases.processes import Process, Work
+from app.usecases.processes import Process, Work, WorkFailed
 from app.usecases.registration.job import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
@@ -230,15 +230,38 @@ def do_attempt(database: Database, settings: Settings, job_id: UUID, attempt: in
         commit = process.run(Work(job, inputs, database, storage, settings, progress))
         with database.transaction() as connection:
             results = commit(connection)
-            attempts.succeed(connection, job.id, attempt, results)
+            message = success_message(results)
+            attempts.succeed(connection, job.id, attempt, results, message)
+        log.info("job %s: %s", job.id, message)
     except AmersError as error:
         if is_no_memory(error):
             raise MemoryError from error
         if isinstance(error, DamagedFile):
             report_damage(database, error)
-        log.info("job %s failed: %s: %s", job.id, type(error).__name__, error)
-        with database.transaction() as connection:
-            attempts.fail(connection, job.id, attempt, error_details(error, storage))
+        _fail(database, storage, job, error)
+    except WorkFailed as failure:
+        _fail(database, storage, job, failure.error, failure.results)
+
+
+def _fail(
+    database: Database,
+    storage: Storage,
+    job: Job,
+    error: AmersError,
+    results: dict[str, Any] | None = None,
+) -> None:
+    """End a job as failed, with its error and what it made all the same."""
+    log.info("job %s failed: %s: %s", job.id, type(error).__name__, error)
+    with database.transaction() as connection:
+        attempts.fail(connection, job.id, job.attempt, error_details(error, storage), results)
+
+
+def success_message(results: dict[str, Any]) -> str:
+    """The last message of a job by its results: a verdict that forbids their use stands in it."""
+    verdict = results.get("verdict")
+    if verdict == "failed":
+        return "done, verdict failed: do not use the refined model"
+    return "done" if verdict is None else f"done, verdict {verdict}"
 
 
 def error_details(error: AmersError, storage: Storage) -> dict[str, Any]:

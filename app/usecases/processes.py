@@ -12,7 +12,7 @@ from app.config import Settings
 from app.db.engine import Connection, Database
 from app.db.jobs.jobs import Job
 from app.db.tokens import Token
-from app.errors import InputError
+from app.errors import AmersError, InputError
 from app.json_values import unusable_value
 from app.storage import Storage
 from services.docstrings import attribute_descriptions
@@ -20,6 +20,20 @@ from services.types import Progress
 
 Commit = Callable[[Connection], dict[str, Any]]
 """Writes the outcome of a job in the transaction that ends the job, and returns the job's results."""
+
+
+class WorkFailed(Exception):
+    """A process could not do its work, and made results that explain why.
+
+    Attributes:
+        error: that ends the job.
+        results: of the job, with the storage keys of its files as `files`.
+    """
+
+    def __init__(self, error: AmersError, results: dict[str, Any]) -> None:
+        super().__init__(str(error))
+        self.error = error
+        self.results = results
 
 
 @dataclass(frozen=True)

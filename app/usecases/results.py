@@ -117,14 +117,20 @@ def requested_results(storage: Storage, job: Job) -> tuple[dict[str, Any], list[
     return {name: values[name] for name in job.outputs if name in values}, files
 
 
+def kept_files(job: Job) -> dict[str, str]:
+    """The storage keys of the files of the results, by name; none once they were removed."""
+    files: dict[str, str] = (job.results or {}).get("files", {})
+    return files if job.results_removed_at is None else {}
+
+
 def result_key(job: Job, name: str) -> str:
     """The storage key of a file of the results.
 
     Raises:
         NotFound: the job has no file of this name, or its files were removed.
     """
-    key: str | None = (job.results or {}).get("files", {}).get(name)
-    if key is None or job.results_removed_at is not None:
+    key = kept_files(job).get(name)
+    if key is None:
         raise NotFound(f"job {job.id} has no result {name:.100}")
     return key
 

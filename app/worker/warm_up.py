@@ -47,7 +47,7 @@ def warm_up() -> None:
         CorrectedModel(registration.model.base, ImageCorrection(mixed, frame.centre, frame.half_size)),
         scene.image.shape,
     )
-    page_template()
+    page_template("registration.html")
     cv2.setNumThreads(threads)
 
 

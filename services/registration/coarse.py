@@ -7,6 +7,7 @@ import numpy as np
 from services.conventions import CHIP_CENTRE, CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
+from services.matching.consensus import Voters
 from services.matching.control_points import ChipSearch, match_points
 from services.matching.correlate import PeakThresholds
 from services.matching.predict import spread_over_image
@@ -97,6 +98,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         level_m=level_m,
         radius_m=radius_px * level_m,
         needed_m=plan.error_m,
+        voters=Voters(matches.line_sample, CHIP_SIZE * plan.gsd_m / scene_gsd_m(scene)),
     )
     context.stages.append(stage)
     check_consensus(stage, consensus, matches.reason, scene, options.coarse.max_false_alarms)

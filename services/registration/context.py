@@ -13,6 +13,35 @@ from services.types import Array, ChipSource, ControlPoints, Progress, part_of
 
 
 @dataclass(frozen=True)
+class NotFound:
+    """Number of points that a search did not find, for one reason.
+
+    Attributes:
+        reason: code of the matching.
+        count: number of points.
+    """
+
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A group of matches that agree on one displacement.
+
+    Attributes:
+        points: number of matches.
+        east_m, north_m: their mean displacement from the expected positions.
+        false_alarms: number of such groups that chance alone makes, see `a_contrario_consensus`.
+    """
+
+    points: int
+    east_m: float
+    north_m: float
+    false_alarms: float
+
+
+@dataclass(frozen=True)
 class SearchStage:
     """Summary of one search of the points through one model.
 
@@ -25,6 +54,9 @@ class SearchStage:
         tried, matched, inliers: numbers of points searched, found, and in agreement with each other.
         at_border: number of points whose best peak lies at the border of the search.
         displacement_rms_m: distance of the inliers from their expected positions, root mean square.
+        not_found: numbers of the points that were not found, by reason, commonest first.
+        candidates: the largest groups of matches that agree, the largest first; none where most matches
+            agree.
     """
 
     name: str
@@ -36,6 +68,8 @@ class SearchStage:
     at_border: int
     inliers: int
     displacement_rms_m: float
+    not_found: tuple[NotFound, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
 
     @property
     def limited(self) -> bool:

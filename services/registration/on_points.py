@@ -5,8 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
+from services.conventions import CHIP_SIZE
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
+from services.matching.consensus import Voters
 from services.matching.control_points import ChipSearch, match_points
 from services.quality.frames import shared_frame
 from services.quality.qualification import Qualification, qualify
@@ -71,6 +73,7 @@ def register_scene(
     options: RegistrationOptions = RegistrationOptions(),
     *,
     progress: Progress = no_progress,
+    stages: list[SearchStage] | None = None,
 ) -> Registration:
     """Refine the model of a scene on control points.
 
@@ -80,6 +83,7 @@ def register_scene(
         chips: of the points.
         options: of all stages.
         progress: receives the fraction done and the work under way.
+        stages: receives the summaries of the searches, also of one that is refused.
 
     Raises:
         CoverageError: no point lies in the scene.
@@ -92,7 +96,7 @@ def register_scene(
         scene=scene,
         options=options,
         progress=progress,
-        stages=[],
+        stages=[] if stages is None else stages,
         points=points,
         chips=chips,
         image=CachedImage(scene.image),
@@ -120,7 +124,13 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Sea
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
     inliers, tolerance_px = select_inliers(prediction.model, points, matches)
     stage = summarise(
-        "fine", matches, inliers, level_m=gsd_m, radius_m=radius_px * gsd_m, needed_m=error_m
+        "fine",
+        matches,
+        inliers,
+        level_m=gsd_m,
+        radius_m=radius_px * gsd_m,
+        needed_m=error_m,
+        voters=Voters(matches.line_sample, CHIP_SIZE * gsd_m / context.gsd_m),
     )
     context.stages.append(stage)
     check_inliers(stage, tolerance_px, matches.reason, context.scene, options.adjustment.min_points)

@@ -9,10 +9,11 @@ from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import ComputationError, CoverageError, NoConsensus
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, reduce_image
+from services.matching.consensus import Voters
 from services.matching.predict import in_image
 from services.matching.reference_image import Places, Reference, match_places, visible_places
 from services.quality.stability import image_places
-from services.registration.context import RegistrationContext
+from services.registration.context import RegistrationContext, SearchStage
 from services.registration.on_points import Registration, build_registration
 from services.registration.options import RegistrationOptions
 from services.registration.reference_points import reference_points
@@ -69,6 +70,7 @@ def register_on_reference(
     *,
     progress: Progress = no_progress,
     earlier_places: Array | None = None,
+    stages: list[SearchStage] | None = None,
 ) -> Registration:
     """Refine the model of a scene on a reference ortho-image and the terrain under it.
 
@@ -84,6 +86,7 @@ def register_on_reference(
         progress: receives the fraction done and the work under way.
         earlier_places: (k, 3) ground positions that earlier scenes of the same ground were found by: at
             the finest level they are searched before any other place of their neighbourhood.
+        stages: receives the summaries of the searches, also of one that is refused.
 
     Returns:
         As `register_scene`; its points are the places of the last search, numbered from 0.
@@ -98,7 +101,7 @@ def register_on_reference(
         scene=scene,
         options=options,
         progress=progress,
-        stages=[],
+        stages=[] if stages is None else stages,
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )
@@ -201,6 +204,7 @@ def _search(
         level_m=level_m,
         radius_m=radius_px * level_m,
         needed_m=level.error_m,
+        voters=Voters(matches.line_sample, matching.window_px * level.factor),
     )
     context.stages.append(stage)
     if level.is_first:

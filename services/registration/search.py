@@ -24,13 +24,17 @@ from services.matching.consensus import (
     robust_affine_inliers,
 )
 from services.matching.control_points import PointMatches
-from services.registration.context import Prediction, SearchStage
+from services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
 """Displacements of a first search agree within this many pixels of the chips that are searched."""
+MOST_CANDIDATES = 3
+"""Number of groups of matches that a summary shows."""
+MOST_CANDIDATE_POINTS = 20
+"""Groups are not looked for where more matches than this, and most of all, agree."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +177,7 @@ def summarise(
     level_m: float,
     radius_m: float,
     needed_m: float,
+    voters: Voters,
 ) -> SearchStage:
     """The summary of a search; see `SearchStage`."""
     displacement_m = matches.displacement_m[inliers]
@@ -187,7 +192,29 @@ def summarise(
         at_border=int((matches.reason == "border_peak").sum()),
         inliers=int(inliers.sum()),
         displacement_rms_m=rms_m,
+        not_found=tuple(NotFound(*counted) for counted in _count_reasons(matches.reason)),
+        candidates=_candidates(matches, inliers, FIRST_TOLERANCE_PX * level_m, radius_m, voters),
     )
+
+
+def _candidates(
+    matches: PointMatches, inliers: BoolArray, tolerance_m: float, radius_m: float, voters: Voters
+) -> tuple[Candidate, ...]:
+    """The largest groups of matches that agree; none where most matches, and many, agree."""
+    displacement_m = np.where((matches.reason == "")[:, None], matches.displacement_m, np.nan)
+    found = int(np.isfinite(displacement_m).all(axis=1).sum())
+    if inliers.sum() > max(found / 2.0, MOST_CANDIDATE_POINTS):
+        return ()
+    candidates: list[Candidate] = []
+    while len(candidates) < MOST_CANDIDATES:
+        group = a_contrario_consensus(displacement_m, tolerance_m, radius_m, voters)
+        count = int(group.inliers.sum())
+        if count < 2:
+            break
+        east_m, north_m = displacement_m[group.inliers].mean(axis=0).tolist()
+        candidates.append(Candidate(count, east_m, north_m, group.false_alarms))
+        displacement_m[group.inliers] = np.nan
+    return tuple(candidates)
 
 
 def first_consensus(
@@ -253,6 +280,18 @@ def check_consensus(
     )
 
 
+def larger_sigma_m(stage: SearchStage | None, sigma_m: float) -> float:
+    """An accuracy of the model that searches about twice as far as a stage did, two digits.
+
+    Args:
+        stage: summary of the search; None when there was none.
+        sigma_m: stated accuracy of the scene, which set the radius of the first search.
+    """
+    reach_m = 0.0 if stage is None else stage.search_radius_m / MAX_ERROR_SIGMAS
+    # The smallest radius is a few pixels, however small the stated accuracy is.
+    return float(f"{2.0 * (reach_m if reach_m > 2.0 * sigma_m else sigma_m):.2g}")
+
+
 def next_step(stage: SearchStage, sigma_m: float) -> str:
     """What to try after a search that was refused, with the option written out.
 
@@ -260,8 +299,7 @@ def next_step(stage: SearchStage, sigma_m: float) -> str:
         stage: summary of the search.
         sigma_m: stated accuracy of the scene, which set the radius of the first search.
     """
-    larger_m = float(f"{2.0 * sigma_m:.2g}")
-    option = f"--sigma-m {larger_m:g}"
+    option = f"--sigma-m {larger_sigma_m(stage, sigma_m):g}"
     if stage.limited:
         smaller_m = float(f"{stage.search_radius_m / MAX_ERROR_SIGMAS:.2g}")
         return (
@@ -282,5 +320,9 @@ def next_step(stage: SearchStage, sigma_m: float) -> str:
 
 def format_reasons(reason: np.ndarray) -> str:
     """Numbers of points that were not found, by reason: "22 low_score, 16 nodata"."""
-    counted = Counter(str(r) for r in reason if r)
-    return ", ".join(f"{count} {name}" for name, count in counted.most_common()) or "none rejected"
+    return ", ".join(f"{count} {name}" for name, count in _count_reasons(reason)) or "none rejected"
+
+
+def _count_reasons(reason: np.ndarray) -> list[tuple[str, int]]:
+    """Numbers of points that were not found, by reason, commonest first."""
+    return Counter(str(r) for r in reason if r).most_common()

@@ -15,19 +15,21 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from services.docstrings import attribute_descriptions
+from services.reports.failure import FAILURE_FORMAT, FailureReport
 from services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
+Report = RegistrationReport | FailureReport
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
 
 
-def format_report(report: RegistrationReport) -> str:
+def format_report(report: Report) -> str:
     """The text of `report.json`."""
     return json.dumps(report_document(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def report_document(report: RegistrationReport) -> dict[str, Any]:
+def report_document(report: Report) -> dict[str, Any]:
     """The report as plain JSON values; numbers that are not finite become null."""
-    return {field.name: _plain(getattr(report, field.name)) for field in _members(RegistrationReport)}
+    return {field.name: _plain(getattr(report, field.name)) for field in _members(type(report))}
 
 
 def _members(kind: type) -> list[Field[Any]]:
@@ -56,6 +58,16 @@ def _plain(value: Any) -> Json:
 
 def report_schema() -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of `report.json`."""
+    return _schema(RegistrationReport, "Amers registration report", REPORT_FORMAT)
+
+
+def failure_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of the `report.json` of a registration that failed."""
+    return _schema(FailureReport, "Amers registration failure", FAILURE_FORMAT)
+
+
+def _schema(kind: type, title: str, document_format: str) -> dict[str, Any]:
+    """JSON Schema of a report, with its title and the value of its member `format`."""
     definitions: dict[str, Any] = {
         "Numbers": {
             "description": "A number, null where it is unknown, or rows of them.",
@@ -63,11 +75,11 @@ def report_schema() -> dict[str, Any]:
             "items": {"$ref": "#/$defs/Numbers"},
         }
     }
-    document = _object_schema(RegistrationReport, definitions)
-    document["properties"]["format"]["const"] = REPORT_FORMAT
+    document = _object_schema(kind, definitions)
+    document["properties"]["format"]["const"] = document_format
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Amers registration report",
+        "title": title,
         **document,
         "$defs": dict(sorted(definitions.items())),
     }

@@ -24,6 +24,7 @@ from services.reports.numbers import (
     quantile,
 )
 from services.reports.published import published_tables
+from services.reports.reasons import reason_label
 from services.reports.report import RegistrationReport
 from services.types import Array, ChipArray
 
@@ -45,20 +46,20 @@ class GalleryGroup:
 
 def format_html(report: RegistrationReport) -> str:
     """The report as a self-contained page for screen, phone and paper."""
-    return page_template().render(
+    return page_template("registration.html").render(
         report=report,
         unmet=unmet_criteria(report),
         figures={draw.__name__: Markup(figure_markup(draw, report)) for draw in FIGURES},
         gallery=choose_pairs(report.figure_data.gallery),
         published=published_tables(report),
         options=list(flat_options(report.run.options)),
-        centre=_centre_words(report.scene.footprint_lon_lat),
+        centre=centre_words(report.scene.footprint_lon_lat),
     )
 
 
 @cache
-def page_template() -> Template:
-    """The compiled template of the page; it escapes all values and raises an error for unknown names."""
+def page_template(name: str) -> Template:
+    """A compiled template of a page; it escapes all values and raises an error for unknown names."""
     environment = Environment(
         loader=PackageLoader("services.reports", "."),
         autoescape=True,
@@ -76,9 +77,10 @@ def page_template() -> Template:
         criterion_limit=criterion_limit,
         margin=margin_words,
         chip=chip_uri,
+        reason_label=reason_label,
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
     )
-    return environment.get_template("registration.html")
+    return environment.get_template(name)
 
 
 def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
@@ -139,7 +141,7 @@ def flat_options(options: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
             yield f"{prefix}{field.name}", str(value)
 
 
-def _centre_words(footprint: Array) -> str:
+def centre_words(footprint: Array) -> str:
     """Latitude and longitude of the middle of the scene."""
     if not len(footprint):
         return ABSENT

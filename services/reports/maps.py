@@ -44,7 +44,7 @@ def ground_overview(report: RegistrationReport) -> Figure:
     offset = measures.lon_lat_h[:, :2] - centre
     offset[:, 0] = (offset[:, 0] + 180.0) % 360.0 - 180.0
     points_km, outline_km = offset * km, (outline - centre) * km
-    panel = _equal_panel(figure, np.concatenate([points_km, outline_km]))
+    panel = equal_panel(figure, np.concatenate([points_km, outline_km]))
     panel.x_axis("km east", count=8, grid=True)
     panel.y_axis("km north", grid=True)
     if len(outline):
@@ -60,7 +60,7 @@ def ground_overview(report: RegistrationReport) -> Figure:
     return figure
 
 
-def _equal_panel(figure: Figure, shown: Array) -> Panel:
+def equal_panel(figure: Figure, shown: Array) -> Panel:
     """A panel that shows places (n, 2) with the same scale on both axes."""
     if not len(shown):
         shown = np.zeros((1, 2))

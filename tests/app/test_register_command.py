@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,9 +15,10 @@ from jsonschema import validate
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
+from app.usecases.registration.failure import FAILURE_OUTPUTS
 from app.usecases.registration.result_folder import MANIFEST
 from services.formats.sensor_models.rpc_files import read_rpc
-from services.reports.document import report_schema
+from services.reports.document import failure_schema, report_schema
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.registration_outputs import (
     A_TENTH_OF_A_PIXEL,
@@ -271,6 +273,16 @@ def test_the_command_lets_a_service_register(
         assert_masked(folder)
         (check,) = json.loads((folder / "report.json").read_text())["checks"]
         assert check["image_residuals_px"]["xy"]["rms"] < A_TENTH_OF_A_PIXEL
+        older = (folder / "report.json").read_bytes()
+        refused = amers(*scene, "--server", url, "--token", "wrong")
+        assert (refused.returncode, (folder / "report.json").read_bytes()) == (2, older)
+        hopeless = ("scene", "register", world.tagged, "--sigma-m", 0.1, "-o", folder, "--json")
+        failed = amers(*hopeless, "--server", url, "--token", token("register"))
+        record = json.loads(failed.stdout)
+        assert (failed.returncode, record["exit_status"]) == (3, 3), failed.stderr + log.read_text()
+        report = json.loads((folder / "report.json").read_text())
+        validate(report, failure_schema())
+        assert report["search_stages"][0]["tried"] == 40
         garbled = tmp_path / "garbled.geojson"
         garbled.write_text("{")
         wrong = (*scene, "--check-points", garbled, "--server", url, "--token", token("register"))
@@ -368,11 +380,51 @@ def test_a_single_scene_that_fails_is_listed_with_its_reason(
     record = json.loads(listed.stdout)
     assert (record["verdict"], record["exit_status"], listed.returncode) == ("not registered", 3, 3)
     assert "found" in record["reason"]
+    assert Path(record["output"]) == tmp_path / "out"
     printed = amers(*failing, "-o", tmp_path / "out")
     assert "not registered" in printed.stdout
     assert record["reason"] in printed.stderr
+    assert "replaces the result of tagged of 20" in printed.stderr
     unreachable = ("--server", "http://127.0.0.1:1", "-o", tmp_path / "other", "--json")
     gone = amers("scene", "register", world.tagged, *unreachable)
     record = json.loads(gone.stdout)
     assert (record["verdict"], record["exit_status"], gone.returncode) == ("not registered", 1, 1)
     assert "127.0.0.1:1" in record["reason"]
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_registration_that_fails_leaves_its_own_report_and_no_older_one(
+    amers: Amers, world: FlatWorld, tmp_path: Path
+):
+    folder = tmp_path / "out"
+    scene = ("scene", "register", world.tagged, "--block", world.block, "-o", folder)
+    good = amers(*scene, "--sigma-m", SIGMA_M)
+    assert good.returncode == 0, good.stderr
+    failed = amers(*scene, "--sigma-m", 0.1)
+    assert failed.returncode == 3, failed.stderr
+    assert {path.name for path in folder.iterdir()} == {*FAILURE_OUTPUTS, MANIFEST}
+    report = json.loads((folder / "report.json").read_text())
+    validate(report, failure_schema())
+    assert (report["verdict"], report["error"], report["visible"]) == (
+        "not registered",
+        "NotEnoughPoints",
+        40,
+    )
+    (stage,) = report["search_stages"]
+    assert sum(one["count"] for one in stage["not_found"]) + stage["matched"] == stage["tried"] == 40
+    assert str(folder) not in report["reason"]
+    # The command of the first step is complete: it registers the scene.
+    program, *words = shlex.split(report["next_steps"][0]["command"])
+    assert program == "amers"
+    assert words[-2] == "--sigma-m"
+    larger = amers(*words[:-1], SIGMA_M)
+    assert larger.returncode == 0, larger.stderr
+    assert f"verdict {report['verdict']}" in larger.stderr
+    assert_registered(folder, world)
+    damaged = tmp_path / "half.tif"
+    damaged.write_bytes(world.tagged.read_bytes()[:100_000])
+    assert amers("scene", "register", damaged, *scene[3:]).returncode == 2
+    report = json.loads((folder / "report.json").read_text())
+    validate(report, failure_schema())
+    assert (report["scene"], report["verdict"]) == ({"name": "half"}, "not registered")
+    assert "truncated or damaged" in report["reason"]

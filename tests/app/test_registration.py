@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from jsonschema import validate
 
 from app.config import Settings
 from app.db import engine
+from app.db.engine import Database
 from app.storage import Storage
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
+from app.usecases.results import reconcile_results
+from app.usecases.retention import remove_old_results
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.refined import refined_rpc
@@ -137,6 +141,89 @@ def test_a_scene_goes_from_upload_to_a_refined_model_by_http(
     assert used is not None
     assert used["block_versions"] == [{"id": "flat", "version": "1"}]
     assert used["options"]["max_points"] == 30
+
+
+def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
+    client: TestClient,
+    bearer: Bearer,
+    settings: Settings,
+    published: None,
+    world: FlatWorld,
+    tmp_path: Path,
+    database: Database,
+    storage: Storage,
+):
+    me = bearer("register")
+    # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
+    image = world.tagged.read_bytes()
+    scene = client.post("/scenes?name=scene.tif&sigma_m=0.1", content=image, headers=me).json()["id"]
+    body = {"inputs": {"scene": scene}}
+    asked = client.post("/processes/register-scene/execution", json=body, headers=me)
+    with running_worker(settings, tmp_path / "log"):
+        job = ended(client, asked.headers["location"], me)
+    assert (job["status"], job.get("amers:verdict")) == ("failed", "not registered"), job
+    assert client.get(f"/jobs/{job['jobID']}/results", headers=me).status_code == 409
+    links = {link["title"]: link for link in job["links"] if "/results/" in link["href"]}
+    assert set(links) == {"report.json", "report.html", "report.txt"}
+    report = client.get(links["report.json"]["href"], headers=me).json()
+    validate(report, client.get("/schemas/failure.json").json())
+    assert (report["scene"]["name"], report["visible"]) == ("scene", 40)
+    assert report["search_stages"][-1]["tried"] == 40
+    assert "--sigma-m" in report["next_steps"][0]["command"]
+    page = client.get(links["report.html"]["href"], headers=me)
+    assert page.headers["content-type"].startswith("text/html")
+    for text in (json.dumps(report), page.text):
+        assert str(tmp_path) not in text
+        assert "/tmp/" not in text
+    assert client.get(links["report.html"]["href"], headers=bearer("register")).status_code == 404
+    (listed,) = client.get("/jobs", headers=me).json()["jobs"]
+    assert listed["amers:verdict"] == "not registered"
+    metrics = client.get("/metrics", headers=bearer("admin")).text
+    assert 'amers_registration_jobs{verdict="not registered"} 1.0' in metrics
+    # The files belong to the job: sweeps keep them, and retention removes them.
+    reconcile_results(database, storage)
+    folder = f"results/{job['jobID']}"
+    assert len(storage.keys(folder)) == 3
+    with database.transaction() as connection:
+        run_sql(connection, "update job set finished_at = finished_at - interval '2 days'")
+        run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * 2")
+    remove_old_results(database, storage, days=1.0)
+    assert storage.keys(folder) == []
+    assert client.get(links["report.html"]["href"], headers=me).status_code == 404
+    gone = client.get(f"/jobs/{job['jobID']}", headers=me).json()
+    assert not [link for link in gone["links"] if "/results/" in link["href"]]
+
+
+def test_a_job_whose_verdict_is_failed_says_so_in_every_list(
+    client: TestClient,
+    bearer: Bearer,
+    settings: Settings,
+    published: None,
+    world: FlatWorld,
+    tmp_path: Path,
+):
+    me = bearer("register")
+    image = world.tagged.read_bytes()
+    scene = client.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()[
+        "id"
+    ]
+    strict = {"options": {"qualification": {"usable_active_points": 1000}}}
+    asked = [
+        client.post(
+            "/processes/register-scene/execution", json={"inputs": {"scene": scene, **more}}, headers=me
+        ).headers["location"]
+        for more in (strict, {})
+    ]
+    with running_worker(settings, tmp_path / "log"):
+        failed, done = (ended(client, job, me) for job in asked)
+    assert failed["status"] == done["status"] == "successful"
+    assert (failed["amers:verdict"], done["amers:verdict"]) in (("failed", "good"), ("failed", "usable"))
+    assert failed["message"] == "done, verdict failed: do not use the refined model"
+    assert done["message"] == f"done, verdict {done['amers:verdict']}"
+    listed = client.get("/jobs", headers=me).json()["jobs"]
+    assert {job["jobID"]: job["amers:verdict"] for job in listed} == {
+        job["jobID"]: job["amers:verdict"] for job in (failed, done)
+    }
 
 
 def test_a_block_is_ingested_by_a_job_of_an_administrator(

@@ -583,6 +583,7 @@ export interface StatusInfo {
   "amers:queuePosition"?: number;
   "amers:estimatedEnd"?: string;
   "amers:priority"?: number;
+  "amers:verdict"?: "good" | "usable" | "failed" | "not registered";
 }
 
 export interface StoredFile {

@@ -40,9 +40,9 @@ interface Stated {
   on_the_earth?: { label: string; words: string };
 }
 
-/** A state as a word; its colour repeats the word and adds nothing. */
-export function badge(state: string): HTMLElement {
-  return h("span", { class: `badge ${state.replace(/\W/g, "-")}` }, state);
+/** A state as a word, after what it is a state of; its colour repeats the word and adds nothing. */
+export function badge(state: string, of = ""): HTMLElement {
+  return h("span", { class: `badge ${state.replace(/\W/g, "-")}` }, of + state);
 }
 
 export function problem(error: unknown): HTMLElement {

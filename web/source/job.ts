@@ -34,7 +34,7 @@ export const showJob: ShowView = async (place, id) => {
   }
   announce(`The job is ${job.status}.`);
   if (job.status === "successful") await showResults(place, job, heading, body);
-  else fill(body, outcome(job));
+  else fill(body, outcome(job), await failureReport(job, signal));
 };
 
 function find(id: string, signal: AbortSignal): Promise<StatusInfo> {
@@ -82,6 +82,14 @@ function outcome(job: StatusInfo): HTMLElement {
     h("p", {}, badge(job.status), " ", h("span", { class: "quiet" }, when(job.finished))),
     job.error ? problem(`${job.error.title}: ${job.error.detail}`) : h("p", {}, job.message),
   );
+}
+
+/** A link to the report of a registration that failed, where the job has one. */
+async function failureReport(job: StatusInfo, signal: AbortSignal): Promise<HTMLElement | null> {
+  const page = job.links.find(({ title }) => title === "report.html");
+  if (!page) return null;
+  const link = h("a", { class: "button strong", target: "_blank", href: await blobUrl(page.href, signal) }, "Open the report");
+  return h("p", {}, link, " ", h("span", { class: "quiet" }, "what was tried, and what to try next"));
 }
 
 async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: HTMLElement, body: HTMLElement): Promise<void> {

@@ -36,6 +36,13 @@ export interface BlockUsed {
   version: string;
 }
 
+export interface Candidate {
+  points: number;
+  east_m: number | null;
+  north_m: number | null;
+  false_alarms: number | null;
+}
+
 export interface Check {
   against: string;
   accuracy: Accuracy;
@@ -132,6 +139,11 @@ export interface NormalisedError {
   upper: number | null;
   n: number;
   confidence: number | null;
+}
+
+export interface NotFound {
+  reason: string;
+  count: number;
 }
 
 export type Numbers = number | null | Numbers[];
@@ -286,6 +298,8 @@ export interface SearchStage {
   at_border: number;
   inliers: number;
   displacement_rms_m: number | null;
+  not_found: NotFound[];
+  candidates: Candidate[];
 }
 
 export interface Stability {

@@ -129,12 +129,19 @@ function sceneRow(scene: Scene): HTMLElement {
   );
 }
 
+/** The verdict on the registration of a job: a job that ran to its end may have made a model not to be used. */
+export function verdict(job: StatusInfo): HTMLElement | null {
+  const word = job["amers:verdict"];
+  return word ? badge(word, "verdict ") : null;
+}
+
 function jobRow(job: StatusInfo): HTMLElement {
   return h(
     "li",
     {},
     h("a", { href: `#/job/${job.jobID}` }, job.processID.replace("-", " ")),
     badge(job.status),
+    verdict(job),
     h("span", { class: "quiet" }, when(job.created)),
   );
 }

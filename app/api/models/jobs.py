@@ -74,6 +74,9 @@ class JobError(Reply):
 class StatusInfo(Reply):
     """The state of a job.
 
+    `status` says whether the job ran to its end; `amers:verdict` says whether the registration that it
+    made can be used. A job that failed after a search has a report too, under a link.
+
     `amers:queuePosition` is the place in the queue of a job that waits. `amers:estimatedEnd` is
     estimated from the durations of earlier jobs. `amers:priority` is that of a job to which an
     administrator gave one.
@@ -95,6 +98,7 @@ class StatusInfo(Reply):
     queue_position: int | None = missing("amers:queuePosition")
     estimated_end: datetime | None = missing("amers:estimatedEnd")
     priority: int | None = missing("amers:priority")
+    verdict: Literal["good", "usable", "failed", "not registered"] | None = missing("amers:verdict")
 
 
 class Jobs(Reply):

@@ -98,13 +98,14 @@ def reserve_results(connection: Connection, job_id: UUID, attempt: int, size_byt
 
 
 def release_results(connection: Connection, job_id: UUID, attempt: int) -> None:
-    """Give back the room for the files of an attempt that is over without success."""
+    """Give back the room for the files of an attempt that is over without results."""
     connection.execute(
         update(job)
         .where(
             job.c.id == job_id,
             job.c.attempt == attempt,
-            job.c.state.not_in(("running", "successful")),
+            job.c.state != "running",
+            job.c.results.is_(None),
             job.c.results_bytes > 0,
         )
         .values(results_bytes=0)
@@ -112,14 +113,16 @@ def release_results(connection: Connection, job_id: UUID, attempt: int) -> None:
 
 
 def lost_reservations(connection: Connection) -> dict[UUID, int]:
-    """Jobs that neither run nor have succeeded and have room reserved, each with its last attempt."""
+    """Jobs that neither run nor have results and have room reserved, each with its last attempt."""
     statement = select(job.c.id, job.c.attempt).where(
-        job.c.results_bytes > 0, job.c.state.not_in(("running", "successful"))
+        job.c.results_bytes > 0, job.c.state != "running", job.c.results.is_(None)
     )
     return {row.id: row.attempt for row in connection.execute(statement)}
 
 
-def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[str, Any]) -> None:
+def succeed(
+    connection: Connection, job_id: UUID, attempt: int, results: dict[str, Any], message: str = "done"
+) -> None:
     """End a job with its results; the last statement of the transaction that writes them.
 
     Raises:
@@ -131,7 +134,7 @@ def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[st
         attempt,
         state="successful",
         progress=100,
-        message="done",
+        message=message,
         results=results,
         error=None,
         lease_until=None,
@@ -140,8 +143,14 @@ def succeed(connection: Connection, job_id: UUID, attempt: int, results: dict[st
     replace_spent_ticket(connection)
 
 
-def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, Any]) -> None:
-    """End a job for good, with problem details for its owner.
+def fail(
+    connection: Connection,
+    job_id: UUID,
+    attempt: int,
+    error: dict[str, Any],
+    results: dict[str, Any] | None = None,
+) -> None:
+    """End a job for good, with problem details for its owner, and what it made all the same.
 
     Raises:
         LostJob: the attempt is over.
@@ -153,6 +162,7 @@ def fail(connection: Connection, job_id: UUID, attempt: int, error: dict[str, An
         state="failed",
         message=error.get("detail", error["title"]),
         error=error,
+        results=results,
         lease_until=None,
         finished_at=clock,
     )
@@ -240,8 +250,9 @@ def take_back(connection: Connection, failures_allowed: int) -> list[UUID]:
 
 
 def counting_attempts(connection: Connection, job_ids: list[UUID]) -> dict[UUID, int | None]:
-    """Of some jobs those that exist, with the attempt that runs or succeeded if its results are kept."""
-    counts = job.c.results_removed_at.is_(None) & job.c.state.in_(("running", "successful"))
+    """Of some jobs those that exist, with the attempt that runs or has results that are kept."""
+    has_results = (job.c.state == "successful") | job.c.results.is_not(None)
+    counts = job.c.results_removed_at.is_(None) & ((job.c.state == "running") | has_results)
     statement = select(job.c.id, case((counts, job.c.attempt)).label("attempt")).where(
         among(job.c.id, job_ids)
     )

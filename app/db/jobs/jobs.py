@@ -34,7 +34,7 @@ class Job:
         failures: attempts that ended without an outcome: a crash, an outage, a lost worker.
         claimed_at, started_at: when the last attempt began, and the first.
         error: problem details of a failure.
-        results: what a successful job made.
+        results: what a successful job made; of a failed registration its verdict and its report.
         results_removed_at: when the files of the results were removed.
         priority: jobs of a higher one come first; 0 unless an administrator set it.
     """
@@ -197,7 +197,8 @@ def remove_old_results(connection: Connection, older_than_s: float) -> list[UUID
     removed = connection.scalars(
         update(job)
         .where(
-            job.c.state == "successful",
+            # Each part has an index of its own.
+            (job.c.state == "successful") | ((job.c.state == "failed") & (job.c.results_bytes > 0)),
             job.c.results_removed_at.is_(None),
             job.c.results.has_key("files"),
             *_older_than(older_than_s),

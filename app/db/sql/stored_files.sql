@@ -21,7 +21,7 @@ with named as (
     select file.key, 'result', result_file.size_bytes, result_file.sha256
     from job cross join jsonb_each_text(results->'files') as file (name, key)
         left join result_file on result_file.storage_key = file.key
-    where state = 'successful' and results_removed_at is null and results ? 'files'
+    where state in ('successful', 'failed') and results_removed_at is null and results ? 'files'
 )
 select * from named
 where cast(:keys as text[]) is null or storage_key = any(cast(:keys as text[]))

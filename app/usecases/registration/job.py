@@ -10,11 +10,13 @@ from app.auth import Scope
 from app.db import scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
+from app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
 from app.usecases.damage import suspecting_damage
-from app.usecases.processes import Commit, Process, Work
+from app.usecases.processes import Commit, Process, Work, WorkFailed
 from app.usecases.references import references_of_store
 from app.usecases.registration.control_sources import points_of_store
 from app.usecases.registration.deliverables import OUTPUTS
+from app.usecases.registration.failure import FAILURE_OUTPUTS
 from app.usecases.registration.register import (
     ControlSources,
     SceneFiles,
@@ -29,6 +31,7 @@ from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
 from services.quality.accuracy_statement import accuracy_document
 from services.registration.options import RegistrationOptions
+from services.reports.failure import NOT_REGISTERED
 from services.reports.report import Method as ReportedMethod
 
 Method = Literal["auto", "points", "reference"]
@@ -80,15 +83,20 @@ def _run(work: Work) -> Commit:
         scene = present_scene(connection, inputs.scene)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
-        with suspecting_damage(work.database, work.storage, stored_keys(scene)):
-            registered = run_registration(
-                _scene_files(inputs, image, scene.sigma_m),
-                _control_sources(work, inputs.method),
-                Path(folder),
-                options=inputs.options,
-                copy_image=inputs.copy_image,
-                progress=work.progress,
-            )
+        try:
+            with suspecting_damage(work.database, work.storage, stored_keys(scene)):
+                registered = run_registration(
+                    _scene_files(inputs, image, scene.sigma_m),
+                    _control_sources(work, inputs.method),
+                    Path(folder),
+                    options=inputs.options,
+                    copy_image=inputs.copy_image,
+                    progress=work.progress,
+                )
+        except (InputError, ComputationError) as error:
+            if is_no_memory(error):
+                raise
+            raise _with_report(work, Path(folder), error) from error
         gsd_m = scene_gsd_m(registered.scene)
         keys = store_results(work, registered.files)
 
@@ -109,6 +117,15 @@ def _run(work: Work) -> Commit:
         }
 
     return commit
+
+
+def _with_report(work: Work, folder: Path, error: AmersError) -> WorkFailed | AmersError:
+    """The error of a registration with the report of its failure; without it where there is no room."""
+    try:
+        keys = store_results(work, {name: folder / name for name in FAILURE_OUTPUTS})
+    except TooLarge:
+        return error
+    return WorkFailed(error, {"verdict": NOT_REGISTERED, "files": keys})
 
 
 def _control_sources(work: Work, method: Method) -> ControlSources:

@@ -11,6 +11,7 @@ from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_t
 from services.formats.images.raster import map_grid_of, open_raster
 from services.imagery.scene import Scene
 from services.matching.reference_image import Reference
+from services.registration.context import SearchStage
 from services.registration.on_points import Registration
 from services.registration.on_reference import register_on_reference
 from services.registration.options import RegistrationOptions
@@ -72,16 +73,25 @@ def given_reference(files: ReferenceFiles) -> FindReference:
 
 
 def register_on(
-    covering: CoveringReference, scene: Scene, options: RegistrationOptions, progress: Progress
+    covering: CoveringReference,
+    scene: Scene,
+    options: RegistrationOptions,
+    progress: Progress,
+    stages: list[SearchStage] | None = None,
 ) -> tuple[Registration, ControlSet]:
-    """Register a scene on a reference.
+    """Register a scene on a reference; `stages` receives the searches, also one that is refused.
 
     Returns:
         The registration, and its places on the reference as control points.
     """
     reference = read_reference(covering.files)
     registration = register_on_reference(
-        scene, reference, options, progress=progress, earlier_places=covering.earlier_places
+        scene,
+        reference,
+        options,
+        progress=progress,
+        earlier_places=covering.earlier_places,
+        stages=stages,
     )
     lon_lat_h = registration.measures.lon_lat_h
     points = reference_points(lon_lat_h, reference)

@@ -17,9 +17,10 @@ from app.usecases.references import record_places
 from app.usecases.registration.check_points import read_check_points
 from app.usecases.registration.control_sources import ControlSet, FindPoints
 from app.usecases.registration.deliverables import write_outputs
+from app.usecases.registration.failure import Attempt, write_failure
 from app.usecases.registration.reference_source import CoveringReference, FindReference, register_on
 from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import CoverageError
+from services.errors import ComputationError, CoverageError, InputError
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.refined_model import write_refined
@@ -100,8 +101,9 @@ def run_registration(
     options: RegistrationOptions = RegistrationOptions(),
     copy_image: bool = False,
     progress: Progress = no_progress,
+    command: str = "",
 ) -> RegisteredScene:
-    """Register one scene and write the outputs into a folder.
+    """Register one scene and write the outputs into a folder; for one that fails, a report of that.
 
     Args:
         files: of the scene.
@@ -110,19 +112,40 @@ def run_registration(
         options: of the registration.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
         progress: receives the fraction done and a message.
+        command: that repeats this registration, without the accuracy of the model, for the report of a
+            failure; by default one that names the image.
 
     Raises:
         InputError: the scene, its mask or its check points cannot be used.
         ComputationError: the scene cannot be registered.
     """
-    started_at = datetime.now(UTC)
+    attempt = Attempt(files.image, command or f"amers scene register {files.image.name}", options)
+    try:
+        return _register_and_write(files, sources, folder, attempt, copy_image, progress=progress)
+    except (InputError, ComputationError) as error:
+        write_failure(folder, attempt, error)
+        raise
+
+
+def _register_and_write(
+    files: SceneFiles,
+    sources: ControlSources,
+    folder: Path,
+    attempt: Attempt,
+    copy_image: bool,
+    *,
+    progress: Progress,
+) -> RegisteredScene:
+    """Register one scene and write the outputs; what is done is noted in the attempt."""
+    options = attempt.options
     bands = None if files.bands is None else parse_bands(files.bands)
     scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
+    attempt.scene = scene
     check_points = None
     if files.check_points is not None:
         check_points = read_check_points(files.check_points, files.check_heights, files.image, scene)
 
-    registration, control, reference = _register(scene, sources, options, part_of(progress, 0.0, 0.9))
+    registration, control, reference = _register(scene, sources, attempt, part_of(progress, 0.0, 0.9))
 
     checks: tuple[Check, ...] = ()
     if check_points is not None and files.check_points is not None:
@@ -144,7 +167,7 @@ def run_registration(
         scene_record(scene, files.image.stem),
         RunRecord(
             software_version=version("amers"),
-            started_at=started_at,
+            started_at=attempt.started_at,
             finished_at=datetime.now(UTC),
             method="control points" if reference is None else "reference image",
             blocks=control.blocks,
@@ -204,17 +227,22 @@ def image_key(image: Path) -> str:
 
 
 def _register(
-    scene: Scene, sources: ControlSources, options: RegistrationOptions, progress: Progress
+    scene: Scene, sources: ControlSources, attempt: Attempt, progress: Progress
 ) -> tuple[Registration, ControlSet, CoveringReference | None]:
     """The registration of a scene on control points, or else on a reference image; and its control."""
     outline = _grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
     if sources.find_points is not None:
         progress(0.0, "looking for points")
-        control = sources.find_points(outline)
+        control = attempt.control = sources.find_points(outline)
         try:
             registration = register_scene(
-                scene, control.points, control.chips, options, progress=progress
+                scene,
+                control.points,
+                control.chips,
+                attempt.options,
+                progress=progress,
+                stages=attempt.stages,
             )
             return registration, control, None
         except CoverageError as error:
@@ -222,7 +250,8 @@ def _register(
     reference = None if sources.find_reference is None else sources.find_reference(outline)
     if reference is None:
         raise no_control
-    return (*register_on(reference, scene, options, progress), reference)
+    attempt.reference = reference.name
+    return (*register_on(reference, scene, attempt.options, progress, attempt.stages), reference)
 
 
 def _check(

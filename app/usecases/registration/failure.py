@@ -1,0 +1,113 @@
+"""The report of a registration that failed, written where its outputs would have been."""
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from app.usecases.registration.control_sources import ControlSet
+from services.errors import AmersError, CoverageError
+from services.imagery.scene import Scene
+from services.registration.context import SearchStage
+from services.registration.options import RegistrationOptions
+from services.registration.point_selection import visible_points
+from services.reports.build import scene_record
+from services.reports.document import format_report
+from services.reports.failure import (
+    EXPLANATION,
+    FAILURE_FORMAT,
+    NOT_REGISTERED,
+    FailureReport,
+    UnreadScene,
+    next_steps,
+)
+from services.reports.failure_pages import format_failure_html, format_failure_tables
+from services.reports.report import BlockUsed, RunRecord
+from services.types import Array
+
+FAILURE_OUTPUTS = ("report.json", "report.html", "report.txt")
+
+
+@dataclass
+class Attempt:
+    """What a registration has done so far; it is filled while the work goes on.
+
+    Attributes:
+        image: of the scene.
+        command: that repeats the registration, without the accuracy of the model.
+        options: of the registration.
+        started_at: UTC.
+        scene: once it was read.
+        control: points around the scene, once they were looked for.
+        reference: name of the reference image, once it was chosen; "" before.
+        stages: summaries of the searches, also of one that was refused.
+    """
+
+    image: Path
+    command: str
+    options: RegistrationOptions
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    scene: Scene | None = None
+    control: ControlSet | None = None
+    reference: str = ""
+    stages: list[SearchStage] = field(default_factory=list)
+
+
+def write_failure(folder: Path, attempt: Attempt, error: AmersError) -> None:
+    """Write the report of an attempt that an error has ended into a folder, created when missing."""
+    report = _failure_report(attempt, error)
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = format_report(report), format_failure_html(report), format_failure_tables(report)
+    for name, text in zip(FAILURE_OUTPUTS, texts, strict=True):
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
+    name, scene = attempt.image.stem, attempt.scene
+    record = UnreadScene(name) if scene is None else scene_record(scene, name)
+    stages = tuple(attempt.stages)
+    return FailureReport(
+        format=FAILURE_FORMAT,
+        run=RunRecord(
+            software_version=version("amers"),
+            started_at=attempt.started_at,
+            finished_at=datetime.now(UTC),
+            method="reference image" if attempt.reference else "control points",
+            blocks=_blocks(attempt),
+            options=attempt.options,
+        ),
+        verdict=NOT_REGISTERED,
+        verdict_explanation=EXPLANATION,
+        error=type(error).__name__,
+        # The folder of the image may be that of a job on a service.
+        reason=str(error).replace(f"{attempt.image.parent}/", ""),
+        scene=record,
+        visible=_visible(attempt),
+        search_stages=stages,
+        next_steps=next_steps(error, record, stages, attempt.command),
+        ground=_ground(attempt),
+    )
+
+
+def _blocks(attempt: Attempt) -> tuple[BlockUsed, ...]:
+    """The blocks whose points were tried, or the reference image."""
+    if attempt.reference:
+        return (BlockUsed(attempt.reference, "reference image"),)
+    return () if attempt.control is None else attempt.control.blocks
+
+
+def _visible(attempt: Attempt) -> int | None:
+    """Number of control points that the scene may show; None when none was looked for."""
+    if attempt.scene is None or attempt.control is None or attempt.reference:
+        return None
+    try:
+        return len(visible_points(attempt.scene, attempt.control.points))
+    except CoverageError:
+        return 0
+
+
+def _ground(attempt: Attempt) -> Array:
+    """The control points around the scene (n, 2), lon and lat."""
+    return np.zeros((0, 2)) if attempt.control is None else attempt.control.points.lon_lat_h[:, :2]

@@ -1,0 +1,155 @@
+"""The report of a registration that failed: what was tried and where, and what to try next."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from services.conventions import MAX_ERROR_SIGMAS
+from services.errors import CoverageError, NoConsensus, NotEnoughPoints
+from services.registration.context import SearchStage
+from services.registration.search import larger_sigma_m
+from services.reports.numbers import number
+from services.reports.report import NOT_IN_JSON, RunRecord, SceneRecord
+from services.types import Array
+
+FAILURE_FORMAT = "amers-registration-failure/1"
+NOT_REGISTERED: Literal["not registered"] = "not registered"
+"""Verdict on a scene whose registration ended with an error."""
+
+EXPLANATION = "There is no refined model. The delivered model is as it was."
+
+
+@dataclass(frozen=True)
+class UnreadScene:
+    """A scene whose files could not be used.
+
+    Attributes:
+        name: for people.
+    """
+
+    name: str
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """Something to try.
+
+    Attributes:
+        text: what to do, and why.
+        command: that does it; "" when it is no command.
+    """
+
+    text: str
+    command: str
+
+
+@dataclass(frozen=True)
+class FailureReport:
+    """The report of a registration that failed.
+
+    Attributes:
+        format: of the document, with its version.
+        run: how and when the registration was run.
+        verdict: always "not registered".
+        verdict_explanation: what the verdict means, for people.
+        error: kind of the error.
+        reason: the error, for people.
+        scene: what was to be registered; only its name when its files could not be used.
+        visible: number of control points that the scene may show; null when none was looked for.
+        search_stages: the searches that were made, in order; the last one was refused.
+        next_steps: what to try, the most promising first.
+        ground: (n, 2) lon, lat of the control points around the scene; not part of report.json.
+    """
+
+    format: str
+    run: RunRecord
+    verdict: Literal["not registered"]
+    verdict_explanation: str
+    error: str
+    reason: str
+    scene: SceneRecord | UnreadScene
+    visible: int | None
+    search_stages: tuple[SearchStage, ...]
+    next_steps: tuple[NextStep, ...]
+    ground: Array = field(metadata=NOT_IN_JSON)
+
+
+def next_steps(
+    error: Exception, scene: SceneRecord | UnreadScene, stages: tuple[SearchStage, ...], command: str
+) -> tuple[NextStep, ...]:
+    """What to try after a registration that failed, the most promising first.
+
+    Args:
+        error: that ended it.
+        scene: that was to be registered.
+        stages: the searches that were made; the last one was refused.
+        command: that ran it, without the accuracy of the model.
+    """
+    if isinstance(scene, UnreadScene) or not isinstance(
+        error, (CoverageError, NoConsensus, NotEnoughPoints)
+    ):
+        return (NextStep("Correct what the reason names, and run the registration again.", command),)
+    if not stages:
+        return (*_find_control(scene, command), _state_larger(scene, command))
+    last = stages[-1]
+    check = NextStep(
+        "Check that the model belongs to this image, and that the points show this ground: the reasons "
+        "in the table say why points were not found.",
+        "",
+    )
+    if last.limited:
+        smaller = f"--sigma-m {last.search_radius_m / MAX_ERROR_SIGMAS:.2g}"
+        text = (
+            f"The search reached {number(last.search_radius_m, 0)} m of the "
+            f"{number(last.needed_radius_m, 0)} m that the accuracy of the model asks for. State a "
+            "smaller error where it is known, or give points with coarser chips."
+        )
+        return NextStep(text, f"{command} {smaller}"), check
+    larger = _state_larger(scene, command, last)
+    if 2 * last.at_border > last.tried:
+        return larger, check
+    if 2 * last.matched > last.tried or any(one.points > 2 for one in last.candidates):
+        return check, larger
+    look = NextStep(
+        "The points do not look like the scene there. Register on points or on an ortho-image of a "
+        "similar season, sun and ground sampling.",
+        f"{command} --reference ORTHO.tif --dem DEM.tif --vertical DATUM",
+    )
+    return (larger, check, look) if len(stages) == 1 else (check, look, larger)
+
+
+def _state_larger(scene: SceneRecord, command: str, stage: SearchStage | None = None) -> NextStep:
+    """Search further out: the model may be further off than stated."""
+    larger_m = larger_sigma_m(stage, scene.sigma_m)
+    why = "When the model may be further off"
+    if stage is not None and 2 * stage.at_border > stage.tried:
+        why = f"{stage.at_border} of {stage.tried} best peaks lie at the border of the search"
+    text = (
+        f"{why}: search further. The model was taken to be accurate to {scene.sigma_m:g} m (one "
+        "standard deviation a coordinate); state a larger value."
+    )
+    return NextStep(text, f"{command} --sigma-m {larger_m:g}")
+
+
+def _find_control(scene: SceneRecord, command: str) -> tuple[NextStep, ...]:
+    """Look for points of the ground, or register on something else."""
+    west, south = scene.footprint_lon_lat.min(axis=0)
+    east, north = scene.footprint_lon_lat.max(axis=0)
+    return (
+        NextStep(
+            "Look whether published points cover the ground of the scene.",
+            f"amers points query --bbox {west:.4f},{south:.4f},{east:.4f},{north:.4f}",
+        ),
+        NextStep(
+            "Where there are no points, register on an ortho-image of this ground.",
+            f"{command} --reference ORTHO.tif --dem DEM.tif --vertical DATUM",
+        ),
+    )
+
+
+def significance_words(false_alarms: float) -> str:
+    """How likely chance alone makes a group of matches that agree, in words."""
+    if not false_alarms < 1.0:
+        return "no more than chance gives"
+    if false_alarms > 1e-4:
+        return f"chance gives one in {1.0 / false_alarms:.0f} searches: not enough to trust it"
+    return "beyond chance"

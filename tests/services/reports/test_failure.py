@@ -1,0 +1,140 @@
+"""The report of a registration that failed: valid, honest about what was tried, with the next step."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+
+from services.errors import CoverageError, FormatError, NoConsensus, NotEnoughPoints
+from services.registration.context import Candidate, NotFound, SearchStage
+from services.registration.options import RegistrationOptions
+from services.reports.document import failure_schema, report_document
+from services.reports.failure import (
+    EXPLANATION,
+    FAILURE_FORMAT,
+    NOT_REGISTERED,
+    FailureReport,
+    UnreadScene,
+    next_steps,
+    significance_words,
+)
+from services.reports.failure_pages import format_failure_html, format_failure_tables
+from services.reports.report import RunRecord
+from tests.services.reports.test_html import HOSTILE, Page
+
+COMMAND = "amers scene register scene.tif --block points -o out"
+STAGE = SearchStage(
+    name="coarse",
+    chip_gsd_m=2.0,
+    search_radius_m=150.0,
+    needed_radius_m=150.0,
+    tried=60,
+    matched=12,
+    at_border=4,
+    inliers=3,
+    displacement_rms_m=40.0,
+    not_found=(NotFound("low_score", 44), NotFound("border_peak", 4)),
+    candidates=(Candidate(3, 31.0, -25.5, 2.5), Candidate(2, -80.0, 3.0, 40.0)),
+)
+
+
+def failure(report, stages=(STAGE,), error=None, scene=None) -> FailureReport:
+    """A failure with the scene of the sample report."""
+    error = NoConsensus("no agreement") if error is None else error
+    scene = report.scene if scene is None else scene
+    return FailureReport(
+        format=FAILURE_FORMAT,
+        run=RunRecord("1", datetime.now(UTC), None, "control points", (), RegistrationOptions()),
+        verdict=NOT_REGISTERED,
+        verdict_explanation=EXPLANATION,
+        error=type(error).__name__,
+        reason=str(error),
+        scene=scene,
+        visible=60,
+        search_stages=stages,
+        next_steps=next_steps(error, scene, stages, COMMAND),
+        ground=np.zeros((0, 2)),
+    )
+
+
+def commands(report, stages, error) -> list[str]:
+    """The commands of the next steps."""
+    return [step.command for step in next_steps(error, report.scene, stages, COMMAND)]
+
+
+def test_the_document_follows_its_schema_and_has_no_figure_of_a_result(report):
+    document = report_document(failure(report))
+    Draft202012Validator.check_schema(failure_schema())
+    Draft202012Validator(failure_schema()).validate(document)
+    unread = failure(report, (), FormatError("damaged"), UnreadScene("half"))
+    Draft202012Validator(failure_schema()).validate(report_document(unread))
+    assert document["verdict"] == "not registered"
+    assert not {"criteria", "correction", "predicted", "refined_model", "checks"} & set(document)
+    candidate = document["search_stages"][0]["candidates"][0]
+    assert (candidate["points"], candidate["east_m"], candidate["north_m"]) == (3, 31.0, -25.5)
+
+
+def test_page_and_text_state_search_candidates_reasons_and_commands(report):
+    made = failure(report)
+    page, text = format_failure_html(made), format_failure_tables(made)
+    shown = " ".join(Page(page).texts)
+    for words in ("coarse", "150.0 m", "60", "31.0", "-25.5", "correlation too low", "44", COMMAND):
+        assert words in shown, words
+        assert words.removesuffix(" m") in text, words
+    assert "no more than chance gives" in shown
+    for banned in ("nan", "inf "):
+        assert banned not in text.lower().split()
+
+
+def test_hostile_names_stay_text(report):
+    scene = replace(report.scene, name=HOSTILE)
+    page = Page(format_failure_html(failure(report, scene=scene, error=NoConsensus(HOSTILE))))
+    assert "script" not in page.tags
+    assert HOSTILE in page.texts
+    assert not [value for _, value in page.attributes if value and value.startswith("http")]
+    assert HOSTILE in format_failure_tables(failure(report, scene=UnreadScene(HOSTILE), stages=()))
+
+
+def test_a_larger_sigma_comes_first_when_the_peaks_lie_at_the_border(report):
+    radius_m = 3.0 * report.scene.sigma_m
+    at_border = replace(STAGE, at_border=40, search_radius_m=radius_m, needed_radius_m=radius_m)
+    first = next_steps(NoConsensus(""), report.scene, (at_border,), COMMAND)[0]
+    assert first.command == f"{COMMAND} --sigma-m {2.0 * report.scene.sigma_m:g}"
+    assert "40 of 60 best peaks lie at the border" in first.text
+
+
+def test_a_limited_search_proposes_the_accuracy_that_it_reaches(report):
+    limited = replace(STAGE, needed_radius_m=3000.0)
+    assert commands(report, (limited,), NoConsensus(""))[0] == f"{COMMAND} --sigma-m 50"
+
+
+def test_without_a_visible_point_the_ground_is_looked_up(report):
+    lookup, reference, larger = commands(report, (), CoverageError(""))
+    west, south = report.scene.footprint_lon_lat.min(axis=0)
+    assert lookup.startswith(f"amers points query --bbox {west:.4f},{south:.4f},")
+    assert "--reference" in reference
+    assert "--sigma-m" in larger
+
+
+def test_a_stated_accuracy_below_the_smallest_radius_is_raised_beyond_it(report):
+    scene = replace(report.scene, sigma_m=0.1)
+    nothing = replace(
+        STAGE, search_radius_m=6.0, needed_radius_m=0.3, matched=0, at_border=0, candidates=()
+    )
+    steps = next_steps(NotEnoughPoints(0, 6), scene, (nothing,), COMMAND)
+    assert steps[0].command == f"{COMMAND} --sigma-m 4"
+
+
+def test_an_input_that_cannot_be_used_is_to_be_corrected(report):
+    (step,) = next_steps(FormatError("damaged"), UnreadScene("half"), (), COMMAND)
+    assert step.command == COMMAND
+
+
+@pytest.mark.parametrize(
+    ("false_alarms", "words"),
+    [(3.0, "no more than chance"), (0.01, "one in 100 searches"), (1e-9, "beyond chance")],
+)
+def test_significance_is_said_in_words(false_alarms: float, words: str):
+    assert words in significance_words(false_alarms)
