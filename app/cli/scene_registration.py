@@ -125,6 +125,7 @@ def register_scenes(
         jobs: number of processes at once.
     """
     outcomes: dict[int, Outcome] = {}
+    replaced = set()
     for number, request in enumerate(requests):
         try:
             older = older_result(request.folder)
@@ -132,6 +133,7 @@ def register_scenes(
             outcomes[number] = _failed_outcome(request, error)
             continue
         if older is not None:
+            replaced.add(number)
             typer.echo(
                 f"amers: {request.folder}: replaces the result of {older.scene} of "
                 f"{older.written_at:%Y-%m-%d %H:%M} UTC, verdict {older.verdict}",
@@ -141,6 +143,9 @@ def register_scenes(
     outcomes |= zip(
         accepted, _register_accepted([requests[k] for k in accepted], control, remote, jobs), strict=True
     )
+    for number in replaced:
+        if "output" not in outcomes[number]:
+            outcomes[number]["reason"] += "; the older result stays in its folder as it was"
     return [outcomes[number] for number in range(len(requests))]
 
 

@@ -276,6 +276,7 @@ def test_the_command_lets_a_service_register(
         older = (folder / "report.json").read_bytes()
         refused = amers(*scene, "--server", url, "--token", "wrong")
         assert (refused.returncode, (folder / "report.json").read_bytes()) == (2, older)
+        assert "the older result stays in its folder as it was" in refused.stderr
         hopeless = ("scene", "register", world.tagged, "--sigma-m", 0.1, "-o", folder, "--json")
         failed = amers(*hopeless, "--server", url, "--token", token("register"))
         record = json.loads(failed.stdout)
@@ -318,10 +319,10 @@ def test_an_older_result_is_named_and_replaced_as_a_whole(
     assert first.returncode == 0, first.stderr
     assert "replaces" not in first.stderr
     assert (folder / "tagged.tif").exists()
+    verdict = json.loads((folder / "report.json").read_text())["verdict"]
     second = amers("scene", "register", world.image, "--model", world.rpc_text, *control)
     assert second.returncode == 0, second.stderr
     assert f"{folder}: replaces the result of tagged of 20" in second.stderr
-    verdict = next(line.split()[1] for line in first.stdout.splitlines() if line.startswith("verdict"))
     assert second.stderr.index(f"verdict {verdict}") < second.stderr.index("100 %")
     assert {path.name for path in folder.iterdir()} == COMMON_FILES | {"scene_RPC.TXT", MANIFEST}
     assert_registered(folder, world)
