@@ -40,7 +40,8 @@ class QualificationOptions:
         good_displacement_m: displacements up to this are good where the pixels are finer (SRP: corners
             within 0.3 m).
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
-        good_ce90_m: a predicted CE90 up to this is good where the pixels are finer (SRP: 0.4 m).
+        good_ce90_m: a predicted CE90 up to this is good where the pixels are finer (SRP: 0.4 m over the
+            image, which is up to 0.75 m at its worst place).
         max_ce90_on_earth_m: largest CE90 on the Earth, with the frame of the control points, of a usable
             registration; None sets no limit.
         good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
@@ -60,7 +61,7 @@ class QualificationOptions:
     good_displacement_px: float = 0.5
     good_displacement_m: float = 0.3
     good_ce90_px: float = 1.0
-    good_ce90_m: float = 0.4
+    good_ce90_m: float = 0.75
     max_ce90_on_earth_m: float | None = None
     good_unit_weight: float = 3.0
     good_second_consensus_share: float = 0.3
