@@ -8,6 +8,7 @@ AmersError
 └── ComputationError        the input is valid, but gives no trustworthy result
     ├── NotEnoughPoints
     ├── NoConsensus
+    ├── UndeterminedCorrection
     └── NoConvergence
 
 Every message states the values found and expected.
@@ -55,6 +56,10 @@ class NotEnoughPoints(ComputationError):
 
 class NoConsensus(ComputationError):
     """The measures do not agree on one correction."""
+
+
+class UndeterminedCorrection(ComputationError):
+    """The points leave a part of the correction open that the user asks for."""
 
 
 class NoConvergence(ComputationError):

@@ -1,29 +1,29 @@
 """The least squares: the image correction of one scene from points on known ground."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
+from scipy.special import ndtr
 
-from services.adjustment.robust import MAD_TO_STD, cauchy_weights, deactivate, likeliest_variance
-from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import NotEnoughPoints
+from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
+from services.adjustment.order_selection import choose_order
+from services.adjustment.robust import deactivate
+from services.adjustment.shared_errors import (
+    SharedErrors,
+    likeliest_shared_errors,
+    offset_sigma_px,
+    overlap_correlation,
+)
+from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
-from services.types import Array, BoolArray
+from services.types import Array, BoolArray, IntArray
 
-Order = Literal["shift", "drift", "affine"]
+_LOOSE_PX = 1000.0
+"""A priori standard deviation of the offset of a block before anything is known of it."""
 
-_FREE = {
-    "shift": np.array([[True, False, False], [True, False, False]]),
-    "drift": np.array([[True, True, False], [True, False, True]]),
-    "affine": np.ones((2, 3), dtype=bool),
-}
-ORDERS: tuple[Order, ...] = ("shift", "drift", "affine")
-
-_MUCH_BETTER = 0.5
-"""Below this ratio of residuals to declared sigmas, the points are better than declared."""
+_THIN = 1e-3
+"""Smallest width of the area of the points that determines drift and skew, half sizes of the image."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,6 @@ class AdjustmentOptions:
         folds: of the cross-validation.
         prior_slope_sigma_px: a priori standard deviation of drift and skew at the edge of the image,
             pixels; the measures may raise it, never lower it.
-        slope_px: the same where the order is given; None leaves drift and skew to the measures.
     """
 
     order: Order | None = None
@@ -54,13 +53,6 @@ class AdjustmentOptions:
     min_gain: float = 0.03
     folds: int = 5
     prior_slope_sigma_px: float = 1.0
-    slope_px: float | None = None
-
-    def repeating(self, adjustment: "SceneAdjustment") -> "AdjustmentOptions":
-        """Options that repeat an adjustment on other measures, with the same prior of drift and skew."""
-        if self.order is not None:
-            return self
-        return replace(self, order="affine", slope_px=adjustment.slope_px)
 
 
 @dataclass(frozen=True)
@@ -75,6 +67,10 @@ class ControlObservations:
         usable: (n,) measures that may be used; all finite measures when None.
         common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to the
             covariance of the shift. None when there is no such error.
+        block: (n,) block that each point comes from; None when all come from one.
+        frame_covariance_m2: (b, 3, 3) of the frames of the blocks, east, north, up, NaN where unknown;
+            `block` counts its rows. None when all are unknown.
+        chip_side_px: side of the chips in the scene: nearer measures share pixels. 0 when none do.
     """
 
     lon_lat_h: Array
@@ -83,6 +79,9 @@ class ControlObservations:
     covariance_m2: Array
     usable: BoolArray | None = None
     common_covariance_px2: Array | None = None
+    block: IntArray | None = None
+    frame_covariance_m2: Array | None = None
+    chip_side_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,8 @@ class SceneAdjustment:
         validation_px: every order tried, with its cross-validated residual (rms distance, pixels).
         slope_px: a priori standard deviation of drift and skew at the edge of the image, as used.
         covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that a given
-            order leaves out.
+            order leaves out. It is relative to the frame that the blocks of the points scatter about.
+        shared: what the residuals tell of errors that the points share.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
@@ -108,6 +108,7 @@ class SceneAdjustment:
     validation_px: tuple[tuple[Order, float], ...]
     slope_px: float
     covariance: Array
+    shared: SharedErrors
     residual_px: Array
     active: BoolArray
     sigma0: float
@@ -115,7 +116,8 @@ class SceneAdjustment:
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
-        t = (line_sample - self.correction.centre) / self.correction.half_size
+        delivered = self.correction.invert(line_sample)
+        t = (delivered - self.correction.centre) / self.correction.half_size
         design = np.zeros((len(t), 2, 6))
         design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
         return np.asarray(design @ self.covariance @ design.transpose(0, 2, 1))
@@ -128,6 +130,7 @@ def adjust_scene(
     options: AdjustmentOptions = AdjustmentOptions(),
     *,
     min_points: int | None = None,
+    like: SceneAdjustment | None = None,
 ) -> SceneAdjustment:
     """The correction of a model that best explains where control points were seen.
 
@@ -139,7 +142,9 @@ def adjust_scene(
 
     Drift and skew that are too small to be seen beside the errors of the points still exist. They are
     not fixed at zero: their a priori standard deviation is estimated from the measures (empirical
-    Bayes), and their covariance states what remains undetermined.
+    Bayes), and their covariance states what remains undetermined. So it is with an offset for each
+    block, where the points come from several. The covariance holds what the residuals show of errors
+    that neighbours share: see `shared_errors`.
 
     Args:
         model: as delivered.
@@ -147,221 +152,176 @@ def adjust_scene(
         observations: of the control points.
         options: thresholds.
         min_points: smallest number of active measures; that of the options when None.
+        like: an adjustment of these measures and others, whose prior of drift and skew and whose shared
+            errors hold; both are estimated when None.
 
     Raises:
         NotEnoughPoints: fewer than `min_points` measures are usable.
+        UndeterminedCorrection: the points lie on a line, which does not determine the order given.
     """
-    line_sample, sigma_px = observations.line_sample, observations.sigma_px
     min_points = options.min_points if min_points is None else min_points
+    declared, usable, of_points = _declared_fit(model, shape, observations)
+    if usable.sum() < min_points:
+        raise NotEnoughPoints(int(usable.sum()), min_points, "measures with a position and a sigma")
+    order, validation = _order(declared, usable, options, like)
+    free = FREE[order]
+    start = declared.robust_solution(usable, free)
+    fit = declared.with_empirical_variance(start, usable, of_points)
+    start = fit.robust_solution(usable, free)
+    scale = fit.scale(start, usable, free)
+    agreeing = usable & (fit.magnitude(start) / scale <= 2.0 * options.tolerance)
+    slope_px = float("inf")
+    if options.order is None:
+        free = FREE["affine"]
+        least_px = options.prior_slope_sigma_px
+        slope_px = like.slope_px if like else fit.likeliest_slope_px(agreeing, max(scale, 1.0), least_px)
+    else:
+        _refuse_undetermined(fit, agreeing, order)
+    if fit.member.shape[1]:
+        stated_px = _frame_sigma_px(model, observations, fit.member)
+        unit = max(scale, 1.0)
+        offset_px = offset_sigma_px(fit, agreeing, free, slope_px, unit=unit, stated_px=stated_px)
+        fit, declared = (replace(one, offset_px=offset_px) for one in (fit, declared))
+
+    def magnitude(active: BoolArray) -> Array:
+        parameters, _ = fit.solution(active, free, slope_px)
+        # The scale is that of the robust start: a scale of the active measures would shrink with them.
+        return np.asarray(fit.magnitude(parameters) / scale)
+
+    active = deactivate(magnitude, agreeing, options.tolerance, min_points)
+    kept_variance = _kept_variance(options.tolerance)
+    size = float(np.sqrt(shape[0] * shape[1]))
+    position_px = no_correction(shape).centre + fit.t * no_correction(shape).half_size
+    own_share = (1.0 - of_points / declared.variance).mean(axis=1)
+    overlapping = overlap_correlation(position_px, observations.chip_side_px, own_share)
+    shared = (
+        like.shared
+        if like
+        else likeliest_shared_errors(
+            declared,
+            active,
+            free,
+            slope_px,
+            position=position_px / size,
+            overlapping=overlapping,
+            kept_variance=kept_variance,
+        )
+    )
+    parameters, _ = fit.scaled(shared.factor).solution(active, free, slope_px)
+    of_errors = shared.covariance(position_px[active] / size, overlapping[np.ix_(active, active)])
+    covariance = _covariance(
+        declared.scaled(shared.factor), active, free, slope_px, of_errors / shared.factor
+    )
+    if observations.common_covariance_px2 is not None:
+        covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
+    correction = replace(no_correction(shape), parameters=parameters[:, :3])
+    misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
+    return SceneAdjustment(
+        correction=correction,
+        order=order,
+        validation_px=validation,
+        slope_px=slope_px,
+        covariance=covariance,
+        shared=shared,
+        residual_px=np.where(usable[:, None], misfit_px, np.nan),
+        active=active,
+        sigma0=_sigma0(declared, active, free, slope_px, kept_variance),
+        point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
+    )
+
+
+def _declared_fit(
+    model: SensorModel, shape: tuple[int, int], observations: ControlObservations
+) -> tuple[AffineFit, BoolArray, Array]:
+    """The misfits with their declared variances, which of them are usable, and their points' part."""
+    line_sample, sigma_px = observations.line_sample, observations.sigma_px
     misfit = line_sample - model.project(observations.lon_lat_h)
     usable = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
     if observations.usable is not None:
         usable &= observations.usable
-    if usable.sum() < min_points:
-        raise NotEnoughPoints(int(usable.sum()), min_points, "measures with a position and a sigma")
     derivative = np.nan_to_num(model.project_derivative(observations.lon_lat_h))
     covariance_px2 = derivative @ observations.covariance_m2 @ derivative.transpose(0, 2, 1)
     own = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2
     of_points = np.diagonal(covariance_px2, 0, 1, 2)
     frame = no_correction(shape)
-    t = (line_sample - misfit - frame.centre) / frame.half_size
-    declared = _Problem(t, np.where(usable[:, None], misfit, 0.0), own + of_points)
-
-    order, validation = _choose_order(declared, usable, options)
-    start = declared.robust_solution(usable, _FREE[order])
-    problem = declared.with_empirical_variance(start, usable, of_points)
-    start = problem.robust_solution(usable, _FREE[order])
-    scale = max(problem.scale(start, usable), 1e-9)
-    agreeing = usable & (problem.magnitude(start) / scale <= 2.0 * options.tolerance)
-    free = _FREE[order]
-    slope_px = float("inf") if options.slope_px is None else options.slope_px
-    if options.order is None:
-        free = _FREE["affine"]
-        slope_px = problem.likeliest_slope_px(agreeing, max(scale, 1.0), options.prior_slope_sigma_px)
-
-    def magnitude(active: BoolArray) -> Array:
-        parameters, _ = problem.solution(active, free, slope_px)
-        # The scale is that of the robust start: a scale of the active measures would shrink with them.
-        return np.asarray(problem.magnitude(parameters) / scale)
-
-    active = deactivate(magnitude, agreeing, options.tolerance, min_points)
-    sigma0 = declared.sigma0(active, free, slope_px)
-    parameters, _ = problem.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
-    # A good fit does not reduce the stated sigmas; a bad fit increases them.
-    _, covariance = declared.scaled_by_sigma0(sigma0).solution(active, free, slope_px)
-    if observations.common_covariance_px2 is not None:
-        covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
-    return SceneAdjustment(
-        correction=ImageCorrection(parameters, frame.centre, frame.half_size),
-        order=order,
-        validation_px=validation,
-        slope_px=slope_px,
-        covariance=covariance,
-        residual_px=np.where(usable[:, None], problem.residual(parameters), np.nan),
-        active=active,
-        sigma0=sigma0,
-        point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
-    )
+    t = np.nan_to_num((line_sample - misfit - frame.centre) / frame.half_size)
+    member = np.zeros((len(misfit), 0), dtype=bool)
+    if observations.block is not None:
+        blocks = np.unique(observations.block[usable])
+        if len(blocks) > 1:
+            member = observations.block[:, None] == blocks
+    offset_px = np.full((2, member.shape[1]), _LOOSE_PX)
+    misfit = np.where(usable[:, None], misfit, 0.0)
+    return AffineFit(t, misfit, own + of_points, member, offset_px), usable, of_points
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """Misfits that an affine displacement has to explain; the two coordinates are independent.
-
-    Attributes:
-        t: (n, 2) positions, -1 to 1 over the image.
-        misfit: (n, 2) pixels.
-        variance: (n, 2) px^2.
-    """
-
-    t: Array
-    misfit: Array
-    variance: Array
-
-    def with_empirical_variance(
-        self, parameters: Array, active: BoolArray, of_points: Array
-    ) -> "_Problem":
-        """The same problem with smaller variances, where residuals are much smaller than declared."""
-        if self.scale(parameters, active) >= _MUCH_BETTER:
-            return self
-        variance = self.variance.copy()
-        own = (variance - of_points)[active]
-        variance[active] = likeliest_variance(self.residual(parameters)[active], own, of_points[active])
-        return replace(self, variance=variance)
-
-    def scaled_by_sigma0(self, sigma0: float) -> "_Problem":
-        """The same problem with its variances multiplied by sigma0 squared, where sigma0 exceeds 1."""
-        return replace(self, variance=self.variance * max(sigma0, 1.0) ** 2)
-
-    def solution(
-        self,
-        active: BoolArray,
-        free: BoolArray,
-        slope_px: float = np.inf,
-        weights: Array | None = None,
-    ) -> tuple[Array, Array]:
-        """Parameters (2, 3) and covariance (6, 6), with an a priori sigma of drift and skew."""
-        design = np.column_stack([np.ones(len(self.t)), self.t])[active]
-        # Both coordinates have as many free parameters in every order: they are solved at once.
-        columns = np.array([np.flatnonzero(of_one) for of_one in free])
-        weight = 1.0 / self.variance[active].T
-        if weights is not None:
-            weight = weight * weights[active]
-        a = design[:, columns].transpose(1, 2, 0)
-        expected = np.where(columns > 0, slope_px**-2.0, 0.0)[:, :, None] * np.eye(columns.shape[1])
-        weighted = a * weight[:, None, :]
-        inverse = np.linalg.pinv(weighted @ a.transpose(0, 2, 1) + expected, hermitian=True)
-        solved = inverse @ (weighted @ self.misfit[active].T[:, :, None])
-        parameters = np.zeros((2, 3))
-        covariance = np.zeros((6, 6))
-        for k in range(2):
-            parameters[k, columns[k]] = solved[k, :, 0]
-            covariance[np.ix_(3 * k + columns[k], 3 * k + columns[k])] = inverse[k]
-        return parameters, covariance
-
-    def likeliest_slope_px(self, active: BoolArray, unit: float, least_px: float) -> float:
-        """The a priori sigma of drift and skew that makes their estimates most likely.
-
-        Args:
-            active: (n,) measures.
-            unit: standard deviation of unit weight.
-            least_px: smallest sigma.
-        """
-        parameters, covariance = self.solution(active, _FREE["affine"])
-        slope = parameters[:, 1:].ravel()
-        variance = unit**2 * np.diagonal(covariance)[[1, 2, 4, 5]]
-        spread_px = least_px * np.geomspace(1.0, 1000.0, 121)
-        total = variance + spread_px[:, None] ** 2
-        likelihood = -(np.log(total) + slope**2 / total).sum(axis=1)
-        return float(spread_px[np.argmax(likelihood)])
-
-    def sigma0(self, active: BoolArray, free: BoolArray, slope_px: float) -> float:
-        """Standard deviation of unit weight; 1 without redundancy."""
-        parameters, covariance = self.solution(active, free, slope_px)
-        chi2 = float((self.residual(parameters)[active] ** 2 / self.variance[active]).sum())
-        # A parameter that its prior determines is not determined by the measures.
-        prior = np.diagonal(covariance)[[1, 2, 4, 5]].sum() / slope_px**2
-        freedom = 2 * int(active.sum()) - int(free.sum()) + prior
-        return float(np.sqrt(chi2 / freedom)) if freedom > 0 else 1.0
-
-    def spread(self, active: BoolArray) -> float:
-        """Standard deviation of the measures along the worse axis, half sizes of the image."""
-        return float(self.t[active].std(axis=0).min())
-
-    def residual(self, parameters: Array) -> Array:
-        """(n, 2) pixels."""
-        return np.asarray(self.misfit - parameters[:, 0] - self.t @ parameters[:, 1:].T)
-
-    def magnitude(self, parameters: Array) -> Array:
-        """(n,) the larger of the two normalised residuals."""
-        return np.asarray(np.abs(self.residual(parameters) / np.sqrt(self.variance)).max(axis=1))
-
-    def scale(self, parameters: Array, active: BoolArray) -> float:
-        """Robust standard deviation of the normalised residuals."""
-        normalised = self.residual(parameters)[active] / np.sqrt(self.variance[active])
-        return float(MAD_TO_STD * np.median(np.abs(normalised)))
-
-    def robust_solution(self, active: BoolArray, free: BoolArray) -> Array:
-        """Parameters (2, 3) by iterative re-weighting that starts at the median shift."""
-        parameters = np.zeros((2, 3))
-        parameters[:, 0] = np.median(self.misfit[active], axis=0)
-        for _ in range(20):
-            scale = max(self.scale(parameters, active), 1e-9)
-            weights = cauchy_weights(self.magnitude(parameters) / scale)
-            updated, _ = self.solution(active, free, weights=weights)
-            if np.abs(updated - parameters).max() < 1e-4:
-                return updated
-            parameters = updated
-        return parameters
+def _frame_sigma_px(model: SensorModel, observations: ControlObservations, member: BoolArray) -> Array:
+    """Standard deviation (2, b) of the frames of the blocks in the image; NaN where unknown."""
+    if observations.frame_covariance_m2 is None or observations.block is None:
+        return np.full((2, member.shape[1]), np.nan)
+    sigma_px = []
+    for of_block in member.T:
+        derivative = np.nanmean(model.project_derivative(observations.lon_lat_h[of_block]), axis=0)
+        frame_m2 = observations.frame_covariance_m2[observations.block[of_block][0]]
+        sigma_px.append(np.sqrt(np.diagonal(derivative @ frame_m2 @ derivative.T)))
+    return np.array(sigma_px).T
 
 
-def _choose_order(
-    problem: _Problem, usable: BoolArray, options: AdjustmentOptions
+def _order(
+    fit: AffineFit, usable: BoolArray, options: AdjustmentOptions, like: SceneAdjustment | None
 ) -> tuple[Order, tuple[tuple[Order, float], ...]]:
-    """Simplest order that predicts held-out measures as well as any, and the score of each order."""
-    orders = [options.order] if options.order else _considered(problem, usable, options)
-    # All orders are compared on the same measures: those that fit the order with most parameters.
-    fullest = problem.robust_solution(usable, _FREE[orders[-1]])
-    scale = max(problem.scale(fullest, usable), 1e-9)
-    judges = usable & (problem.magnitude(fullest) <= MAX_ERROR_SIGMAS * scale)
-    validation = tuple(
-        (order, _validation_px(problem, usable, judges, order, options.folds)) for order in orders
-    )
-    best, best_px = validation[0]
-    for order, value_px in validation[1:]:
-        if value_px < best_px * (1.0 - options.min_gain):
-            best, best_px = order, value_px
-    return best, validation
+    """The order given or chosen, and the score of each order that was considered."""
+    if like is not None:
+        return like.order, like.validation_px
+    orders: list[Order] = [options.order] if options.order else ["shift"]
+    if options.order is None and fit.spread(usable) >= options.min_spread:
+        # Of all measures: those that agree with a shift are few where there is a drift.
+        enough = usable.sum() / options.points_per_parameter
+        orders += [order for order in ORDERS[1:] if enough >= FREE[order].sum()]
+    return choose_order(fit, usable, orders, options.min_gain, options.folds)
 
 
-def _considered(problem: _Problem, usable: BoolArray, options: AdjustmentOptions) -> Sequence[Order]:
-    """Orders that the number and the spread of the measures can determine."""
-    start = problem.robust_solution(usable, _FREE["shift"])
-    agreeing = usable & (problem.magnitude(start) <= 5.0 * max(problem.scale(start, usable), 1e-9))
-    count = int(agreeing.sum())
-    spread = problem.spread(agreeing)
-    return [
-        order
-        for order in ORDERS
-        if order == "shift"
-        or (spread >= options.min_spread and count >= options.points_per_parameter * _FREE[order].sum())
-    ]
+def _refuse_undetermined(fit: AffineFit, active: BoolArray, order: Order) -> None:
+    """Raise where the measures do not determine what the user's order leaves to them."""
+    for of_one in FREE[order]:
+        slopes = fit.t[active][:, of_one[1:]] - fit.t[active][:, of_one[1:]].mean(axis=0)
+        if not slopes.shape[1]:
+            continue
+        width = float(np.sqrt(max(np.linalg.eigvalsh(slopes.T @ slopes / len(slopes))[0], 0.0)))
+        if width < _THIN:
+            raise UndeterminedCorrection(
+                f"the {int(active.sum())} points lie on a line, {width:.1g} half sizes of the image "
+                f"wide, which does not determine the order {order!r} (at least {_THIN:g} expected): "
+                "give the order 'shift', or none: what no point determines is then expected to be small"
+            )
 
 
-def _validation_px(
-    problem: _Problem, usable: BoolArray, judges: BoolArray, order: Order, folds: int
+def _kept_variance(tolerance: float) -> float:
+    """Variance that a normal law of unit variance keeps within a tolerance on both sides."""
+    density = np.exp(-0.5 * tolerance**2) / np.sqrt(2.0 * np.pi)
+    return float(1.0 - 2.0 * tolerance * density / (2.0 * ndtr(tolerance) - 1.0))
+
+
+def _sigma0(
+    fit: AffineFit, active: BoolArray, free: BoolArray, slope_px: float, kept_variance: float
 ) -> float:
-    """Distance (rms, pixels) of the judging measures from the prediction of a fit without them."""
-    rows = np.flatnonzero(usable)
-    folds = min(folds, len(rows))
-    # Neighbours in the image go into different folds.
-    rank = np.empty(len(rows), dtype=np.int64)
-    rank[np.lexsort((problem.t[rows, 1], problem.t[rows, 0]))] = np.arange(len(rows))
-    held_out = np.empty((len(rows), 2))
-    for fold in range(folds):
-        out = rank % folds == fold
-        active = usable.copy()
-        active[rows[out]] = False
-        parameters = problem.robust_solution(active, _FREE[order])
-        held_out[out] = problem.residual(parameters)[rows[out]]
-    return float(np.sqrt((held_out[judges[rows]] ** 2).sum(axis=1).mean()))
+    """Standard deviation of unit weight; 1 without redundancy."""
+    parameters, covariance = fit.solution(active, free, slope_px)
+    chi2 = float((fit.residual(parameters)[active] ** 2 / fit.variance[active]).sum())
+    freedom = fit.freedom(active, free, slope_px, covariance)
+    return float(np.sqrt(chi2 / freedom / kept_variance)) if freedom > 0 else 1.0
+
+
+def _covariance(
+    fit: AffineFit, active: BoolArray, free: BoolArray, slope_px: float, correlation: Array
+) -> Array:
+    """Covariance (6, 6) of the parameters of a weighted solution whose errors are correlated."""
+    _, independent = fit.solution(active, free, slope_px)
+    covariance = np.zeros((6, 6))
+    for k, expected in enumerate(fit.expected(slope_px)):
+        weighted = fit.design[active] / fit.sigma[active, k, None]
+        spread = weighted.T @ correlation @ weighted + np.diag(expected)
+        covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = (independent[k] @ spread @ independent[k])[
+            :3, :3
+        ]
+    return covariance

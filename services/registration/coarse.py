@@ -102,7 +102,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
     )
     context.stages.append(stage)
     check_consensus(stage, consensus, matches.reason, scene, options.coarse.max_false_alarms)
-    search = Search(points, plan.rows, matches, consensus.inliers)
+    search = Search(points, plan.rows, matches, consensus.inliers, CHIP_SIZE * plan.gsd_m)
     adjustment = adjust_search(scene, search, options.adjustment, min_points=min(3, stage.inliers))
     corrected = predict(scene, context.points, adjustment)
     uncertainty_m = np.hypot(corrected.uncertainty_m, level_m / 2.0)

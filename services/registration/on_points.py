@@ -134,7 +134,7 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Sea
     )
     context.stages.append(stage)
     check_inliers(stage, tolerance_px, matches.reason, context.scene, options.adjustment.min_points)
-    return Search(points, rows, matches, inliers)
+    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m)
 
 
 def build_registration(
@@ -154,10 +154,10 @@ def build_registration(
     context.progress(0.95, "qualifying the result")
     scene, options = context.scene, context.options
     measures = point_results(scene, points, search, adjustment)
-    repetition = options.adjustment.repeating(adjustment)
 
     def refit(used: BoolArray) -> SceneAdjustment:
-        return adjust_search(scene, search, repetition, usable=used[search.rows])
+        usable = used[search.rows]
+        return adjust_search(scene, search, options.adjustment, usable=usable, like=adjustment)
 
     frame = shared_frame(points, measures.active)
     model = CorrectedModel(scene.model, adjustment.correction)

@@ -211,7 +211,7 @@ def _search(
         check_consensus(stage, consensus, matches.reason, scene, options.reference.max_false_alarms)
     else:
         check_inliers(stage, tolerance_px, matches.reason, scene, options.adjustment.min_points)
-    search = Search(points, np.arange(len(points)), matches, inliers)
+    search = Search(points, np.arange(len(points)), matches, inliers, matching.window_px * level_m)
     return search, adjust_search(scene, search, options.adjustment)
 
 

@@ -46,12 +46,14 @@ class Search:
         rows: (k,) their rows among all visible points of the registration, ascending.
         matches: of the points tried.
         inliers: (k,) points that agree on one displacement of the image.
+        chip_side_m: side on the ground of the chips that were searched.
     """
 
     points: ControlPoints
     rows: IntArray
     matches: PointMatches
     inliers: BoolArray
+    chip_side_m: float
 
 
 def largest_error_m(uncertainty_m: Array) -> float:
@@ -71,6 +73,7 @@ def adjust_search(
     *,
     usable: BoolArray | None = None,
     min_points: int | None = None,
+    like: SceneAdjustment | None = None,
 ) -> SceneAdjustment:
     """The correction of a scene from the matches of a search; see `adjust_scene`.
 
@@ -80,6 +83,7 @@ def adjust_search(
         options: of the adjustment.
         usable: (k,) matches that may be used; the inliers when None.
         min_points: smallest number of active measures; that of the options when None.
+        like: an adjustment of these matches and others, whose prior and shared errors hold.
     """
     matches = search.matches
     ground_to_px = scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, :2]
@@ -90,8 +94,13 @@ def adjust_search(
         covariance_m2=search.points.covariance_m2,
         usable=search.inliers if usable is None else usable,
         common_covariance_px2=ground_to_px @ matches.common_covariance_m2 @ ground_to_px.T,
+        block=search.points.block,
+        frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
+        chip_side_px=search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5),
     )
-    return adjust_scene(scene.model, scene.image.shape, observations, options, min_points=min_points)
+    return adjust_scene(
+        scene.model, scene.image.shape, observations, options, min_points=min_points, like=like
+    )
 
 
 def select_inliers(

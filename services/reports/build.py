@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from services.adjustment.image_correction import Order, SceneAdjustment
+from services.adjustment.affine_fit import Order
+from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
 from services.registration.on_points import Registration

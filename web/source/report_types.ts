@@ -28,7 +28,6 @@ export interface AdjustmentOptions {
   min_gain: number | null;
   folds: number;
   prior_slope_sigma_px: number | null;
-  slope_px: number | null | null;
 }
 
 export interface BlockUsed {

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from services.adjustment.affine_fit import Order
 from services.adjustment.image_correction import (
     AdjustmentOptions,
     ControlObservations,
-    Order,
     SceneAdjustment,
     adjust_scene,
 )
-from services.errors import NotEnoughPoints
+from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
 from tests.services.conftest import GSD_M, SHAPE, FlatModel
@@ -193,7 +193,11 @@ def test_sigmas_that_were_too_large_are_not_made_smaller() -> None:
     stated = points.adjust(AdjustmentOptions(order="shift"))
     wide = replace(points, sigma_px=points.sigma_px * 4.0).adjust(AdjustmentOptions(order="shift"))
     assert wide.sigma0 < 0.4
-    np.testing.assert_allclose(np.diag(wide.covariance)[[0, 3]], (4.0 * NOISE_PX) ** 2 / 40.0, rtol=0.01)
+    stated_variance = (4.0 * NOISE_PX) ** 2 / 40.0
+    variance = np.diag(wide.covariance)[[0, 3]]
+    # Errors that neighbours may share are at most as large as the residuals, and add little here.
+    assert (variance > 0.99 * stated_variance).all()
+    assert (variance < 1.1 * stated_variance).all()
     np.testing.assert_allclose(
         wide.correction.parameters, stated.correction.parameters, atol=0.1 * NOISE_PX
     )
@@ -225,10 +229,13 @@ def test_a_point_s_covariance_is_seen_along_its_own_direction() -> None:
     east_only = np.tile(np.diag([4.0, 0.0, 0.0]), (40, 1, 1))
     moved = replace(points, line_sample=line_sample, covariance_m2=east_only)
     result = moved.adjust(AdjustmentOptions(order="shift"))
-    std_px = np.sqrt(np.diag(result.covariance)[[0, 3]]) / max(result.sigma0, 1.0)
+    std_px = np.sqrt(np.diag(result.covariance)[[0, 3]])
     expected = np.array([NOISE_PX, np.hypot(NOISE_PX, 2.0 / GSD_M)]) / np.sqrt(result.active.sum())
     assert result.active.sum() >= 38
-    np.testing.assert_allclose(std_px, expected, rtol=0.01)
+    np.testing.assert_allclose(std_px[1] / std_px[0], expected[1] / expected[0], rtol=0.01)
+    # What may be wrong with the stated sigmas, and with their independence, only adds.
+    assert (std_px >= expected).all()
+    assert (std_px < 1.3 * expected).all()
 
 
 @pytest.mark.parametrize(("usable", "minimum"), [(0, 4), (3, 4), (5, 6)])
@@ -338,3 +345,111 @@ def test_wrong_measures_still_leave_where_points_are_better_than_declared() -> N
     result = replace(points, covariance_m2=declared).adjust()
     assert not result.active[:40].any()
     assert result.active[40:].mean() > 0.95
+
+
+@pytest.mark.parametrize("drift_px", [2.0, 10.0])
+def test_a_drift_does_not_cost_good_points_where_most_lie_together(drift_px: float) -> None:
+    for trial in range(20):
+        rng = np.random.default_rng([16, trial])
+        points = seen(np.array([[3.0, drift_px, 0.0], [-2.0, 0.0, drift_px]]), rng, 30)
+        predicted = FlatModel().project(points.lon_lat_h)
+        predicted[:21] = np.array([3400.0, 4200.0]) + 0.1 * (predicted[:21] - predicted.mean(axis=0))
+        line_sample = points.truth.apply(predicted) + rng.normal(0.0, NOISE_PX, (30, 2))
+        ground = FlatModel().locate(predicted, np.zeros(30))
+        result = replace(points, lon_lat_h=ground, line_sample=line_sample).adjust()
+        assert result.active.sum() >= 27
+
+
+def test_a_user_s_order_is_refused_where_points_on_a_line_leave_it_open() -> None:
+    rng = np.random.default_rng(17)
+    points = seen(TRUTH["shift"], rng, 20)
+    predicted = np.linspace(0.1, 0.9, 20)[:, None] * np.array(SHAPE)
+    line_sample = points.truth.apply(predicted) + rng.normal(0.0, NOISE_PX, (20, 2))
+    ground = FlatModel().locate(predicted, np.zeros(20))
+    on_a_line = replace(points, lon_lat_h=ground, line_sample=line_sample)
+    with pytest.raises(UndeterminedCorrection, match=r"20 points lie on a line.*give the order 'shift'"):
+        on_a_line.adjust(AdjustmentOptions(order="affine"))
+    assert on_a_line.adjust(AdjustmentOptions(order="drift")).order == "drift"
+    # Left to the adjustment, what no point determines is uncertain, away from the line.
+    beside = np.array([[0.0, SHAPE[1] - 1.0]])
+    assert np.diagonal(on_a_line.adjust().covariance_at(beside)[0]).min() > 0.5
+
+
+def test_the_covariance_of_a_place_is_that_of_where_the_delivered_model_puts_it() -> None:
+    rng = np.random.default_rng(18)
+    points = seen(np.array([[400.0, 0.0, 0.0], [-300.0, 0.0, 0.0]]), rng)
+    result = points.adjust(AdjustmentOptions(order="affine"))
+    moved = np.array([[400.0, -300.0]])
+    place = np.array([[100.0, 4000.0]])
+    t = (place - result.correction.centre) / result.correction.half_size
+    design = np.kron(np.eye(2), np.concatenate([[1.0], t[0]]))
+    expected = design @ result.covariance @ design.T
+    np.testing.assert_allclose(result.covariance_at(place + moved)[0], expected, rtol=0.01)
+
+
+def blocks_apart(apart_px: float, rng: np.random.Generator, n: int = 100) -> tuple[Seen, np.ndarray]:
+    """Points of two blocks, the left and the right half of an image, that differ by an offset."""
+    points = seen(TRUTH["shift"], rng, n)
+    block = (FlatModel().project(points.lon_lat_h)[:, 1] > SHAPE[1] / 2.0).astype(np.int64)
+    moved = points.line_sample + apart_px * (block[:, None] - 0.5)
+    return replace(points, line_sample=moved), block
+
+
+def corner_std_px(points: Seen, block: np.ndarray | None, frame_m2: Array | None = None) -> float:
+    observations = ControlObservations(
+        points.lon_lat_h,
+        points.line_sample,
+        points.sigma_px,
+        points.covariance_m2,
+        block=block,
+        frame_covariance_m2=frame_m2,
+    )
+    result = adjust_scene(FlatModel(), SHAPE, observations)
+    return float(np.sqrt(result.covariance_at(np.zeros((1, 2)))[0, 0, 0]))
+
+
+def test_blocks_that_disagree_do_not_pretend_to_agree() -> None:
+    points, block = blocks_apart(0.8, np.random.default_rng(19))
+    assert corner_std_px(points, None) < 0.2
+    assert corner_std_px(points, block) > 0.3
+
+
+def test_blocks_that_agree_cost_little_whatever_their_frames_state() -> None:
+    points, block = blocks_apart(0.0, np.random.default_rng(20))
+    alone = corner_std_px(points, None)
+    for frame_m in (np.nan, 0.1, 76.0):
+        frames = np.tile(frame_m**2 * np.eye(3), (2, 1, 1))
+        assert corner_std_px(points, block, frames) < alone + 0.1
+
+
+def test_points_of_a_second_block_do_not_look_wrong() -> None:
+    points, block = blocks_apart(4.0, np.random.default_rng(21))
+    observations = ControlObservations(
+        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2, block=block
+    )
+    assert adjust_scene(FlatModel(), SHAPE, observations).active.mean() > 0.9
+
+
+def test_chips_that_overlap_do_not_count_twice() -> None:
+    """Ten times the same chip tells no more than one."""
+    rng = np.random.default_rng(22)
+    points = seen(TRUTH["shift"], rng, 12)
+    rows = np.repeat(np.arange(12), 10)
+    ten_times = replace(
+        points,
+        lon_lat_h=points.lon_lat_h[rows],
+        line_sample=points.line_sample[rows],
+        sigma_px=points.sigma_px[rows],
+        covariance_m2=points.covariance_m2[rows],
+    )
+
+    def variance(of: Seen, side_px: float) -> float:
+        observations = ControlObservations(
+            of.lon_lat_h, of.line_sample, of.sigma_px, of.covariance_m2, chip_side_px=side_px
+        )
+        shift_only = AdjustmentOptions(order="shift")
+        return float(adjust_scene(FlatModel(), SHAPE, observations, shift_only).covariance[0, 0])
+
+    assert variance(ten_times, 100.0) > 0.9 * NOISE_PX**2 / 12.0
+    assert variance(ten_times, 0.0) < 0.5 * variance(ten_times, 100.0)
+    assert variance(points, 100.0) < 2.0 * NOISE_PX**2 / 12.0
