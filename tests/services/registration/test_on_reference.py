@@ -111,7 +111,7 @@ def test_few_places_lead_to_the_finest_level_where_all_are_searched() -> None:
 
 def test_all_places_lead_where_few_of_the_few_are_to_be_seen() -> None:
     hidden = reference().image.read(Window(0, 0, *reference().image.shape)).copy()
-    hidden[:, hidden.shape[1] * 2 // 5 :] = np.nan
+    hidden[:, hidden.shape[1] // 4 :] = np.nan
     scene = spoiled_view().as_scene(SIGMA_M)
     result = register_on_reference(scene, replace(reference(), image=ArrayImage(hidden)), OPTIONS)
     assert result.search_stages[0].tried > REFERENCE_OPTIONS.leading_places
