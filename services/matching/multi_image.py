@@ -23,6 +23,8 @@ from services.types import (
 
 _CORE_PX = 51
 """Side of the core of a chip whose correlation with the whole chip measures the saliency."""
+_MAX_LOST_SHARE = 0.1
+"""Largest share of missing and saturated pixels in the chip of a new point."""
 
 
 @dataclass(frozen=True)
@@ -151,13 +153,15 @@ def chip_saliency(chip: FloatImage) -> float:
     """How well a chip can be located by its own content, 0 to 1.
 
     The core of the chip is correlated with the whole chip. The saliency is 1 minus the second best
-    score, the best being 1 at the true position. Lines and repeated patterns have a saliency near 0.
+    score, the best being 1 at the true position. Lines and repeated patterns have a saliency near 0, and
+    so has a chip of which more than `_MAX_LOST_SHARE` is missing or saturated.
     """
-    if not np.isfinite(chip).all():
+    valid = np.isfinite(chip)
+    if valid.mean() < 1.0 - _MAX_LOST_SHARE:
         return 0.0
     margin = (CHIP_SIZE - _CORE_PX) // 2
     core = np.ascontiguousarray(chip[margin:-margin, margin:-margin])
-    if core.std() == 0.0:
+    if core[np.isfinite(core)].std() == 0.0:
         return 0.0
     scores = correlation_map(chip, core)
     if scores is None:
