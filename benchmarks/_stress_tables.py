@@ -165,12 +165,13 @@ def show(
         results: of the family, by factor below them.
         factors: edges of the classes.
     """
-    console = Console(width=150)
+    console = Console(width=165)
     headings = (
         "factor  from  to  scenes  good  usable  failed  refused  success  good, wrong  wrong  "
         "wrong, Earth  CE90 m  90 %  normalised  Earth"
     )
     table = Table(*headings.split("  "), title=f"registration under stress: {family}")
+    table.columns[0].min_width = max(len(name) for name in [*factors, "nominal"])
     lines = [(name, {"from": "", "to": "", **summary(part)}) for name, part in rows]
     lines += [(name, row) for name, classes in by_factor(results, factors).items() for row in classes]
     for name, row in lines:
@@ -196,7 +197,7 @@ def show(
 
 def show_acceptance(lines: Sequence[tuple[str, bool, str]]) -> None:
     """Print whether each requirement holds."""
-    console = Console(width=150)
+    console = Console(width=165)
     for requirement, holds, figures in lines:
         console.print(
             f"{'holds' if holds else 'DOES NOT HOLD'}: {requirement}: {figures}", highlight=False
