@@ -109,6 +109,11 @@ def test_a_scene_that_cannot_be_used_ends_its_job_with_the_reason(
     results = client.get(f"/jobs/{job['jobID']}/results")
     assert results.status_code >= 400
     assert results.headers["content-type"] == "application/problem+json"
+    (link,) = (link for link in job["links"] if link.get("title") == "report.json")
+    report = client.get(link["href"])
+    assert report.json()["verdict"] == job["amers:verdict"] == "not registered"
+    assert says in report.text
+    assert "/tmp/" not in report.text
     assert store() == before
 
 
