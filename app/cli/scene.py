@@ -75,6 +75,10 @@ def register(
         str | None,
         typer.Option(help="Vertical datum of the check points, if not in the file: ellipsoid, EPSG:…"),
     ] = None,
+    max_ce90_on_earth_m: Annotated[
+        float | None,
+        typer.Option(help="Largest CE90 on the Earth, metres: with the frame of the points.", min=0.001),
+    ] = None,
     copy_image: Annotated[
         bool, typer.Option("--copy-image", help="Copy a GeoTIFF with the refined model in its tags.")
     ] = False,
@@ -105,6 +109,11 @@ def register(
     files_of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
     _refuse_contradictions(block, reference, dem, server)
     _refuse_shared_files(images, [name for name, file in files_of_one.items() if file is not None])
+    if server is not None and max_ce90_on_earth_m is not None:
+        raise InputError(
+            "--max-ce90-on-earth-m: not sent to a service; leave it out with --server, and give the "
+            "process register-scene the input options.qualification.max_ce90_on_earth_m"
+        )
     if server is not None and jobs > 1:
         raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
@@ -114,7 +123,13 @@ def register(
         files = SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights)
         folder = output if is_one_scene else output / image.stem
         requests.append(
-            SceneRequest(files, folder, copy_image, _command_for(files, control, folder, server))
+            SceneRequest(
+                files,
+                folder,
+                copy_image,
+                _command_for(files, control, folder, server),
+                max_ce90_on_earth_m,
+            )
         )
     outcomes = register_scenes(requests, control, Remote(server, token or "") if server else None, jobs)
     for outcome in outcomes:

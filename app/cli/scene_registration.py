@@ -37,6 +37,7 @@ from app.usecases.registration.register import (
 from app.usecases.registration.result_folder import older_result, replacing
 from app.usecases.uploads import IMAGE_SUFFIXES
 from app.worker.warm_process import WarmProcess, WarmServer
+from services.quality.qualification import QualificationOptions
 from services.registration.options import RegistrationOptions
 from services.reports.document import report_document
 from services.reports.failure import NOT_REGISTERED
@@ -87,12 +88,14 @@ class SceneRequest:
         folder: for its outputs.
         copy_image: also copy a GeoTIFF, with the refined model in its tags.
         command: that repeats the registration, without the accuracy of the model.
+        max_ce90_on_earth_m: see `QualificationOptions`.
     """
 
     files: SceneFiles
     folder: Path
     copy_image: bool
     command: str
+    max_ce90_on_earth_m: float | None
 
 
 def images_of(paths: Sequence[Path]) -> list[Path]:
@@ -297,6 +300,9 @@ def _run(
         request.files,
         sources,
         folder,
+        options=RegistrationOptions(
+            qualification=QualificationOptions(max_ce90_on_earth_m=request.max_ce90_on_earth_m)
+        ),
         copy_image=request.copy_image,
         progress=progress,
         command=request.command,

@@ -57,13 +57,13 @@ def amers(settings: Settings) -> Callable[..., str]:
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
 
-    def run(*arguments: object) -> str:
+    def run(*arguments: object, fails: bool = False) -> str:
         command = [sys.executable, "-m", "app.cli.main", *map(str, arguments)]
         done = subprocess.run(
             command, env=environment, capture_output=True, text=True, timeout=240, check=False
         )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        assert (done.returncode != 0) == fails, done.stderr
+        return done.stdout + (done.stderr if fails else "")
 
     return run
 
@@ -158,6 +158,10 @@ def test_the_command_that_registers_states_both(
     text = amers(*command, "-o", tmp_path / "out")
     assert_shown(text, words)
     assert f"{output['verdict']}, {SCOPE}" in text
+    report = tmp_path / "out" / "report.json"
+    limited = amers(*command, "--max-ce90-on-earth-m", 10, "-o", tmp_path / "out", fails=not is_known)
+    assert json.loads(report.read_text())["verdict_scope"] == f"{SCOPE} and on the Earth"
+    assert ("unknown: nobody stated the frame of the control points" in limited) == (not is_known)
     several = tmp_path / "several"
     several.mkdir()
     for name in ("a.tif", "b.tif"):
