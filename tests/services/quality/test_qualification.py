@@ -164,8 +164,12 @@ def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
     covariance = np.diag([0.01, 0.03, 0.0, 0.01, 0.0, 0.0])
     adjustment = replace(scene.adjustment, covariance=covariance)
     result = predict_accuracy(replace(scene, adjustment=adjustment).adjusted(), 3)
-    assert result.std_line_px[0, 0] == pytest.approx(0.2, rel=1e-3)
-    assert result.std_line_px[1, 0] == pytest.approx(0.1)
+    for row, line in ((0, 0.0), (1, (scene.shape[0] - 1.0) / 2.0)):
+        delivered = adjustment.correction.invert(np.array([[line, 0.0]]))
+        along = (delivered - adjustment.correction.centre)[0, 0] / adjustment.correction.half_size[0]
+        expected_px = np.sqrt(0.01 + 0.03 * along**2)
+        assert result.std_line_px[row, 0] == pytest.approx(expected_px, rel=1e-3)
+    assert result.std_line_px[0, 0] > 1.9 * result.std_line_px[1, 0]
     assert result.std_sample_px == pytest.approx(np.full((3, 3), 0.1))
     assert np.isnan(result.on_the_earth_worst_m)
 
