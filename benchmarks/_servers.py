@@ -26,7 +26,7 @@ create schema {PEER_SCHEMA};
 create view {PEER_SCHEMA}.point as
     select id, st_setsrid(geom, 4326)::geometry(PointZ, 4326) as geom, sigma_east_m, sigma_north_m,
         sigma_up_m, corr_east_north, corr_east_up, corr_north_up, n_views, saliency, typology,
-        first_view, last_view, block_number
+        first_view, last_view, block_number, surface_height_m, surface_sigma_m
     from public.point;
 create index point_peer on point using gist ((st_setsrid(geom, 4326)::geometry(PointZ, 4326)));
 """

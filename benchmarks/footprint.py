@@ -35,7 +35,8 @@ SECRET = b"of pages"
 ROWS = """
 select p.id, st_x(p.geom) as lon, st_y(p.geom) as lat, st_z(p.geom) as h,
     p.sigma_east_m, p.sigma_north_m, p.sigma_up_m, p.corr_east_north, p.corr_east_up, p.corr_north_up,
-    p.n_views, p.saliency, p.typology, p.first_view, p.last_view, p.block_number
+    p.n_views, p.saliency, p.typology, p.first_view, p.last_view, p.block_number,
+    p.surface_height_m, p.surface_sigma_m
 from point p join block b on b.number = p.block_number
 where b.state = 'published' and p.geom && st_makeenvelope(%s, %s, %s, %s, 4979)
     and st_x(p.geom) between %s and %s and st_y(p.geom) between %s and %s

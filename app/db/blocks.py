@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+import numpy as np
 import shapely
 from sqlalchemy import (
     ARRAY,
@@ -33,7 +34,7 @@ from app.db.schema import BlockState, block, chip_file, now, point
 from app.db.schema.base import Double
 from services.formats.block.reader import BlockContents
 from services.quality.block import BlockQuality, parse_quality_document, quality_document
-from services.types import Array, IntArray
+from services.types import Array, IntArray, SurfaceHeights
 
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""
@@ -213,6 +214,18 @@ def find_typology(connection: Connection, point_ids: IntArray) -> list[str | Non
     rows = connection.execute(select(point.c.id, point.c.typology).where(among(point.c.id, ids)))
     typology = {row.id: row.typology for row in rows}
     return [typology[point_id] for point_id in ids]
+
+
+def find_surface_heights(connection: Connection, point_ids: IntArray) -> SurfaceHeights | None:
+    """The surface at each of some points, in the order given; None where none of them states it."""
+    stated = point.c.surface_height_m.is_not(None)
+    columns = (point.c.id, point.c.surface_height_m, point.c.surface_sigma_m)
+    rows = connection.execute(select(*columns).where(among(point.c.id, point_ids.tolist()), stated))
+    known = {row.id: (row.surface_height_m, row.surface_sigma_m) for row in rows}
+    if not known:
+        return None
+    height_m, sigma_m = np.array([known.get(i, (np.nan, np.nan)) for i in point_ids.tolist()]).T
+    return SurfaceHeights(height_m, sigma_m)
 
 
 def storage_keys(connection: Connection) -> set[str]:

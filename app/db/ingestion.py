@@ -13,7 +13,7 @@ from app.db.schema import chip_file, image, point, view
 from app.db.statements import CopyIn, hot
 from services.formats.block.reader import BlockContents
 from services.formats.block.tables import sigmas_from_covariance
-from services.types import IntArray, Progress
+from services.types import IntArray, Progress, SurfaceHeights
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,8 @@ def _point_columns(number: int, contents: BlockContents, file_ids: IntArray) -> 
     points = contents.points
     sigma_m, correlation = sigmas_from_covariance(points.covariance_m2)
     spread = np.column_stack([sigma_m, correlation])
+    unknown = np.full(len(points), np.nan)
+    surface = points.surface or SurfaceHeights(unknown, unknown)
     spread_columns = (
         "sigma_east_m",
         "sigma_north_m",
@@ -87,6 +89,8 @@ def _point_columns(number: int, contents: BlockContents, file_ids: IntArray) -> 
         "chip_file": binary.numbers(file_ids[points.chip_file], "i4"),
         "chip_row": binary.numbers(points.chip_row, "i8"),
         "chip_count": binary.numbers(np.diff(points.views.start), "i2"),
+        "surface_height_m": binary.reals(surface.height_m, "f8"),
+        "surface_sigma_m": binary.reals(surface.sigma_m, "f4"),
     }
 
 

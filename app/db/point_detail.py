@@ -40,6 +40,8 @@ class PointDetail:
     """One point with its block, its views and its history.
 
     Attributes:
+        height_m: of the content of its chips, which registration searches.
+        surface_height_m, surface_sigma_m: the surface at the centre of its chips; None where unknown.
         chip_key: key of its chips in the storage; `chip_row` is the first, `chip_count` their number.
         frame: of its block, on the Earth.
         history: how registrations fared with it.
@@ -60,6 +62,8 @@ class PointDetail:
     typology: str | None
     first_view: date | None
     last_view: date | None
+    surface_height_m: float | None
+    surface_sigma_m: float | None
     block: str
     block_version: str
     frame: Frame

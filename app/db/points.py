@@ -96,6 +96,8 @@ POINTS = Collection(
         column_property(point.c.first_view, "Date of the first view"),
         column_property(point.c.last_view, "Date of the last view"),
         column_property(point.c.block_number, "Number of its block"),
+        column_property(point.c.surface_height_m, "Height of the surface at its centre", "m"),
+        column_property(point.c.surface_sigma_m, "Standard deviation of the surface height", "m"),
     ),
     geometry_type="Point",
     geometry=point.c.geom,
@@ -167,6 +169,8 @@ class StoredPoints:
 
 def control_points(connection: Connection, outline: Array, limit: int | None = None) -> StoredPoints:
     """The published points inside an outline, with their views, as arrays.
+
+    Heights of the surface are left out: registration has no use for them.
 
     Args:
         outline: (m, 2) lon, lat, not closed, longitudes continuous (beyond 180 degrees across the

@@ -292,6 +292,8 @@ export interface PointFeatureProperties {
   first_view?: string | null;
   last_view?: string | null;
   block_number?: number;
+  surface_height_m?: number | null;
+  surface_sigma_m?: number | null;
 }
 
 export interface PointHistoryFeature {
@@ -379,6 +381,8 @@ export interface PointProperties {
   typology: string | null;
   first_view: string | null;
   last_view: string | null;
+  surface_height_m: number | null;
+  surface_sigma_m: number | null;
   block: string;
   block_version: string;
   views: PointViewProperties[];

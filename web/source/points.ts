@@ -54,6 +54,9 @@ export const showPoint: ShowView = async ({ panel, atlas, signal }, id) => {
       Latitude: `${lat?.toFixed(7)}°`,
       Longitude: `${lon?.toFixed(7)}°`,
       "Height above the ellipsoid": `${height?.toFixed(2)} m`,
+      "Height of the surface":
+        properties.surface_height_m != null &&
+        `${properties.surface_height_m.toFixed(2)} ± ${figure(properties.surface_sigma_m, "m")}`,
       "Standard deviation east, north, up": [properties.sigma_east_m, properties.sigma_north_m, properties.sigma_up_m]
         .map((sigma) => figure(sigma))
         .join(", ")

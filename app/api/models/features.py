@@ -80,6 +80,8 @@ class PointProperties(PointHistoryProperties):
     typology: str | None
     first_view: date | None
     last_view: date | None
+    surface_height_m: float | None
+    surface_sigma_m: float | None
     block: str
     block_version: str
     views: list[PointViewProperties]

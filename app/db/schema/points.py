@@ -127,6 +127,9 @@ point = Table(
     # Set by an administrator: the point is not served.
     Column("suspended_at", Timestamp),
     Column("suspended_because", Text),
+    # The surface at the centre of its chips, where its block states it: both or neither.
+    Column("surface_height_m", Double),
+    Column("surface_sigma_m", Real),
     CheckConstraint("id >> 26 = block_number", name="id_in_block"),
     CheckConstraint("sigma_east_m > 0 and sigma_east_m < 'infinity'", name="sigma_east_m"),
     CheckConstraint("sigma_north_m > 0 and sigma_north_m < 'infinity'", name="sigma_north_m"),

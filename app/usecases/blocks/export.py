@@ -119,7 +119,9 @@ def select_points(
         parse_block_json(blocks.find_document(connection, block.number)).metadata
         for block in stored.blocks
     ]
-    selected = _with_unique_images(stored)
+    selected = replace(
+        _with_unique_images(stored), surface=blocks.find_surface_heights(connection, stored.points.id)
+    )
     typology = blocks.find_typology(connection, stored.points.id)
     return SelectedPoints(_metadata(inputs, outline, selected, stored, sources), selected, typology)
 
