@@ -141,4 +141,4 @@ def stored(connection, block_number: int) -> tuple[np.ndarray, np.ndarray]:
         "select surface_height_m, surface_sigma_m from point where block_number = %s order by id",
         [block_number],
     ).fetchall()
-    return columns(*map(list, zip(*rows, strict=True)))
+    return columns(*([row[name] for row in rows] for name in ("surface_height_m", "surface_sigma_m")))
