@@ -37,11 +37,11 @@ class QualificationOptions:
             of the worse coordinate, without the part that chance and the accuracy of the points explain.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
-        good_displacement_m: displacements up to this are good where the pixels are finer (SRP: corners
-            within 0.3 m).
+        good_displacement_m, usable_displacement_m: displacements up to this are good, usable where the
+            pixels are finer (SRP: corners within 0.3 m).
         good_ce90_px, usable_ce90_px: largest predicted CE90 of the correction over the image.
-        good_ce90_m: a predicted CE90 up to this is good where the pixels are finer (SRP: 0.4 m over the
-            image, which is up to 0.75 m at its worst place).
+        good_ce90_m, usable_ce90_m: a predicted CE90 up to this is good, usable where the pixels are
+            finer (SRP: 0.4 m over the image, which is up to 0.75 m at its worst place).
         max_ce90_on_earth_m: largest CE90 on the Earth, with the frame of the control points, of a usable
             registration; None sets no limit.
         good_unit_weight: largest standard deviation of unit weight: residuals over the stated sigmas.
@@ -68,7 +68,9 @@ class QualificationOptions:
     usable_active_points: int = 6
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
+    usable_displacement_m: float = 0.9
     usable_ce90_px: float = 3.0
+    usable_ce90_m: float = 1.5
     coverage_cells: int = 5
     grid: int = 7
     draws: int = 10
@@ -289,6 +291,8 @@ def _criteria(figures: _Figures, options: QualificationOptions, gsd_m: float) ->
     """The figures compared with the thresholds."""
     f, o = figures, options
     good_ce90_px = max(o.good_ce90_px, o.good_ce90_m / gsd_m)
+    usable_ce90_px = max(o.usable_ce90_px, o.usable_ce90_m / gsd_m)
+    usable_displacement_px = max(o.usable_displacement_px, o.usable_displacement_m / gsd_m)
     good_displacement_px = max(o.good_displacement_px, o.good_displacement_m / gsd_m)
     return (
         at_least("active_points", f.active_points, o.good_active_points, "good"),
@@ -299,8 +303,8 @@ def _criteria(figures: _Figures, options: QualificationOptions, gsd_m: float) ->
         at_most("predicted_ce90_px", f.predicted_ce90_px, good_ce90_px, "good"),
         at_least("active_points", f.active_points, o.usable_active_points, "usable"),
         at_most("residual_std_px", f.residual_std_px, o.usable_residual_std_px, "usable"),
-        at_most("displacement_px", f.displacement_px, o.usable_displacement_px, "usable"),
-        at_most("predicted_ce90_px", f.predicted_ce90_px, o.usable_ce90_px, "usable"),
+        at_most("displacement_px", f.displacement_px, usable_displacement_px, "usable"),
+        at_most("predicted_ce90_px", f.predicted_ce90_px, usable_ce90_px, "usable"),
         at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"),
         at_most(
             "second_consensus_share",

@@ -188,7 +188,9 @@ export interface QualificationOptions {
   usable_active_points: number;
   usable_residual_std_px: number | null;
   usable_displacement_px: number | null;
+  usable_displacement_m: number | null;
   usable_ce90_px: number | null;
+  usable_ce90_m: number | null;
   coverage_cells: number;
   grid: number;
   draws: number;

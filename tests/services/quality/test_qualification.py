@@ -199,7 +199,13 @@ def test_coverage_is_the_share_of_cells_with_an_active_point():
     ],
 )
 def test_each_threshold_costs_its_verdict(registered, field, limit, lost):
-    in_pixels = replace(DEFAULT, good_displacement_m=0.0, good_ce90_m=0.0)
+    in_pixels = replace(
+        DEFAULT,
+        good_displacement_m=0.0,
+        good_ce90_m=0.0,
+        usable_displacement_m=0.0,
+        usable_ce90_m=0.0,
+    )
     result = qualified(registered(), replace(in_pixels, **{field: limit}))
     assert failed(result) == {lost}
     assert result.verdict == ("usable" if lost[1] == "good" else "failed")
