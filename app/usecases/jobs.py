@@ -113,7 +113,7 @@ def execute(
     if idempotency_key is not None:
         earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
         if earlier is not None:
-            return _same_request(earlier, checked)
+            return _same_request(process, earlier, checked)
     process.check(connection, caller, parsed)
     quotas.require_free_job(connection, settings, caller)
     if process.outputs:
@@ -134,12 +134,18 @@ def execute(
     # Another request has just used the key; the insert waited for it, so its job is visible now.
     earlier = jobs.find_by_key(connection, caller.id, idempotency_key)
     assert earlier is not None
-    return _same_request(earlier, checked)
+    return _same_request(process, earlier, checked)
 
 
-def _same_request(job: Job, request: JobRequest) -> Job:
-    """The job of an idempotency key, if it was created by the same request."""
-    if JobRequest(job.kind, job.inputs, job.outputs, job.response, job.priority) != request:
+def _same_request(process: Process, job: Job, request: JobRequest) -> Job:
+    """The job of an idempotency key, if it was created by the same request.
+
+    Inputs that an earlier release stored are compared with the defaults of later options.
+    """
+    inputs = job.inputs
+    if job.kind == process.id:
+        inputs = process.format_inputs(process.parse_inputs(job.inputs))
+    if JobRequest(job.kind, inputs, job.outputs, job.response, job.priority) != request:
         raise InputError(
             f"idempotency key: job {job.id} was created with this key by a different request; "
             "send a new key"
