@@ -23,7 +23,8 @@ def visible_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
 
     Returns:
         Pixels. `half_side` when the patch has no gaps; 0 where no square of at least `MIN_VISIBLE_SIDE`
-        of the chip is centred to `MAX_OFF_CENTRE_PX`.
+        of the chip is centred to `MAX_OFF_CENTRE_PX`. A search wider than that square does not know
+        where the chip will lie, and tries the whole of it.
     """
     row_col = np.argwhere(~np.isfinite(patch))
     if len(row_col) == 0:
@@ -41,7 +42,7 @@ def visible_half_side(patch: FloatImage, half_side: int, radius_px: int) -> int:
     for half in range(half_side, smallest - 1, -1):
         if is_centred[half + radius_px]:
             return half
-    return 0
+    return 0 if radius_px <= smallest else half_side
 
 
 def central_square(pixels: FloatImage, half_side: int) -> FloatImage:

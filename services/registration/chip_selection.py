@@ -40,7 +40,13 @@ def fine_gsd_m(scene: Scene, points: ControlPoints, prediction: Prediction) -> f
 
 
 def visibility_probability(
-    scene: Scene, points: ControlPoints, prediction: Prediction, gsd_m: float, share: float = 1.0
+    scene: Scene,
+    points: ControlPoints,
+    prediction: Prediction,
+    gsd_m: float,
+    share: float = 1.0,
+    *,
+    cut_px: Array | float = 0.0,
 ) -> Array:
     """Probability (n,) that the scene shows the chips of points, for normal errors of the prediction.
 
@@ -50,11 +56,12 @@ def visibility_probability(
         prediction: of these points.
         gsd_m: ground sampling of the chips.
         share: of the side of the chips, round their points, that has to be shown.
+        cut_px: (2,) lines and samples at each border of the scene that do not count.
     """
     line_sample = prediction.model.project(points.lon_lat_h)
     middle = points.lon_lat_h[len(points) // 2 : len(points) // 2 + 1]
     derivative = np.abs(scene.model.project_derivative(middle)[0, :, :2])
-    reach_px = share * CHIP_CENTRE * gsd_m * derivative.sum(axis=1)
+    reach_px = share * CHIP_CENTRE * gsd_m * derivative.sum(axis=1) + cut_px
     sigma_px = np.maximum(prediction.uncertainty_m / scene_gsd_m(scene), _MIN_SIGMA_PX)[:, None]
     last_px = np.array(scene.image.shape) - 1.0 - reach_px
     inside = ndtr((last_px - line_sample) / sigma_px) - ndtr((reach_px - line_sample) / sigma_px)

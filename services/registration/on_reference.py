@@ -5,18 +5,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
-from services.conventions import MAX_ERROR_SIGMAS
+from services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.errors import ComputationError, CoverageError, NoConsensus
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import ImageSource, ReducedImage, reduce_image
+from services.imagery.source import ImageSource, ReducedImage, image_gsds_m, reduce_image
 from services.matching.consensus import Voters
 from services.matching.predict import in_image
-from services.matching.reference_image import Places, Reference, match_places, visible_places
+from services.matching.reference_image import (
+    Places,
+    Reference,
+    locate_on_terrain,
+    match_places,
+    visible_places,
+)
 from services.quality.stability import image_places
-from services.registration.context import RegistrationContext, SearchStage
+from services.registration.context import Prediction, RegistrationContext, SearchStage
+from services.registration.far import search_far
 from services.registration.on_points import Registration, build_registration
 from services.registration.options import RegistrationOptions
-from services.registration.reference_points import reference_points
+from services.registration.point_selection import initial_prediction
+from services.registration.reference_points import ReferenceChips, reference_points
 from services.registration.search import (
     Search,
     adjust_search,
@@ -31,6 +39,11 @@ from services.registration.search import (
 )
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import Array, Progress, no_progress
+
+_FAR = 0.25
+"""Largest error, over the smaller side of a scene, at which places within the scene are enough."""
+_CHIPS_ACROSS = 6
+"""Chips side by side in a scene that is far off."""
 
 
 @dataclass(frozen=True)
@@ -122,9 +135,45 @@ def register_on_reference(
 
 def _first_level(context: _ReferenceContext) -> _Level:
     """The level at which the error of the delivered model is searched."""
-    error_m = MAX_ERROR_SIGMAS * context.scene.sigma_m
-    model = CorrectedModel(context.scene.model, no_correction(context.scene.image.shape))
+    scene, error_m = context.scene, MAX_ERROR_SIGMAS * context.scene.sigma_m
+    model = CorrectedModel(scene.model, no_correction(scene.image.shape))
+    if error_m > _FAR * min(scene.image.shape) * context.gsd_m:
+        prediction = _search_around(context.part(0.0, 0.1))
+        model, error_m = prediction.model, largest_error_m(prediction.uncertainty_m)
     return _Level(model, _factor(context, error_m), error_m, is_first=True)
+
+
+def _search_around(context: _ReferenceContext) -> Prediction:
+    """A prediction by a shift, from chips of the reference all around a scene that may be far off.
+
+    The places of a level lie in the scene as its model predicts it. Those that a scene really shows,
+    when it is off by much of its size, lie beside it.
+    """
+    scene, reference = context.scene, context.reference
+    size = np.array(scene.image.shape, dtype=np.float64)
+    reach_px = MAX_ERROR_SIGMAS * scene.sigma_m / context.gsd_m
+    step = np.sqrt(size.prod() / context.options.coarse.points)
+    axes = [np.arange(-reach_px, length + reach_px, step) for length in size]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    gsd_m = max(
+        context.gsd_m * context.finest_factor,
+        float(size.min()) * context.gsd_m / (_CHIPS_ACROSS * CHIP_SIZE),
+    )
+    ground = locate_on_terrain(scene.model, grid, reference.terrain)
+    seen = reference.model.project(ground)
+    known = np.isfinite(ground).all(axis=1) & np.isfinite(seen).all(axis=1)
+    ground, seen = ground[known], seen[known]
+    margin_px = CHIP_SIZE / 2.0 * gsd_m / image_gsds_m(reference.model, ground)
+    ground = ground[in_image(seen, reference.image.shape, -margin_px)]
+    if len(ground) < context.options.adjustment.min_points:
+        raise CoverageError(
+            f"the reference shows {len(ground)} of {len(grid)} places within "
+            f"{MAX_ERROR_SIGMAS * scene.sigma_m:.0f} m of the scene, "
+            f"{context.options.adjustment.min_points} needed: it lies elsewhere, or its terrain is void"
+        )
+    points = reference_points(ground, reference, gsd_m)
+    chips = ReferenceChips(reference, ground, gsd_m)
+    return search_far(context, points, chips, initial_prediction(scene, points), gsd_m)
 
 
 def _next_level(

@@ -21,7 +21,8 @@ class CoarseOptions:
             them that must fit into it side by side, for that ground sampling to be used.
         min_score: normalised correlation below which a chip is not found; the consensus of many points
             decides which of these matches are right.
-        max_search_px: largest search radius, pixels; to search further, the chips are reduced.
+        max_search_px: largest search radius around single points, pixels of their chips; further out,
+            the whole scene is searched.
         max_reduction: largest reduction of a chip; below 25 pixels a chip is hardly distinctive.
         max_false_alarms: a consensus with more expected false alarms than this is refused.
     """

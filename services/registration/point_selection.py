@@ -7,10 +7,10 @@ from services.errors import CoverageError
 from services.imagery.scene import Scene, scene_gsd_m
 from services.matching.chip_extent import MIN_VISIBLE_SIDE
 from services.matching.predict import in_image, spread_over_image
-from services.registration.chip_selection import visibility_probability
+from services.registration.chip_selection import has_chip, visibility_probability
 from services.registration.context import Prediction
 from services.sensors.correction import CorrectedModel, no_correction
-from services.types import ControlPoints, IntArray
+from services.types import Array, ControlPoints, IntArray
 
 MIN_RELATIVE_PROBABILITY = 0.5
 """Drop points whose probability of being shown is below this fraction of the best point's, where there
@@ -69,3 +69,36 @@ def points_to_try(
         predicted[likely], points.lon_lat_h[likely, 2], preference[likely], scene.image.shape, count
     )
     return np.sort(likely[best])
+
+
+def points_expected(
+    scene: Scene,
+    points: ControlPoints,
+    prediction: Prediction,
+    gsd_m: float,
+    *,
+    count: int,
+    cut_px: Array | float = 0.0,
+) -> IntArray:
+    """Rows of well-spread points of which a scene that may be far off is expected to show some whole.
+
+    Args:
+        scene: gives the size of the image.
+        points: that the scene may show.
+        prediction: of these points.
+        gsd_m: ground sampling of the chips.
+        count: number of points that the scene is expected to show.
+        cut_px: (2,) lines and samples at each border of the scene that do not count.
+    """
+    probability = visibility_probability(scene, points, prediction, gsd_m, cut_px=cut_px)
+    probability[~has_chip(points, gsd_m)] = 0.0
+    rows = np.flatnonzero(probability > 0.0)
+    line_sample = prediction.model.project(points.lon_lat_h[rows])
+    preference = (points.saliency * points.health * probability)[rows]
+    order = rows[
+        spread_over_image(
+            line_sample, points.lon_lat_h[rows, 2], preference, scene.image.shape, len(rows)
+        )
+    ]
+    needed = int(np.searchsorted(np.cumsum(probability[order]), count)) + 1
+    return np.sort(order[:needed])

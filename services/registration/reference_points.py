@@ -9,10 +9,17 @@ from services.matching.reference_image import Reference
 from services.types import Acquisition, Array, ChipArray, ControlPoints, Views
 
 
-def reference_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
+def reference_points(
+    lon_lat_h: Array, reference: Reference, gsd_m: float | None = None
+) -> ControlPoints:
     """Places on the ground (n, 3) as control points, each with one chip cut from the reference.
 
     `ReferenceChips` reads the chips.
+
+    Args:
+        lon_lat_h: the places.
+        reference: what the chips are cut from.
+        gsd_m: ground sampling of the chips; that of the reference when None.
     """
     n = len(lon_lat_h)
     unknown = np.full(n, np.nan)
@@ -28,7 +35,7 @@ def reference_points(lon_lat_h: Array, reference: Reference) -> ControlPoints:
         health=np.ones(n),
         views=Views(
             start=np.arange(n + 1),
-            gsd_m=image_gsds_m(reference.model, lon_lat_h),
+            gsd_m=image_gsds_m(reference.model, lon_lat_h) if gsd_m is None else np.full(n, gsd_m),
             image=np.zeros(n, dtype=np.int64),
             incidence_deg=unknown,
             azimuth_deg=unknown,
@@ -48,17 +55,19 @@ class ReferenceChips:
     Attributes:
         reference: what they are cut from.
         lon_lat_h: (n, 3) the points, by their rows.
+        gsd_m: ground sampling of the chips; that of the reference when None.
     """
 
     reference: Reference
     lon_lat_h: Array
+    gsd_m: float | None = None
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
         """Chips (count, 101, 101) uint16, each stretched over the whole range; 0 is nodata."""
         return np.stack([self._chip(ground) for ground in self.lon_lat_h[row : row + count]])
 
     def _chip(self, ground: Array) -> ChipArray:
-        gsd_m = image_gsd_m(self.reference.model, ground)
+        gsd_m = self.gsd_m or image_gsd_m(self.reference.model, ground)
         pixels = render_chip(self.reference.image, self.reference.model, ground, gsd_m)
         valid = np.isfinite(pixels)
         if not valid.any():

@@ -227,7 +227,14 @@ def _candidates(
 
 
 def first_consensus(
-    scene: Scene, predicted: Array, measured: Array, *, level_m: float, radius_m: float, side_m: float
+    scene: Scene,
+    predicted: Array,
+    measured: Array,
+    *,
+    level_m: float,
+    radius_m: float,
+    side_m: float,
+    cut_px: Array | float = 0.0,
 ) -> Consensus:
     """The displacements of a first search that agree, and whether beyond chance.
 
@@ -241,10 +248,11 @@ def first_consensus(
         level_m: ground sampling of what was searched.
         radius_m: search radius.
         side_m: side of the chips.
+        cut_px: (2,) lines and samples at each border of the scene that were not searched.
     """
     gsd_m = scene_gsd_m(scene)
     last = np.array(scene.image.shape) - 1.0
-    margin, radius = side_m / 2.0 / gsd_m, radius_m / gsd_m
+    margin, radius = side_m / 2.0 / gsd_m + cut_px, radius_m / gsd_m
     low = np.maximum(margin - predicted, -radius)
     high = np.minimum(last - margin - predicted, radius)
     return a_contrario_consensus(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import CoverageError, InputError, NoConsensus
+from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage, Window, sample_image
 from services.map_grid import MapGrid, utm_of
 from services.matching.reference_image import Reference, ReferenceMatchingOptions
@@ -14,7 +15,7 @@ from services.registration.on_points import Registration
 from services.registration.on_reference import register_on_reference
 from services.registration.options import ReferenceOptions, RegistrationOptions
 from services.sensors.ortho import OrthoModel
-from services.simulation.view import true_ground
+from services.simulation.view import SimulatedView, true_ground
 from services.terrain import Terrain
 from tests.services.simulated import block_views, spoiled_view, world
 
@@ -126,6 +127,31 @@ def test_the_last_search_is_one_that_hardly_moves_the_image() -> None:
     assert len(finest) < options.reference.fine_stages
     error = error_px(settled)
     assert np.sqrt((error**2).sum(axis=1).mean()) < ERROR_ALLOWED_PX
+
+
+def crop_of(view: SimulatedView, sigma_m: float) -> Scene:
+    """The middle 350 x 350 pixels of a view."""
+    first, side = 175, 350
+    delivered = view.geometry.delivered
+    return Scene(
+        ArrayImage(view.image.pixels[first : first + side, first : first + side]),
+        replace(delivered, image_offset=delivered.image_offset - first),
+        view.geometry.acquisition,
+        sigma_m,
+    )
+
+
+def test_a_small_scene_off_by_most_of_its_size_ends_where_a_good_start_does() -> None:
+    """The places that the scene shows lie beside the ground that its model predicts."""
+    far = register_on_reference(crop_of(spoiled_view((215.0, -160.0)), 100.0), reference(), OPTIONS)
+    near = register_on_reference(crop_of(spoiled_view((3.0, 2.0)), 10.0), reference(), OPTIONS)
+    first = far.search_stages[0]
+    assert first.name == "far"
+    assert not first.limited
+    assert first.displacement_rms_m > 250.0
+    assert near.search_stages[0].name == "reference"
+    ground = near.measures.lon_lat_h
+    np.testing.assert_allclose(far.model.project(ground), near.model.project(ground), atol=0.1)
 
 
 def test_places_found_before_are_the_first_to_be_searched_again() -> None:

@@ -1,0 +1,59 @@
+"""A scene kilometres off is found to its final accuracy, or refused with how far was searched."""
+
+import numpy as np
+import pytest
+
+from services.errors import NoConsensus
+from services.registration.on_points import Registration, register_scene
+from tests.services.registration.wide_ground import CENTRE, true_model, wide_points, wide_scene
+
+pytestmark = pytest.mark.long
+
+SCENE = (10_000.0, 2.0, 5_000)
+"""Size of the scene, ground sampling, side of what is delivered of it."""
+CROP = (20_000.0, 0.5, 3_000)
+"""1.5 km of a scene of 20 km."""
+FINAL_PX = 0.3
+DIRECTION = np.array([0.8, -0.6])
+
+
+def largest_error_px(registration: Registration, case: tuple[float, float, int]) -> float:
+    """Largest distance of the registered model from the true model over the image."""
+    side = case[2]
+    axis = np.linspace(0.0, side - 1.0, 5)
+    shown = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    truth = true_model(*case)
+    ground = truth.locate(shown, np.full(len(shown), CENTRE[2]))
+    return float(np.linalg.norm(registration.model.project(ground) - shown, axis=1).max())
+
+
+@pytest.mark.parametrize("error_km", [1.0, 2.0, 4.9])
+@pytest.mark.parametrize("gsds_m", [(2.0, 20.0), (2.0,)], ids=["2 m and 20 m chips", "2 m chips"])
+def test_a_scene_kilometres_off_is_found(gsds_m: tuple[float, ...], error_km: float) -> None:
+    east, north = (1000.0 * error_km * DIRECTION).tolist()
+    points, chips = wide_points(10_000.0, 500.0, gsds_m)
+    registration = register_scene(wide_scene(*SCENE, (east, north)), points, chips)
+    first = registration.search_stages[0]
+    assert first.search_radius_m >= 5000.0
+    assert not first.limited
+    assert first.name == ("coarse" if 20.0 in gsds_m else "far")
+    assert largest_error_px(registration, SCENE) < FINAL_PX
+
+
+@pytest.mark.parametrize("error_km", [1.0, 2.0, 4.9])
+def test_a_small_crop_kilometres_off_is_found(error_km: float) -> None:
+    east, north = (1000.0 * error_km * DIRECTION).tolist()
+    points, chips = wide_points(6_500.0, 220.0, (2.0, 20.0))
+    registration = register_scene(wide_scene(*CROP, (east, north)), points, chips)
+    assert registration.search_stages[0].name == "far"
+    assert registration.search_stages[0].search_radius_m >= 5000.0
+    assert largest_error_px(registration, CROP) < 4.0 * FINAL_PX
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched(seed: int) -> None:
+    points, chips = wide_points(6_500.0, 220.0, (2.0,))
+    with pytest.raises(NoConsensus, match=r"far search .* tried within 50\d\d m") as refused:
+        register_scene(wide_scene(*CROP, (0.0, 0.0), seed=seed), points, chips)
+    assert "inf" not in str(refused.value)
+    assert "nan" not in str(refused.value)

@@ -1,0 +1,179 @@
+"""Flat ground of many kilometres that is computed where it is seen, its scenes and its points."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import cv2
+import numpy as np
+
+from services.conventions import CHIP_SIZE
+from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from services.imagery.scene import Scene
+from services.imagery.source import Window, chip_ground
+from services.sensors.base import SensorModel
+from services.sensors.correction import CorrectedModel, no_correction
+from services.simulation.orbit import pushbroom_over
+from services.types import (
+    UNKNOWN_FRAME,
+    Acquisition,
+    Array,
+    ChipArray,
+    ControlPoints,
+    FloatImage,
+    IntArray,
+    Views,
+)
+
+CENTRE = np.array([5.4, 43.6, 0.0])
+STEP_M = 2.0
+PERIODS_PX = (997, 1103, 1217, 1321)
+"""Of four textures that repeat; their sum does so nowhere within 10 km."""
+_NODE_PX = 16
+
+
+@cache
+def _textures(seed: int) -> tuple[FloatImage, ...]:
+    made = []
+    for k, period in enumerate(PERIODS_PX):
+        rng = np.random.default_rng([seed, k])
+        frequency = np.hypot(np.fft.fftfreq(period)[:, None], np.fft.fftfreq(period)[None, :])
+        spectrum = np.fft.fft2(rng.standard_normal((period, period)))
+        spectrum *= np.exp(-((frequency * 1.2) ** 2)) / np.maximum(frequency, 1.0 / period)
+        texture = np.fft.ifft2(spectrum).real
+        made.append((texture / texture.std()).astype(np.float32))
+    return tuple(made)
+
+
+def brightness(east: Array, north: Array, seed: int = 0) -> FloatImage:
+    """Grey values of the ground at positions in the frame of `CENTRE`, metres."""
+    total = np.zeros(east.shape, dtype=np.float32)
+    for period, texture in zip(PERIODS_PX, _textures(seed), strict=True):
+        wrapped = cv2.copyMakeBorder(texture, 0, 1, 0, 1, cv2.BORDER_WRAP)
+        x, y = ((axis / STEP_M % period).astype(np.float32) for axis in (east, north))
+        total += cv2.remap(wrapped, x, y, cv2.INTER_LINEAR)
+    return np.asarray(1000.0 + 120.0 * total, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class WideImage:
+    """What a sensor sees of the ground, with noise of its own.
+
+    Attributes:
+        model: true.
+        shape: lines and samples.
+        seed: of the ground.
+    """
+
+    model: SensorModel
+    shape: tuple[int, int]
+    seed: int = 0
+
+    def read(self, window: Window) -> FloatImage:
+        """Pixels of a window; NaN beyond the image."""
+        counts = [-(-size // _NODE_PX) + 1 for size in (window.lines, window.samples)]
+        axes = [np.arange(count) * float(_NODE_PX) for count in counts]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1) + (window.line, window.sample)
+        ground = self.model.locate(nodes.reshape(-1, 2), np.zeros(nodes.size // 2))
+        enu = east_north_up(ground, CENTRE)[:, :2].reshape(nodes.shape)
+        weights = [
+            np.maximum(0.0, 1.0 - np.abs(np.arange(size)[:, None] - axis) / _NODE_PX)
+            for size, axis in zip((window.lines, window.samples), axes, strict=True)
+        ]
+        east, north = (weights[0] @ enu[..., k] @ weights[1].T for k in range(2))
+        pixels = brightness(east, north, self.seed)
+        pixels += (
+            np.random.default_rng(10_000 + window.line)
+            .normal(0.0, 20.0, pixels.shape)
+            .astype(np.float32)
+        )
+        line, sample = window.line + np.arange(window.lines), window.sample + np.arange(window.samples)
+        pixels[(line < 0) | (line >= self.shape[0])] = np.nan
+        pixels[:, (sample < 0) | (sample >= self.shape[1])] = np.nan
+        return pixels
+
+
+@cache
+def true_model(size_m: float, gsd_m: float, side: int) -> SensorModel:
+    """The model of the middle `side` x `side` pixels of a scene of `size_m`."""
+    whole = round(size_m / gsd_m)
+    model = pushbroom_over(CENTRE, (whole, whole), gsd_m, (8.0, 100.0), (-100.0, 500.0))
+    crop = no_correction((side, side))
+    crop.parameters[:, 0] = -(whole - side) / 2.0
+    return CorrectedModel(model, crop)
+
+
+def wide_scene(
+    size_m: float, gsd_m: float, side: int, error_m: tuple[float, float], *, seed: int = 0
+) -> Scene:
+    """A scene whose model is off by an error east and north; 5 km are three of its sigmas."""
+    truth = true_model(size_m, gsd_m, side)
+    error = no_correction((side, side))
+    error.parameters[:, 0] = truth.project_derivative(CENTRE[None, :])[0, :, :2] @ np.array(error_m)
+    return Scene(
+        WideImage(truth, (side, side), seed),
+        CorrectedModel(truth, error),
+        Acquisition("wide", incidence_deg=8.0, azimuth_deg=100.0),
+        5000.0 / 3.0,
+    )
+
+
+@dataclass(frozen=True)
+class WideChips:
+    """Chips that are cut from the ground when they are read.
+
+    Attributes:
+        lon_lat_h: (n, 3) the points.
+        gsds_m: of the chips of each point.
+    """
+
+    lon_lat_h: Array
+    gsds_m: tuple[float, ...]
+
+    def read(self, file: str, row: int, count: int) -> ChipArray:
+        """The chips of the point whose first row is `row`."""
+        point = self.lon_lat_h[row // len(self.gsds_m)]
+        return np.stack([self._chip(point, gsd_m) for gsd_m in self.gsds_m])
+
+    def _chip(self, point: Array, gsd_m: float) -> ChipArray:
+        finer = max(1, round(gsd_m / STEP_M))
+        size = CHIP_SIZE * finer
+        ground = chip_ground(point, gsd_m / finer, size + 1 - size % 2)
+        enu = east_north_up(ground, CENTRE)[:, :2].reshape(size + 1 - size % 2, -1, 2)
+        pixels = brightness(enu[:size, :size, 0], enu[:size, :size, 1])
+        pixels = pixels.reshape(CHIP_SIZE, finer, CHIP_SIZE, finer).mean(axis=(1, 3))
+        return np.clip(pixels, 1.0, 65535.0).astype(np.uint16)
+
+
+def wide_points(
+    half_m: float, spacing_m: float, gsds_m: tuple[float, ...]
+) -> tuple[ControlPoints, WideChips]:
+    """Points on a jittered grid around the centre, and their chips."""
+    axis = np.arange(-half_m, half_m, spacing_m)
+    enu = np.stack([*np.meshgrid(axis, axis), np.zeros((len(axis), len(axis)))], -1).reshape(-1, 3)
+    enu[:, :2] += np.random.default_rng(5).uniform(0.0, 0.8 * spacing_m, (len(enu), 2))
+    lon_lat_h = lon_lat_h_from_east_north_up(enu, CENTRE)
+    lon_lat_h[:, 2] = 0.0
+    n, k = len(lon_lat_h), len(gsds_m)
+    rows: IntArray = np.arange(n, dtype=np.int64)
+    points = ControlPoints(
+        id=rows,
+        lon_lat_h=lon_lat_h,
+        covariance_m2=np.tile(np.diag([0.3, 0.3, 0.3]) ** 2, (n, 1, 1)),
+        block=np.zeros(n, dtype=np.int64),
+        frames=(UNKNOWN_FRAME,),
+        saliency=np.ones(n),
+        health=np.ones(n),
+        views=Views(
+            start=np.arange(n + 1, dtype=np.int64) * k,
+            gsd_m=np.tile(gsds_m, n),
+            image=np.zeros(n * k, dtype=np.int64),
+            incidence_deg=np.full(n * k, 8.0),
+            azimuth_deg=np.full(n * k, 100.0),
+            health=np.ones(n * k),
+            images=(replace(Acquisition("base"), incidence_deg=8.0, azimuth_deg=100.0),),
+        ),
+        chip_file=np.zeros(n, dtype=np.int64),
+        chip_row=rows * k,
+        chip_files=("chips",),
+    )
+    return points, WideChips(lon_lat_h, gsds_m)
