@@ -1,6 +1,7 @@
 """The search of a scene that may be kilometres off: small chips in a map of the scene, and one shift."""
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,7 +14,13 @@ from services.imagery.source import low_pass, sample_image
 from services.matching.consensus import Consensus
 from services.matching.radiometry import gradient_image
 from services.matching.view_selection import select_views
-from services.registration.context import Prediction, RegistrationContext, SearchStage
+from services.registration.context import (
+    Candidate,
+    NotFound,
+    Prediction,
+    RegistrationContext,
+    SearchStage,
+)
 from services.registration.point_selection import points_expected
 from services.registration.search import (
     FIRST_TOLERANCE_PX,
@@ -287,8 +294,12 @@ def _find(
 
 def _summary(scene: Scene, plan: _Plan, consensus: Consensus, reason: np.ndarray) -> SearchStage:
     """The summary of the search."""
-    gsd_m = scene_gsd_m(scene)
-    agree = bool(consensus.inliers.any())
+    derivative = scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, :2]
+    moved_m = np.linalg.solve(derivative, consensus.displacement)
+    count = int(consensus.inliers.sum())
+    east_m, north_m = moved_m.tolist()
+    group = (Candidate(count, east_m, north_m, consensus.false_alarms),) if count >= 2 else ()
+    counted = Counter(r for r in reason.tolist() if r).most_common()
     return SearchStage(
         name="far",
         chip_gsd_m=plan.level_m,
@@ -297,6 +308,8 @@ def _summary(scene: Scene, plan: _Plan, consensus: Consensus, reason: np.ndarray
         tried=len(reason),
         matched=int((reason == "").sum()),
         at_border=int((reason == "border_peak").sum()),
-        inliers=int(consensus.inliers.sum()),
-        displacement_rms_m=float(np.hypot(*consensus.displacement)) * gsd_m if agree else math.nan,
+        inliers=count,
+        displacement_rms_m=math.hypot(east_m, north_m),
+        not_found=tuple(NotFound(*of_reason) for of_reason in counted),
+        candidates=group,
     )
