@@ -32,7 +32,8 @@ _NODE_PX = 16
 
 
 @cache
-def _textures(seed: int) -> tuple[FloatImage, ...]:
+def _textures(seed: int, mean_px: int) -> tuple[FloatImage, ...]:
+    """One period of each texture, averaged over squares of `mean_px` pixels around each."""
     made = []
     for k, period in enumerate(PERIODS_PX):
         rng = np.random.default_rng([seed, k])
@@ -40,17 +41,19 @@ def _textures(seed: int) -> tuple[FloatImage, ...]:
         spectrum = np.fft.fft2(rng.standard_normal((period, period)))
         spectrum *= np.exp(-((frequency * 1.2) ** 2)) / np.maximum(frequency, 1.0 / period)
         texture = np.fft.ifft2(spectrum).real
-        made.append((texture / texture.std()).astype(np.float32))
+        texture = (texture / texture.std()).astype(np.float32)
+        around = np.pad(texture, mean_px, mode="wrap")
+        averaged = cv2.blur(around, (mean_px, mean_px))[mean_px:-mean_px, mean_px:-mean_px]
+        made.append(np.pad(averaged, (0, 1), mode="wrap"))
     return tuple(made)
 
 
-def brightness(east: Array, north: Array, seed: int = 0) -> FloatImage:
-    """Grey values of the ground at positions in the frame of `CENTRE`, metres."""
+def brightness(east: Array, north: Array, seed: int = 0, mean_px: int = 1) -> FloatImage:
+    """Grey values of the ground at positions in the frame of `CENTRE`, metres; means of squares."""
     total = np.zeros(east.shape, dtype=np.float32)
-    for period, texture in zip(PERIODS_PX, _textures(seed), strict=True):
-        wrapped = cv2.copyMakeBorder(texture, 0, 1, 0, 1, cv2.BORDER_WRAP)
+    for period, texture in zip(PERIODS_PX, _textures(seed, mean_px), strict=True):
         x, y = ((axis / STEP_M % period).astype(np.float32) for axis in (east, north))
-        total += cv2.remap(wrapped, x, y, cv2.INTER_LINEAR)
+        total += cv2.remap(texture, x, y, cv2.INTER_LINEAR)
     return np.asarray(1000.0 + 120.0 * total, dtype=np.float32)
 
 
@@ -135,12 +138,11 @@ class WideChips:
         return np.stack([self._chip(point, gsd_m) for gsd_m in self.gsds_m])
 
     def _chip(self, point: Array, gsd_m: float) -> ChipArray:
-        finer = max(1, round(gsd_m / STEP_M))
-        size = CHIP_SIZE * finer
-        ground = chip_ground(point, gsd_m / finer, size + 1 - size % 2)
-        enu = east_north_up(ground, CENTRE)[:, :2].reshape(size + 1 - size % 2, -1, 2)
-        pixels = brightness(enu[:size, :size, 0], enu[:size, :size, 1])
-        pixels = pixels.reshape(CHIP_SIZE, finer, CHIP_SIZE, finer).mean(axis=(1, 3))
+        ground = chip_ground(point, gsd_m, CHIP_SIZE)
+        enu = east_north_up(ground, CENTRE)[:, :2].reshape(CHIP_SIZE, CHIP_SIZE, 2)
+        # An odd number of pixels is averaged, so that the mean stays on the pixel.
+        mean_px = int(gsd_m / STEP_M) | 1
+        pixels = brightness(enu[..., 0], enu[..., 1], mean_px=mean_px)
         return np.clip(pixels, 1.0, 65535.0).astype(np.uint16)
 
 
