@@ -255,7 +255,7 @@ def _find(
     """Positions (n, 2) in the scene where chips correlate best, and why there is none (n,)."""
     missing = ~np.isfinite(scene_map.pixels)
     filled = np.where(missing, np.float32(np.nanmean(scene_map.pixels)), scene_map.pixels)
-    count = cv2.integral(missing.astype(np.uint8))
+    count, size = cv2.integral(missing.astype(np.uint8)), len(filled)
     centres = scene_map.row_col(predicted)
     found = np.full((len(templates), 2), np.nan)
     reason = np.full(len(templates), "nodata", dtype="<U16")
@@ -267,7 +267,7 @@ def _find(
             continue
         wanted = np.round(centres[i]).astype(int) - side // 2
         top, left = (int(v) for v in np.maximum(wanted - plan.radius_px, 0))
-        bottom, right = (int(v) for v in np.minimum(wanted + plan.radius_px, plan.size - side) + 1)
+        bottom, right = (int(v) for v in np.minimum(wanted + plan.radius_px, size - side) + 1)
         if bottom <= top or right <= left:
             continue
         gaps = (
