@@ -51,13 +51,16 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     file = arguments.folder / f"outcomes_{arguments.seed}.jsonl"
     families = list(FAMILIES) if arguments.family == "all" else [arguments.family]
-    numbers = {family: range(arguments.scenes or FAMILIES[family].scenes) for family in families}
+    scenes = {
+        family: FAMILIES[family].scenes if arguments.scenes is None else arguments.scenes
+        for family in families
+    }
     wanted = [("nominal", number) for number in range(arguments.nominal) if "ordinary" in families]
     wanted += [
         (kind, number)
         for family in families
         for kind in FAMILIES[family].kinds
-        for number in numbers[family]
+        for number in range(scenes[family])
     ]
     outcomes = run_missing(arguments, file, wanted)
     of_kind = {

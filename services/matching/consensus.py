@@ -21,6 +21,9 @@ MIN_FOR_AFFINE = 6
 
 MAX_SCALE_UPDATES = 4
 
+_CELLS = 8
+"""Cells along the side of a chip in which the area that chips cover is counted."""
+
 
 @dataclass(frozen=True)
 class Consensus:
@@ -44,11 +47,11 @@ class Voters:
 
     Attributes:
         position: (n, 2) centres of the chips.
-        apart: side of a chip, same unit: chips nearer to each other than this overlap.
+        side: of a chip, same unit.
     """
 
     position: Array
-    apart: float
+    side: float
 
 
 def a_contrario_consensus(
@@ -58,9 +61,9 @@ def a_contrario_consensus(
     significance.
 
     The background model is a uniform distribution of each displacement over the area of its search.
-    Chips that overlap show the same ground and err together, so those nearer than a chip count once: a
-    set has as many voters as it holds chips that lie apart. Where overlapping chips differ, each of
-    their displacements is a chance of its own for the voter they form.
+    Chips that overlap show the same ground and err together: a set has as many voters as chips fit into
+    the area that its chips cover. Where overlapping chips differ, each of their displacements is a
+    chance of its own for the voter they form.
 
     Source: Desolneux, Moisan and Morel (2000), Meaningful alignments: the number of false alarms.
 
@@ -82,16 +85,16 @@ def a_contrario_consensus(
     for members in sorted(tree.query_ball_point(valid, tolerance), key=len, reverse=True):
         if len(members) <= most:
             break
-        count = _count_apart(rows[members], voters)
+        count = _count_voters(rows[members], voters)
         if count > most:
             best, most = members, count
     around = tree.query_ball_point(valid[best].mean(axis=0), tolerance)
-    if _count_apart(rows[around], voters) >= most:
+    if _count_voters(rows[around], voters) >= most:
         best = around
     inliers[rows[best]] = True
     centre = valid[best].mean(axis=0)
     tried = rows[_reaches(centre, tolerance, search, rows) | inliers[rows]]
-    trials, agreeing = _count_apart(tried, voters), _count_apart(rows[best], voters)
+    trials, agreeing = _count_voters(tried, voters), _count_voters(rows[best], voters)
     trials = max(trials, agreeing)
     chance = _chance(tolerance, search, tried)[_distinct(displacement[tried], tolerance, tried, voters)]
     probability = min(1.0, float(chance.sum()) / trials)
@@ -123,21 +126,20 @@ def _distinct(displacement: Array, tolerance: float, rows: IntArray, voters: Vot
         return distinct
     position = voters.position[rows]
     for row in range(1, len(rows)):
-        near = np.hypot(*(position[:row] - position[row]).T) < voters.apart
+        near = np.hypot(*(position[:row] - position[row]).T) < voters.side
         near &= np.hypot(*(displacement[:row] - displacement[row]).T) <= tolerance
         distinct[row] = not (near & distinct[:row]).any()
     return distinct
 
 
-def _count_apart(rows: IntArray, voters: Voters | None) -> int:
-    """Number of chips of a maximal set that lie apart, taken in the order of their rows."""
-    if voters is None:
+def _count_voters(rows: IntArray, voters: Voters | None) -> int:
+    """Number of chips; those that overlap are counted by the area that they cover together."""
+    if voters is None or len(rows) == 0:
         return len(rows)
-    taken: list[Array] = []
-    for position in voters.position[rows]:
-        if not taken or np.hypot(*(np.array(taken) - position).T).min() >= voters.apart:
-            taken.append(position)
-    return len(taken)
+    corner = np.round(voters.position[rows] / voters.side * _CELLS).astype(np.int64)
+    of_chip = np.stack(np.meshgrid(np.arange(_CELLS), np.arange(_CELLS)), axis=-1).reshape(-1, 2)
+    covered = (corner[:, None] + of_chip).reshape(-1, 2)
+    return len(np.unique(covered, axis=0)) // _CELLS**2
 
 
 def consensus_tolerance_px(sigma_px: float) -> float:

@@ -212,6 +212,16 @@ def test_overlapping_chips_of_the_same_ground_are_significant(step_px: int, in_c
     assert np.mean(accepted) >= 0.9
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_chips_that_nearly_all_agree_in_a_small_scene_are_significant(seed: int) -> None:
+    """A scene of 2.5 chips a side holds few chips side by side, but six of their area."""
+    rng = np.random.default_rng(seed)
+    displacement = rng.uniform(-80.0, 80.0, (28, 2))
+    displacement[:26] = [30.0, -40.0] + rng.normal(0.0, 1.0, (26, 2))
+    voters = Voters(rng.uniform(0.0, 150.0, (28, 2)), 100.0)
+    assert a_contrario_consensus(displacement, 6.0, 80.0, voters).false_alarms < 1e-4
+
+
 def test_displacements_that_a_search_could_not_reach_do_not_weigh_against_a_consensus() -> None:
     """A small scene shows few of the chips tried; the others cannot agree with those."""
     rng = np.random.default_rng(3)
