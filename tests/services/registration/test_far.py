@@ -27,8 +27,7 @@ def largest_error_px(registration: Registration, case: tuple[float, float, int])
     return float(np.linalg.norm(registration.model.project(ground) - shown, axis=1).max())
 
 
-@pytest.mark.parametrize("error_km", [1.0, 2.0, 4.9])
-@pytest.mark.parametrize("gsds_m", [(2.0, 20.0), (2.0,)], ids=["2 m and 20 m chips", "2 m chips"])
+@pytest.mark.parametrize(("gsds_m", "error_km"), [((2.0, 20.0), 4.9), ((2.0,), 1.0), ((2.0,), 4.9)])
 def test_a_scene_kilometres_off_is_found(gsds_m: tuple[float, ...], error_km: float) -> None:
     east, north = (1000.0 * error_km * DIRECTION).tolist()
     points, chips = wide_points(10_000.0, 500.0, gsds_m)
@@ -40,9 +39,8 @@ def test_a_scene_kilometres_off_is_found(gsds_m: tuple[float, ...], error_km: fl
     assert largest_error_px(registration, SCENE) < FINAL_PX
 
 
-@pytest.mark.parametrize("error_km", [1.0, 2.0, 4.9])
-def test_a_small_crop_kilometres_off_is_found(error_km: float) -> None:
-    east, north = (1000.0 * error_km * DIRECTION).tolist()
+def test_a_small_crop_kilometres_off_is_found() -> None:
+    east, north = (4900.0 * DIRECTION).tolist()
     points, chips = wide_points(6_500.0, 220.0, (2.0, 20.0))
     registration = register_scene(wide_scene(*CROP, (east, north)), points, chips)
     assert registration.search_stages[0].name == "far"
@@ -50,10 +48,9 @@ def test_a_small_crop_kilometres_off_is_found(error_km: float) -> None:
     assert largest_error_px(registration, CROP) < 4.0 * FINAL_PX
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched(seed: int) -> None:
+def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched() -> None:
     points, chips = wide_points(6_500.0, 220.0, (2.0,))
     with pytest.raises(NoConsensus, match=r"far search .* tried within 50\d\d m") as refused:
-        register_scene(wide_scene(*CROP, (0.0, 0.0), seed=seed), points, chips)
+        register_scene(wide_scene(*CROP, (0.0, 0.0), seed=1), points, chips)
     assert "inf" not in str(refused.value)
     assert "nan" not in str(refused.value)
