@@ -211,6 +211,7 @@ def test_bombs_end_as_failed_jobs_within_their_limits(
         assert reply.status_code == 201, reply.text
         jobs[name] = reply.json()["jobID"]
     settings = store.settings.model_copy(update=limits)
+    storage = settings.data_folder / "storage"
     with running_worker(settings, tmp_path / "log") as worker:
 
         def open_jobs() -> list[str]:
@@ -234,7 +235,13 @@ def test_bombs_end_as_failed_jobs_within_their_limits(
         assert (outcome["state"], outcome["attempt"]) == ("failed", 1), (name, outcome)
         assert outcome["error"]["title"] not in ("Internal error", "Time limit"), (name, outcome)
         assert CANARY not in json.dumps(outcome["error"])
-    assert store.digest(LEFT_BY_WORKERS) == before
+    # Each failed job leaves its report, and nothing else changes.
+    left = store.digest((*LEFT_BY_WORKERS, "result_file", "results"))
+    assert left == {key: value for key, value in before.items() if key in left}
+    assert {key for key in before if key not in left} == {"result_file"}
+    for job in jobs.values():
+        files = {path.name for path in (storage / "results" / job).rglob("*") if path.is_file()}
+        assert files == {"report.html", "report.json", "report.txt"}
 
 
 @pytest.mark.parametrize("suffix", [".ovr", ".msk", ".aux", ".vrt", ".png", ".hdr", ".lrc"])
