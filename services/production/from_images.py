@@ -10,19 +10,18 @@ from services.adjustment.intersection import Intersection, intersect
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around, continuous, east_north_up
-from services.imagery.scene import Scene, scene_gsd_m, view_direction
+from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import render_chip
 from services.matching.multi_image import (
     RefinementOptions,
     chip_inside,
     chip_saliency,
     refine_on_chips,
-    stored_chip,
 )
 from services.matching.predict import rank_in_group
-from services.matching.surface_heights import surface_height
 from services.matching.tie_points import FeatureOptions, find_tie_points
 from services.production.block_frame import block_frame
+from services.production.point_views import chips_of, point_views, shows_chip, surface_heights
 from services.types import (
     Array,
     BoolArray,
@@ -32,7 +31,6 @@ from services.types import (
     IntArray,
     Observations,
     Progress,
-    SurfaceHeights,
     Views,
     no_progress,
     part_of,
@@ -159,12 +157,15 @@ def produce_points(
         adjustment.models, _with_scaled_sigma(active, adjustment.sigma_px), len(candidates)
     )
     adjusted = _with_models(scenes, adjustment)
-    rows, saliency = _select_points(adjusted, intersection, active, options)
+    shown = active.take(shows_chip(adjusted, active, intersection.lon_lat_h, options.fine_gsd_m))
+    rows, saliency = _select_points(adjusted, intersection, shown, options)
     acquisitions = [scene.acquisition for scene in scenes]
     frame = block_frame(adjustment, acquisitions, _prior_sigma_px(scenes))
-    views = _views(adjusted, intersection, rows, active, options)
+    shown = shown.take(np.isin(shown.point, rows))
+    shown = replace(shown, point=np.searchsorted(rows, shown.point))
+    views = point_views(adjusted, shown, intersection.lon_lat_h[rows], options.gsds_m)
     points = _control_points(intersection, rows, frame, saliency, views)
-    points = replace(points, surface=_surface_heights(adjusted, points, options.fine_gsd_m))
+    points = replace(points, surface=surface_heights(adjusted, points, options.fine_gsd_m))
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
         before_px=_median_px(before.residual_px),
@@ -174,20 +175,8 @@ def produce_points(
     )
     progress(1.0, f"{len(points)} points")
 
-    def cut_chips(row: int) -> ChipArray:
-        views = slice(points.views.start[row], points.views.start[row + 1])
-        return np.stack(
-            [
-                stored_chip(
-                    render_chip(
-                        adjusted[i].image, adjusted[i].model, points.lon_lat_h[row], float(gsd_m)
-                    )
-                )
-                for i, gsd_m in zip(points.views.image[views], points.views.gsd_m[views], strict=True)
-            ]
-        )
-
-    return Production(points, cut_chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
+    chips = chips_of(adjusted, points)
+    return Production(points, chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
@@ -280,28 +269,29 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
 
 
 def _select_points(
-    scenes: Sequence[Scene],
-    points: Intersection,
-    observations: Observations,
-    options: ProductionOptions,
+    scenes: Sequence[Scene], points: Intersection, shown: Observations, options: ProductionOptions
 ) -> tuple[IntArray, Array]:
-    """Row (n,) and saliency (n,) of the best point of every square of ground."""
+    """Row (n,), ascending, and saliency (n,) of the best point of every square of ground.
+
+    `shown` are the measures in images that show the whole fine chip: those that become views.
+    """
     sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
-    usable = np.isfinite(points.lon_lat_h[:, 0]) & (points.rays >= options.min_views)
+    views = np.bincount(shown.point, minlength=len(points.lon_lat_h))
+    usable = np.isfinite(points.lon_lat_h[:, 0]) & (views >= options.min_views)
     rows = np.flatnonzero(usable & _precise(sigma_m, options))
     saliency = np.zeros(len(rows))
     for number, row in enumerate(rows):
-        scene = scenes[observations.image[observations.point == row][0]]
+        scene = scenes[shown.image[shown.point == row][0]]
         chip = render_chip(scene.image, scene.model, points.lon_lat_h[row], options.fine_gsd_m)
         saliency[number] = chip_saliency(chip)
     salient = saliency >= options.min_saliency
     rows, saliency = rows[salient], saliency[salient]
     if len(rows) < options.block.min_points:
         raise NotEnoughPoints(
-            len(rows), options.block.min_points, f"salient points out of {len(points.rays)} candidates"
+            len(rows), options.block.min_points, f"salient points out of {len(views)} candidates"
         )
     square = _squares(points.lon_lat_h[rows], options)
-    best = np.flatnonzero(rank_in_group(square, points.rays[rows] + saliency) == 0)
+    best = np.flatnonzero(rank_in_group(square, views[rows] + saliency) == 0)
     return rows[best], saliency[best]
 
 
@@ -322,60 +312,4 @@ def _control_points(
         chip_file=np.zeros(n, dtype=np.int64),
         chip_row=views.start[:-1].copy(),
         chip_files=("chips",),
-    )
-
-
-def _surface_heights(scenes: Sequence[Scene], points: ControlPoints, gsd_m: float) -> SurfaceHeights:
-    """The surface at the centres of the fine chips, each in its steepest view."""
-    views = points.views
-    above_m, sigma_m = np.full(len(points), np.nan), np.full(len(points), np.nan)
-    for row, ground in enumerate(points.lon_lat_h):
-        of_point = np.arange(*views.start[row : row + 2])
-        of_point = of_point[views.gsd_m[of_point] == gsd_m]
-        steepest_first = views.image[of_point[np.argsort(views.incidence_deg[of_point])]]
-        above_m[row], sigma_m[row] = surface_height([scenes[i] for i in steepest_first], ground, gsd_m)
-    return SurfaceHeights(points.lon_lat_h[:, 2] + above_m, sigma_m)
-
-
-def _views(
-    scenes: Sequence[Scene],
-    intersection: Intersection,
-    rows: IntArray,
-    observations: Observations,
-    options: ProductionOptions,
-) -> Views:
-    """The views of the selected points: every image that measured the point and shows its whole chip."""
-    lon_lat_h = intersection.lon_lat_h[rows]
-    whole = np.stack(
-        [
-            [chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for gsd_m in options.gsds_m]
-            for scene in scenes
-        ]
-    )
-    images: list[int] = []
-    gsds_m: list[float] = []
-    start = [0]
-    for number, row in enumerate(rows):
-        measured_in = observations.image[observations.point == row]
-        for level, gsd_m in enumerate(options.gsds_m):
-            of_level = [int(i) for i in measured_in if whole[i, level, number]]
-            images += of_level
-            gsds_m += [gsd_m] * len(of_level)
-        start.append(len(images))
-    image = np.array(images, dtype=np.int64)
-    ground = np.repeat(lon_lat_h, np.diff(start), axis=0)
-    incidence, azimuth = np.empty(len(image)), np.empty(len(image))
-    for i, scene in enumerate(scenes):
-        of_image = np.flatnonzero(image == i)
-        incidence[of_image], azimuth[of_image] = view_direction(
-            scene.model, scene.model.project(ground[of_image]), ground[of_image]
-        )
-    return Views(
-        start=np.array(start, dtype=np.int64),
-        gsd_m=np.array(gsds_m),
-        image=image,
-        incidence_deg=incidence,
-        azimuth_deg=azimuth,
-        health=np.ones(len(image)),
-        images=tuple(scene.acquisition for scene in scenes),
     )

@@ -100,6 +100,20 @@ def test_every_point_has_enough_views_and_one_per_image(made: Production) -> Non
         assert len(set(images)) == len(images)
 
 
+def test_points_near_the_border_of_an_image_have_enough_views() -> None:
+    # The second adjustment moves points: chips at the border of an image are then no longer whole.
+    many = ProductionOptions(
+        fine_gsd_m=3.0, coarse_gsd_m=6.0, points=2000, candidates=2, min_views=len(block_views())
+    )
+    points = produce_points(scenes(), many).points
+    counts = [
+        len(set(points.views.image[slice(*points.views.start[row : row + 2])]))
+        for row in range(len(points))
+    ]
+    assert len(points) > 300
+    assert min(counts) == many.min_views
+
+
 def test_chips_are_those_of_the_views(made: Production) -> None:
     views = made.points.views
     for row in range(0, len(made.points), 9):

@@ -1,0 +1,111 @@
+"""The views of produced points: which images show them, their chips, the surface at their centres."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from services.imagery.scene import Scene, view_direction
+from services.imagery.source import render_chip
+from services.matching.multi_image import chip_inside, stored_chip
+from services.matching.surface_heights import surface_height
+from services.types import (
+    Array,
+    BoolArray,
+    ChipArray,
+    ControlPoints,
+    Observations,
+    SurfaceHeights,
+    Views,
+)
+
+
+def shows_chip(
+    scenes: Sequence[Scene], observations: Observations, lon_lat_h: Array, gsd_m: float
+) -> BoolArray:
+    """Which observations (m,) are of an image that shows the whole chip of their point.
+
+    Args:
+        scenes: the images.
+        observations: `point` is the row of `lon_lat_h`.
+        lon_lat_h: (n, 3) the points; NaN where unknown.
+        gsd_m: ground sampling of the chips, metres.
+    """
+    whole = np.zeros(len(observations), dtype=np.bool_)
+    for image, scene in enumerate(scenes):
+        rows = np.flatnonzero(observations.image == image)
+        ground = lon_lat_h[observations.point[rows]]
+        whole[rows] = chip_inside(scene.model, scene.image.shape, ground, gsd_m)
+    return whole
+
+
+def point_views(
+    scenes: Sequence[Scene], observations: Observations, lon_lat_h: Array, gsds_m: Sequence[float]
+) -> Views:
+    """The views of points: one for every observation and ground sampling whose chip is whole.
+
+    Args:
+        scenes: the images.
+        observations: `point` is the row of `lon_lat_h`.
+        lon_lat_h: (n, 3) the points.
+        gsds_m: ground samplings of the chips, finest first, metres.
+    """
+    levels = [observations.take(shows_chip(scenes, observations, lon_lat_h, g)) for g in gsds_m]
+    point = np.concatenate([level.point for level in levels])
+    gsd_m = np.repeat(np.array(gsds_m), [len(level) for level in levels])
+    order = np.lexsort((gsd_m, point))
+    point, gsd_m = point[order], gsd_m[order]
+    image = np.concatenate([level.image for level in levels])[order]
+    incidence, azimuth = np.empty(len(image)), np.empty(len(image))
+    for i, scene in enumerate(scenes):
+        rows = np.flatnonzero(image == i)
+        ground = lon_lat_h[point[rows]]
+        incidence[rows], azimuth[rows] = view_direction(scene.model, scene.model.project(ground), ground)
+    return Views(
+        start=np.searchsorted(point, np.arange(len(lon_lat_h) + 1)).astype(np.int64),
+        gsd_m=gsd_m,
+        image=image,
+        incidence_deg=incidence,
+        azimuth_deg=azimuth,
+        health=np.ones(len(image)),
+        images=tuple(scene.acquisition for scene in scenes),
+    )
+
+
+def chips_of(scenes: Sequence[Scene], points: ControlPoints) -> Callable[[int], ChipArray]:
+    """From the row of a point to the chips of its views, (views, 101, 101), cut when asked for.
+
+    Args:
+        scenes: the images of the views, with the models that the points refer to.
+        points: with their views.
+    """
+
+    def cut(row: int) -> ChipArray:
+        views = slice(points.views.start[row], points.views.start[row + 1])
+        of_views = zip(points.views.image[views], points.views.gsd_m[views], strict=True)
+        ground = points.lon_lat_h[row]
+        return np.stack(
+            [
+                stored_chip(render_chip(scenes[i].image, scenes[i].model, ground, float(gsd_m)))
+                for i, gsd_m in of_views
+            ]
+        )
+
+    return cut
+
+
+def surface_heights(scenes: Sequence[Scene], points: ControlPoints, gsd_m: float) -> SurfaceHeights:
+    """The surface at the centres of the fine chips, each in its steepest view.
+
+    Args:
+        scenes: the images of the views, with adjusted models.
+        points: with their views.
+        gsd_m: ground sampling of the fine chips, metres.
+    """
+    views = points.views
+    above_m, sigma_m = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    for row, ground in enumerate(points.lon_lat_h):
+        of_point = np.arange(*views.start[row : row + 2])
+        of_point = of_point[views.gsd_m[of_point] == gsd_m]
+        steepest_first = views.image[of_point[np.argsort(views.incidence_deg[of_point])]]
+        above_m[row], sigma_m[row] = surface_height([scenes[i] for i in steepest_first], ground, gsd_m)
+    return SurfaceHeights(points.lon_lat_h[:, 2] + above_m, sigma_m)
