@@ -149,19 +149,24 @@ def chip_inside(
     return inside
 
 
+def nearly_whole(chip: FloatImage) -> bool:
+    """Whether at most a tenth of a chip is missing or saturated."""
+    return bool(np.isfinite(chip).mean() >= 1.0 - _MAX_LOST_SHARE)
+
+
 def chip_saliency(chip: FloatImage) -> float:
     """How well a chip can be located by its own content, 0 to 1.
 
     The core of the chip is correlated with the whole chip. The saliency is 1 minus the second best
     score, the best being 1 at the true position. Lines and repeated patterns have a saliency near 0, and
-    so has a chip of which more than `_MAX_LOST_SHARE` is missing or saturated.
+    so has a chip that is not nearly whole.
     """
-    valid = np.isfinite(chip)
-    if valid.mean() < 1.0 - _MAX_LOST_SHARE:
+    if not nearly_whole(chip):
         return 0.0
+    valid = np.isfinite(chip)
     margin = (CHIP_SIZE - _CORE_PX) // 2
     core = np.ascontiguousarray(chip[margin:-margin, margin:-margin])
-    if core[np.isfinite(core)].std() == 0.0:
+    if core[valid[margin:-margin, margin:-margin]].std() == 0.0:
         return 0.0
     scores = correlation_map(chip, core)
     if scores is None:

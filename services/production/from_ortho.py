@@ -13,7 +13,9 @@ from services.geodesy import box_around
 from services.imagery.gaps import bridged, filled
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import Window, block_means, render_chip
-from services.matching.multi_image import chip_inside, chip_saliency, stored_chip
+from services.matching.control_points import chip_pixels
+from services.matching.multi_image import chip_inside, chip_saliency, nearly_whole, stored_chip
+from services.production.point_views import chips_of
 from services.terrain import Terrain
 from services.types import (
     Array,
@@ -108,7 +110,8 @@ def produce_ortho_points(
 
     The image is divided into squares. The most salient corner of each square becomes a point. Its
     horizontal position is that of the image and its height that of the ground: the points inherit the
-    errors and the frame of the image.
+    errors and the frame of the image. The height of the surface stays unknown, as a single view without
+    parallax does not show it, and a terrain need not have roofs and trees.
 
     Source of the corners: Shi and Tomasi (1994), Good features to track.
 
@@ -185,7 +188,7 @@ def _best_corner(
     best: tuple[Array, float] | None = None
     for ground in lon_lat_h[whole]:
         stored = stored_chip(render_chip(scene.image, scene.model, ground, fine_m))
-        saliency = chip_saliency(stored.astype(np.float32)) if stored.all() else 0.0
+        saliency = chip_saliency(chip_pixels(stored))
         if saliency >= options.min_saliency and (best is None or saliency > best[1]):
             best = ground, saliency
     return best
@@ -214,8 +217,7 @@ def _assembled(
     n = len(lon_lat_h)
     has_coarse = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsds_m[1])
     for row in np.flatnonzero(has_coarse):
-        chip = render_chip(scene.image, scene.model, lon_lat_h[row], gsds_m[1])
-        has_coarse[row] = np.isfinite(chip).all()
+        has_coarse[row] = nearly_whole(render_chip(scene.image, scene.model, lon_lat_h[row], gsds_m[1]))
     start = np.concatenate([[0], np.cumsum(1 + has_coarse)]).astype(np.int64)
     gsd_m = np.full(start[-1], gsds_m[0])
     gsd_m[start[1:][has_coarse] - 1] = gsds_m[1]
@@ -243,12 +245,4 @@ def _assembled(
         chip_files=("chips",),
     )
 
-    def cut_chips(row: int) -> ChipArray:
-        return np.stack(
-            [
-                stored_chip(render_chip(scene.image, scene.model, lon_lat_h[row], float(g)))
-                for g in gsd_m[start[row] : start[row + 1]]
-            ]
-        )
-
-    return OrthoPoints(points, cut_chips, gsds_m, box_around(lon_lat_h))
+    return OrthoPoints(points, chips_of([scene], points), gsds_m, box_around(lon_lat_h))

@@ -115,9 +115,44 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     known = GroundHeights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
     points = produce_ortho_points(scene, known, replace(OPTIONS, points=100)).points
     seen = scene.model.project(points.lon_lat_h)
-    assert seen[:, 1].min() > SIDE / 2 + CHIP_SIZE / 2 - 1
+    # At most a tenth of a chip is missing.
+    assert seen[:, 1].min() > SIDE / 2 + 0.4 * CHIP_SIZE - 1
     assert seen[:, 0].min() > SIDE / 2 - 1
     np.testing.assert_allclose(points.lon_lat_h[:, 2], 40.0)
+
+
+def test_scattered_saturated_pixels_cost_no_points() -> None:
+    pixels = land().copy()
+    pixels[np.random.default_rng(5).random(pixels.shape) < 300e-6] = np.inf
+    found = produce_ortho_points(ortho(pixels), FLAT, OPTIONS)
+    assert len(found.points) == len(made().points)
+    assert len(found.points.views.gsd_m) == len(made().points.views.gsd_m)
+    scene = replace(ortho(moved(land(), *MOVED_PX)), sigma_m=30.0)
+    active = [
+        register_scene(scene, points.points, chips_of(points)).qualification.point_counts.active
+        for points in (found, made())
+    ]
+    assert active[0] > 0.95 * active[1]
+
+
+def test_a_patch_without_data_costs_the_points_that_it_covers() -> None:
+    seen = ortho(land()).model.project(made().points.lon_lat_h)
+    pixels = land().copy()
+    for line, sample in seen.astype(int) + 15:  # beside every corner, 9 % of its chip
+        pixels[line : line + 30, sample : sample + 30] = np.nan
+    found = produce_ortho_points(ortho(pixels), FLAT, OPTIONS)
+    missing = np.array([(found.chips(row)[0] == 0).mean() for row in range(len(found.points))])
+    assert len(missing) > 10
+    assert (missing > 0.0).any()
+    assert missing.max() <= 0.1
+
+
+def test_the_height_of_the_surface_is_unknown() -> None:
+    # A terrain model does not say whether roofs and trees are in it, and one image does not show it.
+    grid = ortho(land()).model.grid  # type: ignore[attr-defined]
+    heights = ArrayImage(np.full((SIDE, SIDE), 40.0, dtype=np.float32))
+    points = produce_ortho_points(ortho(land()), GroundHeights(Terrain(grid, heights), 0.0, 3.0)).points
+    assert points.surface is None
 
 
 def test_points_on_both_sides_of_180_degrees_form_one_block() -> None:
