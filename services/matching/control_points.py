@@ -107,9 +107,8 @@ class ChipSearch:
         image: the scene, or a reduction of it.
         model: of the scene.
         acquisition: how the scene was taken.
-        gsd_m: ground sampling of the chips to use, metres, as they are stored.
-        radius_px: search radius, pixels of the chips after their reduction.
-        reduction: factor by which the chips are reduced before the search.
+        gsd_m: ground sampling of the chips to use, metres.
+        radius_px: search radius, pixels of the chips.
         thresholds: of the correlation of grey values; None takes those of the options.
     """
 
@@ -118,18 +117,7 @@ class ChipSearch:
     acquisition: Acquisition
     gsd_m: float
     radius_px: int
-    reduction: int = 1
     thresholds: PeakThresholds | None = None
-
-    @property
-    def level_m(self) -> float:
-        """Ground sampling of the chips after their reduction, metres."""
-        return self.gsd_m * self.reduction
-
-    @property
-    def half_side(self) -> int:
-        """Half side of the chips after their reduction, pixels."""
-        return CHIP_CENTRE // self.reduction
 
 
 @dataclass(frozen=True)
@@ -175,13 +163,13 @@ def match_points(
     selected = select_views(
         points, search.gsd_m, search.acquisition, options.max_views, options.view_distance
     )
-    shifts = [shadow_shift(image, search.acquisition, search.level_m) for image in points.views.images]
+    shifts = [shadow_shift(image, search.acquisition, search.gsd_m) for image in points.views.images]
     matches = [_not_searched("")] * len(points)
     order = _tile_order(search.model.project(points.lon_lat_h))
     for count, row in enumerate(order):
         if count % 64 == 0:
             progress(
-                count / len(points), f"searching {len(points)} points with chips of {search.level_m:g} m"
+                count / len(points), f"searching {len(points)} points with chips of {search.gsd_m:g} m"
             )
         view_rows = selected.row[selected.start[row] : selected.start[row + 1]]
         if len(view_rows) == 0:
@@ -212,9 +200,9 @@ def _not_searched(reason: str) -> _PointMatch:
 
 
 def _predicted_patch(search: ChipSearch, lon_lat_h: Array) -> FloatImage:
-    """The scene around a point (3,), in the geometry of its reduced chips, as far as it is searched."""
-    size = 2 * (search.half_side + search.radius_px) + 1
-    return render_chip(search.image, search.model, lon_lat_h, search.level_m, size)
+    """The scene around a point (3,), in the geometry of its chips, as far as it is searched."""
+    size = 2 * (CHIP_CENTRE + search.radius_px) + 1
+    return render_chip(search.image, search.model, lon_lat_h, search.gsd_m, size)
 
 
 def _match_point(
@@ -235,16 +223,13 @@ def _match_point(
         scene_gsd_m: ground sampling of the scene at the point, metres.
         options: thresholds.
     """
-    half_side = visible_half_side(patch, search.half_side, search.radius_px)
+    half_side = visible_half_side(patch, CHIP_CENTRE, search.radius_px)
     if half_side == 0:
         peaks = [rejected(missing_reason(patch)) for _ in candidates]
         return peaks, combine_views(peaks, options.agreement_px), False
     patch = central_square(patch, half_side + search.radius_px)
     ratio = scene_gsd_m / search.gsd_m
-    chips = [
-        central_square(_at_scene_resolution(stored, ratio, search.reduction), half_side)
-        for stored, _ in candidates
-    ]
+    chips = [central_square(_at_scene_resolution(stored, ratio), half_side) for stored, _ in candidates]
     thresholds = search.thresholds or options.correlation.thresholds
     peaks = [
         find_chip(patch, chip, options.correlation, thresholds=thresholds, shadows=shift)
@@ -268,10 +253,10 @@ def _assembled(
     search: ChipSearch, points: ControlPoints, matches: list[_PointMatch], order: Sequence[int]
 ) -> PointMatches:
     """The matches of all points, in the rows of the points; `order` is that of the search."""
-    level_m, n = search.level_m, len(points)
+    n = len(points)
     row_col = np.array([match.combination.row_col for match in matches]).reshape(-1, 2)
-    displacement_m = np.column_stack([row_col[:, 1] * level_m, -row_col[:, 0] * level_m])
-    sigma_m = combined_sigmas_px([match.combination for match in matches]) * level_m
+    displacement_m = np.column_stack([row_col[:, 1] * search.gsd_m, -row_col[:, 0] * search.gsd_m])
+    sigma_m = combined_sigmas_px([match.combination for match in matches]) * search.gsd_m
     reason = np.array([match.combination.reason for match in matches], dtype="<U16")
     # A point beyond the border of the scene, or in a saturated area, has its own reason.
     clouded = cloud_mask([match.statistics for match in matches], reason == FOUND)
@@ -285,7 +270,7 @@ def _assembled(
         views=np.array([match.combination.agreeing.sum() for match in matches], dtype=np.int64),
         reason=reason,
         by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
-        common_covariance_m2=_common_covariance_px2(search, points, matches, order) * level_m**2,
+        common_covariance_m2=_common_covariance_px2(search, points, matches, order) * search.gsd_m**2,
         view_measures=_view_measures(matches),
     )
 
@@ -344,17 +329,9 @@ def chip_pixels(chip: ChipArray) -> FloatImage:
     return pixels
 
 
-def _at_scene_resolution(chip: ChipArray, ratio: float, reduction: int) -> FloatImage:
-    """A stored chip low-passed to the resolution of the scene or of the reduction, then reduced.
-
-    Args:
-        chip: as stored.
-        ratio: ground sampling of the scene over that of the chip.
-        reduction: every so many pixels one is kept, the centre among them.
-    """
-    smooth = low_pass(bridged(chip_pixels(chip)), max(ratio, float(reduction)))
-    first = CHIP_CENTRE % reduction
-    return np.ascontiguousarray(smooth[first::reduction, first::reduction])
+def _at_scene_resolution(chip: ChipArray, ratio: float) -> FloatImage:
+    """A stored chip low-passed to the resolution of the scene, `ratio` times its ground sampling."""
+    return low_pass(bridged(chip_pixels(chip)), ratio)
 
 
 def _tile_order(line_sample: Array) -> Sequence[int]:
