@@ -148,9 +148,16 @@ def consensus_tolerance_px(sigma_px: float) -> float:
 
 
 def robust_affine_inliers(
-    position: Array, displacement: Array, candidates: BoolArray, sigma_px: float
+    position: Array,
+    displacement: Array,
+    candidates: BoolArray,
+    sigma_px: float,
+    block: IntArray | None = None,
 ) -> tuple[BoolArray, float]:
     """Measures that fit one affine displacement field, with the scale of their observed scatter.
+
+    The frames of blocks differ by offsets that exceed the scatter of points: those of a block that agree
+    on an offset against the largest block fit the field with this offset.
 
     Points worse than declared scatter beyond a tolerance taken from the declared sigma. Cutting them off
     there would leave a set that looks as good as declared. So the tolerance is widened until it matches
@@ -160,10 +167,13 @@ def robust_affine_inliers(
         position, displacement: (n, 2) pixels.
         candidates: (n,) measures to consider.
         sigma_px: declared standard deviation of a measure relative to its point.
+        block: (n,) block that each point comes from; None when all come from one.
 
     Returns:
         Inliers (n,), and the ratio of their observed scatter to the declared sigma, at least 1.
     """
+    if block is not None:
+        displacement = _without_offsets(position, displacement, candidates, sigma_px, block)
     scale, inliers = 1.0, candidates
     for _ in range(MAX_SCALE_UPDATES):
         tolerance_px = consensus_tolerance_px(scale * sigma_px)
@@ -175,6 +185,30 @@ def robust_affine_inliers(
             break
         scale = scatter_px / sigma_px
     return inliers, scale
+
+
+def _without_offsets(
+    position: Array, displacement: Array, candidates: BoolArray, sigma_px: float, block: IntArray
+) -> Array:
+    """Displacements (n, 2) less the offset of each block against the largest.
+
+    An offset is removed where half of the candidates of its block, and enough for an affine, agree on it
+    within the tolerance of the largest block.
+    """
+    blocks, counts = np.unique(block[candidates], return_counts=True)
+    if len(blocks) < 2:
+        return displacement
+    largest = candidates & (block == blocks[counts.argmax()])
+    inliers, scale = robust_affine_inliers(position, displacement, largest, sigma_px)
+    residual = displacement - _affine_field(position, displacement, inliers)
+    without = displacement.copy()
+    for number in blocks[counts >= MIN_FOR_AFFINE]:
+        of_block = residual[candidates & (block == number)]
+        offset = np.median(of_block, axis=0)
+        agreeing = np.hypot(*(of_block - offset).T) <= consensus_tolerance_px(scale * sigma_px)
+        if agreeing.sum() >= max(MIN_FOR_AFFINE, len(of_block) / 2.0):
+            without[block == number] -= offset
+    return without
 
 
 def affine_inliers(
@@ -217,7 +251,12 @@ def _scatter_px(
 
     Candidates farther than `reach_px` from the affine are outliers and do not count.
     """
-    design = np.column_stack([np.ones(len(position)), position])
-    affine = np.linalg.lstsq(design[inliers], displacement[inliers], rcond=None)[0]
-    distance = np.hypot(*(displacement - design @ affine)[candidates].T)
+    misfit = displacement - _affine_field(position, displacement, inliers)
+    distance = np.hypot(*misfit[candidates].T)
     return float(np.median(distance[distance <= reach_px]) / MEDIAN_DISTANCE)
+
+
+def _affine_field(position: Array, displacement: Array, inliers: BoolArray) -> Array:
+    """Displacements (n, 2) of the affine field of the inliers."""
+    design = np.column_stack([np.ones(len(position)), position])
+    return np.asarray(design @ np.linalg.lstsq(design[inliers], displacement[inliers], rcond=None)[0])

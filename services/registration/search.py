@@ -119,7 +119,7 @@ def select_inliers(
     predicted = model.project(points.lon_lat_h)
     sigma_px = float(np.median(_point_sigma_px(model, points, matches)[matched]))
     displacement_px = matches.line_sample - predicted
-    inliers, scale = robust_affine_inliers(predicted, displacement_px, matched, sigma_px)
+    inliers, scale = robust_affine_inliers(predicted, displacement_px, matched, sigma_px, points.block)
     return inliers, consensus_tolerance_px(scale * sigma_px)
 
 

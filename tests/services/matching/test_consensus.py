@@ -132,6 +132,36 @@ def test_points_worse_than_declared_are_kept_with_their_scatter() -> None:
     assert np.mean(scales) == pytest.approx(3.0, rel=0.15)
 
 
+@pytest.mark.parametrize("offset_px", [0.0, 2.0, 10.0])
+@pytest.mark.parametrize("sizes", [(40, 40), (60, 20), (20, 60)])
+def test_blocks_apart_by_metres_both_keep_their_points(sizes: tuple[int, int], offset_px: float) -> None:
+    """At 0.5 m a pixel these are 1 and 5 m: block frames differ so much, points of a block do not."""
+    declared_px, block = 0.15, np.repeat([7, 3], sizes)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        position, measured, right = field(rng, 80, 80)
+        wrong = rng.random(80) < 0.1
+        measured[block == 3] += offset_px * np.array([np.cos(seed), np.sin(seed)])
+        measured[wrong] += rng.uniform(3.0, 20.0, (wrong.sum(), 2))
+        inliers, scale = robust_affine_inliers(
+            position, measured, np.ones(80, dtype=bool), declared_px, block
+        )
+        assert inliers[right & ~wrong].mean() > 0.95
+        assert not inliers[wrong].any()
+        assert scale == pytest.approx(1.0, abs=0.3)
+
+
+def test_scattered_points_of_another_block_get_no_offset() -> None:
+    block = np.repeat([0, 1], [60, 20])
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        position, measured, _ = field(rng, 80, 80)
+        measured[60:] += rng.uniform(-20.0, 20.0, (20, 2))
+        inliers, _ = robust_affine_inliers(position, measured, np.ones(80, dtype=bool), 0.15, block)
+        assert inliers[:60].mean() > 0.95
+        assert inliers[60:].sum() <= 1
+
+
 def test_points_as_good_as_declared_have_a_scale_of_one() -> None:
     rng = np.random.default_rng(2)
     position = rng.uniform(0.0, 700.0, (80, 2))

@@ -100,6 +100,18 @@ def test_the_predicted_spread_is_that_of_the_errors(name: str) -> None:
     assert 0.3 < ratio < 2.0
 
 
+def test_blocks_whose_frames_differ_by_metres_both_keep_their_points() -> None:
+    points, chips = block()
+    second = np.arange(len(points)) % 4 == 0
+    places = points.lon_lat_h.copy()
+    places[second, 0] += 2.0 / per_degree()[0]
+    two = replace(points, lon_lat_h=places, block=second.astype(np.int64), frames=2 * points.frames)
+    active = registration(FIRST).measures.active
+    of_both = register_scene(view_of(FIRST).as_scene(SIGMA_M), two, chips).measures.active
+    for of_block in (second, ~second):
+        assert of_both[of_block].sum() >= 0.9 * active[of_block].sum()
+
+
 def test_a_scene_coarser_than_the_chips_is_registered_as_well() -> None:
     coarse = plan(shape=(350, 350), gsd_m=2.0)
     view = simulate_view(world(), coarse, np.random.default_rng(3), (31.0, -24.0))
