@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from services.adjustment.robust import MAD_TO_STD, cauchy_weights, likeliest_variance
+from services.adjustment.robust import MAD_TO_STD, ROUNDING, likeliest_variance
+from services.adjustment.robust_kernel import reweighted_solution
 from services.types import Array, BoolArray
 
 Order = Literal["shift", "drift", "affine"]
@@ -23,9 +24,6 @@ _MUCH_BETTER = 0.5
 
 _MAD_SPREAD = 1.16
 """Relative standard deviation of a robust scale of n normal residuals, times the square root of n."""
-
-_ROUNDING = 1e-12
-"""Share of the normal matrix that keeps an undetermined direction solvable: it gets no displacement."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,11 @@ class AffineFit:
     def design(self) -> Array:
         """Derivative (n, 3 + b) of each coordinate by its parameters."""
         return np.column_stack([np.ones(len(self.t)), self.t, self.member])
+
+    @cached_property
+    def products(self) -> Array:
+        """Products (n, (3 + b)^2) of the derivatives by each two parameters."""
+        return (self.design[:, :, None] * self.design[:, None, :]).reshape(len(self.t), -1)
 
     @cached_property
     def sigma(self) -> Array:
@@ -100,11 +103,11 @@ class AffineFit:
         weight = 1.0 / self.variance[active].T
         if weights is not None:
             weight = weight * weights[active]
-        design = self.design[active]
-        weighted = design.T * weight[:, None, :]
-        right = (weighted @ self.misfit[active].T[:, :, None])[:, :, 0]
-        normal = weighted @ design
-        inverse = inverse_normal(normal, self.expected(slope_px), self.estimated(free))
+        normal = weight @ self.products[active]
+        right = (weight * self.misfit[active].T) @ self.design[active]
+        inverse = inverse_normal(
+            normal.reshape(2, *self.design.shape[1:] * 2), self.expected(slope_px), self.estimated(free)
+        )
         return (inverse @ right[:, :, None])[:, :, 0], inverse
 
     def likeliest_slope_px(self, active: BoolArray, unit: float, least_px: float) -> float:
@@ -154,16 +157,13 @@ class AffineFit:
 
     def robust_solution(self, active: BoolArray, free: BoolArray) -> Array:
         """Parameters (2, 3 + b) by iterative re-weighting that starts at the median shift."""
-        parameters = np.zeros((2, 3 + self.member.shape[1]))
-        parameters[:, 0] = np.median(self.misfit[active], axis=0)
-        for _ in range(20):
-            normalised = np.abs(self.residual(parameters) / self.sigma)
-            weights = cauchy_weights(normalised.max(axis=1) / _robust_std(normalised[active]))
-            updated, _ = self.solution(active, free, weights=weights)
-            if np.abs(updated - parameters).max() < 1e-4:
-                return updated
-            parameters = updated
-        return parameters
+        return reweighted_solution(
+            self.design[active],
+            np.ascontiguousarray(self.misfit[active].T),
+            np.ascontiguousarray(self.sigma[active].T),
+            self.expected(np.inf),
+            self.estimated(free),
+        )
 
     def spread(self, active: BoolArray) -> float:
         """Standard deviation of the positions along the axis where it is smallest."""
@@ -172,11 +172,12 @@ class AffineFit:
 
 def inverse_normal(normal: Array, expected: Array, estimated: BoolArray) -> Array:
     """Inverse (2, k, k) of normal matrices with a priori weights (2, k); zero where not estimated."""
-    size = normal.shape[-1]
     both = estimated[:, :, None] & estimated[:, None, :]
-    rounding = _ROUNDING * np.trace(normal, axis1=1, axis2=2)[:, None]
-    diagonal = np.where(estimated, expected + rounding, 1.0)
-    return np.asarray(np.linalg.inv(normal * both + diagonal[:, :, None] * np.eye(size)) * both)
+    filled = np.where(both, normal, 0.0)
+    diagonal = np.einsum("ijj->ij", filled)
+    rounding = ROUNDING * np.einsum("ijj->i", normal)[:, None]
+    diagonal[:] = np.where(estimated, diagonal + expected + rounding, 1.0)
+    return np.asarray(np.linalg.inv(filled) * both)
 
 
 def _robust_std(magnitude: Array) -> float:

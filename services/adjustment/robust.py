@@ -10,6 +10,9 @@ MAD_TO_STD = 1.4826
 CAUCHY_TUNING = 2.385
 """Tuning constant for 95 % efficiency on normal errors (Holland and Welsch, 1977)."""
 
+ROUNDING = 1e-12
+"""Share of a normal matrix that keeps an undetermined direction solvable: it gets no displacement."""
+
 _SHARES = np.geomspace(1.0, 1e-3, 31)
 _BEYOND_CHANCE = 12.0
 """Smallest gain in log-likelihood that shows points to be better than declared. For points as good as
