@@ -22,7 +22,7 @@ from app.cli.scene_registration import (
 )
 from app.errors import InputError
 from app.usecases.orthorectification import OrthoMap, run_orthorectification
-from app.usecases.registration.reference_source import ReferenceFiles
+from app.usecases.registration.reference_source import ReferenceFiles, check_map
 from app.usecases.registration.register import SceneFiles
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
@@ -118,6 +118,8 @@ def register(
         raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     control = Control(block, None if reference is None else ReferenceFiles(reference, terrain))
+    if reference is not None:
+        check_map(reference)
     requests = []
     for image in images:
         files = SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights)

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from app.usecases.registration.failure import FAILURE_OUTPUTS
 from tests.app.bad_images import ARCHIVES, IMAGES, MODELS, BadScene, folder_archive
 from tests.app.bad_requests import BAD_REQUESTS
 from tests.app.conftest import TEMPLATE, fresh_database
@@ -40,7 +41,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 
 @pytest.fixture(scope="module")
 def store(cluster, world, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installation]:
-    """One installation for all cases; they leave only files of scenes and failed jobs."""
+    """One installation for all cases; they leave only files of scenes, failed jobs and their reports."""
     folder = tmp_path_factory.mktemp("hostile_installation")
     with fresh_database(cluster, TEMPLATE) as dsn, hostile_installation(dsn, folder, world) as store:
         yield store
@@ -102,10 +103,17 @@ def test_a_bad_scene_is_refused_or_its_job_fails_with_the_reason(
     inputs = {"scene": scene} | ({"model": store.filled(case.model)} if case.model else {})
     reply = store.client.post("/processes/register-scene/execution", json={"inputs": inputs}, headers=me)
     if reply.status_code == 201:
-        failed(store, store.outcome(reply), case.says)
+        job = store.outcome(reply)
+        failed(store, job, case.says)
+        added = {f"results/{job['jobID']}/1/{name}" for name in FAILURE_OUTPUTS}
     else:
         refused(store, reply, case.says)
-    assert store.digest(LEFT_BY_JOBS) == before
+        added = set()
+    after = store.digest(LEFT_BY_JOBS)
+    changed = {name for name in after | before if after.get(name) != before.get(name)}
+    assert changed == added | ({"result_file"} if added else set())
+    for name in added:
+        keeps_secrets(store, (store.settings.data_folder / "storage" / name).read_text())
 
 
 @pytest.mark.parametrize(("name", "says", "content"), ARCHIVES, ids=[case[0] for case in ARCHIVES])

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from jsonschema import validate
 from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
+from app.db.usage import read_usage
 from app.storage import Storage
 from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
@@ -183,12 +185,17 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     # The files belong to the job: sweeps keep them, and retention removes them.
     reconcile_results(database, storage)
     folder = f"results/{job['jobID']}"
-    assert len(storage.keys(folder)) == 3
+    sizes = storage.sizes(folder)
+    assert len(sizes) == 3
+    owner = UUID(client.get("/tokens/self", headers=me).json()["id"])
     with database.transaction() as connection:
+        assert read_usage(connection, owner).result_bytes == sum(sizes.values()), "of the owner's quota"
         run_sql(connection, "update job set finished_at = finished_at - interval '2 days'")
         run_sql(connection, "update uptime set elapsed_s = elapsed_s + 86400 * 2")
     remove_old_results(database, storage, days=1.0)
     assert storage.keys(folder) == []
+    with database.transaction() as connection:
+        assert read_usage(connection, owner).result_bytes == 0
     assert client.get(links["report.html"]["href"], headers=me).status_code == 404
     gone = client.get(f"/jobs/{job['jobID']}", headers=me).json()
     assert not [link for link in gone["links"] if "/results/" in link["href"]]

@@ -75,6 +75,8 @@ def test_a_reference_that_lies_on_no_map_is_refused_by_name(
     plain = tmp_path / "plain.tif"
     with rasterio.open(plain, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8") as file:
         file.write(np.full((64, 64), 7, np.uint8), 1)
-    command = ["scene", "register", images[1], "--reference", plain, "--sigma-m", "40", "-o", tmp_path]
+    output = tmp_path / "registered"
+    command = ["scene", "register", images[1], "--reference", plain, "--sigma-m", "40", "-o", output]
     assert run(*command) == 2
     assert "plain.tif: expected an ortho-image on a map" in capsys.readouterr().err
+    assert not output.exists(), "a mistake in the command, not a failed registration"

@@ -8,8 +8,9 @@ from pathlib import Path
 from app.errors import InputError
 from app.usecases.registration.control_sources import ControlSet
 from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.images.raster import map_grid_of, open_raster
+from services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from services.imagery.scene import Scene
+from services.map_grid import MapGrid
 from services.matching.reference_image import Reference
 from services.registration.context import SearchStage
 from services.registration.on_points import Registration
@@ -100,19 +101,22 @@ def register_on(
     return registration, ControlSet(points, chips, (used,))
 
 
+def check_map(image: Path) -> None:
+    """Refuse a reference image that lies on no map, before any scene is registered on it.
+
+    Raises:
+        InputError: the image cannot be read, or has no coordinate reference system.
+    """
+    _on_map(image)[0].close()
+
+
 def read_reference(files: ReferenceFiles) -> Reference:
     """Open a reference; its files stay open and are read by windows.
 
     Raises:
         InputError: the image has no coordinate reference system, or the terrain cannot be used.
     """
-    image = open_raster(files.image)
-    grid = map_grid_of(image)
-    if grid is None:
-        image.close()
-        raise InputError(
-            f"{files.image}: expected an ortho-image on a map, found no coordinate reference system"
-        )
+    image, grid = _on_map(files.image)
     model = OrthoModel(grid)
     gsd_m = grid.gsd_m
     terrain = None
@@ -129,3 +133,15 @@ def read_reference(files: ReferenceFiles) -> Reference:
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
         frame=UNKNOWN_FRAME if files.sigma_m is None else Frame.from_sigmas(files.sigma_m, math.nan),
     )
+
+
+def _on_map(path: Path) -> tuple[RasterImage, MapGrid]:
+    """An opened image and its map."""
+    image = open_raster(path)
+    grid = map_grid_of(image)
+    if grid is None:
+        image.close()
+        raise InputError(
+            f"{path}: expected an ortho-image on a map, found no coordinate reference system"
+        )
+    return image, grid
