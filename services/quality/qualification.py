@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 from services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
 from services.quality.accuracy import Statistics, statistics
 from services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
+from services.quality.cell_stability import CellStability, measure_cell_stability
 from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
 from services.quality.frames import why_unknown
 from services.quality.predicted import PredictedAccuracy, predict_accuracy
@@ -139,7 +140,8 @@ class Qualification:
         criteria: the figures that have limits.
         point_counts: visible, matched and active points.
         image_residuals_px, ground_residuals_m: of the active points.
-        stability: the adjustment repeated without a part of its points.
+        stability: the adjustment repeated without a part of its points, drawn at random.
+        cell_stability: the same without the points of one cell at a time.
         predicted: accuracy by the covariance of the correction.
         accuracy: as every place states it.
         coverage: of the image by active points.
@@ -151,6 +153,7 @@ class Qualification:
     image_residuals_px: ImageResiduals
     ground_residuals_m: GroundResiduals
     stability: Stability
+    cell_stability: CellStability
     predicted: PredictedAccuracy
     accuracy: AccuracyStatement
     coverage: Coverage
@@ -192,6 +195,7 @@ def qualify(
         image_residuals_px=residuals,
         ground_residuals_m=_residuals_on_ground(measures.residual_m[measures.active]),
         stability=stability,
+        cell_stability=measure_cell_stability(scene),
         predicted=predicted,
         accuracy=scene_accuracy(predicted.worst_m, predicted.on_the_earth_worst_m, scene.frame),
         coverage=coverage,

@@ -1,7 +1,7 @@
 """How stable a correction is: repeated with fewer points."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
 from services.quality.accuracy import Statistics, statistics
 from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, Frame, Measures
+from services.types import Array, BoolArray, Frame, IntArray, Measures
 
 PLACES = ("top left", "top right", "bottom right", "bottom left", "centre")
 
@@ -58,9 +58,7 @@ class Displacement:
 
     Attributes:
         place: "top left", "top right", "bottom right", "bottom left" or "centre".
-        median_px, max_px, median_m, max_m: length, over the draws.
-        x_m, y_m: along samples and lines in the first draw: one repeated adjustment, as in the published
-            tables.
+        median_px, max_px, median_m, max_m: length, over the repeated adjustments.
     """
 
     place: str
@@ -68,8 +66,38 @@ class Displacement:
     max_px: float
     median_m: float
     max_m: float
+
+
+@dataclass(frozen=True)
+class DrawnDisplacement(Displacement):
+    """Displacement of one place over random draws.
+
+    Attributes:
+        x_m, y_m: along samples and lines in the first draw: one repeated adjustment, as in the published
+            tables.
+    """
+
     x_m: float
     y_m: float
+
+
+@dataclass(frozen=True)
+class GroupMeans:
+    """Mean residuals of groups of points that were held out together; null without any.
+
+    Errors that are independent average out in a mean; errors that the points of a group share do not.
+
+    Attributes:
+        rms_px: root mean square of their lengths.
+        over_independent: root mean square over what independent errors of the size of the residuals
+            predict: about 1 when errors are independent.
+        over_stated: the same over what the stated covariance of the correction and the size of the
+            residuals predict: about 1 or less where the stated accuracy covers what the points share.
+    """
+
+    rms_px: float
+    over_independent: float
+    over_stated: float
 
 
 @dataclass(frozen=True)
@@ -85,6 +113,7 @@ class Stability:
         held_out_px: residuals of the points held out, all draws together; a point counts once in each
             draw that it was held out of.
         held_out_m: the same on the ground, by the ground sampling of the image.
+        group_means: mean residuals of the points held out together.
         note: why there is no figure; "" otherwise.
     """
 
@@ -92,9 +121,10 @@ class Stability:
     draws: int
     failed_draws: int
     held_out_per_draw: int
-    displacements: tuple[Displacement, ...]
+    displacements: tuple[DrawnDisplacement, ...]
     held_out_px: ImageResiduals
     held_out_m: ImageResiduals
+    group_means: GroupMeans
     note: str
 
 
@@ -117,32 +147,96 @@ def measure_stability(
         kept_share: share of the active points in each draw.
         rng: draws the points that are held out.
     """
-    measures, correction = scene.measures, scene.adjustment.correction
-    active = np.flatnonzero(measures.active)
+    active = np.flatnonzero(scene.measures.active)
     held_count = len(active) - round(kept_share * len(active))
+    drawn = [rng.permutation(active)[:held_count] for _ in range(draws if held_count else 0)]
+    repeated = repeat_without(scene, drawn)
+    return Stability(
+        kept_share=kept_share,
+        draws=len(repeated.moved_px),
+        failed_draws=len(drawn) - len(repeated.moved_px),
+        held_out_per_draw=held_count,
+        displacements=_drawn_displacements(repeated.moved_px, scene.gsd_m),
+        held_out_px=residuals_in_image(repeated.residual_px),
+        held_out_m=residuals_in_image(repeated.residual_px * scene.gsd_m),
+        group_means=repeated.means,
+        note="" if len(repeated.moved_px) else _why_no_stability(len(active), held_count),
+    )
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """Adjustments repeated without some points each.
+
+    Attributes:
+        moved_px: (r, 5, 2) displacement of the places, line and sample, of those that succeeded.
+        residual_px: (k, 2) of the points held out, all together.
+        means: of the residuals of each group.
+    """
+
+    moved_px: Array
+    residual_px: Array
+    means: GroupMeans
+
+
+def repeat_without(scene: AdjustedScene, groups: Sequence[IntArray]) -> Repeated:
+    """The adjustment repeated without each of these groups of measures."""
+    measures, correction = scene.measures, scene.adjustment.correction
     places = image_places(scene.shape)
-    displacements, held_out = [], []
-    for _ in range(draws if held_count else 0):
-        held = rng.permutation(active)[:held_count]
+    moved, residuals, means = [], [np.empty((0, 2))], []
+    independent, stated = [], []
+    for held in groups:
         used = measures.active.copy()
         used[held] = False
         try:
-            repeated = scene.refit(used).correction
+            repeated = scene.refit(used)
         except ComputationError:
             continue
-        displacements.append(repeated.apply(places) - correction.apply(places))
-        held_out.append(measures.line_sample[held] - repeated.apply(measures.predicted[held]))
-    residual = np.concatenate(held_out) if held_out else np.empty((0, 2))
-    return Stability(
-        kept_share=kept_share,
-        draws=len(displacements),
-        failed_draws=(draws if held_count else 0) - len(displacements),
-        held_out_per_draw=held_count,
-        displacements=_displacements(np.array(displacements), scene.gsd_m) if displacements else (),
-        held_out_px=residuals_in_image(residual),
-        held_out_m=residuals_in_image(residual * scene.gsd_m),
-        note="" if displacements else _why_no_stability(len(active), held_count),
+        moved.append(repeated.correction.apply(places) - correction.apply(places))
+        seen = measures.line_sample[held]
+        residuals.append(seen - repeated.correction.apply(measures.predicted[held]))
+        means.append(residuals[-1].mean(axis=0))
+        middle = seen.mean(axis=0)
+        independent.append(1.0 / len(held) + _leverage(measures.line_sample[used], middle))
+        stated.append((repeated.covariance_at(middle[None])[0], len(held)))
+    scatter = _scatter_px2(measures.residual_px[measures.active])
+    return Repeated(
+        moved_px=np.array(moved).reshape(-1, len(PLACES), 2),
+        residual_px=np.concatenate(residuals),
+        means=GroupMeans(
+            rms_px=_rms([np.linalg.norm(mean) for mean in means]),
+            over_independent=_over(means, [factor * scatter for factor in independent]),
+            over_stated=_over(means, [covariance + scatter / n for covariance, n in stated]),
+        ),
     )
+
+
+def _scatter_px2(residual: Array) -> Array:
+    """Covariance (2, 2) of single measures about the correction, by their residuals (n, 2)."""
+    most_parameters = 3
+    return np.asarray(residual.T @ residual / max(len(residual) - most_parameters, 1))
+
+
+def _leverage(line_sample: Array, place: Array) -> float:
+    """Variance of an affine fit to measures (n, 2) of unit variance, at a place (2,)."""
+    middle, size = line_sample.mean(axis=0), max(float(line_sample.std()), 1.0)
+    design = np.column_stack([np.ones(len(line_sample)), (line_sample - middle) / size])
+    at_place = np.concatenate([[1.0], (place - middle) / size])
+    return float(at_place @ np.linalg.pinv(design.T @ design, rcond=1e-6) @ at_place)
+
+
+def _over(means: Sequence[Array], predicted: Sequence[Array]) -> float:
+    """Root mean square of vectors in units of their predicted covariances (2, 2); NaN without any."""
+    least = 1e-12 * np.eye(2)
+    squared = [
+        mean @ np.linalg.solve(one + least, mean) for mean, one in zip(means, predicted, strict=True)
+    ]
+    return _rms(np.sqrt(squared)) / np.sqrt(2.0)
+
+
+def _rms(values: Sequence[float]) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
 def image_places(shape: tuple[int, int]) -> Array:
@@ -153,8 +247,10 @@ def image_places(shape: tuple[int, int]) -> Array:
     )
 
 
-def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
-    """Lengths over the draws, and the first draw, of displacements (d, 5, 2) in line and sample."""
+def displacements_of(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
+    """Lengths over the repetitions of displacements (r, 5, 2) in line and sample; empty without any."""
+    if not len(moved_px):
+        return ()
     length_px = np.linalg.norm(moved_px, axis=2)
     median, largest = np.median(length_px, axis=0), length_px.max(axis=0)
     return tuple(
@@ -164,10 +260,20 @@ def _displacements(moved_px: Array, gsd_m: float) -> tuple[Displacement, ...]:
             max_px=float(largest[k]),
             median_m=float(median[k] * gsd_m),
             max_m=float(largest[k] * gsd_m),
+        )
+        for k, place in enumerate(PLACES)
+    )
+
+
+def _drawn_displacements(moved_px: Array, gsd_m: float) -> tuple[DrawnDisplacement, ...]:
+    """Lengths over the draws, and the first draw, of displacements (d, 5, 2) in line and sample."""
+    return tuple(
+        DrawnDisplacement(
+            **asdict(of_place),
             x_m=float(moved_px[0, k, 1] * gsd_m),
             y_m=float(moved_px[0, k, 0] * gsd_m),
         )
-        for k, place in enumerate(PLACES)
+        for k, of_place in enumerate(displacements_of(moved_px, gsd_m))
     )
 
 

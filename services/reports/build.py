@@ -61,6 +61,7 @@ def build_report(
         image_residuals_px=qualification.image_residuals_px,
         ground_residuals_m=qualification.ground_residuals_m,
         stability=qualification.stability,
+        cell_stability=qualification.cell_stability,
         predicted=qualification.predicted,
         coverage=qualification.coverage,
         checks=checks,

@@ -26,6 +26,7 @@ from services.reports.numbers import (
 from services.reports.published import published_tables
 from services.reports.reasons import reason_label
 from services.reports.report import RegistrationReport
+from services.reports.stability_words import CELLS_EXPLANATION, cells_left_out_text, group_means_text
 from services.types import Array, ChipArray
 
 PAIRS_PER_GROUP = 4
@@ -54,6 +55,7 @@ def format_html(report: RegistrationReport) -> str:
         published=published_tables(report),
         options=list(flat_options(report.run.options)),
         centre=centre_words(report.scene.footprint_lon_lat),
+        cells_explanation=CELLS_EXPLANATION,
     )
 
 
@@ -78,6 +80,8 @@ def page_template(name: str) -> Template:
         margin=margin_words,
         chip=chip_uri,
         reason_label=reason_label,
+        group_means_text=group_means_text,
+        cells_left_out_text=cells_left_out_text,
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
     )
     return environment.get_template(name)

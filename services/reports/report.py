@@ -12,6 +12,7 @@ from typing import Literal
 
 from services.quality.accuracy import Accuracy, NormalisedError
 from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy
+from services.quality.cell_stability import CellStability
 from services.quality.criteria import Criterion, Verdict
 from services.quality.predicted import PredictedAccuracy
 from services.quality.qualification import Coverage, GroundResiduals, PointCounts
@@ -189,7 +190,10 @@ class RegistrationReport:
         reasons: why points are not active, commonest first.
         image_residuals_px: of the active points; x along samples, y along lines.
         ground_residuals_m: of the active points; no heights, which a single scene does not give.
-        stability: the adjustment repeated without a part of its points; not absolute accuracy.
+        stability: the adjustment repeated without a part of its points, drawn at random; not absolute
+            accuracy.
+        cell_stability: the same without the points of one cell at a time: shows errors that neighbours
+            share, not those that all points share.
         predicted: accuracy by the covariance of the correction.
         coverage: of the image by active points.
         checks: accuracy at points that had no part in the registration.
@@ -213,6 +217,7 @@ class RegistrationReport:
     image_residuals_px: ImageResiduals
     ground_residuals_m: GroundResiduals
     stability: Stability
+    cell_stability: CellStability
     predicted: PredictedAccuracy
     coverage: Coverage
     checks: tuple[Check, ...]

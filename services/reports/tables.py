@@ -9,8 +9,10 @@ from rich.table import Table
 from rich.text import Text
 
 from services.quality.accuracy import Statistics
+from services.quality.stability import Displacement
 from services.reports.numbers import ABSENT, criterion_limit, criterion_value, number, percent, quantile
 from services.reports.report import Check, RegistrationReport
+from services.reports.stability_words import CELLS_EXPLANATION, cells_left_out_text, group_means_text
 
 _WIDTH = 100
 
@@ -23,6 +25,7 @@ def report_tables(report: RegistrationReport) -> RenderableType:
         point_count_table(report),
         residual_table(report),
         stability_table(report),
+        cell_stability_table(report),
         criteria_table(report),
     ]
     if report.checks:
@@ -80,20 +83,34 @@ def residual_table(report: RegistrationReport) -> Table:
 def stability_table(report: RegistrationReport) -> Table:
     """Displacements of an adjustment with fewer points, and residuals of the points held out."""
     stability = report.stability
-    rows = [
-        [place.place, number(place.median_px, 3), number(place.max_px, 3)]
-        + [number(place.median_m, 3), number(place.max_m, 3)]
-        for place in stability.displacements
-    ]
     held_px, held_m = stability.held_out_px.xy, stability.held_out_m.xy
     caption = stability.note or (
         f"{stability.draws} adjustments with {percent(stability.kept_share)} of the active points. "
         f"Residuals of the {stability.held_out_per_draw} points held out each time: mean "
         f"{number(held_px.mean)} px ({number(held_m.mean)} m), std {number(held_px.std)} px "
-        f"({number(held_m.std)} m), n = {held_px.n}. Shows stability, not absolute accuracy."
+        f"({number(held_m.std)} m), n = {held_px.n}. {group_means_text(stability.group_means)} Shows "
+        "stability, not absolute accuracy."
     )
+    return _displacement_table("Stability", stability.displacements, caption)
+
+
+def cell_stability_table(report: RegistrationReport) -> Table:
+    """Displacements of an adjustment without the points of a cell, and mean residuals of the cells."""
+    stability = report.cell_stability
+    caption = stability.note or (
+        f"{cells_left_out_text(stability)} {group_means_text(stability.group_means)} {CELLS_EXPLANATION}"
+    )
+    return _displacement_table("Stability by cells", stability.displacements, caption)
+
+
+def _displacement_table(title: str, places: Sequence[Displacement], caption: str) -> Table:
+    rows = [
+        [place.place, number(place.median_px, 3), number(place.max_px, 3)]
+        + [number(place.median_m, 3), number(place.max_m, 3)]
+        for place in places
+    ]
     columns = ["Displacement", "Median px", "Max px", "Median m", "Max m"]
-    return _table("Stability", columns, rows, caption)
+    return _table(title, columns, rows, caption)
 
 
 def criteria_table(report: RegistrationReport) -> Table:

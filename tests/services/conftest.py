@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from services.adjustment.image_correction import (
     AdjustmentOptions,
@@ -80,6 +82,7 @@ def register(
     points_px: float = 0.0,
     stated_px: float | None = None,
     bend_px: float = 0.0,
+    shared_px: float = 0.0,
 ) -> Registered:
     """A simulated registration on n visible points.
 
@@ -91,6 +94,8 @@ def register(
         points_px: errors of the points, as the image shows them.
         stated_px: their stated standard deviation; by default the true one.
         bend_px: largest error of the model along the lines that no correction removes.
+        shared_px: errors of the points that neighbours share, correlated over 0.2 of the image; no sigma
+            states them.
     """
     rng = np.random.default_rng(seed)
     model, frame = FlatModel(), no_correction(SHAPE)
@@ -99,6 +104,10 @@ def register(
     lon_lat_h = model.locate(predicted, np.zeros(n))
     observed = truth.apply(predicted) + rng.normal(0.0, noise_px, (n, 2))
     observed += np.random.default_rng(seed + 1).normal(0.0, points_px, (n, 2))
+    if shared_px:
+        apart = cdist(predicted / SHAPE, predicted / SHAPE)
+        smooth = np.linalg.cholesky(np.exp(-apart / 0.2) + 1e-9 * np.eye(n))
+        observed += shared_px * smooth @ np.random.default_rng(seed + 2).normal(size=(n, 2))
     observed[:, 1] += bend_px * np.sin(2.0 * np.pi * predicted[:, 0] / SHAPE[0])
     observed[:lost] = np.nan
     observed[lost : lost + wrong] += rng.choice([-1.0, 1.0], (wrong, 2)) * rng.uniform(
@@ -107,11 +116,11 @@ def register(
 
     sigma_m = GSD_M * (points_px if stated_px is None else stated_px)
 
-    def refit(usable: BoolArray) -> SceneAdjustment:
+    def refit(usable: BoolArray, like: SceneAdjustment | None = None) -> SceneAdjustment:
         observations = ControlObservations(
             lon_lat_h, observed, np.full(n, noise_px), np.tile(sigma_m**2 * np.eye(3), (n, 1, 1)), usable
         )
-        return adjust_scene(model, SHAPE, observations, AdjustmentOptions(order="drift"))
+        return adjust_scene(model, SHAPE, observations, AdjustmentOptions(order="drift"), like=like)
 
     matched = np.isfinite(observed).all(axis=1)
     adjustment = refit(matched)
@@ -135,7 +144,7 @@ def register(
         active=adjustment.active,
         reason=reason,
     )
-    return Registered(measures, adjustment, refit, truth)
+    return Registered(measures, adjustment, partial(refit, like=adjustment), truth)
 
 
 @pytest.fixture

@@ -1,11 +1,15 @@
 """The published tables, as a terminal shows them."""
 
-from dataclasses import replace
+import re
+from dataclasses import asdict, replace
+from html import unescape
 
 import numpy as np
 import pytest
 
 from services.quality.accuracy import sample_quantile
+from services.reports.document import report_document
+from services.reports.html import format_html
 from services.reports.numbers import number, quantile
 from services.reports.tables import format_tables
 
@@ -49,6 +53,24 @@ def test_the_stability_table_says_what_it_does_not_show(report):
     text = " ".join(format_tables(report).split())
     assert "Shows stability, not absolute accuracy." in text
     assert "top left" in text
+
+
+def test_hold_outs_by_cells_stand_beside_those_at_random_with_what_they_show(material):
+    report = material(n=200).report()
+    means = report.cell_stability.group_means
+    pages = (format_tables(report), re.sub("<[^>]+>", "", unescape(format_html(report))))
+    for text in (" ".join(page.split()) for page in pages):
+        assert text.index("Shows stability" if "Shows" in text else "shows stability") < text.index(
+            "Stability by cells"
+        )
+        assert f"{report.cell_stability.left_out} adjustments, each without the active points" in text
+        assert text.count("times what independent errors give") == 2
+        assert f"{means.over_independent:.1f} times what independent errors give" in text
+        assert f"{means.over_stated:.1f} times what the stated accuracy gives" in text
+        assert "an error which neighbours share stays hidden" in text
+        assert "An error that all points share" in text
+        assert "No verdict depends on this" in text
+    assert report_document(report)["cell_stability"]["group_means"] == asdict(means)
 
 
 def test_an_unmet_criterion_stands_out_with_its_value_and_limit(material):
