@@ -82,6 +82,7 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         radius_m=radius_px * gsd_m,
         needed_m=error_m,
         voters=Voters(matches.line_sample, CHIP_SIZE * gsd_m / scene_gsd_m(scene)),
+        lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
     check_consensus(stage, consensus, matches.reason, scene, options.coarse.max_false_alarms)

@@ -131,6 +131,7 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Sea
         radius_m=radius_px * gsd_m,
         needed_m=error_m,
         voters=Voters(matches.line_sample, CHIP_SIZE * gsd_m / context.gsd_m),
+        lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
     check_inliers(stage, tolerance_px, matches.reason, context.scene, options.adjustment.min_points)

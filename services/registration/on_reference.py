@@ -254,6 +254,7 @@ def _search(
         radius_m=radius_px * level_m,
         needed_m=level.error_m,
         voters=Voters(matches.line_sample, matching.window_px * level.factor),
+        lon_lat_h=places.lon_lat_h,
     )
     context.stages.append(stage)
     if level.is_first:

@@ -14,6 +14,7 @@ from services.adjustment.image_correction import (
 )
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import NoConsensus, NotEnoughPoints
+from services.geodesy import continuous, ecef_from_east_north_up
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import image_gsds_m
 from services.matching.consensus import (
@@ -187,8 +188,9 @@ def summarise(
     radius_m: float,
     needed_m: float,
     voters: Voters,
+    lon_lat_h: Array,
 ) -> SearchStage:
-    """The summary of a search; see `SearchStage`."""
+    """The summary of a search of places on known ground (n, 3); see `SearchStage`."""
     displacement_m = matches.displacement_m[inliers]
     rms_m = float(np.sqrt((displacement_m**2).sum(axis=1).mean())) if len(displacement_m) else math.nan
     return SearchStage(
@@ -202,18 +204,32 @@ def summarise(
         inliers=int(inliers.sum()),
         displacement_rms_m=rms_m,
         not_found=tuple(NotFound(*counted) for counted in _count_reasons(matches.reason)),
-        candidates=_candidates(matches, inliers, FIRST_TOLERANCE_PX * level_m, radius_m, voters),
+        candidates=_candidates(
+            matches,
+            inliers,
+            lon_lat_h,
+            tolerance_m=FIRST_TOLERANCE_PX * level_m,
+            radius_m=radius_m,
+            voters=voters,
+        ),
     )
 
 
 def _candidates(
-    matches: PointMatches, inliers: BoolArray, tolerance_m: float, radius_m: float, voters: Voters
+    matches: PointMatches,
+    inliers: BoolArray,
+    lon_lat_h: Array,
+    *,
+    tolerance_m: float,
+    radius_m: float,
+    voters: Voters,
 ) -> tuple[Candidate, ...]:
     """The largest groups of matches that agree; none where most matches, and many, agree."""
-    displacement_m = np.where((matches.reason == "")[:, None], matches.displacement_m, np.nan)
-    found = int(np.isfinite(displacement_m).all(axis=1).sum())
-    if inliers.sum() > max(found / 2.0, MOST_CANDIDATE_POINTS):
+    found = matches.reason == ""
+    if inliers.sum() > max(found.sum() / 2.0, MOST_CANDIDATE_POINTS):
         return ()
+    displacement_m = np.full((len(found), 2), np.nan)
+    displacement_m[found] = _in_one_frame(lon_lat_h[found], matches.displacement_m[found])
     candidates: list[Candidate] = []
     while len(candidates) < MOST_CANDIDATES:
         group = a_contrario_consensus(displacement_m, tolerance_m, radius_m, voters)
@@ -224,6 +240,19 @@ def _candidates(
         candidates.append(Candidate(count, east_m, north_m, group.false_alarms))
         displacement_m[group.inliers] = np.nan
     return tuple(candidates)
+
+
+def _in_one_frame(lon_lat_h: Array, displacement_m: Array) -> Array:
+    """Displacements (n, 2), each east and north of its place (n, 3), in the frame of their middle.
+
+    Meridians converge: a model that is off by a constant angle moves places of different longitudes by
+    different metres east and north.
+    """
+    if not len(lon_lat_h):
+        return displacement_m
+    to_middle = ecef_from_east_north_up(continuous(lon_lat_h).mean(axis=0)).T[:2]
+    moved = zip(lon_lat_h, displacement_m, strict=True)
+    return np.array([to_middle @ ecef_from_east_north_up(place)[:, :2] @ d for place, d in moved])
 
 
 def first_consensus(

@@ -9,12 +9,13 @@ from services.errors import NoConsensus
 from services.geodesy import ecef_from_east_north_up, ecef_from_lon_lat_h
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
-from services.matching.consensus import Consensus
+from services.matching.consensus import Consensus, Voters
+from services.matching.control_points import PointMatches
 from services.registration.context import SearchStage
-from services.registration.search import check_consensus, first_consensus
+from services.registration.search import check_consensus, first_consensus, summarise
 from services.sensors.base import SensorModel
 from services.simulation.orbit import pushbroom_over
-from services.types import Acquisition, Array
+from services.types import Acquisition, Array, ViewMeasures
 
 LINES, GSD_M = 5000, 20.0
 SHIFT_PX = np.array([180.0, -165.0])
@@ -67,6 +68,44 @@ def test_a_shift_of_the_image_is_one_consensus_wherever_the_scene_lies(
     spread_m = np.hypot(*(ground_m - ground_m.mean(axis=0)).T).max()
     if lat_deg == 75.0 or incidence_deg == 30.0:
         assert spread_m > of_three_level_pixels  # East and north would lose points.
+
+
+def test_a_candidate_of_a_refused_search_is_one_group_over_converging_meridians() -> None:
+    scene = wide_scene(75.0, 5.0)
+    predicted = spread_positions()
+    ground = scene.model.locate(predicted, np.full(len(predicted), 100.0))
+    displacement_m = east_north_m(scene.model, predicted, predicted + SHIFT_PX)
+    spread_m = np.hypot(*(displacement_m - displacement_m.mean(axis=0)).T).max()
+    assert spread_m > of_three_level_pixels, "east and north of each place would split them"
+    n = len(predicted)
+    found = np.arange(n) % 4 > 0
+    nothing = np.zeros(0, dtype=np.int64)
+    matches = PointMatches(
+        line_sample=np.where(found[:, None], predicted + SHIFT_PX, np.nan),
+        displacement_m=np.where(found[:, None], displacement_m, np.nan),
+        sigma_px=np.full(n, 0.1),
+        score=np.ones(n),
+        views=np.ones(n, dtype=np.int64),
+        reason=np.where(found, "", "low_score"),
+        by_gradient=np.zeros(n, dtype=bool),
+        common_covariance_m2=np.zeros((2, 2)),
+        view_measures=ViewMeasures(nothing, nothing, np.zeros(0), np.zeros(0, bool), np.zeros(0, str)),
+    )
+    refused = summarise(
+        "coarse",
+        matches,
+        np.zeros(n, dtype=bool),
+        level_m=LEVEL_M,
+        radius_m=5_000.0,
+        needed_m=5_000.0,
+        voters=Voters(matches.line_sample, 100.0),
+        lon_lat_h=ground,
+    )
+    (one,) = refused.candidates
+    assert one.points == found.sum()
+    middle = np.array([[LINES / 2.0, LINES / 2.0]])
+    expected = east_north_m(scene.model, middle, middle + SHIFT_PX)[0]
+    assert np.hypot(one.east_m - expected[0], one.north_m - expected[1]) < of_three_level_pixels
 
 
 def stage(**changes: object) -> SearchStage:
