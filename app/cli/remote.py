@@ -47,7 +47,13 @@ class Service:
         self._http.close()
 
     def register(
-        self, files: SceneFiles, folder: Path, progress: Progress, copy_image: bool = False
+        self,
+        files: SceneFiles,
+        folder: Path,
+        progress: Progress,
+        *,
+        copy_image: bool = False,
+        max_ce90_on_earth_m: float | None = None,
     ) -> dict[str, Any]:
         """Register a scene on the service and download the outputs.
 
@@ -56,6 +62,7 @@ class Service:
             folder: for the outputs.
             progress: receives the fraction done and a message.
             copy_image: also copy a GeoTIFF, with the refined model in its tags.
+            max_ce90_on_earth_m: see `QualificationOptions`.
 
         Returns:
             The report as a document.
@@ -77,6 +84,8 @@ class Service:
             **{name: names[path] for name, path in paths.items() if path is not None},
             **{name: value for name, value in values.items() if value is not None},
         }
+        if max_ce90_on_earth_m is not None:
+            inputs["options"] = {"qualification": {"max_ce90_on_earth_m": max_ce90_on_earth_m}}
         execution = "processes/register-scene/execution"
         job = self._request("POST", execution, json={"inputs": inputs}).json()
         job = self._wait(job, progress)

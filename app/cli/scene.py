@@ -109,11 +109,6 @@ def register(
     files_of_one = {"--model": model, "--mask": mask, "--check-points": check_points}
     _refuse_contradictions(block, reference, dem, server)
     _refuse_shared_files(images, [name for name, file in files_of_one.items() if file is not None])
-    if server is not None and max_ce90_on_earth_m is not None:
-        raise InputError(
-            "--max-ce90-on-earth-m: not sent to a service; leave it out with --server, and give the "
-            "process register-scene the input options.qualification.max_ce90_on_earth_m"
-        )
     if server is not None and jobs > 1:
         raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)

@@ -37,10 +37,11 @@ from app.usecases.registration.register import (
 from app.usecases.registration.result_folder import older_result, replacing
 from app.usecases.uploads import IMAGE_SUFFIXES
 from app.worker.warm_process import WarmProcess, WarmServer
+from services.quality.accuracy_statement import accuracy_document
 from services.quality.qualification import QualificationOptions
 from services.registration.options import RegistrationOptions
 from services.reports.document import report_document
-from services.reports.failure import NOT_REGISTERED
+from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
 from services.types import Progress, no_progress
 
 Register = Callable[["SceneRequest", Path, Progress], dict[str, Any]]
@@ -205,6 +206,7 @@ def _failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
     return {
         "scene": request.files.image,
         "verdict": NOT_REGISTERED,
+        **accuracy_document(NO_ACCURACY),
         "reason": str(error),
         "exit_status": exit_status(error),
     }
@@ -326,7 +328,11 @@ def _on_store(database: Database, settings: Settings) -> Register:
 def _on_service(service: Service) -> Register:
     """A function that lets a service register scenes."""
     return lambda request, folder, progress: service.register(
-        request.files, folder, progress, request.copy_image
+        request.files,
+        folder,
+        progress,
+        copy_image=request.copy_image,
+        max_ce90_on_earth_m=request.max_ce90_on_earth_m,
     )
 
 
@@ -398,6 +404,7 @@ def _read_outcome(file: Path, request: SceneRequest, code: int) -> Outcome:
     return {
         "scene": request.files.image,
         "verdict": NOT_REGISTERED,
+        **accuracy_document(NO_ACCURACY),
         "reason": reason,
         "exit_status": FAILURE,
     }

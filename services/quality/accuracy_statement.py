@@ -98,6 +98,15 @@ def points_accuracy(covariance_m2: Array, frame: Frame, of: str) -> AccuracyStat
     )
 
 
+def no_accuracy(reason: str) -> AccuracyStatement:
+    """The statement where there is no accuracy, such as for a scene that could not be registered."""
+    words = f"none: {reason}"
+    return AccuracyStatement(
+        StatedAccuracy(RELATIVE, np.nan, np.nan, words),
+        StatedAccuracy(ON_THE_EARTH, np.nan, np.nan, words),
+    )
+
+
 def _point_figures(covariance_m2: Array, of: str) -> tuple[tuple[float, float], str]:
     """CE90 and LE90 of a covariance (3, 3), and their words."""
     ce90_m = float(normal_ce90(covariance_m2[None, :2, :2])[0])

@@ -5,6 +5,7 @@ from typing import Literal
 
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import CoverageError, NoConsensus, NotEnoughPoints
+from services.quality.accuracy_statement import AccuracyStatement, StatedAccuracy, no_accuracy
 from services.registration.context import SearchStage
 from services.registration.search import larger_sigma_m
 from services.reports.numbers import number
@@ -15,6 +16,8 @@ FAILURE_FORMAT = "amers-registration-failure/1"
 NOT_REGISTERED: Literal["not registered"] = "not registered"
 """Verdict on a scene whose registration ended with an error."""
 
+NO_ACCURACY = no_accuracy("the scene is not registered")
+"""The accuracy of such a scene, as every place states it."""
 EXPLANATION = "There is no refined model. The delivered model is as it was."
 
 
@@ -51,6 +54,7 @@ class FailureReport:
         run: how and when the registration was run.
         verdict: always "not registered".
         verdict_explanation: what the verdict means, for people.
+        relative_to_control_points, on_the_earth: none.
         error: kind of the error.
         reason: the error, for people.
         scene: what was to be registered; only its name when its files could not be used.
@@ -64,6 +68,8 @@ class FailureReport:
     run: RunRecord
     verdict: Literal["not registered"]
     verdict_explanation: str
+    relative_to_control_points: StatedAccuracy
+    on_the_earth: StatedAccuracy
     error: str
     reason: str
     scene: SceneRecord | UnreadScene
@@ -71,6 +77,11 @@ class FailureReport:
     search_stages: tuple[SearchStage, ...]
     next_steps: tuple[NextStep, ...]
     ground: Array = field(metadata=NOT_IN_JSON)
+
+    @property
+    def accuracy_lines(self) -> tuple[str, ...]:
+        """The two accuracies, as every place states them."""
+        return AccuracyStatement(self.relative_to_control_points, self.on_the_earth).lines
 
 
 def next_steps(

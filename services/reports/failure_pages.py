@@ -41,6 +41,8 @@ def format_failure_tables(report: FailureReport) -> str:
     text = io.StringIO()
     console = Console(file=text, width=_WIDTH, no_color=True, force_terminal=False)
     console.print(f"{escape(report.scene.name)}: {report.verdict}")
+    for line in report.accuracy_lines:
+        console.print(escape(line))
     console.print(f"{escape(report.reason)}\n")
     if report.search_stages:
         console.print(_stage_table(report))

@@ -18,6 +18,7 @@ from services.reports.document import format_report
 from services.reports.failure import (
     EXPLANATION,
     FAILURE_FORMAT,
+    NO_ACCURACY,
     NOT_REGISTERED,
     FailureReport,
     UnreadScene,
@@ -80,6 +81,8 @@ def _failure_report(attempt: Attempt, error: AmersError) -> FailureReport:
         ),
         verdict=NOT_REGISTERED,
         verdict_explanation=EXPLANATION,
+        relative_to_control_points=NO_ACCURACY.relative_to_control_points,
+        on_the_earth=NO_ACCURACY.on_the_earth,
         error=type(error).__name__,
         # The folder of the image may be that of a job on a service.
         reason=str(error).replace(f"{attempt.image.parent}/", ""),

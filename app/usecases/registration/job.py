@@ -31,7 +31,7 @@ from services.formats.images.bands import parse_bands
 from services.imagery.scene import scene_gsd_m
 from services.quality.accuracy_statement import accuracy_document
 from services.registration.options import RegistrationOptions
-from services.reports.failure import NOT_REGISTERED
+from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
 from services.reports.report import Method as ReportedMethod
 
 Method = Literal["auto", "points", "reference"]
@@ -125,7 +125,9 @@ def _with_report(work: Work, folder: Path, error: AmersError) -> WorkFailed | Am
         keys = store_results(work, {name: folder / name for name in FAILURE_OUTPUTS})
     except TooLarge:
         return error
-    return WorkFailed(error, {"verdict": NOT_REGISTERED, "files": keys})
+    return WorkFailed(
+        error, {"verdict": NOT_REGISTERED, **accuracy_document(NO_ACCURACY), "files": keys}
+    )
 
 
 def _control_sources(work: Work, method: Method) -> ControlSources:

@@ -14,6 +14,7 @@ from services.reports.document import failure_schema, report_document
 from services.reports.failure import (
     EXPLANATION,
     FAILURE_FORMAT,
+    NO_ACCURACY,
     NOT_REGISTERED,
     FailureReport,
     UnreadScene,
@@ -49,6 +50,8 @@ def failure(report, stages=(STAGE,), error=None, scene=None) -> FailureReport:
         run=RunRecord("1", datetime.now(UTC), None, "control points", (), RegistrationOptions()),
         verdict=NOT_REGISTERED,
         verdict_explanation=EXPLANATION,
+        relative_to_control_points=NO_ACCURACY.relative_to_control_points,
+        on_the_earth=NO_ACCURACY.on_the_earth,
         error=type(error).__name__,
         reason=str(error),
         scene=scene,
@@ -84,6 +87,8 @@ def test_page_and_text_state_search_candidates_reasons_and_commands(report):
         assert words in shown, words
         assert words.removesuffix(" m") in text, words
     assert "no more than chance gives" in shown
+    assert "Relative to the control points none: the scene is not registered On the Earth none:" in shown
+    assert "On the Earth: none: the scene is not registered" in text
     for banned in ("nan", "inf "):
         assert banned not in text.lower().split()
 
