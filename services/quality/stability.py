@@ -204,7 +204,7 @@ def repeat_without(scene: AdjustedScene, groups: Sequence[IntArray]) -> Repeated
         moved_px=np.array(moved).reshape(-1, len(PLACES), 2),
         residual_px=np.concatenate(residuals),
         means=GroupMeans(
-            rms_px=_rms([np.linalg.norm(mean) for mean in means]),
+            rms_px=_rms(np.array([np.hypot(*mean) for mean in means])),
             over_independent=_over(means, [factor * scatter for factor in independent]),
             over_stated=_over(means, [covariance + scatter / n for covariance, n in stated]),
         ),
@@ -231,11 +231,11 @@ def _over(means: Sequence[Array], predicted: Sequence[Array]) -> float:
     squared = [
         mean @ np.linalg.solve(one + least, mean) for mean, one in zip(means, predicted, strict=True)
     ]
-    return _rms(np.sqrt(squared)) / np.sqrt(2.0)
+    return _rms(np.sqrt(np.array(squared) / 2.0))
 
 
-def _rms(values: Sequence[float]) -> float:
-    """Root mean square; NaN of nothing."""
+def _rms(values: Array) -> float:
+    """Root mean square of (n,) values; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 

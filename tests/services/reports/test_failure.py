@@ -87,7 +87,8 @@ def test_page_and_text_state_search_candidates_reasons_and_commands(report):
         assert words in shown, words
         assert words.removesuffix(" m") in text, words
     assert "no more than chance gives" in shown
-    assert "Relative to the control points none: the scene is not registered On the Earth none:" in shown
+    stated = "Relative to the control points none: the scene is not registered On the Earth none:"
+    assert stated in " ".join(shown.split())
     assert "On the Earth: none: the scene is not registered" in text
     for banned in ("nan", "inf "):
         assert banned not in text.lower().split()
