@@ -1,5 +1,6 @@
 """What the stages of a registration share: the context of the work, and the current prediction."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -57,6 +58,8 @@ class SearchStage:
         not_found: numbers of the points that were not found, by reason, commonest first.
         candidates: the largest groups of matches that agree, the largest first; none where most matches
             agree.
+        middle_m: side on the ground of the middle of the scene, where the scene was too large to be
+            searched whole; NaN when it was.
     """
 
     name: str
@@ -70,6 +73,7 @@ class SearchStage:
     displacement_rms_m: float
     not_found: tuple[NotFound, ...] = ()
     candidates: tuple[Candidate, ...] = ()
+    middle_m: float = math.nan
 
     @property
     def limited(self) -> bool:

@@ -88,6 +88,7 @@ class _Plan:
         reduction: factor by which the chips are reduced.
         error_m: largest error that is expected.
         size: side of the map, pixels; odd.
+        whole: side of the map that would hold all of the scene, pixels.
         cut_px: (2,) lines and samples at each border of the scene that lie beyond the map.
         rows: the points to try.
     """
@@ -96,6 +97,7 @@ class _Plan:
     reduction: int
     error_m: float
     size: int
+    whole: int
     cut_px: Array
     rows: IntArray
 
@@ -108,6 +110,11 @@ class _Plan:
     def radius_px(self) -> int:
         """Search radius, pixels of the map."""
         return int(np.ceil(self.error_m / self.level_m)) + 2
+
+    @property
+    def middle_m(self) -> float:
+        """Side of the middle of the scene that the map holds, metres; NaN when it holds all of it."""
+        return self.size * self.level_m if self.size < self.whole else math.nan
 
 
 def search_far(
@@ -187,7 +194,7 @@ def _plan(
         side = min(2.0 * error_m / level_m + CHIP_SIZE / reduction, size)
         if size == whole and len(rows) * side**2 <= MAX_CORRELATED_PX:
             break
-    return _Plan(gsd_m, reduction, error_m, size, cut_px, rows)
+    return _Plan(gsd_m, reduction, error_m, size, whole, cut_px, rows)
 
 
 def _half_extent_m(scene: Scene) -> float:
@@ -312,4 +319,5 @@ def _summary(scene: Scene, plan: _Plan, consensus: Consensus, reason: np.ndarray
         displacement_rms_m=math.hypot(east_m, north_m),
         not_found=tuple(NotFound(*of_reason) for of_reason in counted),
         candidates=group,
+        middle_m=plan.middle_m,
     )

@@ -319,8 +319,11 @@ def check_consensus(
     who, noun = f"the {stage.name} search does not agree on", "points"
     if stage.name == "reference":
         who, noun = "the reference does not agree with the scene on", "places"
+    where = ""
+    if np.isfinite(stage.middle_m):
+        where = f" in the middle {stage.middle_m / 1000.0:.1f} km of the scene only, which is larger"
     raise NoConsensus(
-        f"{who} one correction: {stage.tried} {noun} tried within {stage.search_radius_m:.0f} m, "
+        f"{who} one correction: {stage.tried} {noun} tried within {stage.search_radius_m:.0f} m{where}, "
         f"{stage.matched} found, {agreement}; {format_reasons(reason)}; "
         + next_step(stage, scene.sigma_m)
     )
@@ -357,6 +360,11 @@ def next_step(stage: SearchStage, sigma_m: float) -> str:
         return (
             f"{stage.at_border} best peaks lie at the border of the search: the model is probably "
             f"further off, try {option}"
+        )
+    if np.isfinite(stage.middle_m):
+        return (
+            "give points with coarser chips, so that all of the scene is searched, or points that show "
+            f"its middle; when the model may be further off, try {option}"
         )
     return (
         "check that the points show the ground of the scene; when the model may be further off, "

@@ -1,5 +1,6 @@
 """The report of a registration that failed: what was tried and where, and what to try next."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -116,6 +117,13 @@ def next_steps(
         )
         return NextStep(text, f"{command} {smaller}"), check
     larger = _state_larger(scene, command, last)
+    if math.isfinite(last.middle_m):
+        text = (
+            f"Only the middle {number(last.middle_m / 1000.0, 1)} km of the scene, which is larger, was "
+            "searched. Give points with coarser chips, with which all of it is searched, or points that "
+            "show its middle."
+        )
+        return NextStep(text, command), larger, check
     if 2 * last.at_border > last.tried:
         return larger, check
     if 2 * last.matched > last.tried or any(one.points > 2 for one in last.candidates):

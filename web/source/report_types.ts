@@ -301,6 +301,7 @@ export interface SearchStage {
   displacement_rms_m: number | null;
   not_found: NotFound[];
   candidates: Candidate[];
+  middle_m: number | null;
 }
 
 export interface Stability {

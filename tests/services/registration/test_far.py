@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from services.errors import NoConsensus
+from services.registration.context import SearchStage
 from services.registration.on_points import Registration, register_scene
 from tests.services.registration.wide_ground import CENTRE, true_model, wide_points, wide_scene
 
@@ -46,6 +47,19 @@ def test_a_small_crop_kilometres_off_is_found() -> None:
     assert registration.search_stages[0].name == "far"
     assert registration.search_stages[0].search_radius_m >= 5000.0
     assert largest_error_px(registration, CROP) < 4.0 * FINAL_PX
+
+
+def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_searched() -> None:
+    # 44 km, of which chips of 2 m, reduced four times, let the middle 20 km be searched.
+    points, chips = wide_points(4_000.0, 700.0, (2.0,))
+    scene = wide_scene(44_000.0, 16.0, 2_750, (0.0, 0.0), seed=1)
+    stages: list[SearchStage] = []
+    with pytest.raises(NoConsensus, match=r"in the middle 20\.0 km of the scene only") as refused:
+        register_scene(scene, points, chips, stages=stages)
+    assert "give points with coarser chips, so that all of the scene is searched" in str(
+        refused.value
+    )
+    assert stages[0].middle_m == pytest.approx(20_008.0)
 
 
 def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched() -> None:

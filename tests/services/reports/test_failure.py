@@ -116,6 +116,16 @@ def test_a_limited_search_proposes_the_accuracy_that_it_reaches(report):
     assert commands(report, (limited,), NoConsensus(""))[0] == f"{COMMAND} --sigma-m 50"
 
 
+def test_a_search_of_the_middle_of_a_scene_says_so(report):
+    middle = replace(STAGE, middle_m=20_008.0)
+    steps = next_steps(NoConsensus(""), report.scene, (middle,), COMMAND)
+    assert "Only the middle 20.0 km of the scene" in steps[0].text
+    assert steps[0].command == COMMAND
+    assert "middle" not in " ".join(
+        step.text for step in next_steps(NoConsensus(""), report.scene, (STAGE,), COMMAND)
+    )
+
+
 def test_without_a_visible_point_the_ground_is_looked_up(report):
     lookup, reference, larger = commands(report, (), CoverageError(""))
     west, south = report.scene.footprint_lon_lat.min(axis=0)
