@@ -9,9 +9,12 @@ import numpy as np
 
 from services.conventions import CHIP_CENTRE, CHIP_SIZE
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
+from services.imagery.gaps import filled
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import low_pass, sample_image
 from services.matching.consensus import Consensus
+from services.matching.control_points import chip_pixels
+from services.matching.multi_image import nearly_whole
 from services.matching.radiometry import gradient_image
 from services.matching.view_selection import select_views
 from services.registration.context import (
@@ -232,7 +235,7 @@ def _render(scene: Scene, model: SensorModel, plan: _Plan, points: ControlPoints
 def _templates(
     context: RegistrationContext, points: ControlPoints, chips: ChipSource, plan: _Plan
 ) -> list[FloatImage]:
-    """The mean of the standardised views of each point, reduced; empty where no view is complete."""
+    """The mean of the standardised views of each point, reduced; empty where no view is nearly whole."""
     options, scene = context.options.matching, context.scene
     selected = select_views(
         points, plan.gsd_m, scene.acquisition, options.max_views, options.view_distance
@@ -242,10 +245,12 @@ def _templates(
     templates = []
     for row in range(len(points)):
         views = selected.row[selected.start[row] : selected.start[row + 1]] - points.views.start[row]
-        stored = point_chips(points, chips, row)[views].astype(np.float32)
-        complete = stored[(stored > 0.0).all(axis=(1, 2))]
-        small = np.stack([low_pass(chip, blur) for chip in complete]) if len(complete) else complete
-        small = small[:, first :: plan.reduction, first :: plan.reduction]
+        stored = [chip_pixels(chip) for chip in point_chips(points, chips, row)[views]]
+        smooth = [low_pass(filled(chip), blur) for chip in stored if nearly_whole(chip)]
+        if not smooth:
+            templates.append(np.zeros((0, 0), dtype=np.float32))
+            continue
+        small = np.stack(smooth)[:, first :: plan.reduction, first :: plan.reduction]
         spread = small.std(axis=(1, 2), keepdims=True)
         small = ((small - small.mean(axis=(1, 2), keepdims=True)) / spread)[spread[:, 0, 0] > 0.0]
         templates.append(small.mean(axis=0) if len(small) else np.zeros((0, 0), dtype=np.float32))
@@ -261,8 +266,8 @@ def _find(
 ) -> tuple[Array, np.ndarray]:
     """Positions (n, 2) in the scene where chips correlate best, and why there is none (n,)."""
     missing = ~np.isfinite(scene_map.pixels)
-    filled = np.where(missing, np.float32(np.nanmean(scene_map.pixels)), scene_map.pixels)
-    count, size = cv2.integral(missing.astype(np.uint8)), len(filled)
+    pixels = np.where(missing, np.float32(np.nanmean(scene_map.pixels)), scene_map.pixels)
+    count, size = cv2.integral(missing.astype(np.uint8)), len(pixels)
     centres = scene_map.row_col(predicted)
     found = np.full((len(templates), 2), np.nan)
     reason = np.full(len(templates), "nodata", dtype="<U16")
@@ -286,7 +291,7 @@ def _find(
         usable = gaps <= _MAX_MISSING * side**2
         if not usable.any():
             continue
-        patch = filled[top : bottom + side - 1, left : right + side - 1]
+        patch = pixels[top : bottom + side - 1, left : right + side - 1]
         scores = np.where(usable, cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED), -1.0)
         best = np.array(np.unravel_index(int(scores.argmax()), scores.shape)) + (top, left)
         score = float(scores.max())
