@@ -8,12 +8,18 @@ import pytest
 
 from services.adjustment.intersection import intersect
 from services.formats.images.raster import open_raster, write_raster
+from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.formats.sensor_models.rpc_text import parse_rpc_text
-from services.imagery.source import Window
+from services.imagery.scene import scene_gsd_m
+from services.imagery.source import ArrayImage, Window
+from services.production.from_images import ProductionOptions, produce_points
+from services.registration.on_points import register_scene
+from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, fold_into_rpc, no_correction
 from services.sensors.rpc import RpcModel
 from tests.journeys.ties import independent_tracks
+from tests.services.simulated import MemoryChips
 
 pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
@@ -26,6 +32,9 @@ delivered_residual_px = (0.4, 0.7)
 delivered_shift_px = 2.0
 """Largest expected difference between the views as delivered."""
 three_tenths_of_a_pixel = 0.3
+five_kilometres = 5000.0
+far_sigma_m = 1700.0
+half_metre_chips = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +57,7 @@ def tracks(pixels):
     return independent_tracks([pixels[name] for name in names])
 
 
-def median_residual_px(models: list[RpcModel], tracks) -> float:
+def median_residual_px(models: list[SensorModel], tracks) -> float:
     intersections = intersect(models, tracks, int(tracks.point[-1]) + 1)
     return float(np.median(np.linalg.norm(intersections.residual_px, axis=1)))
 
@@ -113,6 +122,25 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
     assert (np.abs(found_px + injected_shift_px) < delivered_shift_px + drift_there_px).all()
     for name in ("report.json", "report.html", "control_points.geojson", f"{scene.stem}_RPC.TXT"):
         assert (out / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("direction_deg", [30.0, 115.0])
+def test_a_third_view_five_kilometres_off_is_found(triplet, pixels, tracks, direction_deg):
+    images = {
+        name: replace(read_scene(path), image=ArrayImage(pixels[name])) for name, path in triplet.items()
+    }
+    made = produce_points([images["img_01"], images["img_02"]], half_metre_chips)
+    chips = MemoryChips(np.concatenate([made.chips(row) for row in range(len(made.points))]))
+    third = images["img_03"]
+    towards = np.array([np.cos(np.radians(direction_deg)), np.sin(np.radians(direction_deg))])
+    shift_px = five_kilometres / scene_gsd_m(third) * towards
+    far_off = replace(third.model, image_offset=third.model.image_offset + shift_px)
+    registered = register_scene(replace(third, model=far_off, sigma_m=far_sigma_m), made.points, chips)
+    left_px = median_residual_px([*made.adjustment.models, registered.model], tracks)
+    print(f"img_03 from {five_kilometres:g} m: {left_px:.3f} px, {registered.qualification.verdict}")
+    assert registered.search_stages[0].search_radius_m >= five_kilometres
+    assert left_px < three_tenths_of_a_pixel
+    assert registered.qualification.verdict in ("good", "usable")
 
 
 def test_a_refined_model_comes_back_in_the_tags_of_the_image(triplet, pixels, tmp_path):
