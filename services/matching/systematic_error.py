@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 from services.matching.shadows import shadow_vector
 from services.types import Acquisition, Array, IntArray, Views
@@ -26,7 +27,10 @@ UNKNOWN_TANGENT = 0.35
 MIN_VIEWS_OF_IMAGE = 5
 """Fewest views cut from an image whose median offset counts."""
 
-_PRIOR_CONTRASTS = 0.5
+_MEDIAN_VARIANCE = math.pi / 2.0
+"""Variance of the median of many normal values, in units of that of their mean."""
+
+_PRIOR_FREEDOM = 0.5
 """Weight of the expected offset of an image, in differences of images that show it."""
 
 
@@ -67,7 +71,7 @@ def common_covariance_px2(
     ):
         known = np.isfinite(difference).all(axis=1)
         if known.any():
-            mean = difference[known].mean(axis=0)
+            mean = np.average(difference[known], axis=0, weights=weight[used][known])
             covariance += sigma_px**2 * np.outer(mean, mean)
         else:
             covariance += (unknown_sigma_px * UNKNOWN_TANGENT) ** 2 * np.eye(2)
@@ -80,7 +84,9 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
     Each image has an offset of its own. The mean of all measures contains them by the shares `s` of the
     images in it, the measures of the points that an image shows by the shares `S` in these. So the
     offset of an image from the measures of its points is the combination `I - S` of the offsets, whose
-    squares estimate their variance; the mean of all measures has that variance times the sum of `s^2`.
+    squares, less what the scatter of the views brings by chance, estimate their variance; the mean of
+    all measures has that variance times the sum of `s^2`. An image that looks unlike the scene is
+    further off and has a small share: images count in the estimate by their shares.
     Few images show little of it: a prior adds the offset expected without any, and the factor of
     Student's distribution makes the 90 % region hold what it says.
     """
@@ -89,19 +95,24 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
     used_images, image = np.unique(views.image[row], return_inverse=True)
     share = np.zeros((int(point.max()) + 1, len(used_images)))
     np.add.at(share, (point, image), weight)
-    contrasts, square_px2 = 0.0, 0.0
+    mean_share = share[share.any(axis=1)].mean(axis=0)
+    contrast, square_px2 = np.zeros((2, len(used_images)))
     for i in range(len(used_images)):
         seen = image == i
         if seen.sum() >= MIN_VIEWS_OF_IMAGE:
-            contrasts += float(
-                ((np.eye(len(used_images))[i] - share[point[seen]].mean(axis=0)) ** 2).sum()
-            )
-            square_px2 += float((np.median(offset[seen], axis=0) ** 2).mean())
-    mean_share = share[share.any(axis=1)].mean(axis=0)
-    prior_px2 = 3.0 * COMMON_SIGMA_PX**2 / _student_factor(2.0 * _PRIOR_CONTRASTS)
-    freedom = _PRIOR_CONTRASTS + contrasts
-    variance_px2 = (_PRIOR_CONTRASTS * prior_px2 + square_px2) / freedom
-    return float(_student_factor(2.0 * freedom) * variance_px2 * (mean_share**2).sum())
+            contrast[i] = ((np.eye(len(used_images))[i] - share[point[seen]].mean(axis=0)) ** 2).sum()
+            median = np.median(offset[seen], axis=0)
+            scatter_px = median_abs_deviation(offset[seen], axis=0, scale="normal")
+            by_chance_px2 = _MEDIAN_VARIANCE * scatter_px**2 / seen.sum()
+            square_px2[i] = (median**2 - by_chance_px2).mean()
+    seen_px2, freedom = 0.0, 0.0
+    if contrast.any():
+        seen_px2 = max(0.0, float(mean_share @ square_px2 / (mean_share @ contrast)))
+        freedom = float((mean_share @ contrast) ** 2 / (mean_share**2 @ contrast))
+    prior_px2 = 3.0 * COMMON_SIGMA_PX**2 / _student_factor(2.0 * _PRIOR_FREEDOM)
+    variance_px2 = (_PRIOR_FREEDOM * prior_px2 + freedom * seen_px2) / (_PRIOR_FREEDOM + freedom)
+    factor = _student_factor(2.0 * (_PRIOR_FREEDOM + freedom))
+    return float(factor * variance_px2 * (mean_share**2).sum())
 
 
 def _student_factor(freedom: float) -> float:
