@@ -189,7 +189,6 @@ def adjust_scene(
         return np.asarray(fit.magnitude(parameters) / scale)
 
     active = deactivate(magnitude, agreeing, options.tolerance, min_points)
-    kept_variance = _kept_variance(options.tolerance)
     size = float(np.sqrt(shape[0] * shape[1]))
     position_px = no_correction(shape).centre + fit.t * no_correction(shape).half_size
     own_share = (1.0 - of_points / declared.variance).mean(axis=1)
@@ -199,12 +198,11 @@ def adjust_scene(
         if like
         else likeliest_shared_errors(
             declared,
-            active,
+            agreeing,
             free,
             slope_px,
             position=position_px / size,
             overlapping=overlapping,
-            kept_variance=kept_variance,
         )
     )
     parameters, _ = fit.scaled(shared.factor).solution(active, free, slope_px)
@@ -225,7 +223,7 @@ def adjust_scene(
         shared=shared,
         residual_px=np.where(usable[:, None], misfit_px, np.nan),
         active=active,
-        sigma0=_sigma0(declared, active, free, slope_px, kept_variance),
+        sigma0=_sigma0(declared, active, free, slope_px, _kept_variance(options.tolerance)),
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
     )
 

@@ -10,23 +10,34 @@ A residual shows little of what all its neighbours share, and few residuals show
 Therefore no single answer is believed: covariances are averaged over how likely each is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
+from scipy.special import ndtr
 
 from services.adjustment.affine_fit import AffineFit, inverse_normal
+from services.adjustment.robust import MAD_TO_STD
 from services.types import Array, BoolArray
 
 _LENGTHS = np.array([0.05, 0.1, 0.2])
 """Correlation lengths that are considered, sides of the image."""
 _SHARES = np.array([0.4, 0.65, 0.9])
 """Shares of the variance that are considered to be correlated."""
+_MIDDLE = 5
+"""Of the cases: the middle share over the middle length."""
 _INDEPENDENT = 0.5
 """A priori probability that the errors are independent; the other cases share the rest."""
-_STATED_IS_TRUE = 0.5
+_STATED_IS_TRUE = 0.3
 """A priori probability that the stated sigmas are true, rather than off by a factor of up to ten."""
+_CLIP = 2.2
+"""Standard deviations from what its neighbours predict, beyond which a measure is drawn towards them."""
+_CLIPPED_VARIANCE = float(
+    1.0
+    - 2.0 * (_CLIP * np.exp(-0.5 * _CLIP**2) / np.sqrt(2.0 * np.pi) + (1.0 - _CLIP**2) * ndtr(-_CLIP))
+)
+"""Variance of a normal law of unit variance when values beyond the clip are set to it."""
 _ENOUGH = 250
 """Measures that tell share and length; more cost more and tell no more."""
 _UNKNOWN_OFFSET_PX = 1.0
@@ -130,7 +141,6 @@ def likeliest_shared_errors(
     *,
     position: Array,
     overlapping: Array,
-    kept_variance: float,
 ) -> SharedErrors:
     """What the residuals of a scene tell of its errors, averaged over what may be.
 
@@ -139,14 +149,17 @@ def likeliest_shared_errors(
     scale; the mean of its square is then chi^2 / (nu - 2), more than chi^2 / nu where there are few
     degrees of freedom.
 
+    Measures are judged by their neighbours first. To leave out what is far from the fit of the whole
+    image removes patches where a common error is large; to keep what is far from its neighbours makes
+    smooth errors look rough. Both hide what is shared.
+
     Args:
         fit: of the measures.
-        active: (n,) measures.
+        active: (n,) measures, also those that were deactivated later.
         free: (2, 3) parameters of the correction.
         slope_px: a priori standard deviation of drift and skew.
         position: (n, 2) sides of the image.
         overlapping: (n, n) correlation by overlapping chips.
-        kept_variance: variance that a normal law keeps when measures beyond tolerance are left out.
     """
     rows = np.flatnonzero(active)
     # Evenly over the image, whatever the order of the measures.
@@ -165,9 +178,9 @@ def likeliest_shared_errors(
     cases = [(0.0, 0)] + [(share, k) for k in range(len(_LENGTHS)) for share in _SHARES]
     prior = np.full(len(cases), (1.0 - _INDEPENDENT) / (len(cases) - 1))
     prior[0] = _INDEPENDENT
-    told = [
-        system.told_by((1.0 - share) * base + share * smooth[k], kept_variance) for share, k in cases
-    ]
+    correlations = [(1.0 - share) * base + share * smooth[k] for share, k in cases]
+    clipped = system.clipped(correlations[_MIDDLE])
+    told = [clipped.told_by(correlation) for correlation in correlations]
     evidence = np.array([one.log_evidence for one in told]) + np.log(prior)
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -208,7 +221,29 @@ class _WhitenedSystem:
     expected: Array
     estimated: BoolArray
 
-    def told_by(self, correlation: Array, kept_variance: float) -> _Told:
+    def clipped(self, correlation: Array) -> "_WhitenedSystem":
+        """The system where measures far from what all others predict (n, n correlation) are less far."""
+        # The residual of a measure that is left out is (P y)_i / P_ii, its variance 1 / P_ii.
+        inverse = np.linalg.inv(correlation + 1e-6 * np.eye(len(correlation)))
+        weighted = inverse @ self.design
+        information = self.design.transpose(0, 2, 1) @ weighted
+        covariance = inverse_normal(information, self.expected, self.estimated)
+        projection = inverse - weighted @ covariance @ weighted.transpose(0, 2, 1)
+        precision = np.maximum(np.diagonal(projection, 0, 1, 2), 1e-6)[:, :, None]
+        count = self.measured.size
+        freedom = max(count - float(np.trace(covariance @ information, axis1=1, axis2=2).sum()), 1.0)
+        clip = _CLIP * MAD_TO_STD * float(np.sqrt(count / freedom))
+        measured = self.measured
+        # Twice: a wrong measure spoils what is predicted of its neighbours.
+        for _ in range(2):
+            left_out = projection @ measured / precision
+            normalised = np.abs(left_out) * np.sqrt(precision)
+            most = max(clip * float(np.median(normalised)), 1e-9)
+            share = np.minimum(1.0, most / np.maximum(normalised.max(axis=0), 1e-9))
+            measured = measured - (1.0 - share) * left_out
+        return replace(self, measured=measured)
+
+    def told_by(self, correlation: Array) -> _Told:
         """What the residuals tell, if they have this correlation (n, n)."""
         count, size = self.design.shape[1:]
         lower = np.linalg.cholesky(correlation + 1e-9 * np.eye(count))
@@ -219,7 +254,7 @@ class _WhitenedSystem:
         information = design.transpose(0, 2, 1) @ design
         inverse = inverse_normal(information, self.expected, self.estimated)
         residual = measured - design @ (inverse @ (design.transpose(0, 2, 1) @ measured))
-        chi2 = max(float((residual**2).sum()), 1e-12) / kept_variance
+        chi2 = max(float((residual**2).sum()), 1e-12) / _CLIPPED_VARIANCE
         taken = float(np.trace(inverse @ information, axis1=1, axis2=2).sum())
         freedom = max(2.0 * count - taken, 1e-3)
         # What is not estimated has no variance and no part in the determinant.
