@@ -1,7 +1,7 @@
 """Blocks: a version of points, published or not as a whole, with its images and files of chips."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -32,9 +32,10 @@ from app.db.engine import Connection
 from app.db.rows import among, columns_of
 from app.db.schema import BlockState, block, chip_file, now, point
 from app.db.schema.base import Double
+from services.formats.block.frame_json import parse_frame
 from services.formats.block.reader import BlockContents
 from services.quality.block import BlockQuality, parse_quality_document, quality_document
-from services.types import Array, IntArray, SurfaceHeights
+from services.types import Array, Frame, IntArray, SurfaceHeights
 
 ID_BITS = 26
 """A point's id is the number of its block times 2^26 plus its id in the block."""
@@ -47,6 +48,9 @@ FRAME_SIGMA_M = cast(
 
 FRAME = func.jsonb_path_query_first(block.c.metadata, text_constant('$."amers:frame"'), type_=JSONB)
 """The frame of a block on the Earth, as its document states it; null if unstated."""
+
+_SIGMAS = ("sigma_horizontal_m", "sigma_up_m")
+"""Distributions over the points in the quality of a block."""
 
 INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
@@ -173,6 +177,31 @@ def find_quality(connection: Connection, number: int) -> BlockQuality:
     """The quality figures of a block."""
     quality = connection.execute(select(block.c.quality).where(block.c.number == number)).scalar_one()
     return parse_quality_document(quality)
+
+
+@dataclass(frozen=True)
+class StatedSigmas:
+    """What the accuracy of a block follows from.
+
+    Attributes:
+        horizontal_m, up_m: standard deviations of its median point, a coordinate, in its frame.
+        frame: on the Earth.
+    """
+
+    horizontal_m: float
+    up_m: float
+    frame: Frame
+
+
+def stated_sigmas(connection: Connection, numbers: Sequence[int]) -> dict[int, StatedSigmas]:
+    """The stated sigmas of some blocks, by their numbers."""
+    median = [block.c.quality[name, "median"].as_float() for name in _SIGMAS]
+    statement = select(block.c.number, *median, FRAME, FRAME_SIGMA_M)
+    rows = connection.execute(statement.where(block.c.number.in_(numbers)))
+    return {
+        number: StatedSigmas(horizontal_m, up_m, parse_frame(frame, sigma_m))
+        for number, horizontal_m, up_m, frame, sigma_m in rows
+    }
 
 
 def find_document(connection: Connection, number: int) -> str:

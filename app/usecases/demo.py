@@ -19,6 +19,7 @@ from app.usecases.registration.register import (
     record_registration,
     run_registration,
 )
+from app.usecases.registration.result_folder import replacing
 from services.adjustment.intersection import intersect
 from services.formats.images.raster import write_raster
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
@@ -144,17 +145,19 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
             lifecycle.publish_block(connection, str(ingested.block.number))
         sigma_m = float(np.hypot(*options.scene_error_m))
         find_points = points_of_store(database, storage)
-        registered = run_registration(
-            SceneFiles(image, sigma_m=sigma_m),
-            ControlSources(find_points),
-            folder / "registered",
-            progress=part_of(progress, 0.75, 0.25),
-        )
+        with replacing(folder / "registered") as new:
+            registered = run_registration(
+                SceneFiles(image, sigma_m=sigma_m),
+                ControlSources(find_points),
+                new,
+                progress=part_of(progress, 0.75, 0.25),
+            )
         with database.transaction() as connection:
             record_registration(connection, registered, image_key(image))
         n_served = len(find_points(registered.footprint).points)
     counts = DemoCounts(len(production.points), ingested.block.n_points, n_served)
-    return _compare(truth, production, registered.registration, counts, registered.files["report.html"])
+    report = folder / "registered" / "report.html"
+    return _compare(truth, production, registered.registration, counts, report)
 
 
 def _simulate(options: DemoOptions, progress: Progress) -> _Truth:

@@ -91,16 +91,17 @@ def distribution(values: Array | IntArray) -> Distribution:
 
 def block_accuracy(quality: BlockQuality, frame: Frame) -> AccuracyStatement:
     """The accuracy of the median point of a block, in its frame and on the Earth."""
-    return _median_accuracy(quality.sigma_horizontal_m.median, quality.sigma_up_m.median, frame)
+    return median_accuracy(quality.sigma_horizontal_m.median, quality.sigma_up_m.median, frame)
 
 
 def produced_accuracy(points: ControlPoints) -> AccuracyStatement:
     """The accuracy of the median of new points of one block, in its frame and on the Earth."""
     horizontal_m, up_m = _sigmas_m(points)
-    return _median_accuracy(float(np.median(horizontal_m)), float(np.median(up_m)), points.frames[0])
+    return median_accuracy(float(np.median(horizontal_m)), float(np.median(up_m)), points.frames[0])
 
 
-def _median_accuracy(horizontal_m: float, up_m: float, frame: Frame) -> AccuracyStatement:
+def median_accuracy(horizontal_m: float, up_m: float, frame: Frame) -> AccuracyStatement:
+    """The accuracy of the median point of a block by its standard deviations, a coordinate."""
     covariance_m2 = np.diag(np.array([horizontal_m, horizontal_m, up_m]) ** 2)
     return points_accuracy(covariance_m2, frame, "median of the points")
 

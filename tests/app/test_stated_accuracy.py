@@ -144,6 +144,9 @@ def test_everything_about_a_block_and_its_points_states_both(
     for command in ("show", "quality"):
         assert assert_stated(json.loads(amers("block", command, "flat", "--json")), is_known) == words
         assert_shown(amers("block", command, "flat"), words)
+    (listed,) = json.loads(amers("block", "list", "--json"))
+    assert assert_stated(listed, is_known) == words
+    assert all(part in amers("block", "list") for part in words)
     (point,) = client.get("/collections/points/items?limit=1", headers=me).json()["features"]
     item = client.get(f"/collections/points/items/{point['id']}", headers=me).json()
     assert_stated(item["properties"], is_known)

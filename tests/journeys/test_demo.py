@@ -55,6 +55,9 @@ def test_the_report_is_at_the_printed_path(demo):
     report = Path(demo["report"])
     assert "<html" in report.read_text(encoding="utf-8")
     assert (report.parent / "refined_RPC.TXT").is_file()
+    manifest = json.loads((report.parent / "manifest.json").read_text())
+    files = {path.name for path in report.parent.iterdir()}
+    assert files == {*manifest["files"], "manifest.json"}, "a whole result, as any registration leaves"
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):

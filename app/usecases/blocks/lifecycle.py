@@ -1,5 +1,6 @@
 """The life of a block: check and ingest it (staged), publish, withdraw, restore and prioritise it."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
@@ -22,7 +23,7 @@ from services.formats.block.reader import BlockContents, block_member
 from services.formats.chips.checksums import ChipHasher
 from services.formats.chips.npy_files import read_chip_file
 from services.quality.accuracy_statement import AccuracyStatement
-from services.quality.block import BlockQuality, block_accuracy, block_quality
+from services.quality.block import BlockQuality, block_accuracy, block_quality, median_accuracy
 from services.types import Progress, no_progress, part_of
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
@@ -222,6 +223,16 @@ def list_blocks(
 ) -> list[Block]:
     """The blocks in some states, the newest first."""
     return blocks.list_blocks(connection, states)
+
+
+def stated_accuracies(
+    connection: Connection, numbers: Sequence[int]
+) -> dict[int, AccuracyStatement]:
+    """The accuracy of the median points of some blocks, by the numbers of the blocks."""
+    stated = blocks.stated_sigmas(connection, numbers)
+    return {
+        number: median_accuracy(one.horizontal_m, one.up_m, one.frame) for number, one in stated.items()
+    }
 
 
 def block_report(connection: Connection, block: Block) -> BlockReport:
