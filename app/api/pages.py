@@ -74,11 +74,12 @@ def features_page(
         page: title, description and links.
     """
     names = list(features[0]["properties"]) if features else []
+    absent = {name: item.absent for name, item in collection.queryables.items()}
     here = f"{request.base_url}collections/{collection.id}/items"
     rows = [
         [
             Cell(str(feature["id"]), f"{here}/{feature['id']}?f=html"),
-            *(Cell(_shown(feature["properties"].get(name))) for name in names),
+            *(Cell(_shown(feature["properties"].get(name), absent.get(name, ""))) for name in names),
         ]
         for feature in features
     ]
@@ -120,5 +121,5 @@ def drawn(geometries: Iterable[dict[str, Any] | None]) -> Drawing | None:
     )
 
 
-def _shown(value: Any) -> str:
-    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+def _shown(value: Any, absent: str) -> str:
+    return absent if value is None else f"{value:g}" if isinstance(value, float) else str(value)

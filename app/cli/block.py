@@ -60,9 +60,7 @@ def list_blocks(as_json: AsJson = False) -> None:
     with transaction() as connection:
         blocks = lifecycle.list_blocks(connection)
         stated = lifecycle.stated_accuracies(connection, [block.number for block in blocks])
-    shown = {
-        number: accuracy_document(one) if as_json else one.words for number, one in stated.items()
-    }
+    shown = {number: accuracy_document(one) if as_json else one.words for number, one in stated.items()}
     show([{**_record(block), **shown[block.number]} for block in blocks], as_json=as_json)
 
 

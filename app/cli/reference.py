@@ -32,11 +32,15 @@ def add(
         float | None,
         typer.Option(help="Accuracy of the image on the Earth, one sigma, metres.", min=0.001),
     ] = None,
+    sigma_up_m: Annotated[
+        float | None,
+        typer.Option(help="Accuracy of its heights on the Earth, one sigma, metres.", min=0.001),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Add a reference image that scenes can be registered on."""
     settings = read_settings()
-    new = NewReference(name, image, dem, vertical, geoid, sigma_m)
+    new = NewReference(name, image, dem, vertical, geoid, sigma_m, sigma_up_m)
     with transaction(settings) as connection:
         row = references.add_reference(connection, settings, new)
     show_one(_record(row), as_json=as_json)

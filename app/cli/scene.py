@@ -56,6 +56,14 @@ def register(
         str | None, typer.Option(help="Vertical datum of these heights: ellipsoid, EGM96, EPSG:…")
     ] = None,
     geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    reference_sigma_m: Annotated[
+        float | None,
+        typer.Option(help="Accuracy of the reference on the Earth, one sigma, metres.", min=0.001),
+    ] = None,
+    reference_sigma_up_m: Annotated[
+        float | None,
+        typer.Option(help="Accuracy of its heights on the Earth, one sigma, metres.", min=0.001),
+    ] = None,
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
     ] = None,
@@ -112,9 +120,13 @@ def register(
     if server is not None and jobs > 1:
         raise InputError("--jobs: the workers of the service do the jobs; leave it out with --server")
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
-    control = Control(block, None if reference is None else ReferenceFiles(reference, terrain))
+    reference_files = None
     if reference is not None:
         check_map(reference)
+        reference_files = ReferenceFiles(reference, terrain, reference_sigma_m, reference_sigma_up_m)
+    elif reference_sigma_m is not None or reference_sigma_up_m is not None:
+        raise InputError("--reference-sigma-m, --reference-sigma-up-m: of a reference; add --reference")
+    control = Control(block, reference_files)
     requests = []
     for image in images:
         files = SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights)
@@ -205,6 +217,8 @@ def _command_for(files: SceneFiles, control: Control, folder: Path, server: str 
         "--dem": None if terrain is None else terrain.dem,
         "--vertical": None if terrain is None else terrain.vertical,
         "--geoid": None if terrain is None else terrain.geoid,
+        "--reference-sigma-m": None if reference is None else reference.sigma_m,
+        "--reference-sigma-up-m": None if reference is None else reference.sigma_up_m,
         "--server": server,
         "-o": folder,
     }

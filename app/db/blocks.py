@@ -34,7 +34,8 @@ from app.db.schema import BlockState, block, chip_file, now, point
 from app.db.schema.base import Double
 from services.formats.block.frame_json import parse_frame
 from services.formats.block.reader import BlockContents
-from services.quality.block import BlockQuality, parse_quality_document, quality_document
+from services.quality.accuracy_statement import StatedAccuracy
+from services.quality.block import BlockQuality, block_accuracy, parse_quality_document, quality_document
 from services.types import Array, Frame, IntArray, SurfaceHeights
 
 ID_BITS = 26
@@ -132,6 +133,7 @@ def insert_block(
         None when there is a block of that id and version.
     """
     metadata = contents.document.metadata
+    accuracy = block_accuracy(quality, metadata.frame)
     statement = (
         insert(block)
         .values(
@@ -146,6 +148,8 @@ def insert_block(
             quality=cast(literal(json.dumps(quality_document(quality)), Text), JSONB),
             checksum=checksum,
             priority=priority,
+            **_figures("relative", accuracy.relative_to_control_points),
+            **_figures("on_the_earth", accuracy.on_the_earth),
         )
         .on_conflict_do_nothing(index_elements=[block.c.id, block.c.version])
         .returning(*COLUMNS)
@@ -260,6 +264,12 @@ def find_surface_heights(connection: Connection, point_ids: IntArray) -> Surface
 def storage_keys(connection: Connection) -> set[str]:
     """The keys in the storage of the files of chips of all blocks."""
     return set(connection.scalars(select(chip_file.c.storage_key)))
+
+
+def _figures(name: str, stated: StatedAccuracy) -> dict[str, float | None]:
+    """The columns of an accuracy; null where it is unknown."""
+    figures = {f"{name}_ce90_m": stated.ce90_m, f"{name}_le90_m": stated.le90_m}
+    return {column: None if np.isnan(value) else value for column, value in figures.items()}
 
 
 def _blocks(rows: Iterable[Row[Any]]) -> list[Block]:

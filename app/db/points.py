@@ -84,9 +84,15 @@ POINTS = Collection(
     source=point,
     key=column_property(point.c.id, "Identifier"),
     properties=(
-        column_property(point.c.sigma_east_m, "Standard deviation eastwards", "m"),
-        column_property(point.c.sigma_north_m, "Standard deviation northwards", "m"),
-        column_property(point.c.sigma_up_m, "Standard deviation of the height", "m"),
+        column_property(
+            point.c.sigma_east_m, "Standard deviation eastwards, in the frame of its block", "m"
+        ),
+        column_property(
+            point.c.sigma_north_m, "Standard deviation northwards, in the frame of its block", "m"
+        ),
+        column_property(
+            point.c.sigma_up_m, "Standard deviation of the height, in the frame of its block", "m"
+        ),
         column_property(point.c.corr_east_north, "Correlation of east and north"),
         column_property(point.c.corr_east_up, "Correlation of east and height"),
         column_property(point.c.corr_north_up, "Correlation of north and height"),

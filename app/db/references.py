@@ -37,6 +37,7 @@ class NewReferenceImage:
     vertical: str | None
     geoid: str | None
     sigma_m: float | None
+    sigma_up_m: float | None
     gsd_m: float
     checksums: dict[str, str]
 
@@ -52,6 +53,7 @@ class ReferenceRow:
         vertical, geoid: vertical datum of the heights, when their file does not name it.
         sigma_m: absolute accuracy of the whole image, one standard deviation per coordinate; None when
             unknown.
+        sigma_up_m: the same of its heights.
         gsd_m: its ground sampling.
         footprint: GeoJSON.
     """
@@ -63,6 +65,7 @@ class ReferenceRow:
     vertical: str | None
     geoid: str | None
     sigma_m: float | None
+    sigma_up_m: float | None
     gsd_m: float
     created_at: datetime
     footprint: dict[str, object]

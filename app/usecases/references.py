@@ -41,6 +41,7 @@ class NewReference:
         vertical: vertical datum of the heights (ellipsoid, EGM96, EPSG:…), where the file states none.
         geoid: path of a grid file of the geoid, where PROJ has none.
         sigma_m: accuracy of the image's frame on the Earth, one standard deviation per coordinate.
+        sigma_up_m: the same of the heights.
     """
 
     name: str
@@ -49,6 +50,7 @@ class NewReference:
     vertical: str | None = None
     geoid: str | None = None
     sigma_m: float | None = None
+    sigma_up_m: float | None = None
 
 
 def add_reference(connection: Connection, settings: Settings, new: NewReference) -> ReferenceRow:
@@ -60,8 +62,9 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
     """
     if not 1 <= len(new.name.strip()) <= LONGEST_NAME:
         raise InputError(f"name: 1 to {LONGEST_NAME} characters expected, {len(new.name.strip())} found")
-    if new.sigma_m is not None and not 0.0 < new.sigma_m < np.inf:
-        raise InputError(f"sigma_m: {new.sigma_m:g} found, more than 0 expected")
+    for name, value in (("sigma_m", new.sigma_m), ("sigma_up_m", new.sigma_up_m)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise InputError(f"{name}: {value:g} found, more than 0 expected")
     reference = read_reference(_reference_files(settings, new))
     assert isinstance(reference.model, OrthoModel)
     scene = Scene(reference.image, reference.model, Acquisition(new.name), 0.0)
@@ -72,6 +75,7 @@ def add_reference(connection: Connection, settings: Settings, new: NewReference)
         vertical=new.vertical,
         geoid=new.geoid,
         sigma_m=new.sigma_m,
+        sigma_up_m=new.sigma_up_m,
         gsd_m=reference.model.grid.gsd_m,
         checksums={
             path: _sha256(_path_below(settings, field, path))
@@ -177,7 +181,7 @@ def _reference_files(settings: Settings, reference: NewReference | ReferenceRow)
     elif reference.vertical is not None or reference.geoid is not None:
         raise InputError("vertical, geoid: of the heights of a dem, but dem is missing; add it")
     image = _path_below(settings, "image", reference.image)
-    return ReferenceFiles(image, terrain, reference.sigma_m)
+    return ReferenceFiles(image, terrain, reference.sigma_m, reference.sigma_up_m)
 
 
 def _sha256(path: Path) -> str:

@@ -23,6 +23,7 @@ pytestmark = pytest.mark.long
 RELATIVE = "Relative to the control points"
 ON_THE_EARTH = "On the Earth"
 SCOPE = "relative to the control points"
+STATED_NAMES = ("relative", "on_the_earth")
 STATED = Frame.from_sigmas(1.5, 5.0)
 EARTH_LE90_M = 8.22
 a_centimetre = 0.01
@@ -147,6 +148,18 @@ def test_everything_about_a_block_and_its_points_states_both(
     (listed,) = json.loads(amers("block", "list", "--json"))
     assert assert_stated(listed, is_known) == words
     assert all(part in amers("block", "list") for part in words)
+    document = client.get("/blocks/flat/quality", headers=me).json()
+    (block,) = client.get("/collections/blocks/items", headers=me).json()["features"]
+    for name, of in (("relative", "relative_to_control_points"), ("on_the_earth", "on_the_earth")):
+        for figure in ("ce90_m", "le90_m"):
+            value = block["properties"][f"{name}_{figure}"]
+            assert value == pytest.approx(document[of][figure], rel=1e-5) if value else not is_known
+    page = client.get("/collections/blocks/items?f=html", headers=me).text
+    heads = [
+        page.index(f">{name}_{figure}<") for name in STATED_NAMES for figure in ("ce90_m", "le90_m")
+    ]
+    assert heads == sorted(heads)
+    assert page.count("<td>unknown</td>") == (0 if is_known else 2)
     (point,) = client.get("/collections/points/items?limit=1", headers=me).json()["features"]
     item = client.get(f"/collections/points/items/{point['id']}", headers=me).json()
     assert_stated(item["properties"], is_known)

@@ -70,6 +70,7 @@ class Reference(Reply):
     vertical: str | None
     geoid: str | None
     sigma_m: float | None
+    sigma_up_m: float | None
     gsd_m: float
     created_at: datetime
     footprint: AnyGeometry

@@ -75,6 +75,7 @@ class Property:
         unit: as in the conventions, "" without one.
         nullable: whether values may be unknown.
         choices: all possible values, when they are few.
+        absent: what a page shows where the value is null.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Property:
     unit: str = ""
     nullable: bool = False
     choices: tuple[str, ...] = ()
+    absent: str = ""
 
     @cached_property
     def type(self) -> SqlType:
@@ -101,10 +103,18 @@ class Property:
 
 
 def column_property(
-    column: Column[Any], title: str, unit: str = "", *, name: str = "", choices: tuple[str, ...] = ()
+    column: Column[Any],
+    title: str,
+    unit: str = "",
+    *,
+    name: str = "",
+    choices: tuple[str, ...] = (),
+    absent: str = "",
 ) -> Property:
     """The property of a column of a table, nullable as the column is; of the same name unless given."""
-    return Property(name or str(column.name), title, column, unit, bool(column.nullable), choices)
+    return Property(
+        name or str(column.name), title, column, unit, bool(column.nullable), choices, absent
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,24 @@ BLOCKS = Collection(
             block.c.n_unserved, "Points not served: superseded by a better block, or suspended"
         ),
         column_property(block.c.n_views, "Views"),
+        column_property(
+            block.c.relative_ce90_m,
+            "CE90 of its median point, relative to the control points",
+            "m",
+            absent="unknown",
+        ),
+        column_property(
+            block.c.relative_le90_m,
+            "LE90 of its median point, relative to the control points",
+            "m",
+            absent="unknown",
+        ),
+        column_property(
+            block.c.on_the_earth_ce90_m, "CE90 of its median point, on the Earth", "m", absent="unknown"
+        ),
+        column_property(
+            block.c.on_the_earth_le90_m, "LE90 of its median point, on the Earth", "m", absent="unknown"
+        ),
         column_property(block.c.created_at, "When it was ingested"),
         column_property(block.c.state_changed_at, "When its state changed last"),
     ),

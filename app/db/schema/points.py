@@ -58,6 +58,11 @@ block = Table(
     # Points that are superseded by a better block or suspended.
     Column("n_unserved", BigInteger, nullable=False, server_default=text("0")),
     Column("extent_on_map", MapOutline, on_map("extent")),
+    # CE90 and LE90 of its median point, in its frame and on the Earth; null: unknown.
+    Column("relative_ce90_m", Real),
+    Column("relative_le90_m", Real),
+    Column("on_the_earth_ce90_m", Real),
+    Column("on_the_earth_le90_m", Real),
     UniqueConstraint("id", "version"),
     one_of("state", BlockState),
     Index(

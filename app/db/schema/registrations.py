@@ -114,7 +114,10 @@ reference_image = Table(
     Column("created_at", Timestamp, nullable=False, server_default=now),
     # Path to SHA-256 of each of its files; null: added by an earlier version and not verified since.
     Column("checksums", Json),
+    # Of its heights on the Earth, as sigma_m of its positions; null: unknown.
+    Column("sigma_up_m", Real),
     CheckConstraint("sigma_m > 0", name="sigma_m"),
+    CheckConstraint("sigma_up_m > 0", name="sigma_up_m"),
     CheckConstraint("gsd_m > 0", name="gsd_m"),
 )
 

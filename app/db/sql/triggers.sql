@@ -20,7 +20,7 @@ create trigger point_changes after update of suspended_at on point
     for each row execute function record_change('suspended_at', 'suspended_because');
 create trigger reference_image_changes after insert or update or delete on reference_image
     for each row execute function record_change(
-        'name', 'image', 'dem', 'vertical', 'geoid', 'sigma_m');
+        'name', 'image', 'dem', 'vertical', 'geoid', 'sigma_m', 'sigma_up_m');
 
 -- Density cells and the messages of jobs follow the rows they come from.
 create trigger keep_density after insert or delete or update of state on block

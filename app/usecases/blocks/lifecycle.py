@@ -225,9 +225,7 @@ def list_blocks(
     return blocks.list_blocks(connection, states)
 
 
-def stated_accuracies(
-    connection: Connection, numbers: Sequence[int]
-) -> dict[int, AccuracyStatement]:
+def stated_accuracies(connection: Connection, numbers: Sequence[int]) -> dict[int, AccuracyStatement]:
     """The accuracy of the median points of some blocks, by the numbers of the blocks."""
     stated = blocks.stated_sigmas(connection, numbers)
     return {

@@ -19,7 +19,7 @@ from services.registration.options import RegistrationOptions
 from services.registration.reference_points import ReferenceChips, reference_points
 from services.reports.report import BlockUsed
 from services.sensors.ortho import OrthoModel
-from services.types import UNKNOWN_FRAME, Array, Frame, Progress
+from services.types import Array, Frame, Progress
 
 LOCAL_SIGMA_PX = 0.3
 """Assumed local error of an ortho-image, independent between places: one sigma, in its own pixels."""
@@ -38,11 +38,13 @@ class ReferenceFiles:
         terrain: heights of the same ground; only scenes that are ortho-images can be registered without.
         sigma_m: accuracy of the image's frame on the Earth, one standard deviation per coordinate; None
             when unknown.
+        sigma_up_m: the same of the heights of its terrain.
     """
 
     image: Path
     terrain: TerrainFile | None = None
     sigma_m: float | None = None
+    sigma_up_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,9 @@ def read_reference(files: ReferenceFiles) -> Reference:
         sigma_m=LOCAL_SIGMA_PX * gsd_m,
         height_sigma_m=height_sigma_m,
         common_sigma_m=COMMON_SIGMA_PX * gsd_m,
-        frame=UNKNOWN_FRAME if files.sigma_m is None else Frame.from_sigmas(files.sigma_m, math.nan),
+        frame=Frame.from_sigmas(
+            *(math.nan if sigma_m is None else sigma_m for sigma_m in (files.sigma_m, files.sigma_up_m))
+        ),
     )
 
 
