@@ -67,11 +67,12 @@ def listed(amers: Amers) -> list[dict[str, object]]:
 
 def test_a_reference_is_added_listed_and_removed(amers: Amers, folder: Path):
     heights = ("--dem", "heights.tif", "--vertical", "ellipsoid", "--sigma-m", 2.5)
+    heights += ("--sigma-up-m", 4.0)
     result = amers("add", "land.tif", "--name", "Ventoux", *heights, "--json")
     assert result.returncode == 0, result.stderr
     added = json.loads(result.stdout)
     assert (added["name"], added["image"], added["dem"]) == ("Ventoux", "land.tif", "heights.tif")
-    assert (added["vertical"], added["sigma_m"]) == ("ellipsoid", 2.5)
+    assert (added["vertical"], added["sigma_m"], added["sigma_up_m"]) == ("ellipsoid", 2.5, 4.0)
     the_scale_of_the_map = 1e-3
     assert added["gsd_m"] == pytest.approx(GSD_M, rel=the_scale_of_the_map)
     assert amers("add", "land.tif", "--name", "Alps").returncode == 0

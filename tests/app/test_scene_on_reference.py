@@ -56,11 +56,28 @@ def test_a_scene_is_registered_on_a_reference_without_any_database(
     output = json.loads(capsys.readouterr().out)
     assert output["verdict"] == "good"
     assert np.abs(np.array(output["shift_px"]) - SHIFT_PX).max() < SHIFT_ALLOWED_PX
+    assert output["on_the_earth"]["ce90_m"] is None
+    assert output["on_the_earth"]["words"].startswith("CE90 unknown")
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["run"]["blocks"] == [{"id": "reference.tif", "version": "reference image"}]
     assert {"report.html", "correction.json", "control_points.geojson"} <= {
         path.name for path in tmp_path.iterdir()
     }
+
+
+def test_the_stated_frame_of_a_reference_gives_an_accuracy_on_the_earth(
+    images: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference, scene = images
+    command = ["scene", "register", scene, "--sigma-m", "40", "-o", tmp_path / "out", "--json"]
+    frame = ["--reference-sigma-m", "5", "--reference-sigma-up-m", "3"]
+    assert run(*command, "--reference", reference, *frame) == 0
+    output = json.loads(capsys.readouterr().out)
+    relative, earth = output["relative_to_control_points"], output["on_the_earth"]
+    assert earth["ce90_m"] == pytest.approx(np.hypot(2.146 * 5.0, relative["ce90_m"]), rel=0.01)
+    assert earth["le90_m"] == pytest.approx(1.645 * 3.0, rel=1e-3)
+    assert run(*command, *frame) == 2
+    assert "add --reference" in capsys.readouterr().err
 
 
 def test_terrain_without_a_reference_is_a_mistake(images: tuple[Path, Path], tmp_path: Path) -> None:
