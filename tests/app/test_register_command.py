@@ -273,6 +273,10 @@ def test_the_command_lets_a_service_register(
         assert_masked(folder)
         (check,) = json.loads((folder / "report.json").read_text())["checks"]
         assert check["image_residuals_px"]["xy"]["rms"] < A_TENTH_OF_A_PIXEL
+        on_earth = ("--max-ce90-on-earth-m", 10, "--server", url, "--token", token("register"))
+        limited = amers(*scene, *on_earth)
+        assert limited.returncode == 3, limited.stderr + log.read_text()
+        assert "unknown: nobody stated the frame of the control points" in limited.stderr
         older = (folder / "report.json").read_bytes()
         refused = amers(*scene, "--server", url, "--token", "wrong")
         assert (refused.returncode, (folder / "report.json").read_bytes()) == (2, older)
@@ -281,6 +285,8 @@ def test_the_command_lets_a_service_register(
         failed = amers(*hopeless, "--server", url, "--token", token("register"))
         record = json.loads(failed.stdout)
         assert (failed.returncode, record["exit_status"]) == (3, 3), failed.stderr + log.read_text()
+        for stated in ("relative_to_control_points", "on_the_earth"):
+            assert record[stated]["words"] == "none: the scene is not registered"
         report = json.loads((folder / "report.json").read_text())
         validate(report, failure_schema())
         assert report["search_stages"][0]["tried"] == 40
