@@ -13,7 +13,7 @@ from tests.factories import make_block
 from tests.statements import run_sql
 
 FILL = import_module("migrations.versions.0009_stated_accuracy").FILL
-COLUMNS = import_module("migrations.versions.0009_stated_accuracy").COLUMNS
+COLUMNS = ("relative_ce90_m", "relative_le90_m", "on_the_earth_ce90_m", "on_the_earth_le90_m")
 MATRICES = {
     "elliptical": [[9.0, 3.5, 0.2], [3.5, 2.0, 0.1], [0.2, 0.1, 25.0]],
     "along one axis": [[400.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
