@@ -50,9 +50,6 @@ FRAME_SIGMA_M = cast(
 FRAME = func.jsonb_path_query_first(block.c.metadata, text_constant('$."amers:frame"'), type_=JSONB)
 """The frame of a block on the Earth, as its document states it; null if unstated."""
 
-_SIGMAS = ("sigma_horizontal_m", "sigma_up_m")
-"""Distributions over the points in the quality of a block."""
-
 INGESTION_LOCK = 0x616D657273
 """Advisory lock held by ingestions (shared) and by the sweep of unnamed files (exclusive)."""
 
@@ -199,12 +196,13 @@ class StatedSigmas:
 
 def stated_sigmas(connection: Connection, numbers: Sequence[int]) -> dict[int, StatedSigmas]:
     """The stated sigmas of some blocks, by their numbers."""
-    median = [block.c.quality[name, "median"].as_float() for name in _SIGMAS]
-    statement = select(block.c.number, *median, FRAME, FRAME_SIGMA_M)
+    horizontal_m = block.c.quality["sigma_horizontal_m", "median"].as_float()
+    up_m = block.c.quality["sigma_up_m", "median"].as_float()
+    statement = select(block.c.number, horizontal_m, up_m, FRAME, FRAME_SIGMA_M)
     rows = connection.execute(statement.where(block.c.number.in_(numbers)))
     return {
-        number: StatedSigmas(horizontal_m, up_m, parse_frame(frame, sigma_m))
-        for number, horizontal_m, up_m, frame, sigma_m in rows
+        number: StatedSigmas(horizontal, up, parse_frame(frame, sigma_m))
+        for number, horizontal, up, frame, sigma_m in rows
     }
 
 
