@@ -13,7 +13,8 @@ from services.types import Array, FloatImage
 
 _PART_PX = 11
 """Side of a part: small enough to lie on one surface, large enough to be found."""
-_PART_STEP_PX = 6
+_PART_STEP_PX = 13
+"""Parts do not overlap: where the inner ones follow the edge of a roof, outer ones show the ground."""
 _OFFSETS_PX = (-_PART_STEP_PX, 0, _PART_STEP_PX)
 _TEMPLATE_PX = _PART_PX + 2 * _PART_STEP_PX
 _RADIUS_PX = 16
@@ -22,8 +23,15 @@ _STEP_PX = 0.2
 """Displacement between two heights that are tried, in the view with the largest parallax."""
 _MIN_SCORE = 0.5
 _MIN_PARTS = 7
-_MIN_SIGMA_PX = 0.03
-"""Smallest error of a displacement, as for the whole chip."""
+_NOISE_PX = 0.05
+"""Error of the displacement that nine parts measure together, one standard deviation."""
+_RELIEF_SHARE = 0.4
+"""Share of the variance of parts around their plane that their median differs from the surface by.
+
+Chosen with `_NOISE_PX` on simulated worlds and a DSM; see docs/methods/production.md.
+"""
+_MAX_ROUGHNESS_PX = 0.3
+"""Scatter of parts around their plane, pixels of parallax, above which they lie on several surfaces."""
 
 
 def surface_height(scenes: Sequence[Scene], ground: Array, gsd_m: float) -> tuple[float, float]:
@@ -32,8 +40,9 @@ def surface_height(scenes: Sequence[Scene], ground: Array, gsd_m: float) -> tupl
     The height of a point is the one at which its whole chips fit each other: an average over roofs,
     slopes and trees. Here nine parts around the centre are each searched for the height at which the
     views agree best, along the parallax of each view. Their median is the height of the surface. The
-    sigma is that of a prediction from the plane through them: relief that the plane does not follow,
-    and noise of the matching.
+    sigma consists of relief, which the scatter around the plane through them shows, and of noise of the
+    matching. Parts that scatter by more than 0.3 pixels of parallax lie on several surfaces (roof and
+    ground, crown and ground): which of them the line of sight meets first, they do not tell.
 
     Args:
         scenes: that show the chip, with adjusted models; the first shows the surface whose height is
@@ -42,7 +51,8 @@ def surface_height(scenes: Sequence[Scene], ground: Array, gsd_m: float) -> tupl
         gsd_m: ground sampling of the chips, metres.
 
     Returns:
-        NaN where fewer than seven parts are found, or a single scene is given.
+        NaN where fewer than seven parts are found, they lie on several surfaces, or a single scene is
+        given.
     """
     if len(scenes) < 2:
         return np.nan, np.nan
@@ -70,11 +80,11 @@ def surface_height(scenes: Sequence[Scene], ground: Array, gsd_m: float) -> tupl
     heights = heights[known]
     plane = np.array([(1.0, row, col) for row in _OFFSETS_PX for col in _OFFSETS_PX])[known]
     residual_m = heights - plane @ np.linalg.lstsq(plane, heights)[0]
-    freedom = len(heights) - 3.0
-    variance_m2 = residual_m @ residual_m / freedom * (1.0 + 1.0 / len(heights))
-    # The square of an error over a sigma from few residuals is larger than 1 on average: Student's law.
-    sigma_m = np.sqrt(variance_m2 * freedom / (freedom - 2.0))
-    return float(np.median(heights)), max(float(sigma_m), _MIN_SIGMA_PX / largest)
+    roughness_m = float(np.sqrt(residual_m @ residual_m / (len(heights) - 3)))
+    if roughness_m * largest > _MAX_ROUGHNESS_PX:
+        return np.nan, np.nan
+    sigma_m = np.hypot(np.sqrt(_RELIEF_SHARE) * roughness_m, _NOISE_PX / largest)
+    return float(np.median(heights)), float(sigma_m)
 
 
 def _displacement(model: SensorModel, ground: Array) -> Array:

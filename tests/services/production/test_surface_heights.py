@@ -35,6 +35,7 @@ pytestmark = pytest.mark.long
 
 honest = (0.7, 1.5)
 """Mean square of errors over their sigmas."""
+five_sigma = 5.0
 chips_m = (0.5, 2.0)
 dsm_sigma_m = 0.3
 """Of the noise of the elevation model. Its roughness over 2.5 m is 0.1 m; the scatter of tie points
@@ -100,34 +101,39 @@ def simulated_surfaces(
     )
 
 
-def test_errors_of_simulated_surfaces_are_as_large_as_stated() -> None:
-    three = simulated_surfaces(world(), block_views(), production(), OPTIONS.fine_gsd_m)
-    other = world(31)
-    pair = list(
-        simulate_block(
-            other,
-            np.random.default_rng(32),
-            n_views=2,
-            shape=SHAPE,
-            gsd_m=GSD_M,
-            error_m=BLOCK_SIGMA_M,
-            largest_incidence_deg=20.0,
-        )
+def surfaces_of(seed: int, views: int) -> Surfaces:
+    """Many points of a world that no other test uses."""
+    ground = world(seed)
+    seen = simulate_block(
+        ground,
+        np.random.default_rng(seed + 1),
+        n_views=views,
+        shape=SHAPE,
+        gsd_m=GSD_M,
+        error_m=BLOCK_SIGMA_M,
+        largest_incidence_deg=20.0,
     )
-    made = produce_points([view.as_scene(BLOCK_SIGMA_M) for view in pair], OPTIONS)
-    two = simulated_surfaces(other, pair, made, OPTIONS.fine_gsd_m)
-    for found in (three, two):
+    made = produce_points([view.as_scene(BLOCK_SIGMA_M) for view in seen], replace(OPTIONS, points=150))
+    return simulated_surfaces(ground, seen, made, OPTIONS.fine_gsd_m)
+
+
+def test_errors_of_simulated_surfaces_are_as_large_as_stated() -> None:
+    # World 61 has an edge of a roof that parts of 11 px on both of its sides follow.
+    cases = [surfaces_of(61, 3), surfaces_of(51, 3), surfaces_of(31, 2)]
+    for found in cases:
         error_m = found.stated_m - found.true_m
         print(
             f"{len(error_m)} points: heights of chips {nmad(found.true_m):.2f} m from the surface, "
-            f"stated surface {nmad(error_m):.2f} m, mean square {found.mean_square():.2f}"
+            f"stated surface {nmad(error_m):.2f} m, mean square {found.mean_square():.2f}, largest "
+            f"{np.abs(error_m / found.sigma_m).max():.1f}"
         )
         assert len(error_m) > 30
         assert nmad(error_m) < 0.5 * nmad(found.true_m)
         # What a whole chip shows is no statement of the surface at its centre.
         assert np.mean((found.true_m / found.sigma_up_m) ** 2) > 10.0
-    weights = len(three.stated_m), len(two.stated_m)
-    together = np.average([three.mean_square(), two.mean_square()], weights=weights)
+        assert np.abs(error_m / found.sigma_m).max() < five_sigma
+    weights = [len(found.stated_m) for found in cases]
+    together = np.average([found.mean_square() for found in cases], weights=weights)
     assert honest[0] < together < honest[1]
 
 
@@ -226,7 +232,7 @@ def test_real_surfaces_agree_with_an_elevation_model_as_stated(triplet, real_dat
         f"{nmad((stated - reference)[known]):.2f} m, mean square {mean_square:.2f}, robust "
         f"{nmad(normalised[known]) ** 2:.2f}"
     )
-    assert known.sum() > 50
+    assert known.sum() > 30
     assert nmad((stated - reference)[known]) < 0.5 * nmad(chips[known])
     assert honest[0] < mean_square < honest[1]
 
