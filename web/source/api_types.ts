@@ -35,6 +35,10 @@ export interface BlockFeatureProperties {
   n_points?: number;
   n_unserved?: number;
   n_views?: number;
+  relative_ce90_m?: number | null;
+  relative_le90_m?: number | null;
+  on_the_earth_ce90_m?: number | null;
+  on_the_earth_le90_m?: number | null;
   created_at?: string;
   state_changed_at?: string;
 }
@@ -463,6 +467,7 @@ export interface Reference {
   vertical: string | null;
   geoid: string | null;
   sigma_m: number | null;
+  sigma_up_m: number | null;
   gsd_m: number;
   created_at: string;
   footprint: Geometry;

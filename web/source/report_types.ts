@@ -42,6 +42,17 @@ export interface Candidate {
   false_alarms: number | null;
 }
 
+export interface CellStability {
+  cells: number;
+  left_out: number;
+  failed: number;
+  displacements: Displacement[];
+  held_out_px: ImageResiduals;
+  held_out_m: ImageResiduals;
+  group_means: GroupMeans;
+  note: string;
+}
+
 export interface Check {
   against: string;
   accuracy: Accuracy;
@@ -108,6 +119,14 @@ export interface Displacement {
   max_px: number | null;
   median_m: number | null;
   max_m: number | null;
+}
+
+export interface DrawnDisplacement {
+  place: string;
+  median_px: number | null;
+  max_px: number | null;
+  median_m: number | null;
+  max_m: number | null;
   x_m: number | null;
   y_m: number | null;
 }
@@ -116,6 +135,12 @@ export interface GroundResiduals {
   east: Statistics;
   north: Statistics;
   horizontal: Statistics;
+}
+
+export interface GroupMeans {
+  rms_px: number | null;
+  over_independent: number | null;
+  over_stated: number | null;
 }
 
 export interface ImageResiduals {
@@ -264,6 +289,7 @@ export interface Report {
   image_residuals_px: ImageResiduals;
   ground_residuals_m: GroundResiduals;
   stability: Stability;
+  cell_stability: CellStability;
   predicted: PredictedAccuracy;
   coverage: Coverage;
   checks: Check[];
@@ -309,9 +335,10 @@ export interface Stability {
   draws: number;
   failed_draws: number;
   held_out_per_draw: number;
-  displacements: Displacement[];
+  displacements: DrawnDisplacement[];
   held_out_px: ImageResiduals;
   held_out_m: ImageResiduals;
+  group_means: GroupMeans;
   note: string;
 }
 
