@@ -164,10 +164,7 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
     axes = [np.linspace(0.0, size - 1.0, 12) for size in shape]
     line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     shown = prepared.shown(line_sample)
-    measures, points = registration.measures, prepared.points
-    blocks = points.block[measures.point_id[measures.active]]
-    shares = np.bincount(blocks, minlength=len(points.frames)).astype(np.float64)
-    in_frame = prepared.errors.in_frame(shown, shares)
+    in_frame = prepared.errors.in_frame(shown)
 
     def error_px(ground: Array) -> Array:
         return np.asarray(registration.model.project(ground) - line_sample)
