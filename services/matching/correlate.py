@@ -179,11 +179,33 @@ def correlation_map(
     seen, valid = np.isfinite(patch), np.isfinite(chip)
     if seen.all() and valid.all():
         return np.asarray(cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED))
-    if not (seen.any() and valid.any()):
+    if not valid.any():
         return None
-    scores, common = _masked_correlation(patch, seen, chip, valid)
+    # Of a scene's border, what is within reach of chips that show enough.
+    lines = _reached(np.asarray(seen.any(axis=1)), chip.shape[0], max_missing_share)
+    samples = _reached(np.asarray(seen.any(axis=0)), chip.shape[1], max_missing_share)
+    part = patch[lines, samples]
+    if part.shape[0] < chip.shape[0] or part.shape[1] < chip.shape[1]:
+        return None
+    scores, common = _masked_correlation(part, seen[lines, samples], chip, valid)
     blocked = common < (1.0 - max_missing_share) * chip.size - 0.5
-    return None if blocked.all() else np.where(blocked, np.float32(_BLOCKED), scores)
+    if blocked.all():
+        return None
+    rows, columns = np.array(patch.shape) - chip.shape + 1
+    whole = np.full((rows, columns), _BLOCKED, dtype=np.float32)
+    filled_lines = slice(lines.start, lines.start + scores.shape[0])
+    filled_samples = slice(samples.start, samples.start + scores.shape[1])
+    whole[filled_lines, filled_samples] = np.where(blocked, np.float32(_BLOCKED), scores)
+    return whole
+
+
+def _reached(seen: BoolArray, length: int, max_missing_share: float) -> slice:
+    """The part of lines or samples (n,) that chips reach of which no larger share is missing."""
+    rows = np.flatnonzero(seen)
+    if not len(rows):
+        return slice(0, 0)
+    beyond = int(max_missing_share * length) + 1
+    return slice(max(0, int(rows[0]) - beyond), int(rows[-1]) + 1 + beyond)
 
 
 def _masked_correlation(

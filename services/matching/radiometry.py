@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from services.imagery.gaps import LOST_SHARE, missing_reason
+from services.imagery.gaps import LOST_SHARE
 from services.types import Array, BoolArray, FloatImage
 
 MIN_FOUND = 5
@@ -57,27 +57,24 @@ def patch_statistics(pixels: FloatImage) -> Array:
     inner = pixels[: rows * CELL_PX, : columns * CELL_PX]
     squares = inner.reshape(rows, CELL_PX, columns, CELL_PX).transpose(0, 2, 1, 3)
     cells = squares.reshape(rows * columns, CELL_PX, CELL_PX).astype(np.float64)
-    statistics = _mean_and_roughness(cells)
-    for cell in np.flatnonzero(~np.isfinite(statistics).all(axis=1)):
-        statistics[cell] = _of_damaged_square(cells[cell])
+    valid = np.isfinite(cells)
+    if valid.all():
+        roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
+        return np.column_stack([cells.mean(axis=(1, 2)), roughness])
+    statistics = _of_valid_pixels(np.where(valid, cells, 0.0), valid)
+    lost = valid.mean(axis=(1, 2)) < 1.0 - LOST_SHARE
+    saturated = 2 * np.isposinf(cells).sum(axis=(1, 2)) > (~valid).sum(axis=(1, 2))
+    statistics[lost] = np.where(saturated[lost, None], (np.inf, 0.0), np.nan)
     return statistics
 
 
-def _mean_and_roughness(cells: Array) -> Array:
-    """Mean and mean absolute difference of neighbours (n, 2) of squares (n, r, c)."""
-    with np.errstate(invalid="ignore"):
-        roughness = np.abs(np.diff(cells, axis=2)).mean(axis=(1, 2))
-    return np.column_stack([cells.mean(axis=(1, 2)), roughness])
-
-
-def _of_damaged_square(cell: Array) -> tuple[float, float]:
-    """Mean and roughness of the valid pixels of a square (r, c) with lost ones."""
-    valid = np.isfinite(cell)
-    if valid.mean() < 1.0 - LOST_SHARE:
-        return (np.inf, 0.0) if missing_reason(cell) == "saturated" else (np.nan, np.nan)
-    both = valid[:, 1:] & valid[:, :-1]
-    steps = np.abs(cell[:, 1:][both] - cell[:, :-1][both])
-    return float(cell[valid].mean()), float(steps.mean()) if len(steps) else np.nan
+def _of_valid_pixels(cells: Array, valid: BoolArray) -> Array:
+    """Mean and mean absolute difference of neighbours (n, 2), valid pixels of squares (n, r, c) only."""
+    both = valid[:, :, 1:] & valid[:, :, :-1]
+    steps = np.abs(np.diff(cells, axis=2)) * both
+    sums = np.column_stack([cells.sum(axis=(1, 2)), steps.sum(axis=(1, 2))])
+    counts = np.column_stack([valid.sum(axis=(1, 2)), both.sum(axis=(1, 2))])
+    return np.asarray(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan))
 
 
 def cloud_mask(statistics: Sequence[Array], found: BoolArray) -> BoolArray:

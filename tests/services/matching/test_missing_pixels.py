@@ -21,6 +21,7 @@ RADIUS_PX, SIDE, PERIOD = 6, 101, 128
 CHIPS = 100
 
 a_millipixel = 1e-3
+a_hundred_thousandth = 1e-5
 a_twentieth_of_a_pixel = 0.05
 four_standard_errors = 4.0
 
@@ -169,6 +170,23 @@ def test_positions_where_too_much_is_missing_cannot_win() -> None:
     shown = 60 - np.arange(2 * RADIUS_PX + 1)
     assert ((scores == -1.0).all(axis=0) == (shown < SIDE / 2)).all()
     assert find_chip(patch, chip, OPTIONS).reason == "low_score"
+
+
+def test_only_what_chips_reach_beyond_the_border_of_a_scene_is_searched_and_nothing_is_lost() -> None:
+    rng = np.random.default_rng(2)
+    chip = as_pixels(texture(rng, PERIOD, 1.5)[:20, :20])
+    patch = as_pixels(texture(rng, PERIOD, 1.5)[:90, :80])
+    patch[:30], patch[:, 50:] = np.nan, np.nan
+    scores = correlation_map(patch, chip)
+    assert scores is not None
+    assert scores.shape == (71, 61)
+    for row, column in np.ndindex(scores.shape):
+        window = patch[row : row + 20, column : column + 20]
+        valid = np.isfinite(window)
+        expected = -1.0
+        if 2 * valid.sum() >= valid.size:
+            expected = np.corrcoef(window[valid], chip[valid])[0, 1]
+        assert scores[row, column] == pytest.approx(expected, abs=a_hundred_thousandth)
 
 
 def test_a_peak_beside_a_blocked_position_is_rejected() -> None:
