@@ -13,6 +13,7 @@ from services.errors import AmersError
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource
 from services.quality.accuracy import accuracy, normalised_error
+from services.quality.frames import frame_in_image
 from services.registration.on_points import Registration, register_scene
 from services.registration.options import RegistrationOptions
 from services.simulation.conditions import Conditions
@@ -177,8 +178,7 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
 
     error, on_earth = error_px(in_frame), error_px(shown)
     covariance = registration.adjustment.covariance_at(line_sample)
-    frame = derivative @ registration.frame.covariance_m2 @ derivative.transpose(0, 2, 1)
-    both = covariance + frame
+    both = covariance + frame_in_image(registration.frame, derivative, registration.adjustment.apart_px)
     quality = registration.qualification
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(

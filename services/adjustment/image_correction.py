@@ -95,7 +95,10 @@ class SceneAdjustment:
         slope_px: a priori standard deviation of drift and skew at the edge of the image, as used.
         covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that a given
             order leaves out. It is relative to the frame that the blocks of the points scatter about.
+        local_sigma_px: (2,) standard deviation, line and sample, of what parts of the image are off by
+            and no correction follows: seams between detectors, terrain.
         shared: what the residuals tell of errors that the points share.
+        apart_px: standard deviation of the offsets of the points' blocks, beyond chance; 0 for one.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
         sigma0: a posteriori standard deviation of unit weight.
@@ -108,7 +111,9 @@ class SceneAdjustment:
     validation_px: tuple[tuple[Order, float], ...]
     slope_px: float
     covariance: Array
+    local_sigma_px: Array
     shared: SharedErrors
+    apart_px: float
     residual_px: Array
     active: BoolArray
     sigma0: float
@@ -120,7 +125,8 @@ class SceneAdjustment:
         t = (delivered - self.correction.centre) / self.correction.half_size
         design = np.zeros((len(t), 2, 6))
         design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
-        return np.asarray(design @ self.covariance @ design.transpose(0, 2, 1))
+        of_correction = design @ self.covariance @ design.transpose(0, 2, 1)
+        return np.asarray(of_correction + np.diag(self.local_sigma_px**2))
 
 
 def adjust_scene(
@@ -144,7 +150,8 @@ def adjust_scene(
     not fixed at zero: their a priori standard deviation is estimated from the measures (empirical
     Bayes), and their covariance states what remains undetermined. So it is with an offset for each
     block, where the points come from several. The covariance holds what the residuals show of errors
-    that neighbours share: see `shared_errors`.
+    that neighbours share: see `shared_errors`. They are errors of the points and of the image, in the
+    proportion of their declared variances; those of the image remain at every place of it.
 
     Args:
         model: as delivered.
@@ -177,10 +184,13 @@ def adjust_scene(
         slope_px = like.slope_px if like else fit.likeliest_slope_px(agreeing, max(scale, 1.0), least_px)
     else:
         _refuse_undetermined(fit, agreeing, order)
+    apart_px = 0.0
     if fit.member.shape[1]:
         stated_px = _frame_sigma_px(model, observations, fit.member)
         unit = max(scale, 1.0)
-        offset_px = offset_sigma_px(fit, agreeing, free, slope_px, unit=unit, stated_px=stated_px)
+        offset_px, apart_px = offset_sigma_px(
+            fit, agreeing, free, slope_px, unit=unit, stated_px=stated_px
+        )
         fit, declared = (replace(one, offset_px=offset_px) for one in (fit, declared))
 
     def magnitude(active: BoolArray) -> Array:
@@ -214,13 +224,17 @@ def adjust_scene(
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
+    of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
+    local_px2 = shared.likely_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
     return SceneAdjustment(
         correction=correction,
         order=order,
         validation_px=validation,
         slope_px=slope_px,
         covariance=covariance,
+        local_sigma_px=np.sqrt(local_px2),
         shared=shared,
+        apart_px=apart_px,
         residual_px=np.where(usable[:, None], misfit_px, np.nan),
         active=active,
         sigma0=_sigma0(declared, active, free, slope_px, _kept_variance(options.tolerance)),

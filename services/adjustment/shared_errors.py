@@ -50,11 +50,13 @@ class SharedErrors:
 
     Attributes:
         factor: variance, at least 1.
-        correlated: (l,) the part of it that is correlated over each of the lengths.
+        correlated: (l,) the part of it that is correlated over each of the lengths, mean of the cases.
+        likely_share: that is correlated, median of the cases: 0 where errors are rather independent.
     """
 
     factor: float
     correlated: Array
+    likely_share: float
 
     def covariance(self, position: Array, overlapping: Array) -> Array:
         """Covariance (n, n) of normalised errors.
@@ -99,8 +101,8 @@ def offset_sigma_px(
     *,
     unit: float,
     stated_px: Array,
-) -> Array:
-    """A priori standard deviation (2, b) of the offsets of blocks around the frame they scatter about.
+) -> tuple[Array, float]:
+    """Standard deviations of the offsets of blocks around the frame they scatter about, pixels.
 
     It is that of their frames where it is stated, else one pixel, within what the disagreement of the
     blocks allows: at least their scatter beyond chance, at most the variance whose 90 % region would
@@ -114,6 +116,9 @@ def offset_sigma_px(
         slope_px: a priori standard deviation of drift and skew.
         unit: standard deviation of unit weight.
         stated_px: (2, b) of the frames of the blocks; NaN where nobody stated it.
+
+    Returns:
+        (2, b) a priori, and what the blocks were seen to be apart beyond chance.
     """
     parameters, covariance = fit.solution(active, free, slope_px)
     blocks = fit.member.shape[1]
@@ -125,7 +130,7 @@ def offset_sigma_px(
     least = max(0.0, scatter - by_chance)
     most = _few_degrees(freedom) * max(scatter, by_chance)
     expected = np.where(np.isfinite(stated_px), stated_px, _UNKNOWN_OFFSET_PX) ** 2
-    return np.asarray(np.sqrt(np.clip(expected, least, most)))
+    return np.sqrt(np.clip(expected, least, most)), float(np.sqrt(least))
 
 
 def _few_degrees(freedom: float) -> float:
@@ -184,10 +189,19 @@ def likeliest_shared_errors(
     evidence = np.array([one.log_evidence for one in told]) + np.log(prior)
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    correlated = np.zeros(len(_LENGTHS))
-    for w, one, (share, k) in zip(weight, told, cases, strict=True):
-        correlated[k] += w * share * one.as_seen
-    return SharedErrors(float(weight @ [one.factor for one in told]), correlated)
+    shares, lengths = (np.array(column) for column in zip(*cases, strict=True))
+    part = weight * shares * [one.as_seen for one in told]
+    return SharedErrors(
+        factor=float(weight @ [one.factor for one in told]),
+        correlated=np.asarray(np.bincount(lengths, part, len(_LENGTHS)), dtype=np.float64),
+        likely_share=_weighted_median(shares, weight),
+    )
+
+
+def _weighted_median(values: Array, weight: Array) -> float:
+    """The median of values (n,) with weights (n,) of sum 1."""
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weight[order]), 0.5)])
 
 
 @dataclass(frozen=True)

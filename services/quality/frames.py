@@ -32,26 +32,28 @@ def frame_le90_m(frame: Frame) -> float:
     return LINEAR_LE90 * float(np.sqrt(frame.covariance_m2[2, 2]))
 
 
-def frame_on_ground(frame: Frame, derivative: Array) -> Array:
-    """What an error of the frame moves on the ground, by models that are registered in it.
+def frame_in_image(frame: Frame, derivative: Array, apart_px: float) -> Array:
+    """What an error of the frame moves in the image, by models that are registered in it.
 
-    At its true height, a place on the ground moves by the frame's horizontal error, and along the line
-    of sight by its height error: the covariance is H^-1 J F J^T H^-T, with the derivative J of the model
-    and its horizontal part H. Heights that are unknown do not matter where they move nothing.
+    It is J F J^T with the derivative J of the model; heights that are unknown do not matter where they
+    move nothing. Blocks that are seen to be apart do not share all of the error of their frames: what
+    they differ by is an error relative to the control points already.
 
     Args:
         frame: of the control points.
         derivative: (n, 2, 3) of line, sample by east, north, up, pixels per metre.
+        apart_px: standard deviation of the offsets of the blocks; 0 for one.
 
     Returns:
-        (n, 2, 2) of east, north, m^2; NaN where the frame is unknown.
+        (n, 2, 2) of line, sample, px^2; NaN where the frame is unknown.
     """
-    moved = np.linalg.solve(derivative[:, :, :2], derivative)
     covariance = frame.covariance_m2
     if np.isnan(covariance[2, 2]) and not derivative[:, :, 2].any():
         covariance = np.where(np.arange(3)[:, None] == 2, 0.0, covariance)
         covariance = np.where(np.arange(3)[None, :] == 2, 0.0, covariance)
-    return np.asarray(moved @ covariance @ moved.transpose(0, 2, 1))
+    stated = derivative @ covariance @ derivative.transpose(0, 2, 1)
+    variance = np.maximum(np.trace(stated, axis1=1, axis2=2) / 2.0, 1e-12)
+    return np.asarray(stated * np.maximum(1.0 - apart_px**2 / variance, 0.0)[:, None, None])
 
 
 def why_unknown(frame: Frame) -> str:

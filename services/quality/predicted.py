@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.quality.accuracy import normal_ce90
-from services.quality.frames import frame_on_ground
+from services.quality.frames import frame_in_image
 from services.quality.stability import AdjustedScene
 from services.types import Array
 
@@ -54,9 +54,11 @@ def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
     ce90_px = normal_ce90(covariance)
     derivative = _derivative(scene, line_sample)
     to_ground = np.linalg.inv(derivative[:, :, :2])
-    relative = to_ground @ covariance @ to_ground.transpose(0, 2, 1)
-    relative_m = normal_ce90(relative)
-    on_the_earth_m = normal_ce90(relative + frame_on_ground(scene.frame, derivative))
+    of_frame = frame_in_image(scene.frame, derivative, scene.adjustment.apart_px)
+    relative_m, on_the_earth_m = (
+        normal_ce90(to_ground @ part @ to_ground.transpose(0, 2, 1))
+        for part in (covariance, covariance + of_frame)
+    )
     return PredictedAccuracy(
         std_line_px=std[..., 0],
         std_sample_px=std[..., 1],

@@ -103,6 +103,7 @@ def _correction_record(
         shift_m=float(np.hypot(*shift_px) * gsd_m),
         words=correction_in_words(adjustment, gsd_m),
         sigma0=adjustment.sigma0,
+        local_sigma_px=adjustment.local_sigma_px,
     )
 
 

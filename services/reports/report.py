@@ -121,6 +121,8 @@ class CorrectionRecord:
         shift_m: length of that displacement on the ground, by the ground sampling of the image.
         words: the parameters as sentences.
         sigma0: a posteriori standard deviation of unit weight.
+        local_sigma_px: line and sample, one standard deviation of what parts of the image are off by
+            beyond the correction.
     """
 
     order: str
@@ -134,6 +136,7 @@ class CorrectionRecord:
     shift_m: float
     words: tuple[str, ...]
     sigma0: float
+    local_sigma_px: Array
 
 
 @dataclass(frozen=True)

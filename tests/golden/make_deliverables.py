@@ -36,6 +36,7 @@ def correction():
         "centre_px": [make_rpc.LINE_OFF, make_rpc.SAMP_OFF],
         "half_size_px": [make_rpc.LINE_SCALE, make_rpc.SAMP_SCALE],
         "covariance_px2": [[0.25 if i == j else None for j in range(6)] for i in range(6)],
+        "local_sigma_px": [0.125, 0.0625],
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 

@@ -19,7 +19,13 @@ CORRECTION_FORMAT = "amers-image-correction/1"
 
 
 def format_correction(
-    correction: ImageCorrection, order: str, covariance_px2: Array, applies_to: str, carried: str
+    correction: ImageCorrection,
+    order: str,
+    covariance_px2: Array,
+    local_sigma_px: Array,
+    *,
+    applies_to: str,
+    carried: str,
 ) -> str:
     """The JSON document of a correction.
 
@@ -27,6 +33,7 @@ def format_correction(
         correction: from positions of the delivered model to true positions.
         order: "shift", "drift" or "affine".
         covariance_px2: (6, 6) covariance of the parameters, row by row.
+        local_sigma_px: (2,) line and sample, of what parts of the image are off by beyond it.
         applies_to: one sentence on the origin of the delivered model.
         carried: one sentence on the files that contain the correction, and their accuracy.
     """
@@ -44,6 +51,7 @@ def format_correction(
         "covariance_px2": [
             [v if math.isfinite(v) else None for v in row] for row in covariance_px2.tolist()
         ],
+        "local_sigma_px": local_sigma_px.tolist(),
     }
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 

@@ -81,7 +81,12 @@ def write_refined(
         model_files = _write_rpc(delivered, model, shape, folder, copied)
         applies_to = delivered.note if delivered else f"model of {image_path.name}"
     text = format_correction(
-        model.correction, adjustment.order, adjustment.covariance, applies_to, model_files.note
+        model.correction,
+        adjustment.order,
+        adjustment.covariance,
+        adjustment.local_sigma_px,
+        applies_to=applies_to,
+        carried=model_files.note,
     )
     (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
     return RefinedFiles(

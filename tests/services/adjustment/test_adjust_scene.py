@@ -312,6 +312,40 @@ def test_a_drift_too_small_to_be_seen_is_in_the_stated_accuracy():
     assert np.mean(squares) == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.parametrize(("of_points_px", "in_the_image"), [(0.0, True), (2.0, False)])
+def test_what_parts_of_the_image_are_off_by_is_in_the_accuracy_of_every_place(
+    of_points_px: float, in_the_image: bool
+) -> None:
+    """Detectors out of place, which no affine follows; points that may err as much explain them too."""
+    rng = np.random.default_rng(16)
+    seams_px = np.array([[0.5, -0.4], [-0.6, 0.3], [0.2, 0.5], [-0.1, -0.4]])
+
+    def seam(line_sample: Array) -> Array:
+        return np.asarray(seams_px[np.clip(line_sample[:, 1] / SHAPE[1] * 4, 0, 3).astype(int)])
+
+    places = rng.uniform(0.0, 1.0, (200, 2)) * (np.array(SHAPE) - 1.0)
+    squares, local_px = [], []
+    for _ in range(TRIALS // 10):
+        points = seen(TRUTH["shift"], rng, n=120, noise_px=0.05)
+        moved = points.line_sample + seam(points.line_sample)
+        variance = np.tile((of_points_px * GSD_M) ** 2 * np.eye(3), (120, 1, 1))
+        result = replace(points, line_sample=moved, covariance_m2=variance).adjust()
+        error = result.correction.apply(places) - points.truth.apply(places) - seam(places)
+        weighted = np.linalg.solve(result.covariance_at(places), error[:, :, None])[:, :, 0]
+        squares.append((weighted * error).sum() / error.size)
+        local_px.append(result.local_sigma_px)
+    if in_the_image:
+        assert 0.7 < np.mean(squares) < 1.5
+    else:
+        assert np.max(local_px) < 0.1
+
+
+def test_independent_errors_are_no_errors_of_parts_of_the_image() -> None:
+    rng = np.random.default_rng(17)
+    local_px = [seen(TRUTH["affine"], rng, n=120).adjust().local_sigma_px for _ in range(TRIALS // 10)]
+    assert np.median(local_px) < 0.2 * NOISE_PX
+
+
 def test_a_third_of_blunders_does_not_hide_the_order():
     rng = np.random.default_rng(9)
     orders = [
@@ -383,7 +417,7 @@ def test_the_covariance_of_a_place_is_that_of_where_the_delivered_model_puts_it(
     place = np.array([[100.0, 4000.0]])
     t = (place - result.correction.centre) / result.correction.half_size
     design = np.kron(np.eye(2), np.concatenate([[1.0], t[0]]))
-    expected = design @ result.covariance @ design.T
+    expected = design @ result.covariance @ design.T + np.diag(result.local_sigma_px**2)
     np.testing.assert_allclose(result.covariance_at(place + moved)[0], expected, rtol=0.01)
 
 
@@ -405,7 +439,8 @@ def corner_std_px(points: Seen, block: np.ndarray | None, frame_m2: Array | None
         frame_covariance_m2=frame_m2,
     )
     result = adjust_scene(FlatModel(), SHAPE, observations)
-    return float(np.sqrt(result.covariance_at(np.zeros((1, 2)))[0, 0, 0]))
+    corner = np.array([1.0, -1.0, -1.0, 0.0, 0.0, 0.0])
+    return float(np.sqrt(corner @ result.covariance @ corner))
 
 
 def test_blocks_that_disagree_do_not_pretend_to_agree() -> None:

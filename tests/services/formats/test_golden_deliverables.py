@@ -64,7 +64,12 @@ def test_a_written_correction_is_identical_to_the_byte() -> None:
     np.fill_diagonal(covariance, 0.25)
     document = json.loads(CORRECTION)
     again = format_correction(
-        correction, "drift", covariance, document["applies_to"], document["carried"]
+        correction,
+        "drift",
+        covariance,
+        np.array([0.125, 0.0625]),
+        applies_to=document["applies_to"],
+        carried=document["carried"],
     )
     assert again == CORRECTION
 

@@ -5,7 +5,7 @@ import pytest
 
 from services.quality.accuracy import normal_ce90
 from services.quality.accuracy_statement import points_accuracy, scene_accuracy
-from services.quality.frames import frame_on_ground
+from services.quality.frames import frame_in_image
 from services.types import UNKNOWN_FRAME, Frame
 
 a_percent = 0.01
@@ -20,7 +20,8 @@ def test_an_error_of_the_frame_moves_the_ground_as_its_covariance_says():
     error = np.random.default_rng(1).multivariate_normal(np.zeros(3), TILTED.covariance_m2, 400_000)
     moved_px = error @ OBLIQUE[0].T
     moved_m = np.linalg.solve(OBLIQUE[0, :, :2], moved_px.T).T
-    expected = frame_on_ground(TILTED, OBLIQUE)[0]
+    to_ground = np.linalg.inv(OBLIQUE[0, :, :2])
+    expected = to_ground @ frame_in_image(TILTED, OBLIQUE, 0.0)[0] @ to_ground.T
     np.testing.assert_allclose(np.cov(moved_m.T), expected, rtol=a_percent, atol=a_percent)
     ce90_m = np.quantile(np.linalg.norm(moved_m, axis=1), 0.9)
     assert normal_ce90(expected[None])[0] == pytest.approx(ce90_m, rel=a_percent)
@@ -30,9 +31,18 @@ def test_an_unknown_height_of_the_frame_matters_only_where_heights_move_the_imag
     frame = Frame.from_sigmas(2.0, np.nan)
     vertical = OBLIQUE.copy()
     vertical[:, :, 2] = 0.0
-    np.testing.assert_allclose(frame_on_ground(frame, vertical)[0], 4.0 * np.eye(2), atol=1e-12)
-    assert np.isnan(frame_on_ground(frame, OBLIQUE)).all()
-    assert np.isnan(frame_on_ground(UNKNOWN_FRAME, vertical)).all()
+    horizontal = vertical[0, :, :2]
+    expected = 4.0 * horizontal @ horizontal.T
+    np.testing.assert_allclose(frame_in_image(frame, vertical, 0.0)[0], expected, atol=1e-12)
+    assert np.isnan(frame_in_image(frame, OBLIQUE, 0.0)).all()
+    assert np.isnan(frame_in_image(UNKNOWN_FRAME, vertical, 0.0)).all()
+
+
+def test_what_blocks_differ_by_is_not_counted_as_common_to_them_again():
+    stated = frame_in_image(TILTED, OBLIQUE, 0.0)
+    variance = np.trace(stated[0]) / 2.0
+    np.testing.assert_allclose(frame_in_image(TILTED, OBLIQUE, np.sqrt(0.25 * variance)), 0.75 * stated)
+    assert not frame_in_image(TILTED, OBLIQUE, np.sqrt(2.0 * variance)).any()
 
 
 def test_the_words_state_both_accuracies_in_their_order():

@@ -30,7 +30,10 @@ CORRECTION = ImageCorrection(
 
 
 def written(correction: ImageCorrection = CORRECTION) -> str:
-    return format_correction(correction, "affine", np.diag([np.nan, 1, 2, 3, 4, 5]), "tags", "none")
+    covariance = np.diag([np.nan, 1, 2, 3, 4, 5])
+    return format_correction(
+        correction, "affine", covariance, np.zeros(2), applies_to="tags", carried="none"
+    )
 
 
 def test_a_correction_survives_a_round_trip() -> None:
