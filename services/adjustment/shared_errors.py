@@ -27,7 +27,7 @@ _SHARES = np.array([0.4, 0.65, 0.9])
 """Shares of the variance that are considered to be correlated."""
 _MIDDLE = 5
 """Of the cases: the middle share over the middle length."""
-_INDEPENDENT = 0.5
+_INDEPENDENT = 0.35
 """A priori probability that the errors are independent; the other cases share the rest."""
 _STATED_IS_TRUE = 0.3
 """A priori probability that the stated sigmas are true, rather than off by a factor of up to ten."""
