@@ -6,15 +6,18 @@ export OMP_NUM_THREADS := 1
 BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
+# Tests of services wait for them: half as many processes again as there are cores.
+WORKERS := $(shell expr $$(nproc) \* 3 / 2)
 LONG := faults load stress throughput
 
-.PHONY: demo test test-fast test-security check docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
+.PHONY: demo test test-fast test-security test-endurance check docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
 
 test: check postgis page chromium
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --ignore tests/app/test_openapi.py
+	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
+		--ignore tests/app/test_openapi.py
 	# All its operations have one name, of which files handed out as a whole run only the first.
 	$(BIN)/python -m pytest -n auto --dist load tests/app/test_openapi.py
 
@@ -25,6 +28,10 @@ test-fast: $(READY)
 # All operations with all callers, and all hostile values, filters, archives and images: some minutes.
 test-security: postgis
 	$(BIN)/python -m pytest -m security --attacks full -n auto --dist loadfile --no-loadscope-reorder
+
+# Repeated kills, cuts and floods, bombs, further real views: about ten minutes.
+test-endurance: postgis
+	$(BIN)/python -m pytest -m endurance -n auto --dist load
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

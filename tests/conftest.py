@@ -59,7 +59,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     """Report what a fast run has left out."""
     if counts := config.stash.get(LEFT_OUT, None):
         parts = ", ".join(f"{count} {reason}" for reason, count in counts.items())
-        terminalreporter.write_line(f"left out by --fast: {parts}; `make test` runs all tests")
+        terminalreporter.write_line(f"left out by --fast: {parts}; `make test` runs more")
 
 
 def _keep_fast(config: pytest.Config, items: list[pytest.Item]) -> None:

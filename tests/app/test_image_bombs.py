@@ -185,6 +185,7 @@ def store(cluster, world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -
         yield store
 
 
+@pytest.mark.endurance
 def test_bombs_end_as_failed_jobs_within_their_limits(
     store: Installation, world: FlatWorld, tmp_path: Path
 ):

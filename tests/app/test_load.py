@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.load import run
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 CLIENTS, SECONDS, SEED = 8, 5.0, 1
 KINDS = {"chips", "footprint", "point", "tile"}

@@ -31,7 +31,7 @@ from tests.app.worker_processes import (
 )
 from tests.statements import run_sql
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 LEASE_S = 3.0
 PIECE_BYTES = 65_536

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.faults import Work, run
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.endurance]
 
 WORK = Work(registrations=4, ingestions=2, uploads=2, exports=1, backups=2)
 KILL_EVERY_S = 2.0

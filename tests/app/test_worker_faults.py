@@ -119,6 +119,7 @@ def test_a_killed_worker_loses_its_job_to_another_and_there_is_one_result(
     assert attempts == {"2"}
 
 
+@pytest.mark.endurance
 def test_a_killed_job_process_is_tried_again_by_the_worker_that_lives_on(
     client: TestClient,
     me: dict[str, str],
@@ -181,6 +182,7 @@ def test_a_job_that_writes_too_large_a_file_fails_at_once_and_leaves_nothing(
     assert not list(storage.scratch().glob(f"job-{job_id}*"))
 
 
+@pytest.mark.endurance
 def test_a_stopped_worker_gives_its_job_back_at_once(
     client: TestClient,
     me: dict[str, str],
@@ -260,6 +262,7 @@ def test_a_job_over_its_time_limit_fails_cleanly_and_the_worker_lives_on(
     assert "1 s" in ended_job["message"]
 
 
+@pytest.mark.endurance
 def test_a_worker_that_was_suspended_beyond_its_lease_ends_nothing_twice(
     client: TestClient,
     me: dict[str, str],
@@ -312,6 +315,7 @@ def test_a_truncated_scene_fails_for_good_with_the_reason(
     assert str(settings.data_folder) not in ended_job["message"], "no path of the server is told"
 
 
+@pytest.mark.endurance
 def test_a_worker_outlives_the_loss_of_all_its_connections(
     client: TestClient,
     me: dict[str, str],
