@@ -11,6 +11,7 @@ Array = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+StrArray = npt.NDArray[np.str_]
 ChipArray = npt.NDArray[Any]
 
 
@@ -192,6 +193,24 @@ class ControlPoints:
             if self.surface is None
             else SurfaceHeights(self.surface.height_m[rows], self.surface.sigma_m[rows]),
         )
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """n points of known ground without chips, such as those of another base.
+
+    Attributes:
+        id: (n,) str, unique.
+        lon_lat_h: (n, 3); the height is NaN where unknown.
+        sigma_m: (n, 3) east, north, up, one standard deviation; NaN where unknown.
+    """
+
+    id: StrArray
+    lon_lat_h: Array
+    sigma_m: Array
+
+    def __len__(self) -> int:
+        return len(self.id)
 
 
 HEALTH_PRIOR_TRIES = 5.0

@@ -14,7 +14,7 @@ _MAX_TEXT_BYTES = 20_000_000
 
 
 def read_text(path: Path) -> str:
-    """The content of a small text file in UTF-8, or else in Latin-1.
+    """The content of a small text file in UTF-8, with or without a byte order mark, or else in Latin-1.
 
     Raises:
         FormatError: the file cannot be read, or is larger than 20 MB.
@@ -28,7 +28,7 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
 

@@ -51,7 +51,7 @@ def rows():
 
 
 def asp():
-    lines = ["# invented"]
+    lines = ["# invented, for bundle_adjust --use-lon-lat-height-gcp-error"]
     for number, ((lon, lat, h), (east, north, up), (line, sample), sigma) in rows():
         lines.append(
             f"{number}, {lat:.10f} {lon:.10f} {h} {north} {east} {up} "
@@ -145,6 +145,96 @@ def orthority():
     return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
 
 
+def ecef_sigmas():
+    """The same points with sigmas of x, y and z, as ASP reads them by default, and one fixed point."""
+    lines = []
+    for number, ((lon, lat, h), _, (line, sample), sigma) in rows():
+        sigmas = "1e-10 1e-10 1e-10" if number == 13 else "1.0 2.0 3.0"
+        lines.append(
+            f"{number} {lat:.10f} {lon:.10f} {h} {sigmas} {IMAGE} {sample!r} {line!r} {sigma} {sigma}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def gcplib(utm_points):
+    names = [
+        "Unique Ground Control Point ID - integer",
+        "Name of the chip image - string",
+        "Reference line",
+        "Reference sample",
+        "Latitude",
+        "Longitude",
+        "Projection X",
+        "Projection Y",
+        "Elevation",
+        "Pixel size X",
+        "Pixel size Y",
+        "Chip lines",
+        "Chip samples",
+        "Source",
+        "Type",
+        "Projection",
+        "Zone",
+        "Date",
+        "Absolute or relative",
+        "Data type",
+    ]
+    lines = [f"# {name}" for name in names] + ["BEGIN", str(len(LON_LAT_H))]
+    for (number, ((lon, lat, h), *_)), (x, y, _) in zip(rows(), utm_points, strict=True):
+        lines.append(
+            f"{number} gcp_{number}.chip 31.500000 31.500000 {lat:.10f} {lon:.10f} {y:.6f} {x:.6f} "
+            f"{h:.6f} 30.000000 30.000000 64.000000 64.000000 GLS+ GRAYSCALE UTM 33 07-14-1999 ABS BYTE"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def copernicus(utm_points):
+    gcps = []
+    for (number, ((lon, lat, h), *_)), (x, y, _) in zip(rows(), utm_points, strict=True):
+        info = {"Longitude": f"{lon:.10f}", "Latitude": f"{lat:.10f}", "EPSG": "32633"}
+        info |= {"Altimetry": {"@unit": "m", "#text": str(h)}, "X": f"{x:.4f}", "Y": f"{y:.4f}"}
+        measure = {"Chips": {"Chip_File": f"{number}_00.TIF"}}
+        measures = [measure, {"Chips": {"Chip_File": {"Chip_File": f"{number}_01.TIF"}}}]
+        gcps.append(
+            {
+                "ID": str(number),
+                "GCP_Info": info,
+                "Quality_Indicators": {"Quality_Score": "3"},
+                "GRI_List": {"GRI_Measure": measure if number % 2 else measures},
+            }
+        )
+    return json.dumps({"GCP_DB": {"GCP": gcps}}, indent=1) + "\n"
+
+
+def comma_separated():
+    lines = [
+        "id,lon,lat,height_m,sigma_east_m,sigma_north_m,sigma_up_m,image,line,sample,sigma_px,remark"
+    ]
+    for number, ((lon, lat, h), (east, north, up), (line, sample), sigma) in rows():
+        place = f"{lon:.10f},{lat:.10f},{h},{east},{north},{up}"
+        lines.append(f'{number},{place},{IMAGE},{line!r},{sample!r},{sigma},"a corner, sharp"')
+    return "\n".join(lines) + "\n"
+
+
+def semicolon_separated(utm_points):
+    """Other names and order, positions on a map, no marks, and one unknown sigma."""
+    lines = ["N;E;ALT;PT;SH;SV"]
+    for (number, ((_, _, h), (_, north, up), *_)), (x, y, _) in zip(rows(), utm_points, strict=True):
+        lines.append(f"{y:.10f};{x:.10f};{h};{number};{north};{'' if number == 13 else up}")
+    return "\r\n".join(lines) + "\r\n"
+
+
+def feet():
+    """ODM's list in feet: a projection in US survey feet whose heights are feet too."""
+    projection = "+proj=utm +zone=33 +datum=WGS84 +units=us-ft +no_defs"
+    foot_m = 1200 / 3937
+    lines = [projection]
+    for (x, y, h), (number, (_, _, (line, sample), _)) in zip(utm(), rows(), strict=True):
+        ground = f"{x / foot_m!r} {y / foot_m!r} {h / foot_m!r}"
+        lines.append(f"{ground} {sample!r} {line!r} {IMAGE} {number}")
+    return "\n".join(lines) + "\n"
+
+
 if __name__ == "__main__":
     for name, text in {
         "invented.gcp": asp(),
@@ -156,5 +246,11 @@ if __name__ == "__main__":
         "invented_opf.json": opf(),
         "invented.geojson": geojson(),
         "invented_orthority.geojson": orthority(),
+        "invented_ecef.gcp": ecef_sigmas(),
+        "invented_feet.txt": feet(),
+        "invented_gcplib.txt": gcplib(utm()),
+        "invented_copernicus.json": copernicus(utm()),
+        "invented.csv": comma_separated(),
+        "invented_mapped.csv": semicolon_separated(utm()),
     }.items():
         (HERE / name).write_text(text)

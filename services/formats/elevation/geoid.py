@@ -58,20 +58,39 @@ def geoid_of_crs(vertical: CRS) -> Geoid:
         VerticalDatumError: PROJ has no transformation to the ellipsoid with an installed grid.
     """
     compound = CompoundCRS("position and height", ["EPSG:4326", vertical])
-    with warnings.catch_warnings():
-        # PROJ warns that the best transformation is not installed; the code below handles it.
-        warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup(compound, "EPSG:4979", always_xy=True, allow_ballpark=False)
+    group = _transformations(compound)
     if not group.transformers:
-        missing = sorted(
-            {grid.short_name for step in group.unavailable_operations for grid in step.grids}
-        )
-        hint = f": PROJ has no {' or '.join(missing)} installed" if missing else ""
         raise VerticalDatumError(
-            f"heights in {vertical.name} cannot be converted to heights above the ellipsoid{hint}; "
-            "give the grid file of the geoid"
+            f"heights in {vertical.name} cannot be converted to heights above the ellipsoid"
+            f"{missing_grids(compound)}; or give the grid file of the geoid (--geoid)"
         )
     return _geoid(group.transformers[0])
+
+
+def missing_grids(crs: CRS) -> str:
+    """Which grids PROJ lacks to reach WGS 84 from a CRS, and where they are; "" when it lacks none."""
+    operations = _transformations(crs).unavailable_operations
+    grids = [grid for step in operations for grid in step.grids if not grid.available]
+    published = sorted({grid.short_name for grid in grids if grid.url})
+    names = published or sorted({grid.short_name for grid in grids})
+    if not names:
+        return ""
+    message = f": PROJ has no {' or '.join(names)} installed"
+    if published:
+        message += (
+            f"; the package proj-data of conda-forge has it, or run: pyproj sync --file {names[0]}"
+        )
+    if "us_nga_egm96_15.tif" in names:
+        message += "; proj-data of Debian has it as egm96_15.gtx"
+    return message
+
+
+def _transformations(crs: CRS) -> TransformerGroup:
+    """The transformations to WGS 84 that are not approximate."""
+    with warnings.catch_warnings():
+        # PROJ warns that the best transformation is not installed; the callers handle it.
+        warnings.simplefilter("ignore", UserWarning)
+        return TransformerGroup(crs, "EPSG:4979", always_xy=True, allow_ballpark=False)
 
 
 def vertical_crs(name: str) -> CRS | None:

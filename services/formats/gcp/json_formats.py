@@ -11,14 +11,18 @@ from pyproj import CRS
 from services.errors import FormatError, InputError, VerticalDatumError
 from services.formats.gcp.marked_points import (
     MarkedPoints,
+    horizontal_unit_m,
     marked_points,
     parse_crs,
     to_wgs84,
 )
+from services.formats.gcp.text_lines import check_lon_lat
 from services.formats.text_files import load_json
 from services.types import Array, Measures
 
 OPF_FORMAT = "application/opf-input-control-points+json"
+_OPF_FORMATS = (OPF_FORMAT, OPF_FORMAT.removeprefix("application/"))
+"""The name in the examples of the specification, and the one in its text."""
 OPF_CORNER_PX = 0.5
 """OPF counts pixels from the corner of the first one."""
 OPF_EXTENSION = "AMERS_images"
@@ -86,7 +90,7 @@ def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
     `sample`, from the centre of the first pixel, or Orthority's `ji` (column, row). Optional: `id`,
     `image` or `filename`, `sigma_px`, `sigma_east_m`, `sigma_north_m`, `sigma_up_m`, `check`, and
     `status`: a point with a status other than "active" is not active. Features without a position in
-    the image are skipped.
+    the image are points that are not marked.
 
     Args:
         text: contents of the file.
@@ -106,7 +110,7 @@ def parse_geojson_points(text: str, source: str = "GeoJSON") -> MarkedPoints:
         _geojson_row(feature, f"{source}, feature {count}", image, str(count))
         for count, feature in enumerate(features, start=1)
     ]
-    return _points_from_rows([row for row in rows if row is not None])
+    return _points_from_rows(rows)
 
 
 def format_opf(points: MarkedPoints) -> str:
@@ -180,7 +184,7 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
         VerticalDatumError: heights need a grid that is not installed.
     """
     document = load_json(text, source)
-    if not isinstance(document, dict) or document.get("format") != OPF_FORMAT:
+    if not isinstance(document, dict) or document.get("format") not in _OPF_FORMATS:
         raise FormatError(f"{source}: expected a document of the format {OPF_FORMAT}")
     if not str(document.get("version", "")).startswith("1."):
         raise FormatError(f"{source}: expected OPF 1, found version {document.get('version')!r}")
@@ -196,6 +200,8 @@ def parse_opf(text: str, source: str = "OPF") -> MarkedPoints:
     return _points_from_rows(rows)
 
 
+_NOT_MARKED = (math.nan, math.nan)
+
 Row = dict[str, Any]
 """One mark: values by the attribute names of `MarkedPoints`."""
 
@@ -207,8 +213,8 @@ def _points_from_rows(rows: list[Row]) -> MarkedPoints:
     )
 
 
-def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None:
-    """The mark of one feature; None without a position in the image."""
+def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row:
+    """The point of one feature, with its mark if it has a position in the image."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     properties = feature.get("properties") if isinstance(feature, dict) else None
     if not isinstance(geometry, dict) or geometry.get("type") != "Point":
@@ -218,10 +224,11 @@ def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None
     if isinstance(coordinates, list) and len(coordinates) == 2:
         raise VerticalDatumError(f"{where}: expected longitude, latitude and height, found 2 numbers")
     lon, lat, height_m = _numbers(coordinates, 3, "coordinates", where)
+    check_lon_lat(lon, lat, where)
     position = properties.get("ji", [properties.get("sample"), properties.get("line")])
-    if position == [None, None]:
-        return None
-    sample, line = _numbers(position, 2, "line and sample", where)
+    sample, line = _NOT_MARKED
+    if position != [None, None]:
+        sample, line = _numbers(position, 2, "line and sample", where)
     point_id = feature.get("id", properties.get("id"))
     return {
         "id": count if point_id is None else str(point_id),
@@ -242,26 +249,30 @@ def _geojson_row(feature: Any, where: str, image: str, count: str) -> Row | None
 
 
 def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
-    """The marks of one point."""
+    """The marks of one point, or one row without a mark."""
     if not isinstance(gcp, dict) or not isinstance(gcp.get("geolocation"), dict):
         raise FormatError(f"{where}: expected a geolocation")
     location, marks = gcp["geolocation"], gcp.get("marks")
     if not isinstance(marks, list) or not all(isinstance(mark, dict) for mark in marks):
         raise FormatError(f"{where}: expected a list of marks")
     ground, sigma_m = _opf_ground(location, where)
-    rows = []
+    point = {
+        "id": str(gcp.get("id")),
+        "lon_lat_h": ground,
+        "sigma_m": sigma_m,
+        "check": gcp.get("is_checkpoint") is True,
+    }
+    unmarked = {"line_sample": _NOT_MARKED, "image": "", "sigma_px": math.nan}
+    rows = [] if marks else [point | unmarked]
     for mark in marks:
         sample, line = _numbers(mark.get("position_px"), 2, "position_px", where)
         camera = str(mark.get("camera_id"))
         rows.append(
-            {
-                "id": str(gcp.get("id")),
-                "lon_lat_h": ground,
+            point
+            | {
                 "line_sample": (line - OPF_CORNER_PX, sample - OPF_CORNER_PX),
                 "image": str(images.get(camera, camera)),
                 "sigma_px": _optional(mark, "accuracy", where),
-                "sigma_m": sigma_m,
-                "check": gcp.get("is_checkpoint") is True,
             }
         )
     return rows
@@ -274,13 +285,18 @@ def _opf_ground(location: dict[str, Any], where: str) -> tuple[list[float], list
         raise FormatError(f"{where}: expected a crs with a definition")
     crs = parse_crs(crs_node["definition"], where)
     coordinates = np.array([_numbers(location.get("coordinates"), 3, "coordinates", where)])
-    sigmas_m = _numbers(location.get("sigmas"), 3, "sigmas", where)
+    sigmas = _numbers(location.get("sigmas"), 3, "sigmas", where)
     geoid_m = _optional(crs_node, "geoid_height", where)
+    unit_m = horizontal_unit_m(crs)
+    up_unit_m = float(crs.axis_info[2].unit_conversion_factor) if len(crs.axis_info) > 2 else unit_m
+    east, north = sigmas[:2] if _east_first(crs) else sigmas[1::-1]
     if crs.is_compound and not math.isnan(geoid_m):
-        coordinates[:, 2] += geoid_m
+        coordinates[:, 2] = coordinates[:, 2] * up_unit_m + geoid_m
         crs = crs.sub_crs_list[0]
+    elif len(crs.axis_info) < 3:
+        coordinates[:, 2] *= unit_m
     ground = to_wgs84(coordinates, crs, "ellipsoid", where, axes_of_crs=True)[0]
-    return ground.tolist(), sigmas_m if _east_first(crs) else [sigmas_m[1], sigmas_m[0], sigmas_m[2]]
+    return ground.tolist(), [east * unit_m, north * unit_m, sigmas[2] * up_unit_m]
 
 
 def _east_first(crs: CRS) -> bool:

@@ -13,7 +13,9 @@ from pyproj import CRS
 from services.errors import FormatError
 from services.formats.gcp.marked_points import (
     ELLIPSOID,
+    Heights,
     MarkedPoints,
+    horizontal_unit_m,
     marked_points,
     parse_crs,
     to_wgs84,
@@ -21,9 +23,16 @@ from services.formats.gcp.marked_points import (
 from services.formats.gcp.text_lines import content_lines, coordinate_array, format_mark, parse_numbers
 
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS]?)", re.IGNORECASE)
+_DEFINITION = re.compile(r"EPSG:\d+(?:\+\S+)?|\+(?:proj|init)\s*=.*", re.IGNORECASE)
 _NAMES = ["geo_x", "geo_y", "geo_z", "im_x", "im_y"]
 _CHECK = "CHK-"
 """Prefix of the names of check points."""
+
+
+def is_gcp_list(text: str) -> bool:
+    """Whether the first line of a text, after comments, is a reference system alone."""
+    first = next((line for _, line in content_lines(text, "#", "")), "")
+    return _UTM.fullmatch(first) is not None or _DEFINITION.fullmatch(first) is not None
 
 
 def format_gcp_list(points: MarkedPoints) -> str:
@@ -42,10 +51,13 @@ def format_gcp_list(points: MarkedPoints) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_gcp_list(text: str, heights: str | None = None, source: str = "gcp_list.txt") -> MarkedPoints:
+def parse_gcp_list(
+    text: str, heights: Heights | None = None, source: str = "gcp_list.txt"
+) -> MarkedPoints:
     """The marked points of a `gcp_list.txt`: a reference system, then one mark on each line.
 
-    Points without a name are distinguished by their ground coordinates, as in ODM.
+    Points without a name are distinguished by their ground coordinates, as in ODM. Heights have the unit
+    of a projected reference system, such as feet.
 
     Args:
         text: contents of the file; spaces or tabs separate fields.
@@ -91,10 +103,12 @@ def _height(field: str, where: str) -> float:
 
 
 def _ground(
-    coordinates: list[tuple[float, float, float]], crs: CRS, heights: str | None, source: str
+    coordinates: list[tuple[float, float, float]], crs: CRS, heights: Heights | None, source: str
 ) -> np.ndarray:
     """Points (n, 3) in WGS 84; points without a height have none here, and need no vertical datum."""
     points = coordinate_array(coordinates)
+    if len(crs.axis_info) < 3:
+        points[:, 2] *= horizontal_unit_m(crs)
     missing = np.isnan(points[:, 2])
     datum = ELLIPSOID if missing.all() else heights
     ground = to_wgs84(np.nan_to_num(points, nan=0.0), crs, datum, source)

@@ -15,6 +15,7 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.gcp.marked_points import (
     ELLIPSOID,
+    Heights,
     MarkedPoints,
     marked_points,
     parse_crs,
@@ -63,7 +64,7 @@ def format_pci_text(points: MarkedPoints) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_pci_text(text: str, heights: str | None = None, source: str = "PCI text") -> MarkedPoints:
+def parse_pci_text(text: str, heights: Heights | None = None, source: str = "PCI text") -> MarkedPoints:
     """The marked points of a text file of PCI whose first line declares columns and reference system.
 
     Errors on the ground (eX, eY, eZ) are ignored: PCI's help defines them in pixels.

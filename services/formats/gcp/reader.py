@@ -1,54 +1,206 @@
-"""Reading files of marked points in any supported format."""
+"""Reading files of marked points and of ground points in any supported format."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from services.errors import FormatError
+import numpy as np
+
+from services.errors import FormatError, VerticalDatumError
+from services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
+from services.formats.gcp.csv_points import CsvLayout, is_csv, parse_csv
+from services.formats.gcp.gcplib import is_gcplib, parse_gcplib
 from services.formats.gcp.json_formats import parse_geojson_points, parse_opf
-from services.formats.gcp.marked_points import MarkedPoints
-from services.formats.gcp.odm import parse_gcp_list
+from services.formats.gcp.marked_points import ELLIPSOID, Heights, MarkedPoints
+from services.formats.gcp.odm import is_gcp_list, parse_gcp_list
 from services.formats.gcp.pci import is_pci_text, parse_pci_text
-from services.formats.gcp.text_formats import parse_asp_gcp, parse_envi_pts, parse_qgis_points
+from services.formats.gcp.text_formats import (
+    is_asp_gcp,
+    is_envi_pts,
+    is_qgis_points,
+    parse_asp_gcp,
+    parse_envi_pts,
+    parse_qgis_points,
+)
 from services.formats.text_files import read_text
+from services.types import GroundPoints
 
-Parser = Callable[[str, str | None, str], MarkedPoints]
-"""Called with the text, the datum of its heights where the format cannot state it, and the file name."""
+_SAME_PLACE = np.array([1e-9, 1e-9, 1e-4])
+"""Largest difference of the positions of one point in its marks: degrees, degrees, metres."""
 
 
-def read_control_points(path: Path, heights: str | None = None) -> MarkedPoints:
+@dataclass(frozen=True)
+class StatedByCaller:
+    """What a caller states about a file whose format cannot.
+
+    Attributes:
+        heights: datum of the heights.
+        sigma_axes: of the sigmas of an ASP `.gcp`; see `parse_asp_gcp`.
+        csv: layout of a CSV file.
+    """
+
+    heights: Heights | None = None
+    sigma_axes: str | None = None
+    csv: CsvLayout = field(default_factory=lambda: CsvLayout({}))
+
+
+@dataclass(frozen=True)
+class _Format:
+    """A format: its name, whether a text has it, its parser, and the endings of its file names."""
+
+    name: str
+    fits: Callable[[str, StatedByCaller], bool]
+    parse: Callable[[str, StatedByCaller, str], MarkedPoints]
+    endings: tuple[str, ...] = ()
+
+
+def read_control_points(path: Path, heights: Heights | None = None) -> MarkedPoints:
     """The marked points of a file in any format of `services.formats.gcp.marked_points`.
 
     Args:
-        path: `.gcp`, `.points`, `.pts`, `.txt` for ODM and PCI, `.geojson` and `.json` for GeoJSON, OPF.
-        heights: datum of the heights of `.gcp`, `.pts` and `.txt`, which may not state it: "ellipsoid"
-            (of WGS 84) or a vertical reference system such as "EPSG:5773".
+        path: of the file; its content decides on the format.
+        heights: datum of the heights, where the file does not state it.
 
     Raises:
-        FormatError: the file has none of these formats, or its content is wrong.
+        FormatError: the file has none of these formats, its content is wrong, or nothing is marked.
         VerticalDatumError: the datum of the heights is neither in the file nor given, or the grid it
             needs is not installed.
     """
-    parse = _PARSERS.get(path.suffix.lower())
-    if parse is None:
-        raise FormatError(f"{path.name}: expected a file name that ends in {', '.join(_PARSERS)}")
-    return parse(read_text(path), heights, path.name)
+    points = _read(path, StatedByCaller(heights))
+    if len(points) and not points.is_marked.any():
+        raise FormatError(
+            f"{path.name}: expected points with their positions in an image, found {len(points)} points "
+            "without any"
+        )
+    return points.take(points.is_marked)
 
 
-def _parse_json(text: str, heights: str | None, source: str) -> MarkedPoints:
-    """The points of an OPF or a GeoJSON; both state the datum of their heights."""
-    return (parse_opf if '"gcps"' in text else parse_geojson_points)(text, source)
+def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) -> GroundPoints:
+    """The ground points of a file in any format, each once, without those that are switched off.
+
+    Args:
+        path: of the file; its content decides on the format.
+        stated: what the file does not state.
+
+    Raises:
+        FormatError, InputError, VerticalDatumError: as for `read_control_points`; or a point has two
+            positions, or a sigma that is not positive.
+    """
+    marks = _read(path, stated)
+    used = marks.take(marks.active | marks.check)
+    if len(used) == 0:
+        raise FormatError(
+            f"{path.name}: expected points, found {len(marks)}, all switched off"
+            if len(marks)
+            else f"{path.name}: expected points, found none"
+        )
+    _, first, point = np.unique(used.id, return_index=True, return_inverse=True)
+    off = np.abs(used.lon_lat_h - used.lon_lat_h[first][point])
+    for row in np.flatnonzero((off > _SAME_PLACE).any(axis=1)):
+        raise FormatError(
+            f"{path.name}, point {used.id[row]}: expected one position, found "
+            f"{used.lon_lat_h[first][point][row].tolist()} and {used.lon_lat_h[row].tolist()}"
+        )
+    for row in np.flatnonzero((used.sigma_m <= 0.0).any(axis=1)):
+        raise FormatError(
+            f"{path.name}, point {used.id[row]}: sigmas: expected positive metres east, north, up, "
+            f"found {used.sigma_m[row].tolist()}"
+        )
+    rows = np.sort(first)
+    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows])
 
 
-def _parse_txt(text: str, heights: str | None, source: str) -> MarkedPoints:
-    """The points of a PCI text, where the first line declares its columns, else of an ODM list."""
-    return (parse_pci_text if is_pci_text(text) else parse_gcp_list)(text, heights, source)
+def _read(path: Path, stated: StatedByCaller) -> MarkedPoints:
+    text = read_text(path)
+    form = _format_of(text, path, stated)
+    if stated.heights is not None and stated.heights != ELLIPSOID:
+        _refuse_second_datum(form, text, path, stated)
+    return form.parse(text, stated, path.name)
 
 
-_PARSERS: dict[str, Parser] = {
-    ".gcp": parse_asp_gcp,
-    ".points": lambda text, heights, source: parse_qgis_points(text, source),
-    ".pts": parse_envi_pts,
-    ".txt": _parse_txt,
-    ".geojson": _parse_json,
-    ".json": _parse_json,
-}
+def _format_of(text: str, path: Path, stated: StatedByCaller) -> _Format:
+    """The format of a text by its content; where that shows none, the one that its name announces."""
+    fitting = [form for form in _FORMATS if form.fits(text, stated)]
+    if not fitting:
+        # The parser of the announced format names the place that does not fit.
+        fitting = [form for form in _FORMATS if path.suffix.lower() in form.endings][:1]
+    if len(fitting) != 1:
+        found = " and ".join(form.name for form in fitting) or f"a first line {text.lstrip()[:60]!r}"
+        raise FormatError(
+            f"{path.name}: expected one of the formats {', '.join(form.name for form in _FORMATS)}; "
+            f"found {found.splitlines()[0]}"
+        )
+    return fitting[0]
+
+
+def _refuse_second_datum(form: _Format, text: str, path: Path, stated: StatedByCaller) -> None:
+    """Refuse a datum of the caller for a file that states its own."""
+    try:
+        points = form.parse(text, replace(stated, heights=None), path.name)
+    except VerticalDatumError:
+        return
+    if np.isfinite(points.lon_lat_h[:, 2]).any():
+        raise VerticalDatumError(
+            f"{path.name}: {stated.heights} given as datum of the heights, but {form.name} states "
+            "its own; leave --vertical and --geoid out"
+        )
+
+
+_FORMATS = (
+    _Format(
+        "OPF",
+        lambda text, stated: text.lstrip()[:1] == "{" and '"gcps"' in text,
+        lambda text, stated, source: parse_opf(text, source),
+    ),
+    _Format(
+        "GeoJSON",
+        lambda text, stated: text.lstrip()[:1] == "{" and '"FeatureCollection"' in text,
+        lambda text, stated, source: parse_geojson_points(text, source),
+        (".geojson", ".json"),
+    ),
+    _Format(
+        "Copernicus GCP database",
+        lambda text, stated: text.lstrip()[:1] == "{" and f'"{COPERNICUS_KEY}"' in text,
+        lambda text, stated, source: parse_copernicus(text, stated.heights, source),
+    ),
+    _Format(
+        "USGS GCPLib",
+        lambda text, stated: is_gcplib(text),
+        lambda text, stated, source: parse_gcplib(text, stated.heights, source),
+    ),
+    _Format(
+        "ASP",
+        lambda text, stated: is_asp_gcp(text),
+        lambda text, stated, source: parse_asp_gcp(text, stated.heights, source, stated.sigma_axes),
+        (".gcp",),
+    ),
+    _Format(
+        "QGIS",
+        lambda text, stated: is_qgis_points(text),
+        lambda text, stated, source: parse_qgis_points(text, source),
+        (".points",),
+    ),
+    _Format(
+        "ENVI",
+        lambda text, stated: is_envi_pts(text),
+        lambda text, stated, source: parse_envi_pts(text, stated.heights, source),
+        (".pts",),
+    ),
+    _Format(
+        "PCI",
+        lambda text, stated: is_pci_text(text),
+        lambda text, stated, source: parse_pci_text(text, stated.heights, source),
+    ),
+    _Format(
+        "ODM",
+        lambda text, stated: is_gcp_list(text),
+        lambda text, stated, source: parse_gcp_list(text, stated.heights, source),
+        (".txt",),
+    ),
+    _Format(
+        "CSV",
+        lambda text, stated: is_csv(text, stated.csv),
+        lambda text, stated, source: parse_csv(text, stated.csv, stated.heights, source),
+        (".csv", ".tsv"),
+    ),
+)

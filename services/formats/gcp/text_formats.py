@@ -3,6 +3,7 @@
 import csv
 import math
 import re
+from itertools import islice
 
 import numpy as np
 from pyproj import CRS
@@ -11,12 +12,14 @@ from services.errors import FormatError, InputError
 from services.formats.gcp.marked_points import (
     ELLIPSOID,
     WGS84_3D,
+    Heights,
     MarkedPoints,
     marked_points,
     parse_crs,
     to_wgs84,
 )
 from services.formats.gcp.text_lines import (
+    check_lon_lat,
     content_lines,
     coordinate_array,
     format_deg,
@@ -26,13 +29,21 @@ from services.formats.gcp.text_lines import (
     parse_numbers,
     sequential_ids,
 )
+from services.formats.text_files import NUMBER_PATTERN
+from services.geodesy import ecef_from_east_north_up
 
 QGIS_CORNER_PX = 0.5
 """QGIS, like GDAL, counts pixels from the corner of the first one."""
 ENVI_CORNER_PX = 1.5
 """The corner of the first pixel is (1, 1) in ENVI, hence its centre (1.5, 1.5)."""
 
+ECEF, LAT_LON_HEIGHT = "ecef", "lat-lon-height"
+"""Axes of the sigmas on the ground of an ASP `.gcp`."""
+_ASP_FIXED_M = 1e-9
+"""ASP writes sigmas of 1e-10 m for points that its adjustment keeps fixed."""
+
 _QGIS_COLUMNS = ["mapX", "mapY", "sourceX", "sourceY"]
+_OLDER_QGIS_COLUMNS = ["mapX", "mapY", "pixelX", "pixelY"]
 _ENVI_WGS84 = r"WGS[- ]?84"
 _ENVI_UTM = re.compile(rf"UTM\s*,\s*(\d+)\s*,\s*(North|South)\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
 _ENVI_GEOGRAPHIC = re.compile(rf"Geographic Lat/Lon\s*,\s*{_ENVI_WGS84}\b", re.IGNORECASE)
@@ -68,19 +79,38 @@ def format_asp_gcp(points: MarkedPoints) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file") -> MarkedPoints:
+def is_asp_gcp(text: str) -> bool:
+    """Whether the first lines of a text, after comments, have fields as a point of ASP has."""
+    for _, line in islice(content_lines(text, "#", ""), 5):
+        fields = line.replace(",", " ").split()
+        numbers = [re.fullmatch(NUMBER_PATTERN, field) is not None for field in fields]
+        if len(fields) >= 12 and all(numbers[1:7]) and not numbers[7] and all(numbers[8:12]):
+            return True
+    return False
+
+
+def parse_asp_gcp(
+    text: str, heights: Heights | None = None, source: str = "GCP file", sigmas: str | None = None
+) -> MarkedPoints:
     """The marked points of an ASP `.gcp`: one point on each line, with all its marks.
+
+    The three sigmas are those of x, y, z of ECEF, unless ASP is called with
+    `--use-lon-lat-height-gcp-error`. A comment with that option in the file counts as a statement. Equal
+    sigmas mean the same in both. Sigmas of 1e-10 m mark fixed points, not an accuracy: they are unknown.
 
     Args:
         text: contents of the file; spaces or commas separate fields.
-        heights: datum of the heights, which the file never states: "ellipsoid" (of WGS 84) or a vertical
-            reference system.
+        heights: datum of the heights, which the file never states.
         source: its name, for messages.
+        sigmas: axes of the sigmas, where the file does not state them: "ecef" or "lat-lon-height"; when
+            nobody states them, sigmas that differ are unknown.
 
     Raises:
         FormatError: a line has another form.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
+    if sigmas is None and re.search(r"^#.*--use-lon-lat-height-gcp-error", text, re.MULTILINE):
+        sigmas = LAT_LON_HEIGHT
     ids, coordinates, sigmas_m, images, pixels, sigmas_px = [], [], [], [], [], []
     for where, line in content_lines(text, "#", source):
         fields = line.replace(",", " ").split()
@@ -89,21 +119,45 @@ def parse_asp_gcp(text: str, heights: str | None = None, source: str = "GCP file
                 f"{where}: expected id, lat, lon, height, 3 sigmas, then name, column, row and 2 sigmas "
                 f"for each image, found {len(fields)} fields"
             )
-        lat, lon, height_m, north_m, east_m, up_m = parse_numbers(
-            fields[1:7], ["lat", "lon", "height", "sigma_lat", "sigma_lon", "sigma_height"], where
+        lat, lon, height_m, *of_ground_m = parse_numbers(
+            fields[1:7], ["lat", "lon", "height", "sigma_1", "sigma_2", "sigma_3"], where
         )
+        check_lon_lat(lon, lat, where)
+        if min(of_ground_m) <= 0.0:
+            raise FormatError(
+                f"{where}: sigmas on the ground: expected positive metres, found {' '.join(fields[4:7])}"
+            )
+        of_point_m = _east_north_up_sigmas(of_ground_m, lon, lat, sigmas)
         for start in range(7, len(fields), 5):
             column, row, sigma_column, sigma_row = parse_numbers(
                 fields[start + 1 : start + 5], ["column", "row", "sigma_column", "sigma_row"], where
             )
             ids.append(fields[0])
             coordinates.append((lon, lat, height_m))
-            sigmas_m.append((east_m, north_m, up_m))
+            sigmas_m.append(of_point_m)
             images.append(fields[start])
             pixels.append((row, column))
             sigmas_px.append(math.sqrt((sigma_column**2 + sigma_row**2) / 2.0))
     ground = to_wgs84(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
     return marked_points(ids, ground, pixels, sigma_m=sigmas_m, image=images, sigma_px=sigmas_px)
+
+
+def _east_north_up_sigmas(
+    sigmas_m: list[float], lon: float, lat: float, axes: str | None
+) -> tuple[float, float, float]:
+    """Sigmas east, north, up of the three sigmas of an ASP point; NaN where their axes are unknown."""
+    first_m, second_m, third_m = sigmas_m
+    if max(sigmas_m) <= _ASP_FIXED_M:
+        return math.nan, math.nan, math.nan
+    if first_m == second_m == third_m:
+        return first_m, first_m, first_m
+    if axes == LAT_LON_HEIGHT:
+        return second_m, first_m, third_m
+    if axes == ECEF:
+        to_east_north_up = ecef_from_east_north_up(np.array([lon, lat, 0.0])).T
+        east_m, north_m, up_m = np.sqrt(to_east_north_up**2 @ np.array(sigmas_m) ** 2)
+        return float(east_m), float(north_m), float(up_m)
+    return math.nan, math.nan, math.nan
 
 
 def format_qgis_points(points: MarkedPoints) -> str:
@@ -131,21 +185,33 @@ def format_qgis_points(points: MarkedPoints) -> str:
     return f"#CRS: {wkt}\n" + "\n".join(rows) + "\n"
 
 
+def is_qgis_points(text: str) -> bool:
+    """Whether the first line of a text, after comments, has the columns of QGIS."""
+    first = next((line for _, line in content_lines(text, "#", "")), "")
+    return first.split(",")[:4] in (_QGIS_COLUMNS, _OLDER_QGIS_COLUMNS)
+
+
 def parse_qgis_points(text: str, source: str = "points file") -> MarkedPoints:
     """The marked points of a QGIS `.points` of a raw image, which has no heights, names or sigmas.
 
     Args:
-        text: contents of the file; without `#CRS` its map coordinates are longitude and latitude.
+        text: contents of the file.
         source: its name, for messages.
 
     Raises:
-        FormatError: a line has another form.
+        FormatError: a line has another form, or the file does not state its reference system.
     """
-    header = re.match(r"#CRS: *(.*)", text)
-    crs = parse_crs(header[1].strip(), source) if header and header[1].strip() else CRS.from_epsg(4326)
     lines = list(content_lines(text, "#", source))
-    if not lines or lines[0][1].split(",")[:4] != _QGIS_COLUMNS:
+    columns = lines[0][1].split(",")[:4] if lines else []
+    if columns not in (_QGIS_COLUMNS, _OLDER_QGIS_COLUMNS):
         raise FormatError(f"{source}: expected a line that starts with {','.join(_QGIS_COLUMNS)}")
+    header = re.match(r"#CRS: *(\S.*)", text)
+    if header is None:
+        raise FormatError(
+            f"{source}: the file does not state its reference system, as those of older versions of "
+            "QGIS; add it as a first line such as '#CRS: EPSG:32633'"
+        )
+    crs = parse_crs(header[1].strip(), source)
     coordinates, pixels, active = [], [], []
     for where, line in lines[1:]:
         fields = next(csv.reader([line]))
@@ -175,13 +241,22 @@ def format_envi_pts(points: MarkedPoints) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_envi_pts(text: str, heights: str | None = None, source: str = "ENVI points") -> MarkedPoints:
-    """The marked points of an ENVI `.pts` with elevations, in longitude and latitude or UTM of WGS 84.
+def is_envi_pts(text: str) -> bool:
+    """Whether a text has a comment of ENVI with its projection."""
+    return re.search(r"^;\s*projection info\s*=", text, re.MULTILINE) is not None
+
+
+def parse_envi_pts(
+    text: str, heights: Heights | None = None, source: str = "ENVI points"
+) -> MarkedPoints:
+    """The marked points of an ENVI `.pts`, in longitude and latitude or UTM of WGS 84.
+
+    Points of images on a map have no elevation.
 
     Args:
         text: contents of the file.
-        heights: datum of the heights, which the file never states: "ellipsoid" or a vertical reference
-            system.
+        heights: datum of the heights, which the file never states; those of ENVI's rigorous
+            orthorectification are orthometric.
         source: its name, for messages.
 
     Raises:
@@ -189,19 +264,21 @@ def parse_envi_pts(text: str, heights: str | None = None, source: str = "ENVI po
         VerticalDatumError: the caller does not state the datum of the heights.
     """
     crs = _envi_crs(text, source)
+    names = ["map x", "map y", "elevation", "image x", "image y"]
+    if re.search(r"^;\s*Map\s*\(\s*x\s*,\s*y\s*\)", text, re.MULTILINE | re.IGNORECASE):
+        names.remove("elevation")
     coordinates, pixels = [], []
     for where, line in content_lines(text, ";", source):
         fields = line.split()
-        if len(fields) != 5:
-            raise FormatError(
-                f"{where}: expected map x, y, elevation, image x, y, found {len(fields)} fields"
-            )
-        x, y, height_m, column, row = parse_numbers(
-            fields, ["map x", "map y", "elevation", "image x", "image y"], where
-        )
-        coordinates.append((x, y, height_m))
-        pixels.append((row - ENVI_CORNER_PX, column - ENVI_CORNER_PX))
-    ground = to_wgs84(coordinate_array(coordinates), crs, heights, source)
+        if len(fields) != len(names):
+            raise FormatError(f"{where}: expected {', '.join(names)}, found {len(fields)} fields")
+        values = dict(zip(names, parse_numbers(fields, names, where), strict=True))
+        coordinates.append((values["map x"], values["map y"], values.get("elevation", 0.0)))
+        pixels.append((values["image y"] - ENVI_CORNER_PX, values["image x"] - ENVI_CORNER_PX))
+    points = coordinate_array(coordinates)
+    ground = to_wgs84(points, crs, heights if "elevation" in names else ELLIPSOID, source)
+    if "elevation" not in names:
+        ground[:, 2] = np.nan
     return marked_points(sequential_ids(pixels), ground, pixels)
 
 

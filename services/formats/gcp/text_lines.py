@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from services.errors import FormatError
 from services.formats.text_files import parse_number
 from services.types import Array
 
@@ -28,6 +29,19 @@ def parse_numbers(fields: list[str], names: list[str], where: str) -> list[float
         FormatError: a field is not a number; the message names it.
     """
     return [parse_number(field, name, where) for field, name in zip(fields, names, strict=True)]
+
+
+def check_lon_lat(lon: float, lat: float, where: str) -> None:
+    """Refuse a position that is not on the Earth, such as one with its coordinates swapped.
+
+    Raises:
+        FormatError: the latitude is beyond 90 degrees, or the longitude beyond 360.
+    """
+    if abs(lat) > 90.0 or abs(lon) > 360.0:
+        raise FormatError(
+            f"{where}: expected a latitude within 90 degrees and a longitude within 360, "
+            f"found latitude {lat:g}, longitude {lon:g}"
+        )
 
 
 def coordinate_array(coordinates: list[tuple[float, float, float]]) -> Array:

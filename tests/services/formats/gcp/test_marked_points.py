@@ -43,6 +43,7 @@ FILES = [
     "invented_opf.json",
     "invented.geojson",
     "invented_orthority.geojson",
+    "invented_feet.txt",
 ]
 TEXTS = {name: (GOLDEN / name).read_text() for name in FILES}
 
@@ -275,11 +276,9 @@ def test_a_pci_text_has_pixel_errors_only_when_all_are_known() -> None:
 def test_heights_without_a_datum_are_refused(name: str) -> None:
     with pytest.raises(VerticalDatumError, match="does not state the datum of its heights"):
         read_control_points(GOLDEN / name)
-    with pytest.raises(
-        VerticalDatumError, match=r"EPSG:4326 given, .* a vertical reference system expected"
-    ):
+    with pytest.raises(VerticalDatumError, match=r"EPSG:4326 given; .* a vertical reference system"):
         read_control_points(GOLDEN / name, "EPSG:4326")
-    with pytest.raises(VerticalDatumError, match=r"'sea' is no known reference system"):
+    with pytest.raises(VerticalDatumError, match=r"sea given; expected ellipsoid, EGM84"):
         read_control_points(GOLDEN / name, "sea")
 
 
@@ -320,11 +319,13 @@ def test_an_opf_without_our_extension_names_images_by_camera_id() -> None:
     assert parse_opf(json.dumps(document)).image[0] == str(opf_camera_id("invented.tif"))
 
 
-def test_points_that_a_registration_did_not_match_are_no_marks() -> None:
+def test_points_that_a_registration_did_not_match_are_no_marks(tmp_path: Path) -> None:
     document = json.loads(TEXTS["invented.geojson"])
     document["features"][1]["properties"] |= {"line": None, "sample": None, "status": "not matched"}
     document["features"][2]["properties"] |= {"status": "deactivated"}
-    points = parse_geojson_points(json.dumps(document))
+    path = tmp_path / "points.geojson"
+    path.write_text(json.dumps(document))
+    points = read_control_points(path)
     assert points.id.tolist() == ["11", "13", "14", "15"]
     assert points.active.tolist() == [True, False, True, True]
 
@@ -334,11 +335,17 @@ def test_points_that_a_registration_did_not_match_are_no_marks() -> None:
     [
         ("invented.gcp", " 105.25", "", "line 2: expected id, lat"),
         ("invented.gcp", "105.25", "high", "line 2: height: expected a number, found 'high'"),
+        ("invented.points", "#CRS: EPSG:4326\n", "", "does not state its reference system"),
         ("invented.points", "mapX", "X", "expected a line that starts with mapX,mapY"),
         ("invented.points", "12.2912345678", "nan", "line 3: mapX: expected a number, found 'nan'"),
         ("invented.points", "EPSG:4326", "moon", "expected a reference system, .* found 'moon'"),
         ("invented.pts", "WGS-84", "NAD27", "projection info: expected .* found 'Geographic"),
-        ("invented.pts", " 105.25", "", "line 5: expected map x, y, elevation, image x, y"),
+        (
+            "invented.pts",
+            " 105.25",
+            "",
+            "line 5: expected map x, map y, elevation, .*, found 4",
+        ),
         (
             "invented_gcp_list.txt",
             "EPSG:4326",
@@ -384,9 +391,9 @@ def test_a_geojson_point_without_a_height_is_refused() -> None:
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "points.csv").write_text("1,2,3")
-    with pytest.raises(FormatError, match=r"expected a file name that ends in \.gcp, \.points"):
-        read_control_points(tmp_path / "points.csv")
+    (tmp_path / "points.xyz").write_text("1,2,3")
+    with pytest.raises(FormatError, match=r"one of the formats OPF, .*; found a first line '1,2,3'"):
+        read_control_points(tmp_path / "points.xyz")
 
 
 @pytest.mark.parametrize("name", FILES)

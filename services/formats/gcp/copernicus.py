@@ -1,0 +1,93 @@
+"""Ground points of the Copernicus Sentinel-2 GCP database, JSON converted from XML.
+
+Numbers are strings, the text of an element with attributes is `#text`, and a list of one element is the
+element itself. Source: software that reads the database; its specification is not public.
+
+No real file was available to try this reader on.
+"""
+
+import re
+from typing import Any
+
+import numpy as np
+
+from services.errors import FormatError
+from services.formats.gcp.map_check import check_map_position
+from services.formats.gcp.marked_points import (
+    WGS84_3D,
+    Heights,
+    MarkedPoints,
+    marked_points,
+    to_wgs84,
+)
+from services.formats.gcp.text_lines import check_lon_lat, coordinate_array
+from services.formats.text_files import load_json, parse_number
+
+COPERNICUS_KEY = "GCP_DB"
+"""The only member of the document."""
+_PIXEL_M = 10.0
+"""Ground sampling of the chips of the database."""
+
+
+def parse_copernicus(
+    text: str, heights: Heights | None = None, source: str = "Copernicus GCP database"
+) -> MarkedPoints:
+    """The ground points of a file of the database, which have no marks.
+
+    A point that the file repeats is read once.
+
+    Args:
+        text: contents of the file.
+        heights: datum of `Altimetry`, which the file does not state.
+        source: its name, for messages.
+
+    Raises:
+        FormatError: the document or a point has another form, or the position of a point on its map is
+            not that of its longitude and latitude.
+        VerticalDatumError: the caller does not state the datum of the heights.
+    """
+    document = load_json(text, source)
+    root = document.get(COPERNICUS_KEY) if isinstance(document, dict) else None
+    if not isinstance(root, dict) or "GCP" not in root:
+        raise FormatError(f"{source}: expected {COPERNICUS_KEY} with a list GCP")
+    gcps = root["GCP"] if isinstance(root["GCP"], list) else [root["GCP"]]
+    points: dict[str, tuple[float, float, float]] = {}
+    for count, gcp in enumerate(gcps, start=1):
+        where = f"{source}, GCP {count}"
+        name, position = _point(gcp, where)
+        if points.setdefault(name, position) != position:
+            raise FormatError(
+                f"{where}: ID {name} has longitude, latitude and height {position}, and before "
+                f"{points[name]}; expected one position for each ID"
+            )
+    ground = to_wgs84(coordinate_array(list(points.values())), WGS84_3D.to_2d(), heights, source)
+    return marked_points(list(points), ground, np.full((len(points), 2), np.nan))
+
+
+def _point(gcp: Any, where: str) -> tuple[str, tuple[float, float, float]]:
+    """ID, and longitude, latitude and height."""
+    info = gcp.get("GCP_Info") if isinstance(gcp, dict) else None
+    if not isinstance(info, dict):
+        raise FormatError(f"{where}: expected a GCP_Info")
+    name = _text(gcp.get("ID"))
+    if not name:
+        raise FormatError(f"{where}: ID: expected a name, found {gcp.get('ID')!r}")
+    lon, lat, height_m, x, y = (
+        parse_number(_text(info.get(key)), key, f"{where}, ID {name}")
+        for key in ("Longitude", "Latitude", "Altimetry", "X", "Y")
+    )
+    check_lon_lat(lon, lat, f"{where}, ID {name}")
+    epsg = _text(info.get("EPSG")).upper().removeprefix("EPSG:")
+    if re.fullmatch(r"32[67](0[1-9]|[1-5]\d|60)", epsg) is None:
+        raise FormatError(
+            f"{where}, ID {name}: EPSG: expected the code of a UTM zone of WGS 84, such as 32633, "
+            f"found {epsg[:20]!r}"
+        )
+    check_map_position((lon, lat), (x, y), f"EPSG:{epsg}", _PIXEL_M, f"{where}, ID {name}")
+    return name, (lon, lat, height_m)
+
+
+def _text(node: Any) -> str:
+    """The text of an element: a string, a number, or an object with `#text`."""
+    value = node.get("#text") if isinstance(node, dict) else node
+    return "" if value is None or isinstance(value, (dict, list, bool)) else str(value).strip()
