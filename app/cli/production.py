@@ -1,5 +1,6 @@
 """`amers production`: make new blocks of points from images."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +20,12 @@ from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import produced_accuracy
-from services.types import ControlPoints
+from services.types import Array, ControlPoints
 
 app = typer.Typer(no_args_is_help=True)
 
 _DEFAULT = ProductionOptions()
+_ORTHO_DEFAULT = OrthoPointOptions()
 
 
 @app.command()
@@ -86,7 +88,12 @@ def run(
 
 @app.command()
 def ortho(
-    image: Annotated[Path, typer.Argument(help="GeoTIFF (or COG) or JPEG 2000 on a map.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate first."
+        ),
+    ],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     dem: Annotated[Path | None, typer.Option(help="GeoTIFF with the heights of the ground.")] = None,
@@ -124,7 +131,8 @@ def ortho(
         float | None, typer.Option(help="One point per square of this side, metres.", min=1.0)
     ] = None,
     sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the image on the map, one sigma, metres.", min=0.01)
+        float | None,
+        typer.Option(help="Accuracy of the images on the map, one sigma, metres.", min=0.01),
     ] = None,
     frame_sigma_up_m: Annotated[
         float | None,
@@ -132,20 +140,37 @@ def ortho(
             help="Error that all the heights share, one sigma, metres; by default unknown.", min=0.01
         ),
     ] = None,
+    min_views: Annotated[
+        int,
+        typer.Option(
+            help="Least number of images in which a point is found, of those showing it.", min=1
+        ),
+    ] = _ORTHO_DEFAULT.min_views,
     bands: Annotated[str | None, typer.Option(help="Bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
     mask: Annotated[
         Path | None, typer.Option(help="Image of the same ground; no points where it is not 0.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make control points with chips from one ortho-image and the heights of its ground."""
+    """Make control points with chips from ortho-images of one place and the heights of its ground."""
     fine_m, coarse_m = (None, None) if gsd_m is None else _pair(gsd_m)
     options = OrthoPointOptions(
-        fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points
+        fine_gsd_m=fine_m,
+        coarse_gsd_m=coarse_m,
+        spacing_m=spacing_m,
+        points=points,
+        min_views=min_views,
     )
     terrain = None if dem is None else TerrainFile(dem, vertical, geoid)
     files = OrthoFiles(
-        image, terrain, height_m, height_sigma_m, sigma_m, frame_sigma_up_m, bands=bands, mask=mask
+        tuple(images),
+        terrain,
+        height_m,
+        height_sigma_m,
+        sigma_m,
+        frame_sigma_up_m,
+        bands=bands,
+        mask=mask,
     )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     with shown_progress() as progress:
@@ -156,10 +181,21 @@ def ortho(
             "points": len(production.points),
             "views": int(production.points.views.start[-1]),
             "chip_gsds_m": list(production.gsds_m),
+            **agreement_row(production.shift_m, production.local_sigma_m),
             **_accuracy(production.points, as_json=as_json),
         },
         as_json=as_json,
     )
+
+
+def agreement_row(shift_m: Array, local_sigma_m: float) -> Row:
+    """How the images of a block agree: by which each lay off the first, and their local errors."""
+    if len(shift_m) < 2:
+        return {}
+    return {
+        "image_shifts_east_north_m": [[round(v, 2) for v in shift] for shift in shift_m.tolist()],
+        "local_sigma_m": None if math.isnan(local_sigma_m) else round(local_sigma_m, 2),
+    }
 
 
 def _accuracy(points: ControlPoints, *, as_json: bool) -> Row:

@@ -47,21 +47,21 @@ class BlockIdentity:
 
 @dataclass(frozen=True)
 class OrthoFiles:
-    """An ortho-image in a file, and the heights of its ground.
+    """Ortho-images in files, and the heights of their ground.
 
     Attributes:
-        image: GeoTIFF (or COG) or JPEG 2000 on a map.
+        images: GeoTIFF (or COG) or JPEG 2000 on a map, of one place; the most accurate first.
         terrain: heights of the ground; None takes `flat_m` everywhere.
         flat_m: height of flat ground, metres above the ellipsoid.
         height_sigma_m: one standard deviation of the heights, metres; required with `flat_m`.
-        sigma_m: accuracy of the image on the map, metres; by default that of its sensor.
+        sigma_m: accuracy of the images on the map, metres; by default that of their sensors.
         frame_sigma_up_m: error that all the heights share, one standard deviation, metres; None when
             unknown.
         bands: see `services.formats.images.bands.parse_bands`.
         mask: image of the same ground; points are avoided where it is not zero.
     """
 
-    image: Path
+    images: tuple[Path, ...]
     terrain: TerrainFile | None = None
     flat_m: float | None = None
     height_sigma_m: float | None = None
@@ -118,29 +118,31 @@ def run_ortho_production(
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
 ) -> OrthoPoints:
-    """Make a block of points from one ortho-image and write its folder.
+    """Make a block of points from ortho-images of one place and write its folder.
 
     Args:
-        files: the image and its heights.
+        files: the images and their heights.
         folder: of the block; must not exist.
         identity: of the block.
         options: of the points.
         progress: receives the fraction done and a message.
 
     Raises:
-        InputError: the image or its heights cannot be used, or the folder exists.
-        ComputationError: too little of the image makes points.
+        InputError: an image or the heights cannot be used, or the folder exists.
+        ComputationError: too little of the first image makes points that the others show too.
     """
     _refuse_existing(folder)
     heights = _ground_heights(files)
     bands = None if files.bands is None else parse_bands(files.bands)
     with ExitStack() as stack:
-        scene = read_scene(files.image, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
-        stack.callback(scene.image.close)  # type: ignore[attr-defined]
-        production = produce_ortho_points(scene, heights, options, part_of(progress, 0.0, 0.7))
+        scenes = []
+        for image in files.images:
+            scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands, mask=files.mask))
+            stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
+        production = produce_ortho_points(scenes, heights, options, part_of(progress, 0.0, 0.7))
         write_block(
             folder,
-            _ortho_metadata(identity, scene, production, options),
+            _ortho_metadata(identity, scenes, production, options),
             production.points,
             production.chips,
             {},
@@ -214,31 +216,50 @@ def _production_metadata(
 
 
 def _ortho_metadata(
-    identity: BlockIdentity, scene: Scene, production: OrthoPoints, options: OrthoPointOptions
+    identity: BlockIdentity, scenes: Sequence[Scene], production: OrthoPoints, options: OrthoPointOptions
 ) -> BlockMetadata:
     n_points = len(production.points)
+    n_images = f"{len(scenes)} ortho-images" if len(scenes) > 1 else "one ortho-image"
     return _metadata(
         identity,
-        [scene],
+        scenes,
         production.points,
-        description=f"{n_points} ground control points with chips, from one ortho-image",
+        description=f"{n_points} ground control points with chips, from {n_images}",
         outline=production.outline,
         specification=BlockSpecification(
             gsds_m=production.gsds_m,
-            min_views=1,
+            min_views=1 if len(scenes) == 1 else options.min_views,
             points_per_km2=_points_per_km2(options.spacing_m),
         ),
         options=asdict(options),
-        accuracy=(
-            AccuracyFigure(
-                "absolute",
-                "frame_sigma_m",
-                scene.sigma_m,
-                1,
-                "the stated accuracy of the ortho-image, not measured",
-            ),
-        ),
+        accuracy=image_accuracy(production.points, production.local_sigma_m, len(scenes)),
     )
+
+
+def image_accuracy(
+    points: ControlPoints, local_sigma_m: float, n_images: int
+) -> tuple[AccuracyFigure, ...]:
+    """The stated accuracies of points whose position is that of images.
+
+    Args:
+        points: of the block.
+        local_sigma_m: error of details relative to the rest of their image, from the disagreement of
+            images; NaN where nothing shows it.
+        n_images: number of images.
+    """
+    frame_sigma_m = points.frames[0].sigma_m
+    figures = []
+    if math.isfinite(local_sigma_m):
+        disagreement = "the disagreement of the images, after one shift of each"
+        figures = [AccuracyFigure("relative", "local_sigma_m", local_sigma_m, len(points), disagreement)]
+    if math.isfinite(frame_sigma_m):
+        stated = (
+            "the stated accuracy of the first image, not measured; raised where images disagree by more"
+        )
+        if n_images == 1:
+            stated = "the stated accuracy of the image, not measured"
+        figures.append(AccuracyFigure("absolute", "frame_sigma_m", frame_sigma_m, n_images, stated))
+    return tuple(figures)
 
 
 def _metadata(

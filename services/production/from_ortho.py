@@ -1,8 +1,8 @@
-"""ORTHO-IMAGE AND HEIGHTS IN -> NEW POINTS OUT: the salient corners of one image that lies on a map."""
+"""ORTHO-IMAGES AND HEIGHTS IN -> NEW POINTS OUT: the salient corners of images that lie on a map."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -12,10 +12,11 @@ from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around
 from services.imagery.gaps import bridged, filled
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.imagery.source import Window, block_means, render_chip
-from services.matching.control_points import chip_pixels
-from services.matching.multi_image import chip_inside, chip_saliency, nearly_whole, stored_chip
+from services.imagery.source import Window, block_means
+from services.matching.multi_image import chip_inside
+from services.production.detail_points import detail_points, detail_saliency
 from services.production.point_views import chips_of
+from services.production.view_agreement import agreed_views
 from services.terrain import Terrain
 from services.types import (
     Array,
@@ -24,8 +25,8 @@ from services.types import (
     FloatImage,
     Frame,
     Progress,
-    Views,
     no_progress,
+    part_of,
 )
 
 _MIN_POINTS = 6
@@ -47,7 +48,8 @@ class OrthoPointOptions:
         candidates: number of corners of every square that are tried.
         min_saliency: smallest saliency of a point's chip.
         local_sigma_px: position of a detail relative to the rest of the image, pixels of the image, one
-            standard deviation a coordinate.
+            standard deviation a coordinate; several images raise it when they disagree by more.
+        min_views: smallest number of images in which a point is found, of those that show it.
     """
 
     fine_gsd_m: float | None = None
@@ -57,6 +59,7 @@ class OrthoPointOptions:
     candidates: int = 3
     min_saliency: float = 0.05
     local_sigma_px: float = 0.3
+    min_views: int = 2
 
 
 @dataclass(frozen=True)
@@ -85,53 +88,57 @@ class GroundHeights:
 
 @dataclass(frozen=True)
 class OrthoPoints:
-    """The points of an ortho-image.
+    """The points of ortho-images.
 
     Attributes:
-        points: as in `Production`; each has one view at every ground sampling that shows it whole.
+        points: as in `Production`; each has a view of every image in which it was found, at every ground
+            sampling that shows it whole.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
         gsds_m: ground samplings of the chips, fine and coarse, metres.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
+        shift_m: (k, 2) east, north, by which each image lay off the first one.
+        local_sigma_m: horizontal error of details relative to the rest of their image, from the
+            disagreement of the images; NaN where nothing shows it.
     """
 
     points: ControlPoints
     chips: Callable[[int], ChipArray]
     gsds_m: tuple[float, float]
     outline: Array
+    shift_m: Array
+    local_sigma_m: float
 
 
 def produce_ortho_points(
-    scene: Scene,
+    scenes: Sequence[Scene],
     heights: GroundHeights,
     options: OrthoPointOptions = OrthoPointOptions(),
     progress: Progress = no_progress,
 ) -> OrthoPoints:
-    """Control points with chips, produced from one ortho-image and the heights of its ground.
+    """Control points with chips, produced from ortho-images of one place and the heights of its ground.
 
-    The image is divided into squares. The most salient corner of each square becomes a point. Its
-    horizontal position is that of the image and its height that of the ground: the points inherit the
-    errors and the frame of the image. The height of the surface stays unknown, as a single view without
-    parallax does not show it, and a terrain need not have roofs and trees.
+    The first image is divided into squares. The most salient corner of each square becomes a point. Its
+    horizontal position is that of the first image and its height that of the ground: the points inherit
+    the errors and the frame of that image. It is searched in the other images (dates, mosaics), which
+    become further views; their disagreement raises the sigmas (`agreed_views`). The height of the
+    surface stays unknown, as views without parallax do not show it, and a terrain need not have roofs
+    and trees.
 
     Source of the corners: Shi and Tomasi (1994), Good features to track.
 
     Args:
-        scene: an ortho-image, with its map grid as model.
+        scenes: ortho-images, with their map grids as models, the most accurate first.
         heights: of the ground.
         options: thresholds.
         progress: receives the fraction done.
 
     Raises:
-        InputError: the scene has a parallax, so that it is no ortho-image.
-        NotEnoughPoints: too few corners are salient and have a known height.
+        InputError: a scene has a parallax, so that it is no ortho-image, or two have one name.
+        NotEnoughPoints: too few corners are salient and have a known height, or are found in the other
+            images.
     """
-    gsd_m = scene_gsd_m(scene)
-    middle = scene_centre(scene)[None, :]
-    if scene.model.project_derivative(middle)[0, :, 2].any():
-        raise InputError(
-            "an ortho-image is needed: positions in this scene depend on the height of the ground. "
-            "Orthorectify it first"
-        )
+    _check_scenes(scenes)
+    scene, gsd_m = scenes[0], max(scene_gsd_m(scene) for scene in scenes)
     fine_m = options.fine_gsd_m or float(f"{gsd_m:.2g}")
     coarse_m = options.coarse_gsd_m or 4.0 * fine_m
     if not 0.0 < fine_m < coarse_m:
@@ -139,22 +146,73 @@ def produce_ortho_points(
             f"ground samplings of {fine_m:g} and {coarse_m:g} m given: fine_gsd_m must be above 0 and "
             "below coarse_gsd_m"
         )
-    squares = _squares(scene, gsd_m, options)
-    points: list[tuple[Array, float]] = []
-    for number, square in enumerate(squares):
+    squares = _squares(scene, scene_gsd_m(scene), options)
+    corners: list[_Corner] = []
+    search = part_of(progress, 0.0, 0.9 if len(scenes) == 1 else 0.5)
+    for number, window in enumerate(squares):
         if number % 16 == 0:
-            progress(0.9 * number / len(squares), f"searching {len(squares)} squares")
-        best = _best_corner(scene, heights, square, fine_m, options)
-        if best is not None:
-            points.append(best)
-    if len(points) < _MIN_POINTS:
+            search(number / len(squares), f"searching {len(squares)} squares")
+        of_square = _salient_corners(scene, heights, window, fine_m, options)
+        # Other images may not show the best one.
+        corners += [_Corner(number, *c) for c in of_square[: 1 if len(scenes) == 1 else None]]
+    lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
+    agreed = agreed_views(scenes, lon_lat_h, fine_m, progress=part_of(progress, 0.5, 0.4))
+    confirmed = np.flatnonzero(agreed.confirmed(options.min_views))
+    first_of_square = np.unique([corners[row].square for row in confirmed], return_index=True)[1]
+    rows = confirmed[first_of_square]
+    if len(rows) < _MIN_POINTS:
         raise NotEnoughPoints(
-            len(points),
+            len(rows),
             _MIN_POINTS,
-            f"salient corners of known height in {len(squares)} squares of the image",
+            f"salient corners of known height in {len(squares)} squares of the image"
+            + (f", found in {options.min_views} images" if len(scenes) > 1 else ""),
         )
-    progress(1.0, f"{len(points)} points")
-    return _assembled(scene, heights, points, (fine_m, coarse_m), gsd_m * options.local_sigma_px)
+    progress(1.0, f"{len(rows)} points")
+    sigma_m = max(scene_gsd_m(scene) * options.local_sigma_px, np.nan_to_num(agreed.local_sigma_m))
+    variance_m2 = np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2
+    points = detail_points(
+        agreed,
+        rows,
+        lon_lat_h[rows],
+        np.tile(np.diag(variance_m2), (len(rows), 1, 1)),
+        saliency=np.array([corners[row].saliency for row in rows]),
+        frame=Frame.from_sigmas(scene.sigma_m * agreed.disagreement, heights.frame_sigma_m),
+        gsds_m=(fine_m, coarse_m),
+    )
+    vertical = np.zeros(len(points.views.gsd_m))
+    views = replace(points.views, incidence_deg=vertical, azimuth_deg=vertical)
+    return OrthoPoints(
+        points=replace(points, views=views),
+        chips=chips_of(agreed.scenes, points),
+        gsds_m=(fine_m, coarse_m),
+        outline=box_around(points.lon_lat_h),
+        shift_m=agreed.shift_m,
+        local_sigma_m=agreed.local_sigma_m,
+    )
+
+
+@dataclass(frozen=True)
+class _Corner:
+    """A salient corner: the number of its square, its ground position (3,) and its saliency."""
+
+    square: int
+    lon_lat_h: Array
+    saliency: float
+
+
+def _check_scenes(scenes: Sequence[Scene]) -> None:
+    names = [scene.acquisition.image_id for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
+            "one of them"
+        )
+    for scene in scenes:
+        if scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, 2].any():
+            raise InputError(
+                f"{scene.acquisition.image_id}: an ortho-image is needed: positions in this scene "
+                "depend on the height of the ground. Orthorectify it first"
+            )
 
 
 def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Window]:
@@ -174,10 +232,10 @@ def _squares(scene: Scene, gsd_m: float, options: OrthoPointOptions) -> list[Win
     ]
 
 
-def _best_corner(
+def _salient_corners(
     scene: Scene, heights: GroundHeights, square: Window, fine_m: float, options: OrthoPointOptions
-) -> tuple[Array, float] | None:
-    """The most salient corner (lon, lat, height) of a square and its saliency; None without any."""
+) -> list[tuple[Array, float]]:
+    """The salient corners of a square, the best first: lon, lat, height (3,) and saliency."""
     factor = max(1, int(fine_m / scene_gsd_m(scene)))
     corners = _corners(block_means(scene.image.read(square), factor), options.candidates)
     line_sample = corners * factor + (factor - 1) / 2.0 + [square.line, square.sample]
@@ -185,13 +243,9 @@ def _best_corner(
     lon_lat_h = np.column_stack([lon_lat, heights.at(lon_lat)])
     lon_lat_h = lon_lat_h[np.isfinite(lon_lat_h).all(axis=1)]
     whole = chip_inside(scene.model, scene.image.shape, lon_lat_h, fine_m)
-    best: tuple[Array, float] | None = None
-    for ground in lon_lat_h[whole]:
-        stored = stored_chip(render_chip(scene.image, scene.model, ground, fine_m))
-        saliency = chip_saliency(chip_pixels(stored))
-        if saliency >= options.min_saliency and (best is None or saliency > best[1]):
-            best = ground, saliency
-    return best
+    salient = [(ground, detail_saliency(scene, ground, fine_m)) for ground in lon_lat_h[whole]]
+    salient = [corner for corner in salient if corner[1] >= options.min_saliency]
+    return sorted(salient, key=lambda corner: -corner[1])
 
 
 def _corners(pixels: FloatImage, count: int) -> Array:
@@ -203,46 +257,3 @@ def _corners(pixels: FloatImage, count: int) -> Array:
         filled(pixels), count, 0.01, _CORNER_DISTANCE_PX, mask=mask, blockSize=7
     )
     return np.empty((0, 2)) if col_row is None else col_row.reshape(-1, 2)[:, ::-1].astype(np.float64)
-
-
-def _assembled(
-    scene: Scene,
-    heights: GroundHeights,
-    corners: list[tuple[Array, float]],
-    gsds_m: tuple[float, float],
-    sigma_m: float,
-) -> OrthoPoints:
-    """Corners as control points with their views and chips."""
-    lon_lat_h = np.array([ground for ground, _ in corners])
-    n = len(lon_lat_h)
-    has_coarse = chip_inside(scene.model, scene.image.shape, lon_lat_h, gsds_m[1])
-    for row in np.flatnonzero(has_coarse):
-        has_coarse[row] = nearly_whole(render_chip(scene.image, scene.model, lon_lat_h[row], gsds_m[1]))
-    start = np.concatenate([[0], np.cumsum(1 + has_coarse)]).astype(np.int64)
-    gsd_m = np.full(start[-1], gsds_m[0])
-    gsd_m[start[1:][has_coarse] - 1] = gsds_m[1]
-    vertical = np.zeros(start[-1])
-    variance_m2 = np.array([sigma_m, sigma_m, heights.sigma_m]) ** 2
-    points = ControlPoints(
-        id=np.arange(n, dtype=np.int64),
-        lon_lat_h=lon_lat_h,
-        covariance_m2=np.tile(np.diag(variance_m2), (n, 1, 1)),
-        block=np.zeros(n, dtype=np.int64),
-        frames=(Frame.from_sigmas(scene.sigma_m, heights.frame_sigma_m),),
-        saliency=np.array([saliency for _, saliency in corners]),
-        health=np.ones(n),
-        views=Views(
-            start=start,
-            gsd_m=gsd_m,
-            image=np.zeros(start[-1], dtype=np.int64),
-            incidence_deg=vertical,
-            azimuth_deg=vertical,
-            health=np.ones(start[-1]),
-            images=(scene.acquisition,),
-        ),
-        chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=start[:-1].copy(),
-        chip_files=("chips",),
-    )
-
-    return OrthoPoints(points, chips_of([scene], points), gsds_m, box_around(lon_lat_h))

@@ -6,7 +6,7 @@ import numpy as np
 
 from services.imagery.scene import Scene, view_direction
 from services.imagery.source import render_chip
-from services.matching.multi_image import chip_inside, stored_chip
+from services.matching.multi_image import chip_inside, nearly_whole, stored_chip
 from services.matching.surface_heights import surface_height
 from services.types import (
     Array,
@@ -38,6 +38,21 @@ def shows_chip(
     return whole
 
 
+def shows_nearly_whole_chip(
+    scenes: Sequence[Scene], observations: Observations, lon_lat_h: Array, gsd_m: float
+) -> BoolArray:
+    """Which observations (m,) are of an image that shows the chip, at most a tenth of it missing.
+
+    The arguments are those of `shows_chip`.
+    """
+    shown = shows_chip(scenes, observations, lon_lat_h, gsd_m)
+    for row in np.flatnonzero(shown):
+        scene = scenes[observations.image[row]]
+        chip = render_chip(scene.image, scene.model, lon_lat_h[observations.point[row]], gsd_m)
+        shown[row] = nearly_whole(chip)
+    return shown
+
+
 def point_views(
     scenes: Sequence[Scene], observations: Observations, lon_lat_h: Array, gsds_m: Sequence[float]
 ) -> Views:
@@ -50,6 +65,20 @@ def point_views(
         gsds_m: ground samplings of the chips, finest first, metres.
     """
     levels = [observations.take(shows_chip(scenes, observations, lon_lat_h, g)) for g in gsds_m]
+    return views_at_levels(scenes, levels, lon_lat_h, gsds_m)
+
+
+def views_at_levels(
+    scenes: Sequence[Scene], levels: Sequence[Observations], lon_lat_h: Array, gsds_m: Sequence[float]
+) -> Views:
+    """The views of points: one for every observation of every ground sampling.
+
+    Args:
+        scenes: the images.
+        levels: for each ground sampling, which images show the chips; `point` is the row of `lon_lat_h`.
+        lon_lat_h: (n, 3) the points.
+        gsds_m: ground samplings of the chips, finest first, metres.
+    """
     point = np.concatenate([level.point for level in levels])
     gsd_m = np.repeat(np.array(gsds_m), [len(level) for level in levels])
     order = np.lexsort((gsd_m, point))

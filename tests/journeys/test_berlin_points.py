@@ -13,6 +13,28 @@ SHIFT_ALLOWED_M = 1.0
 GSD_M = 10.0
 
 
+def test_both_dates_of_berlin_make_one_block_that_registers_the_may_scene_too(
+    real_data: Path, amers, tmp_path
+) -> None:
+    (june,) = (real_data / "s2a_berlin_pair").glob("ref_*.tif")
+    (may,) = (real_data / "s2a_berlin_pair").glob("tgt_*.tif")
+    block = tmp_path / "berlin-both"
+    heights = ("--height-m", "80", "--height-sigma-m", "30")
+    made = amers("production", "ortho", june, may, *heights, "-o", block)
+    print(f"{made['points']} points, {made['views']} chips, local sigma {made['local_sigma_m']} m")
+    (_, shift_m) = made["image_shifts_east_north_m"]
+    assert np.abs(np.array(shift_m) - SHIFT_M).max() < SHIFT_ALLOWED_M
+    assert made["points"] > 100  # those under the clouds of May are not found in both
+    assert made["views"] > 2 * made["points"]  # coarse chips are not whole everywhere
+    result = amers("scene", "register", may, "--block", block, "-o", tmp_path / "may")
+    line_px, sample_px = result["shift_px"]
+    found_m = np.array([sample_px, -line_px]) * GSD_M
+    print(f"{found_m} m, {result['active']} of {result['visible']} points, {result['verdict']}")
+    assert np.abs(found_m - SHIFT_M).max() < SHIFT_ALLOWED_M
+    assert result["verdict"] == "good"
+    assert result["matched"] > 0.9 * result["visible"]
+
+
 def test_the_may_scene_of_berlin_is_registered_on_points_of_the_june_one(
     real_data: Path, amers, tmp_path
 ) -> None:

@@ -51,7 +51,7 @@ def ortho(pixels: Array, zone: int = 33, corner_xy: tuple[float, float] = LOWER_
 
 @cache
 def made() -> OrthoPoints:
-    return produce_ortho_points(ortho(land()), FLAT, OPTIONS)
+    return produce_ortho_points([ortho(land())], FLAT, OPTIONS)
 
 
 def chips_of(found: OrthoPoints) -> MemoryChips:
@@ -62,7 +62,7 @@ def test_the_frame_is_that_of_the_image_and_of_the_heights_as_stated() -> None:
     unknown = made().points.frames[0]
     assert unknown.sigma_m == ortho(land()).sigma_m
     assert np.isnan(unknown.sigma_up_m)
-    stated = produce_ortho_points(ortho(land()), replace(FLAT, frame_sigma_m=2.5), OPTIONS)
+    stated = produce_ortho_points([ortho(land())], replace(FLAT, frame_sigma_m=2.5), OPTIONS)
     assert stated.points.frames[0].sigma_up_m == 2.5
 
 
@@ -113,7 +113,7 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
     heights[: SIDE // 2] = np.nan
     grid = scene.model.grid  # type: ignore[attr-defined]
     known = GroundHeights(Terrain(grid, ArrayImage(heights)), 0.0, 3.0)
-    points = produce_ortho_points(scene, known, replace(OPTIONS, points=100)).points
+    points = produce_ortho_points([scene], known, replace(OPTIONS, points=100)).points
     seen = scene.model.project(points.lon_lat_h)
     # At most a tenth of a chip is missing.
     assert seen[:, 1].min() > SIDE / 2 + 0.4 * CHIP_SIZE - 1
@@ -124,7 +124,7 @@ def test_missing_pixels_and_unknown_heights_give_no_points() -> None:
 def test_scattered_saturated_pixels_cost_no_points() -> None:
     pixels = land().copy()
     pixels[np.random.default_rng(5).random(pixels.shape) < 300e-6] = np.inf
-    found = produce_ortho_points(ortho(pixels), FLAT, OPTIONS)
+    found = produce_ortho_points([ortho(pixels)], FLAT, OPTIONS)
     assert len(found.points) == len(made().points)
     assert len(found.points.views.gsd_m) == len(made().points.views.gsd_m)
     scene = replace(ortho(moved(land(), *MOVED_PX)), sigma_m=30.0)
@@ -140,7 +140,7 @@ def test_a_patch_without_data_costs_the_points_that_it_covers() -> None:
     pixels = land().copy()
     for line, sample in seen.astype(int) + 15:  # beside every corner, 9 % of its chip
         pixels[line : line + 30, sample : sample + 30] = np.nan
-    found = produce_ortho_points(ortho(pixels), FLAT, OPTIONS)
+    found = produce_ortho_points([ortho(pixels)], FLAT, OPTIONS)
     missing = np.array([(found.chips(row)[0] == 0).mean() for row in range(len(found.points))])
     assert len(missing) > 10
     assert (missing > 0.0).any()
@@ -151,13 +151,15 @@ def test_the_height_of_the_surface_is_unknown() -> None:
     # A terrain model does not say whether roofs and trees are in it, and one image does not show it.
     grid = ortho(land()).model.grid  # type: ignore[attr-defined]
     heights = ArrayImage(np.full((SIDE, SIDE), 40.0, dtype=np.float32))
-    points = produce_ortho_points(ortho(land()), GroundHeights(Terrain(grid, heights), 0.0, 3.0)).points
+    points = produce_ortho_points(
+        [ortho(land())], GroundHeights(Terrain(grid, heights), 0.0, 3.0)
+    ).points
     assert points.surface is None
 
 
 def test_points_on_both_sides_of_180_degrees_form_one_block() -> None:
     scene = ortho(land(), 1, AT_180_DEGREES_XY)
-    found = produce_ortho_points(scene, FLAT, OPTIONS)
+    found = produce_ortho_points([scene], FLAT, OPTIONS)
     lon = found.points.lon_lat_h[:, 0]
     assert (lon < -179.9).any()
     assert (lon > 179.9).any()
@@ -170,15 +172,15 @@ def test_points_on_both_sides_of_180_degrees_form_one_block() -> None:
 
 def test_an_image_without_detail_gives_no_points() -> None:
     with pytest.raises(NotEnoughPoints, match="salient corners of known height in"):
-        produce_ortho_points(ortho(np.zeros((SIDE, SIDE))), FLAT, OPTIONS)
+        produce_ortho_points([ortho(np.zeros((SIDE, SIDE)))], FLAT, OPTIONS)
 
 
 def test_an_image_that_is_not_rectified_is_refused() -> None:
-    with pytest.raises(InputError, match="an ortho-image is needed: positions in this scene depend"):
-        produce_ortho_points(block_views()[0].as_scene(5.0), FLAT, OPTIONS)
+    with pytest.raises(InputError, match="an ortho-image is needed: positions in this scene "):
+        produce_ortho_points([block_views()[0].as_scene(5.0)], FLAT, OPTIONS)
 
 
 def test_a_fine_sampling_above_the_coarse_one_is_refused() -> None:
     options = OrthoPointOptions(fine_gsd_m=20.0, coarse_gsd_m=10.0)
     with pytest.raises(InputError, match="20 and 10 m given: fine_gsd_m must be above 0 and below"):
-        produce_ortho_points(ortho(land()), FLAT, options)
+        produce_ortho_points([ortho(land())], FLAT, options)

@@ -1,0 +1,224 @@
+"""Several images of the same ground: brought onto one of them, with the views of points that agree."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.conventions import CHIP_SIZE
+from services.errors import NotEnoughPoints
+from services.geodesy import move_metres
+from services.imagery.scene import Scene
+from services.imagery.source import render_chip
+from services.matching.correlate import FOUND, find_chip
+from services.matching.multi_image import RefinementOptions, chip_inside, nearly_whole
+from services.sensors.base import SensorModel
+from services.sensors.correction import CorrectedModel, fold_into_rpc, no_correction
+from services.sensors.ortho import OrthoModel, fold_into_ortho
+from services.sensors.rpc import RpcModel
+from services.types import Array, BoolArray, IntArray, Observations, Progress, no_progress
+
+_SEARCH = RefinementOptions()
+"""How the chip of one image is searched in another one."""
+_MIN_COMMON = 6
+"""Fewest points in common that show the shift between two images."""
+_MIN_MEASURES = 20
+"""Fewest measures that show the local errors of images."""
+_SAMPLE = 40
+"""Number of points that show the shift of an image within its stated accuracy."""
+_FIRST_REACH_PX = 60
+"""Largest search radius for this shift: chips are made coarser for a larger one."""
+_CONSENSUS_PX = 2.0
+"""Displacements this close to each other agree."""
+_MAX_DEVIATION = 4.0
+"""Largest deviation of a view from the shift of its image, in standard deviations."""
+_NORMAL_MAD = 1.4826
+"""Standard deviation of a normal law over its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class AgreedViews:
+    """What several images show of n points.
+
+    Attributes:
+        scenes: the images, with models that are shifted onto the earlier ones.
+        views: which images show which points where the point was found; `point` is ascending, and the
+            reference view of a point is its first.
+        reference: (n,) the first image that shows the whole chip of each point; -1 where none does.
+        shown_by: (n,) number of images that show the whole chip.
+        shift_m: (k, 2) east, north, by which each image lay off the earlier ones.
+        local_sigma_m: horizontal error of details relative to the rest of their image, a coordinate,
+            from the disagreement of the images; NaN when fewer than 20 measures show it.
+    """
+
+    scenes: list[Scene]
+    views: Observations
+    reference: IntArray
+    shown_by: IntArray
+    shift_m: Array
+    local_sigma_m: float
+
+    def confirmed(self, min_views: int) -> BoolArray:
+        """Which points (n,) were found in `min_views` images, or in all that show them."""
+        found_in = np.bincount(self.views.point, minlength=len(self.reference))
+        return np.asarray((self.reference >= 0) & (found_in >= np.minimum(min_views, self.shown_by)))
+
+    def take(self, rows: IntArray) -> Observations:
+        """The views of some points, ascending rows, numbered from 0."""
+        views = self.views.take(np.isin(self.views.point, rows))
+        return replace(views, point=np.searchsorted(rows, views.point))
+
+    @property
+    def disagreement(self) -> float:
+        """Largest shift of an image over what both images state, 1 at least: their sigmas times this."""
+        first_m = self.scenes[0].sigma_m
+        stated_m = [math.hypot(first_m, scene.sigma_m) * math.sqrt(2.0) for scene in self.scenes]
+        ratio = np.linalg.norm(self.shift_m, axis=1) / np.array(stated_m)
+        return max(1.0, float(ratio[1:].max(initial=0.0)))
+
+
+def agreed_views(
+    scenes: Sequence[Scene],
+    lon_lat_h: Array,
+    gsd_m: float,
+    progress: Progress = no_progress,
+) -> AgreedViews:
+    """The views of points in several images, of which the first that shows a point defines its detail.
+
+    The chip of the first image is searched in each later one, which is shifted by the median
+    displacement. Points whose displacement differs from it by more than four standard deviations are not
+    views. When the errors of two images are independent and of one size, the variance of their
+    displacements is twice that of one image.
+
+    Args:
+        scenes: the most accurate first; names differ.
+        lon_lat_h: (n, 3) the points.
+        gsd_m: ground sampling of the chips, metres.
+        progress: receives the fraction done.
+
+    Raises:
+        NotEnoughPoints: an image shows the points of earlier ones, but they are not found in it.
+    """
+    inside = np.stack([chip_inside(s.model, s.image.shape, lon_lat_h, gsd_m) for s in scenes])
+    reference, shown_by = _references(scenes, inside, lon_lat_h, gsd_m)
+    search = _Search(list(scenes), reference, lon_lat_h)
+    shift_m = np.zeros((len(scenes), 2))
+    pairs = [(int(row), int(image)) for row, image in enumerate(reference) if image >= 0]
+    variances_m2: list[tuple[int, float]] = []
+    for k in range(1, len(scenes)):
+        progress(k / len(scenes), f"searching points in {scenes[k].acquisition.image_id}")
+        rows = np.flatnonzero(inside[k] & (reference >= 0) & (reference < k))
+        if len(rows) < _MIN_COMMON:
+            continue
+        first_m = search.first_shift(scenes[k], rows, gsd_m)
+        moved = _moved(scenes[k], lon_lat_h[rows], first_m)
+        found, off_m = search.displacements(moved, rows, gsd_m, _SEARCH.radius_px)
+        if len(found) < _MIN_COMMON:
+            raise _not_found(scenes[k], len(found), len(rows))
+        median_m = np.median(off_m, axis=0)
+        residual_m = off_m - median_m
+        sigma_m = max(_NORMAL_MAD * float(np.median(np.abs(residual_m))), _SEARCH.min_sigma_px * gsd_m)
+        agrees = np.linalg.norm(residual_m, axis=1) <= _MAX_DEVIATION * sigma_m
+        shift_m[k] = first_m + median_m
+        search.placed[k] = _moved(scenes[k], lon_lat_h[rows], shift_m[k])
+        pairs += [(int(row), k) for row in found[agrees]]
+        variances_m2.append((int(agrees.sum()), sigma_m**2 / 2.0))
+    placed = search.placed
+    pairs.sort()
+    measures = sum(count for count, _ in variances_m2)
+    variance_m2 = sum(count * value for count, value in variances_m2) / max(measures, 1)
+    point, image = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    line_sample = np.array(
+        [placed[i].model.project(lon_lat_h[p][None, :])[0] for p, i in pairs], dtype=np.float64
+    ).reshape(-1, 2)
+    return AgreedViews(
+        scenes=placed,
+        views=Observations(point, image, line_sample, np.full(len(point), np.nan)),
+        reference=reference,
+        shown_by=shown_by,
+        shift_m=shift_m,
+        local_sigma_m=math.sqrt(variance_m2) if measures >= _MIN_MEASURES else math.nan,
+    )
+
+
+def _references(
+    scenes: Sequence[Scene], inside: BoolArray, lon_lat_h: Array, gsd_m: float
+) -> tuple[IntArray, IntArray]:
+    """The first image that shows the whole chip of each point (n,), and how many do (n,)."""
+    whole = np.zeros(inside.shape, dtype=bool)
+    for k, scene in enumerate(scenes):
+        for row in np.flatnonzero(inside[k]):
+            whole[k, row] = nearly_whole(render_chip(scene.image, scene.model, lon_lat_h[row], gsd_m))
+    first = np.where(whole.any(axis=0), np.argmax(whole, axis=0), -1)
+    return first.astype(np.int64), whole.sum(axis=0).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Points searched in later images: the images in their places so far, the image of each point."""
+
+    placed: list[Scene]
+    reference: IntArray
+    lon_lat_h: Array
+
+    def first_shift(self, scene: Scene, rows: IntArray, gsd_m: float) -> Array:
+        """Displacement (2,) east, north of an image within its stated accuracy, metres."""
+        sigmas_m = [self.placed[i].sigma_m for i in np.unique(self.reference[rows])]
+        reach_m = 3.0 * math.hypot(max(sigmas_m), scene.sigma_m)
+        coarse_m = max(gsd_m, reach_m / _FIRST_REACH_PX)
+        radius_px = math.ceil(reach_m / coarse_m) + _SEARCH.radius_px
+        sample = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(np.int64)]
+        found, off_m = self.displacements(scene, sample, coarse_m, radius_px)
+        if len(found) < _MIN_COMMON:
+            raise _not_found(scene, len(found), len(sample))
+        distance_m = np.linalg.norm(off_m[:, None] - off_m[None, :], axis=2)
+        agreeing = distance_m <= _CONSENSUS_PX * coarse_m
+        best = agreeing[np.argmax(agreeing.sum(axis=1))]
+        if best.sum() < max(_MIN_COMMON, len(found) / 2.0):
+            raise _not_found(scene, int(best.sum()), len(sample))
+        return np.asarray(off_m[best].mean(axis=0))
+
+    def displacements(
+        self, scene: Scene, rows: IntArray, gsd_m: float, radius_px: int
+    ) -> tuple[IntArray, Array]:
+        """The points found (m,) of some rows, and where (m, 2): metres east and north of their place."""
+        found, off_m = [], []
+        for row in rows:
+            first, ground = self.placed[self.reference[row]], self.lon_lat_h[row]
+            patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * radius_px)
+            chip = render_chip(first.image, first.model, ground, gsd_m)
+            peak = find_chip(patch, chip, _SEARCH.correlation)
+            if peak.reason == FOUND:
+                found.append(row)
+                off_m.append((peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m))
+        return np.array(found, dtype=np.int64), np.array(off_m, dtype=np.float64).reshape(-1, 2)
+
+
+def _moved(scene: Scene, lon_lat_h: Array, shift_m: Array) -> Scene:
+    """A scene that shows at each point what it showed at a distance (2,) east, north of it."""
+    step = np.tile([*shift_m, 0.0], (len(lon_lat_h), 1))
+    off_px = scene.model.project(move_metres(lon_lat_h, step)) - scene.model.project(lon_lat_h)
+    return replace(scene, model=_shifted(scene.model, scene.image.shape, off_px.mean(axis=0)))
+
+
+def _shifted(model: SensorModel, shape: tuple[int, int], shift_px: Array) -> SensorModel:
+    correction = no_correction(shape)
+    parameters = correction.parameters.copy()
+    parameters[:, 0] = shift_px
+    correction = replace(correction, parameters=parameters)
+    if isinstance(model, OrthoModel):
+        return fold_into_ortho(model, correction)
+    if isinstance(model, RpcModel):
+        return fold_into_rpc(model, correction)
+    return CorrectedModel(model, correction)
+
+
+def _not_found(scene: Scene, found: int, tried: int) -> NotEnoughPoints:
+    return NotEnoughPoints(
+        found,
+        _MIN_COMMON,
+        f"{tried} points of the earlier images lie in {scene.acquisition.image_id}, and {found} of them "
+        "agree there: it shows other ground, is covered, or lies farther off than its accuracy "
+        f"states ({scene.sigma_m:g} m); leave it out or state another accuracy (--sigma-m)",
+    )
