@@ -1,14 +1,14 @@
 """`amers production`: make new blocks of points from images."""
 
-import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from app.cli.output import AsJson, Row, show_one
+from app.cli.output import AsJson, show_one
+from app.cli.production_points import points as make_known_points
+from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from app.cli.progress import shown_progress
-from app.errors import InputError
 from app.usecases.production import (
     BlockIdentity,
     OrthoFiles,
@@ -18,11 +18,9 @@ from app.usecases.production import (
 from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
-from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import produced_accuracy
-from services.types import Array, ControlPoints
 
 app = typer.Typer(no_args_is_help=True)
+app.command(name="points")(make_known_points)
 
 _DEFAULT = ProductionOptions()
 _ORTHO_DEFAULT = OrthoPointOptions()
@@ -61,7 +59,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Make control points with chips from two or more overlapping images."""
-    fine_m, coarse_m = _pair(gsd_m)
+    fine_m, coarse_m = sampling_pair(gsd_m)
     options = ProductionOptions(
         fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views
     )
@@ -80,7 +78,7 @@ def run(
             "ray_residual_delivered_px": round(relative.before_px, 3),
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
-            **_accuracy(production.points, as_json=as_json),
+            **accuracy_row(production.points, as_json=as_json),
         },
         as_json=as_json,
     )
@@ -153,7 +151,7 @@ def ortho(
     as_json: AsJson = False,
 ) -> None:
     """Make control points with chips from ortho-images of one place and the heights of its ground."""
-    fine_m, coarse_m = (None, None) if gsd_m is None else _pair(gsd_m)
+    fine_m, coarse_m = (None, None) if gsd_m is None else sampling_pair(gsd_m)
     options = OrthoPointOptions(
         fine_gsd_m=fine_m,
         coarse_gsd_m=coarse_m,
@@ -182,34 +180,7 @@ def ortho(
             "views": int(production.points.views.start[-1]),
             "chip_gsds_m": list(production.gsds_m),
             **agreement_row(production.shift_m, production.local_sigma_m),
-            **_accuracy(production.points, as_json=as_json),
+            **accuracy_row(production.points, as_json=as_json),
         },
         as_json=as_json,
     )
-
-
-def agreement_row(shift_m: Array, local_sigma_m: float) -> Row:
-    """How the images of a block agree: by which each lay off the first, and their local errors."""
-    if len(shift_m) < 2:
-        return {}
-    return {
-        "image_shifts_east_north_m": [[round(v, 2) for v in shift] for shift in shift_m.tolist()],
-        "local_sigma_m": None if math.isnan(local_sigma_m) else round(local_sigma_m, 2),
-    }
-
-
-def _accuracy(points: ControlPoints, *, as_json: bool) -> Row:
-    """The accuracy of new points, as every place states it."""
-    stated = produced_accuracy(points)
-    return accuracy_document(stated) if as_json else stated.words
-
-
-def _pair(text: str) -> tuple[float, float]:
-    """Two ground samplings, the finer first."""
-    try:
-        fine_m, coarse_m = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(f"--gsd-m: {text!r} found, FINE,COARSE such as 2,20 expected") from None
-    if not 0.0 < fine_m < coarse_m:
-        raise InputError(f"--gsd-m: {text!r} found, two lengths in metres with the finer first expected")
-    return fine_m, coarse_m

@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from app.errors import InputError
 from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification, Provenance
@@ -94,7 +96,7 @@ def run_production(
         InputError: an image cannot be used, or the folder exists.
         ComputationError: the images do not make a block.
     """
-    _refuse_existing(folder)
+    refuse_existing(folder)
     with ExitStack() as stack:
         scenes = [read_scene(path, sigma_m=sigma_m) for path in images]
         for scene in scenes:
@@ -131,7 +133,7 @@ def run_ortho_production(
         InputError: an image or the heights cannot be used, or the folder exists.
         ComputationError: too little of the first image makes points that the others show too.
     """
-    _refuse_existing(folder)
+    refuse_existing(folder)
     heights = _ground_heights(files)
     bands = None if files.bands is None else parse_bands(files.bands)
     with ExitStack() as stack:
@@ -166,7 +168,12 @@ def _ground_heights(files: OrthoFiles) -> GroundHeights:
     return GroundHeights(None, files.flat_m, files.height_sigma_m, frame_sigma_m)
 
 
-def _refuse_existing(folder: Path) -> None:
+def refuse_existing(folder: Path) -> None:
+    """Refuse a folder that exists.
+
+    Raises:
+        InputError: it exists.
+    """
     if folder.exists():
         raise InputError(f"{folder}: already exists; a block is written into a new folder")
 
@@ -184,7 +191,7 @@ def _production_metadata(
     identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
 ) -> BlockMetadata:
     relative, n_points = production.relative_accuracy, len(production.points)
-    return _metadata(
+    return block_metadata(
         identity,
         scenes,
         production.points,
@@ -220,7 +227,7 @@ def _ortho_metadata(
 ) -> BlockMetadata:
     n_points = len(production.points)
     n_images = f"{len(scenes)} ortho-images" if len(scenes) > 1 else "one ortho-image"
-    return _metadata(
+    return block_metadata(
         identity,
         scenes,
         production.points,
@@ -228,12 +235,20 @@ def _ortho_metadata(
         outline=production.outline,
         specification=BlockSpecification(
             gsds_m=production.gsds_m,
-            min_views=1 if len(scenes) == 1 else options.min_views,
+            min_views=fewest_views(production.points),
             points_per_km2=_points_per_km2(options.spacing_m),
         ),
         options=asdict(options),
         accuracy=image_accuracy(production.points, production.local_sigma_m, len(scenes)),
     )
+
+
+def fewest_views(points: ControlPoints) -> int:
+    """The smallest number of images that show a point."""
+    views = points.views
+    of_point = np.repeat(np.arange(len(points)), np.diff(views.start))
+    pairs = np.unique(np.column_stack([of_point, views.image]), axis=0)
+    return int(np.bincount(pairs[:, 0]).min())
 
 
 def image_accuracy(
@@ -262,7 +277,7 @@ def image_accuracy(
     return tuple(figures)
 
 
-def _metadata(
+def block_metadata(
     identity: BlockIdentity,
     scenes: Sequence[Scene],
     points: ControlPoints,
@@ -273,6 +288,7 @@ def _metadata(
     options: dict[str, Any],
     accuracy: tuple[AccuracyFigure, ...],
 ) -> BlockMetadata:
+    """What a block states of itself: its identity, images, outline, specification and accuracy."""
     dates = [s.acquisition.acquired_at for s in scenes if s.acquisition.acquired_at is not None]
     return BlockMetadata(
         id=identity.id,

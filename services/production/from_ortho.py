@@ -157,6 +157,12 @@ def produce_ortho_points(
         corners += [_Corner(number, *c) for c in of_square[: 1 if len(scenes) == 1 else None]]
     lon_lat_h = np.array([corner.lon_lat_h for corner in corners]).reshape(-1, 3)
     agreed = agreed_views(scenes, lon_lat_h, fine_m, progress=part_of(progress, 0.5, 0.4))
+    for other, tied in zip(scenes, agreed.tied, strict=True):
+        if not tied:
+            raise InputError(
+                f"{other.acquisition.image_id}: shows fewer than 6 salient corners of "
+                f"{scene.acquisition.image_id}; expected images of one place: make a block of each"
+            )
     confirmed = np.flatnonzero(agreed.confirmed(options.min_views))
     first_of_square = np.unique([corners[row].square for row in confirmed], return_index=True)[1]
     rows = confirmed[first_of_square]

@@ -48,6 +48,8 @@ class AgreedViews:
         reference: (n,) the first image that shows the whole chip of each point; -1 where none does.
         shown_by: (n,) number of images that show the whole chip.
         shift_m: (k, 2) east, north, by which each image lay off the earlier ones.
+        tied: (k,) whether an image was brought onto the earlier ones; false where it shows fewer than
+            six of their points.
         local_sigma_m: horizontal error of details relative to the rest of their image, a coordinate,
             from the disagreement of the images; NaN when fewer than 20 measures show it.
     """
@@ -57,6 +59,7 @@ class AgreedViews:
     reference: IntArray
     shown_by: IntArray
     shift_m: Array
+    tied: BoolArray
     local_sigma_m: float
 
     def confirmed(self, min_views: int) -> BoolArray:
@@ -103,7 +106,7 @@ def agreed_views(
     inside = np.stack([chip_inside(s.model, s.image.shape, lon_lat_h, gsd_m) for s in scenes])
     reference, shown_by = _references(scenes, inside, lon_lat_h, gsd_m)
     search = _Search(list(scenes), reference, lon_lat_h)
-    shift_m = np.zeros((len(scenes), 2))
+    shift_m, tied = np.zeros((len(scenes), 2)), np.arange(len(scenes)) == 0
     pairs = [(int(row), int(image)) for row, image in enumerate(reference) if image >= 0]
     variances_m2: list[tuple[int, float]] = []
     for k in range(1, len(scenes)):
@@ -120,7 +123,7 @@ def agreed_views(
         residual_m = off_m - median_m
         sigma_m = max(_NORMAL_MAD * float(np.median(np.abs(residual_m))), _SEARCH.min_sigma_px * gsd_m)
         agrees = np.linalg.norm(residual_m, axis=1) <= _MAX_DEVIATION * sigma_m
-        shift_m[k] = first_m + median_m
+        shift_m[k], tied[k] = first_m + median_m, True
         search.placed[k] = _moved(scenes[k], lon_lat_h[rows], shift_m[k])
         pairs += [(int(row), k) for row in found[agrees]]
         variances_m2.append((int(agrees.sum()), sigma_m**2 / 2.0))
@@ -138,6 +141,7 @@ def agreed_views(
         reference=reference,
         shown_by=shown_by,
         shift_m=shift_m,
+        tied=tied,
         local_sigma_m=math.sqrt(variance_m2) if measures >= _MIN_MEASURES else math.nan,
     )
 

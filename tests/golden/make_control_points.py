@@ -208,7 +208,8 @@ def copernicus(utm_points):
 
 def comma_separated():
     lines = [
-        "id,lon,lat,height_m,sigma_east_m,sigma_north_m,sigma_up_m,image,line,sample,sigma_px,remark"
+        "# pixel-origin=centre",
+        "id,lon,lat,height_m,sigma_east_m,sigma_north_m,sigma_up_m,image,line,sample,sigma_px,remark",
     ]
     for number, ((lon, lat, h), (east, north, up), (line, sample), sigma) in rows():
         place = f"{lon:.10f},{lat:.10f},{h},{east},{north},{up}"

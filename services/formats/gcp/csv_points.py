@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,8 @@ COLUMNS = [
 `sigma_horizontal_m` stands for both horizontal coordinates. Other columns are ignored."""
 PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "corner-1": 1.5}
 """Line and sample of the centre of the first pixel, by the names of conventions: the centre is (0, 0),
-the corner is (0, 0), the corner is (1, 1)."""
+the corner is (0, 0), the corner is (1, 1). A first line states it: `# pixel-origin=corner`."""
+_ORIGIN_LINE = re.compile(r"#\s*pixel-origin=(\S+)\s*")
 _POSITIONS = ({"lon", "lat"}, {"x", "y"})
 _DELIMITERS = ",;\t"
 
@@ -53,12 +55,10 @@ class CsvLayout:
     Attributes:
         columns: name of the file's column for names of `COLUMNS`; the others have their own name.
         crs: reference system of x and y, a code or a definition.
-        pixel_origin: a name of `PIXEL_ORIGINS`; required for files with line and sample.
     """
 
     columns: dict[str, str]
     crs: str | None = None
-    pixel_origin: str | None = None
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -90,6 +90,8 @@ def parse_csv(
 ) -> MarkedPoints:
     """The points of a CSV file with a line of column names; an empty field is an unknown value.
 
+    Positions in images are read where a line before the names states their origin.
+
     Args:
         text: contents of the file; commas, semicolons or tabs separate fields.
         layout: what the caller states about the file.
@@ -98,26 +100,28 @@ def parse_csv(
 
     Raises:
         FormatError: a column is missing, or a line has another form.
-        InputError: the caller does not state what the columns need.
+        InputError: the caller does not state the reference system of x and y.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
+    origin_line, names = _first_lines(text)
     delimiter, header = _header(text)
     places = _places(header, layout, source)
     on_map = "x" in places
-    corner_px = _corner_px(places, layout, source)
+    corner_px = _corner_px(places, origin_line, source)
     crs = _crs(layout, source, on_map=on_map)
     lines = csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)
     rows: list[dict[str, str]] = []
     wheres: list[str] = []
     try:
-        next(lines)
+        for _ in range(names):
+            next(lines)
         for fields in lines:
             where = f"{source}, line {lines.line_num}"
             if not any(field.strip() for field in fields):
                 continue
             if len(fields) != len(header):
                 raise FormatError(
-                    f"{where}: expected the {len(header)} fields of the first line, found {len(fields)}"
+                    f"{where}: expected {len(header)} fields, as many as columns, found {len(fields)}"
                 )
             rows.append({name: fields[place].strip() for name, place in places.items()})
             wheres.append(where)
@@ -142,12 +146,19 @@ def parse_csv(
     )
 
 
-def _header(text: str) -> tuple[str, list[str]]:
-    """The delimiter of the first line, and its fields."""
+def _first_lines(text: str) -> tuple[str, int]:
+    """The line before the names of the columns, if there is one, and the number of the line of names."""
     first = text.partition("\n")[0].rstrip("\r")
-    delimiter = max(_DELIMITERS, key=first.count)
+    return (first, 2) if first.startswith("#") else ("", 1)
+
+
+def _header(text: str) -> tuple[str, list[str]]:
+    """The delimiter of the line of names, and its fields."""
+    lines = text.split("\n", 2)
+    names = lines[_first_lines(text)[1] - 1].rstrip("\r") if len(lines) > 1 else text
+    delimiter = max(_DELIMITERS, key=names.count)
     try:
-        return delimiter, [name.strip() for name in next(csv.reader([first], delimiter=delimiter), [])]
+        return delimiter, [name.strip() for name in next(csv.reader([names], delimiter=delimiter), [])]
     except csv.Error:
         return delimiter, []
 
@@ -159,36 +170,38 @@ def _places(header: list[str], layout: CsvLayout, source: str) -> dict[str, int]
         column = layout.columns.get(name, name)
         if header.count(column) > 1:
             raise FormatError(
-                f"{source}, line 1: {header.count(column)} columns {column!r}, expected one"
+                f"{source}, names of the columns: found {header.count(column)} columns {column!r}, "
+                "expected one"
             )
         if column in header:
             places[name] = header.index(column)
         elif name in layout.columns:
             raise FormatError(
-                f"{source}, line 1: expected a column {column!r} for {name}, found "
+                f"{source}, names of the columns: expected a column {column!r} for {name}, found "
                 f"{', '.join(header)[:200]}"
             )
     given = [position for position in _POSITIONS if position & set(places)]
     if len(given) != 1 or not given[0] <= set(places):
         raise FormatError(
-            f"{source}, line 1: expected the columns lon and lat, or x and y, found "
+            f"{source}, names of the columns: expected the columns lon and lat, or x and y, found "
             f"{', '.join(header)[:200]}; name them (--columns lon=COLUMN,lat=COLUMN)"
         )
     return places
 
 
-def _corner_px(places: dict[str, int], layout: CsvLayout, source: str) -> float:
+def _corner_px(places: dict[str, int], origin_line: str, source: str) -> float:
+    """Line and sample of the centre of the first pixel; NaN where the file does not state its origin."""
     if ("line" in places) != ("sample" in places):
-        raise FormatError(f"{source}, line 1: expected both columns line and sample, or none of them")
-    if "line" not in places:
-        return 0.0
-    if layout.pixel_origin not in PIXEL_ORIGINS:
-        raise InputError(
-            f"{source}: the file does not state the origin of its pixels; state it (--pixel-origin), "
-            f"one of {', '.join(PIXEL_ORIGINS)}: the centre of the first pixel is (0, 0), its corner is "
-            "(0, 0), its corner is (1, 1)"
+        raise FormatError(f"{source}: expected both columns line and sample, or none of them")
+    stated = _ORIGIN_LINE.fullmatch(origin_line)
+    if stated is None:
+        return math.nan
+    if stated[1] not in PIXEL_ORIGINS:
+        raise FormatError(
+            f"{source}, line 1: pixel-origin: expected one of {', '.join(PIXEL_ORIGINS)}, found "
+            f"{stated[1][:20]!r}"
         )
-    return PIXEL_ORIGINS[layout.pixel_origin]
+    return PIXEL_ORIGINS[stated[1]]
 
 
 def _crs(layout: CsvLayout, source: str, *, on_map: bool) -> CRS:
@@ -223,8 +236,8 @@ def _sigmas_m(numbers: dict[str, Array], rows: list[dict[str, str]], source: str
     if "sigma_horizontal_m" in numbers:
         if {"sigma_east_m", "sigma_north_m"} & set(numbers):
             raise FormatError(
-                f"{source}, line 1: expected sigma_horizontal_m, or sigma_east_m and sigma_north_m, "
-                "found both"
+                f"{source}, names of the columns: expected sigma_horizontal_m, or sigma_east_m and "
+                "sigma_north_m, found both"
             )
         sigmas[:2] = [numbers["sigma_horizontal_m"]] * 2
     return np.column_stack(sigmas)

@@ -10,7 +10,7 @@
 | ENVI `.pts` | its corner is (1, 1) | `projection info` | above a datum that the caller states |
 | ODM `gcp_list.txt` | its centre is (0, 0) | its first line | of its CRS, else the caller states them |
 | PCI text | its corner is (0, 0) | a first line of ours | its first line, else the caller states them |
-| CSV | the caller states it | lon, lat, or x, y in a CRS of the caller | the caller states them |
+| CSV | its first line states it | lon, lat, or x, y in a CRS of the caller | the caller states them |
 | USGS GCPLib | no positions in images | lat, lon | the caller states them |
 | Copernicus Sentinel-2 GCP database | no positions in images | lon, lat | the caller states them |
 

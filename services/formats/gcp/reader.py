@@ -8,7 +8,7 @@ import numpy as np
 
 from services.errors import FormatError, VerticalDatumError
 from services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
-from services.formats.gcp.csv_points import CsvLayout, is_csv, parse_csv
+from services.formats.gcp.csv_points import PIXEL_ORIGINS, CsvLayout, is_csv, parse_csv
 from services.formats.gcp.gcplib import is_gcplib, parse_gcplib
 from services.formats.gcp.json_formats import parse_geojson_points, parse_opf
 from services.formats.gcp.marked_points import ELLIPSOID, Heights, MarkedPoints
@@ -70,7 +70,8 @@ def read_control_points(path: Path, heights: Heights | None = None) -> MarkedPoi
     if len(points) and not points.is_marked.any():
         raise FormatError(
             f"{path.name}: expected points with their positions in an image, found {len(points)} points "
-            "without any"
+            "without any; a CSV has them in the columns line and sample, after a first line with the "
+            f"origin of its pixels such as '# pixel-origin=centre' ({', '.join(PIXEL_ORIGINS)})"
         )
     return points.take(points.is_marked)
 

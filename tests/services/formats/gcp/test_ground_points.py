@@ -36,7 +36,7 @@ STATED = {
     "invented_orthority.geojson": StatedByCaller(),
     "invented_gcplib.txt": ELLIPSOID,
     "invented_copernicus.json": ELLIPSOID,
-    "invented.csv": StatedByCaller("ellipsoid", csv=CsvLayout({}, pixel_origin="centre")),
+    "invented.csv": ELLIPSOID,
     "invented_mapped.csv": StatedByCaller("ellipsoid", csv=MAPPED),
 }
 TEXTS = {name: (GOLDEN / name).read_text() for name in STATED}
@@ -212,15 +212,19 @@ def test_an_envi_file_of_an_image_on_a_map_has_no_heights(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("origin", "corner_px"), [("centre", 0.0), ("corner", 0.5), ("corner-1", 1.5)])
-def test_pixels_of_a_csv_count_from_the_origin_that_the_caller_states(
-    origin: str, corner_px: float
+def test_pixels_of_a_csv_count_from_the_origin_that_its_first_line_states(
+    origin: str, corner_px: float, tmp_path: Path
 ) -> None:
-    points = parse_csv(TEXTS["invented.csv"], CsvLayout({}, pixel_origin=origin), "ellipsoid")
+    text = TEXTS["invented.csv"]
+    stated = text.replace("pixel-origin=centre", f"pixel-origin={origin}")
+    points = read_control_points(written(tmp_path, "stated.csv", stated), "ellipsoid")
     expected = parse_geojson_points(TEXTS["invented.geojson"])
     np.testing.assert_allclose(points.line_sample, expected.line_sample - corner_px, atol=1e-9)
     assert points.image.tolist() == ["invented.tif"] * 5
-    with pytest.raises(InputError, match=r"does not state the origin of its pixels.*--pixel-origin"):
-        parse_csv(TEXTS["invented.csv"], CsvLayout({}), "ellipsoid")
+    unstated = written(tmp_path, "unstated.csv", text.partition("\n")[2])
+    with pytest.raises(FormatError, match=r"found 5 points without any; .*'# pixel-origin=centre'"):
+        read_control_points(unstated, "ellipsoid")
+    assert len(read_ground_points(unstated, ELLIPSOID)) == 5
 
 
 @pytest.mark.parametrize(
@@ -248,10 +252,11 @@ def test_pixels_of_a_csv_count_from_the_origin_that_the_caller_states(
         ("invented_copernicus.json", '"ID": "12"', '"ID": "11"', "GCP 2: ID 11 has longitude"),
         ("invented_copernicus.json", '"ID": "12"', '"ID": null', "GCP 2: ID: expected a name"),
         ("invented_copernicus.json", '"GCP":', '"GCPS":', "expected GCP_DB with a list GCP"),
-        ("invented.csv", "12.2912345678", "12,29", "line 2: expected the 12 fields of the first line"),
-        ("invented.csv", "12.2912345678", "east", "line 2: lon: expected a number, found 'east'"),
-        ("invented.csv", "12.2912345678", "", "line 2: expected lon and lat, found an empty field"),
-        ("invented.csv", "lon,lat", "lon,lon", "line 1: 2 columns 'lon', expected one"),
+        ("invented.csv", "12.2912345678", "12,29", "line 3: expected 12 fields "),
+        ("invented.csv", "12.2912345678", "east", "line 3: lon: expected a number, found 'east'"),
+        ("invented.csv", "12.2912345678", "", "line 3: expected lon and lat, found an empty field"),
+        ("invented.csv", "=centre", "=middle", "line 1: pixel-origin: expected one of centre, corner"),
+        ("invented.csv", "lon,lat", "lon,lon", "columns: found 2 columns 'lon', expected one"),
         ("invented.csv", ",line,", ",row,", "expected both columns line and sample"),
         ("invented.csv", "0.5,0.75,1.5", "0.5,-0.75,1.5", "point 11: sigmas: expected positive metres"),
         ("invented_mapped.csv", "E;", "X;", "expected a column 'E' for x, found N, X, ALT"),
@@ -293,7 +298,7 @@ def test_a_text_of_no_known_format_is_refused_with_the_list_of_formats(tmp_path:
 PARSERS: dict[str, Callable[[str], object]] = {
     "invented_gcplib.txt": lambda text: parse_gcplib(text, "ellipsoid"),
     "invented_copernicus.json": lambda text: parse_copernicus(text, "ellipsoid"),
-    "invented.csv": lambda text: parse_csv(text, CsvLayout({}, pixel_origin="centre"), "ellipsoid"),
+    "invented.csv": lambda text: parse_csv(text, CsvLayout({}), "ellipsoid"),
     "invented_mapped.csv": lambda text: parse_csv(text, MAPPED, "ellipsoid"),
 }
 

@@ -1,0 +1,142 @@
+"""Make a block of the points of another base: read them, cut chips from images, write the folder."""
+
+import math
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from app.errors import InputError
+from app.usecases.production import (
+    BlockIdentity,
+    block_metadata,
+    fewest_views,
+    image_accuracy,
+    refuse_existing,
+)
+from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from services.formats.block.document import BlockSpecification
+from services.formats.block.writer import write_block
+from services.formats.gcp.reader import StatedByCaller, read_ground_points
+from services.formats.images.bands import parse_bands
+from services.formats.images.scenes import read_scene
+from services.production.from_points import KnownPointOptions, KnownPoints, produce_known_points
+from services.sensors.rpc import RpcModel
+from services.types import Frame, GroundPoints, Progress, no_progress, part_of
+
+
+@dataclass(frozen=True)
+class KnownPointFiles:
+    """Points of another base in a file, and the images that give them chips.
+
+    Attributes:
+        points: in any format of `services.formats.gcp.reader`.
+        images: with registered models, or ortho-images; the most accurate first.
+        stated: what the file of the points does not state.
+        point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
+        terrain: gives the heights of points without any.
+        height_sigma_m: one standard deviation of the heights of the terrain; by default a tenth of the
+            distance of its nodes.
+        sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
+        frame_sigma_m, frame_sigma_up_m: error on the Earth that all points of the base share, metres;
+            None when unknown.
+        bands: see `services.formats.images.bands.parse_bands`.
+    """
+
+    points: Path
+    images: tuple[Path, ...]
+    stated: StatedByCaller = field(default_factory=StatedByCaller)
+    point_sigma_m: tuple[float, float] | None = None
+    terrain: TerrainFile | None = None
+    height_sigma_m: float | None = None
+    sigma_m: float | None = None
+    frame_sigma_m: float | None = None
+    frame_sigma_up_m: float | None = None
+    bands: str | None = None
+
+
+def run_points_production(
+    files: KnownPointFiles,
+    folder: Path,
+    identity: BlockIdentity,
+    options: KnownPointOptions = KnownPointOptions(),
+    progress: Progress = no_progress,
+) -> KnownPoints:
+    """Make a block of points of another base and write its folder.
+
+    Args:
+        files: the points and the images.
+        folder: of the block; must not exist.
+        identity: of the block.
+        options: of the points.
+        progress: receives the fraction done and a message.
+
+    Raises:
+        InputError: a file cannot be used, does not state what it must, or the folder exists.
+        ComputationError: too few points have chips.
+    """
+    refuse_existing(folder)
+    ground = _ground_points(files)
+    bands = None if files.bands is None else parse_bands(files.bands)
+    frame = Frame.from_sigmas(_or_nan(files.frame_sigma_m), _or_nan(files.frame_sigma_up_m))
+    with ExitStack() as stack:
+        scenes = []
+        for image in files.images:
+            scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands))
+            stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
+        production = produce_known_points(ground, scenes, frame, options, part_of(progress, 0.0, 0.8))
+        n_points = len(production.points)
+        metadata = block_metadata(
+            identity,
+            scenes,
+            production.points,
+            description=f"{n_points} points of {files.points.name}, chips from {len(scenes)} images",
+            outline=production.outline,
+            specification=BlockSpecification(production.gsds_m, fewest_views(production.points), None),
+            options=asdict(options) | {"points": files.points.name, "left_out": production.left_out},
+            accuracy=image_accuracy(production.points, production.local_sigma_m, len(scenes)),
+        )
+        models = {
+            scene.acquisition.image_id: scene.model
+            for scene in production.scenes
+            if isinstance(scene.model, RpcModel)
+        }
+        write_block(
+            folder,
+            metadata,
+            production.points,
+            production.chips,
+            models,
+            progress=part_of(progress, 0.8, 0.2),
+        )
+    return production
+
+
+def _ground_points(files: KnownPointFiles) -> GroundPoints:
+    """The points of the file, with heights and sigmas where they are stated elsewhere."""
+    ground = read_ground_points(files.points, files.stated)
+    sigma_m = ground.sigma_m
+    if files.point_sigma_m is not None:
+        horizontal_m, up_m = files.point_sigma_m
+        stated_m = np.array([horizontal_m, horizontal_m, up_m])
+        sigma_m = np.where(np.isnan(sigma_m), stated_m, sigma_m)
+    ground = replace(ground, sigma_m=sigma_m)
+    missing = np.isnan(ground.lon_lat_h[:, 2])
+    if not missing.any():
+        return ground
+    if files.terrain is None:
+        raise InputError(
+            f"{files.points.name}: {int(missing.sum())} of {len(ground)} points, such as "
+            f"{ground.id[missing][0]}, have no height: give a terrain (--dem FILE)"
+        )
+    terrain = read_terrain(files.terrain)
+    lon_lat_h = ground.lon_lat_h.copy()
+    lon_lat_h[missing, 2] = terrain.height_m(lon_lat_h[missing, :2])
+    sigma_m = sigma_m.copy()
+    sigma_m[missing, 2] = files.height_sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m
+    return replace(ground, lon_lat_h=lon_lat_h, sigma_m=sigma_m)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

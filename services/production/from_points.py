@@ -1,0 +1,241 @@
+"""POINTS OF ANOTHER BASE AND IMAGES IN -> POINTS WITH CHIPS OUT: known ground, cut from images."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.errors import InputError, NotEnoughPoints
+from services.geodesy import box_around
+from services.imagery.scene import Scene, scene_gsd_m, view_direction
+from services.matching.multi_image import chip_inside
+from services.production.detail_points import detail_points, detail_saliency
+from services.production.point_views import chips_of
+from services.production.view_agreement import AgreedViews, agreed_views
+from services.types import (
+    Array,
+    BoolArray,
+    ChipArray,
+    ControlPoints,
+    Frame,
+    GroundPoints,
+    IntArray,
+    Progress,
+    StrArray,
+    no_progress,
+    part_of,
+)
+
+_MIN_POINTS = 6
+"""Fewest points of a block."""
+
+NO_HEIGHT = "no height"
+SAME_PLACE = "at the place of another point"
+OUTSIDE = "no image shows the whole chip"
+MISSING = "pixels of the chip are missing"
+NOT_SALIENT = "not salient"
+NOT_CONFIRMED = "not found in the other images"
+"""Why a point is left out, in the order in which the points are judged."""
+
+
+@dataclass(frozen=True)
+class KnownPointOptions:
+    """How chips are cut for points of another base.
+
+    Attributes:
+        fine_gsd_m, coarse_gsd_m: ground samplings of the chips, metres; by default that of the coarsest
+            image in two digits, and four times that.
+        min_saliency: smallest saliency of a point's chip.
+        min_views: smallest number of images in which a point is found, of those that show it.
+        local_sigma_px: position of a detail relative to the rest of its image, pixels of the image, one
+            standard deviation a coordinate; several images raise it when they disagree by more.
+    """
+
+    fine_gsd_m: float | None = None
+    coarse_gsd_m: float | None = None
+    min_saliency: float = 0.05
+    min_views: int = 2
+    local_sigma_px: float = 0.3
+
+
+@dataclass(frozen=True)
+class KnownPoints:
+    """Points of another base with chips.
+
+    Attributes:
+        points: as in `Production`.
+        chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
+        gsds_m: ground samplings of the chips, fine and coarse, metres.
+        outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
+        scenes: the images, with models that are shifted onto the earlier ones.
+        source_id: (n,) id of each point in its own base.
+        left_out: number of points left out, by the reason.
+        shift_m: (k, 2) east, north, by which each image lay off the earlier ones.
+        local_sigma_m: horizontal error of details relative to the rest of their image, from the
+            disagreement of the images; NaN where nothing shows it.
+    """
+
+    points: ControlPoints
+    chips: Callable[[int], ChipArray]
+    gsds_m: tuple[float, float]
+    outline: Array
+    scenes: list[Scene]
+    source_id: StrArray
+    left_out: dict[str, int]
+    shift_m: Array
+    local_sigma_m: float
+
+
+def produce_known_points(
+    ground: GroundPoints,
+    scenes: Sequence[Scene],
+    frame: Frame,
+    options: KnownPointOptions = KnownPointOptions(),
+    progress: Progress = no_progress,
+) -> KnownPoints:
+    """The points of another base that images show, with chips of these images.
+
+    A chip shows what the model of its image puts at the point. Its horizontal error is therefore that of
+    the image: a local one, in the covariance of the point, and one that all points share, in the frame.
+    A wrong height moves the content along the line of sight, so that the sigma of the height acts along
+    that line. The horizontal sigmas of the base are added: they cover the position of its own detail.
+
+    Args:
+        ground: the points, all of them with sigmas.
+        scenes: with registered models, or with the accuracy that is known of their models; the most
+            accurate first.
+        frame: error on the Earth that all points of the base share, NaN where unknown; that of the
+            images is added.
+        options: thresholds.
+        progress: receives the fraction done.
+
+    Raises:
+        InputError: a point has no sigmas, two images have one name, or the samplings are wrong.
+        NotEnoughPoints: too few points have chips; the message counts the others by their reason.
+    """
+    _check(ground, scenes)
+    fine_m, coarse_m = _gsds_m(scenes, options)
+    reason = np.full(len(ground), "", dtype=object)
+    reason[np.isnan(ground.lon_lat_h).any(axis=1)] = NO_HEIGHT
+    reason[_repeated(ground.lon_lat_h) & (reason == "")] = SAME_PLACE
+    rows = np.flatnonzero(reason == "")
+    agreed = agreed_views(scenes, ground.lon_lat_h[rows], fine_m, progress=part_of(progress, 0.0, 0.7))
+    saliency = np.zeros(len(rows))
+    for number, (row, image) in enumerate(zip(rows, agreed.reference, strict=True)):
+        if number % 64 == 0:
+            progress(0.7 + 0.3 * number / len(rows), f"looking at {len(rows)} points")
+        if image >= 0:
+            saliency[number] = detail_saliency(agreed.scenes[image], ground.lon_lat_h[row], fine_m)
+    of_rows = np.full(len(rows), "", dtype=object)
+    of_rows[~agreed.confirmed(options.min_views)] = NOT_CONFIRMED
+    of_rows[saliency < options.min_saliency] = NOT_SALIENT
+    of_rows[agreed.reference < 0] = MISSING
+    of_rows[~_inside(scenes, ground.lon_lat_h[rows], fine_m)] = OUTSIDE
+    reason[rows] = of_rows
+    taken = np.flatnonzero(of_rows == "")
+    left_out = dict(Counter(reason[reason != ""].tolist()).most_common())
+    if len(taken) < _MIN_POINTS:
+        counts = ", ".join(f"{count} {why}" for why, count in left_out.items())
+        raise NotEnoughPoints(len(taken), _MIN_POINTS, f"of {len(ground)} points: {counts}")
+    lon_lat_h = ground.lon_lat_h[rows[taken]]
+    points = detail_points(
+        agreed,
+        taken,
+        lon_lat_h,
+        _covariance_m2(ground.sigma_m[rows[taken]], lon_lat_h, agreed, taken, options.local_sigma_px),
+        saliency=saliency[taken],
+        frame=_frame_with_image(frame, agreed),
+        gsds_m=(fine_m, coarse_m),
+    )
+    progress(1.0, f"{len(points)} points")
+    return KnownPoints(
+        points=points,
+        chips=chips_of(agreed.scenes, points),
+        gsds_m=(fine_m, coarse_m),
+        outline=box_around(points.lon_lat_h),
+        scenes=agreed.scenes,
+        source_id=ground.id[rows[taken]],
+        left_out=left_out,
+        shift_m=agreed.shift_m,
+        local_sigma_m=agreed.local_sigma_m,
+    )
+
+
+def _check(ground: GroundPoints, scenes: Sequence[Scene]) -> None:
+    unknown = np.isnan(ground.sigma_m)
+    if unknown.any():
+        row = int(np.flatnonzero(unknown.any(axis=1))[0])
+        axes = [name for axis, name in enumerate(("east", "north", "up")) if unknown[:, axis].any()]
+        raise InputError(
+            f"{int(unknown.any(axis=1).sum())} of {len(ground)} points, such as {ground.id[row]}, have "
+            f"no sigma {', '.join(axes)}: state it (--point-sigma-m HORIZONTAL,UP); for an ASP file, "
+            "state the axes of its sigmas (--sigma-axes) where you know them"
+        )
+    names = [scene.acquisition.image_id for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
+            "one of them"
+        )
+
+
+def _gsds_m(scenes: Sequence[Scene], options: KnownPointOptions) -> tuple[float, float]:
+    fine_m = options.fine_gsd_m or float(f"{max(scene_gsd_m(scene) for scene in scenes):.2g}")
+    coarse_m = options.coarse_gsd_m or 4.0 * fine_m
+    if not 0.0 < fine_m < coarse_m:
+        raise InputError(
+            f"ground samplings of {fine_m:g} and {coarse_m:g} m given: expected a fine one above 0 and "
+            "below the coarse one (--gsd-m FINE,COARSE)"
+        )
+    return fine_m, coarse_m
+
+
+def _inside(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArray:
+    """Which points (n, 3) have their chip inside an image."""
+    inside = np.zeros(len(lon_lat_h), dtype=bool)
+    for scene in scenes:
+        inside |= chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m)
+    return inside
+
+
+def _repeated(lon_lat_h: Array) -> BoolArray:
+    """Which points (n, 3) have the place of an earlier one."""
+    first = np.unique(lon_lat_h, axis=0, return_index=True)[1]
+    repeated = np.ones(len(lon_lat_h), dtype=bool)
+    repeated[first] = False
+    return repeated
+
+
+def _covariance_m2(
+    sigma_m: Array, lon_lat_h: Array, agreed: AgreedViews, rows: IntArray, local_sigma_px: float
+) -> Array:
+    """Covariances (n, 3, 3): sigmas of the base, that of heights along the line of sight, of images."""
+    up = np.zeros((len(rows), 3))
+    up[:, 2] = 1.0
+    local_m = np.zeros(len(rows))
+    for image in np.unique(agreed.reference[rows]):
+        scene = agreed.scenes[image]
+        of_image = agreed.reference[rows] == image
+        ground = lon_lat_h[of_image]
+        incidence, azimuth = view_direction(scene.model, scene.model.project(ground), ground)
+        slope = np.tan(np.radians(incidence))
+        up[of_image, 0] = slope * np.sin(np.radians(azimuth))
+        up[of_image, 1] = slope * np.cos(np.radians(azimuth))
+        local_m[of_image] = max(
+            scene_gsd_m(scene) * local_sigma_px, float(np.nan_to_num(agreed.local_sigma_m))
+        )
+        if not agreed.tied.all():  # The images have errors of their own, which are not those of a frame.
+            local_m[of_image] = np.hypot(local_m[of_image], scene.sigma_m * agreed.disagreement)
+    horizontal_m2 = sigma_m[:, :2] ** 2 + local_m[:, None] ** 2
+    covariance = sigma_m[:, 2, None, None] ** 2 * up[:, :, None] * up[:, None, :]
+    covariance[:, [0, 1], [0, 1]] += horizontal_m2
+    return covariance
+
+
+def _frame_with_image(frame: Frame, agreed: AgreedViews) -> Frame:
+    """The frame of the base with the error of the images, where they have one in common."""
+    if not agreed.tied.all():
+        return frame
+    image_m = agreed.scenes[0].sigma_m * agreed.disagreement
+    return Frame(frame.covariance_m2 + np.diag([image_m**2, image_m**2, 0.0]))
