@@ -103,15 +103,15 @@ def agreed_views(
     Raises:
         NotEnoughPoints: an image shows the points of earlier ones, but they are not found in it.
     """
-    inside = np.stack([chip_inside(s.model, s.image.shape, lon_lat_h, gsd_m) for s in scenes])
-    reference, shown_by = _references(scenes, inside, lon_lat_h, gsd_m)
+    whole = _whole_chips(scenes, lon_lat_h, gsd_m)
+    reference = np.where(whole.any(axis=0), np.argmax(whole, axis=0), -1).astype(np.int64)
     search = _Search(list(scenes), reference, lon_lat_h)
     shift_m, tied = np.zeros((len(scenes), 2)), np.arange(len(scenes)) == 0
     pairs = [(int(row), int(image)) for row, image in enumerate(reference) if image >= 0]
     variances_m2: list[tuple[int, float]] = []
     for k in range(1, len(scenes)):
         progress(k / len(scenes), f"searching points in {scenes[k].acquisition.image_id}")
-        rows = np.flatnonzero(inside[k] & (reference >= 0) & (reference < k))
+        rows = np.flatnonzero(whole[k] & (reference < k))
         if len(rows) < _MIN_COMMON:
             continue
         first_m = search.first_shift(scenes[k], rows, gsd_m)
@@ -139,23 +139,20 @@ def agreed_views(
         scenes=placed,
         views=Observations(point, image, line_sample, np.full(len(point), np.nan)),
         reference=reference,
-        shown_by=shown_by,
+        shown_by=whole.sum(axis=0).astype(np.int64),
         shift_m=shift_m,
         tied=tied,
         local_sigma_m=math.sqrt(variance_m2) if measures >= _MIN_MEASURES else math.nan,
     )
 
 
-def _references(
-    scenes: Sequence[Scene], inside: BoolArray, lon_lat_h: Array, gsd_m: float
-) -> tuple[IntArray, IntArray]:
-    """The first image that shows the whole chip of each point (n,), and how many do (n,)."""
-    whole = np.zeros(inside.shape, dtype=bool)
-    for k, scene in enumerate(scenes):
-        for row in np.flatnonzero(inside[k]):
-            whole[k, row] = nearly_whole(render_chip(scene.image, scene.model, lon_lat_h[row], gsd_m))
-    first = np.where(whole.any(axis=0), np.argmax(whole, axis=0), -1)
-    return first.astype(np.int64), whole.sum(axis=0).astype(np.int64)
+def _whole_chips(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArray:
+    """Which images show the whole chips of which points (k, n), at most a tenth of it missing."""
+    whole = np.stack([chip_inside(s.model, s.image.shape, lon_lat_h, gsd_m) for s in scenes])
+    for k, row in np.argwhere(whole):
+        chip = render_chip(scenes[k].image, scenes[k].model, lon_lat_h[row], gsd_m)
+        whole[k, row] = nearly_whole(chip)
+    return whole
 
 
 @dataclass(frozen=True)
