@@ -117,7 +117,7 @@ def test_a_frame_that_nobody_states_is_unknown(amers, image: Path, tmp_path: Pat
     ("words", "message"),
     [
         (("--columns", COLUMNS, "--crs", UTM), "does not state the datum of its heights"),
-        (("--columns", COLUMNS, "--vertical", "ellipsoid"), "state it (--crs)"),
+        (("--columns", COLUMNS, "--vertical", "ellipsoid"), "found none; state it (--crs)"),
         (("--vertical", "ellipsoid"), "name them (--columns lon=COLUMN,lat=COLUMN)"),
         (("--columns", "east=E"), "expected NAME=COLUMN of the file"),
         (("--columns", COLUMNS, "--crs", UTM, "--vertical", "EGM2008"), "pyproj sync --file"),

@@ -42,8 +42,10 @@ COLUMNS = [
 `sigma_horizontal_m` stands for both horizontal coordinates. Other columns are ignored."""
 PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "corner-1": 1.5}
 """Line and sample of the centre of the first pixel, by the names of conventions: the centre is (0, 0),
-the corner is (0, 0), the corner is (1, 1). A first line states it: `# pixel-origin=corner`."""
-_ORIGIN_LINE = re.compile(r"#\s*pixel-origin=(\S+)\s*")
+the corner is (0, 0), the corner is (1, 1)."""
+_ORIGIN, _CRS = "pixel-origin", "crs"
+"""What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633`."""
+_STATEMENT = re.compile(r"#\s*(?:(?:pixel-origin|crs)=\S+\s*)+")
 _POSITIONS = ({"lon", "lat"}, {"x", "y"})
 _DELIMITERS = ",;\t"
 
@@ -54,7 +56,7 @@ class CsvLayout:
 
     Attributes:
         columns: name of the file's column for names of `COLUMNS`; the others have their own name.
-        crs: reference system of x and y, a code or a definition.
+        crs: reference system of x and y, a code or a definition, where the file states none.
     """
 
     columns: dict[str, str]
@@ -90,7 +92,8 @@ def parse_csv(
 ) -> MarkedPoints:
     """The points of a CSV file with a line of column names; an empty field is an unknown value.
 
-    Positions in images are read where a line before the names states their origin.
+    A line before the names may state the origin of pixels and the reference system of x and y. Positions
+    in images are read where it states their origin.
 
     Args:
         text: contents of the file; commas, semicolons or tabs separate fields.
@@ -100,15 +103,15 @@ def parse_csv(
 
     Raises:
         FormatError: a column is missing, or a line has another form.
-        InputError: the caller does not state the reference system of x and y.
+        InputError: nobody states the reference system of x and y, or both do.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
-    origin_line, names = _first_lines(text)
+    statements, names = _first_lines(text)
     delimiter, header = _header(text)
     places = _places(header, layout, source)
     on_map = "x" in places
-    corner_px = _corner_px(places, origin_line, source)
-    crs = _crs(layout, source, on_map=on_map)
+    corner_px = _corner_px(places, statements.get(_ORIGIN), source)
+    crs = _crs(statements.get(_CRS), layout.crs, source, on_map=on_map)
     lines = csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)
     rows: list[dict[str, str]] = []
     wheres: list[str] = []
@@ -146,10 +149,12 @@ def parse_csv(
     )
 
 
-def _first_lines(text: str) -> tuple[str, int]:
-    """The line before the names of the columns, if there is one, and the number of the line of names."""
+def _first_lines(text: str) -> tuple[dict[str, str], int]:
+    """What a line before the names of the columns states, and the number of the line of names."""
     first = text.partition("\n")[0].rstrip("\r")
-    return (first, 2) if first.startswith("#") else ("", 1)
+    if _STATEMENT.fullmatch(first) is None:
+        return {}, 1
+    return dict(word.split("=", 1) for word in first.lstrip("#").split()), 2
 
 
 def _header(text: str) -> tuple[str, list[str]]:
@@ -189,30 +194,36 @@ def _places(header: list[str], layout: CsvLayout, source: str) -> dict[str, int]
     return places
 
 
-def _corner_px(places: dict[str, int], origin_line: str, source: str) -> float:
+def _corner_px(places: dict[str, int], origin: str | None, source: str) -> float:
     """Line and sample of the centre of the first pixel; NaN where the file does not state its origin."""
     if ("line" in places) != ("sample" in places):
         raise FormatError(f"{source}: expected both columns line and sample, or none of them")
-    stated = _ORIGIN_LINE.fullmatch(origin_line)
-    if stated is None:
+    if origin is None:
         return math.nan
-    if stated[1] not in PIXEL_ORIGINS:
+    if origin not in PIXEL_ORIGINS:
         raise FormatError(
-            f"{source}, line 1: pixel-origin: expected one of {', '.join(PIXEL_ORIGINS)}, found "
-            f"{stated[1][:20]!r}"
+            f"{source}, line 1: {_ORIGIN}: expected one of {', '.join(PIXEL_ORIGINS)}, found "
+            f"{origin[:20]!r}"
         )
-    return PIXEL_ORIGINS[stated[1]]
+    return PIXEL_ORIGINS[origin]
 
 
-def _crs(layout: CsvLayout, source: str, *, on_map: bool) -> CRS:
+def _crs(of_file: str | None, of_caller: str | None, source: str, *, on_map: bool) -> CRS:
+    definitions = [text for text in (of_file, of_caller) if text is not None]
     if not on_map:
+        if definitions:
+            raise InputError(
+                f"{source}: {definitions[0][:40]} given as reference system of x and y, but the file "
+                "has lon and lat, degrees of WGS 84; leave --crs out, or name the columns x and y"
+            )
         return CRS.from_epsg(4326)
-    if layout.crs is None:
+    if len(definitions) != 1:
+        found = " and ".join(text[:40] for text in definitions) or "none"
         raise InputError(
-            f"{source}: the file does not state the reference system of x and y; state it (--crs), such "
-            "as EPSG:32633"
+            f"{source}: expected one reference system of x and y, found {found}; state it (--crs), "
+            f"such as EPSG:32633, or in a first line '# {_CRS}=EPSG:32633'"
         )
-    return parse_crs(layout.crs, source).to_2d()
+    return parse_crs(definitions[0], source).to_2d()
 
 
 def _number(field: str, name: str, where: str) -> float:

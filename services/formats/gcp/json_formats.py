@@ -252,6 +252,8 @@ def _opf_rows(gcp: Any, images: dict[str, Any], where: str) -> list[Row]:
     """The marks of one point, or one row without a mark."""
     if not isinstance(gcp, dict) or not isinstance(gcp.get("geolocation"), dict):
         raise FormatError(f"{where}: expected a geolocation")
+    if gcp.get("id") in (None, ""):
+        raise FormatError(f"{where}: id: expected a name, found {gcp.get('id')!r}")
     location, marks = gcp["geolocation"], gcp.get("marks")
     if not isinstance(marks, list) or not all(isinstance(mark, dict) for mark in marks):
         raise FormatError(f"{where}: expected a list of marks")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.errors import FormatError, VerticalDatumError
+from services.errors import FormatError, InputError, VerticalDatumError
 from services.formats.gcp.copernicus import COPERNICUS_KEY, parse_copernicus
 from services.formats.gcp.csv_points import PIXEL_ORIGINS, CsvLayout, is_csv, parse_csv
 from services.formats.gcp.gcplib import is_gcplib, parse_gcplib
@@ -114,6 +114,12 @@ def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) ->
 def _read(path: Path, stated: StatedByCaller) -> MarkedPoints:
     text = read_text(path)
     form = _format_of(text, path, stated)
+    if form.name != "CSV" and (stated.csv.columns or stated.csv.crs):
+        raise InputError(
+            f"{path.name}: --columns and --crs are for CSV, found {form.name}; leave them out"
+        )
+    if form.name != "ASP" and stated.sigma_axes is not None:
+        raise InputError(f"{path.name}: --sigma-axes is for ASP, found {form.name}; leave it out")
     if stated.heights is not None and stated.heights != ELLIPSOID:
         _refuse_second_datum(form, text, path, stated)
     return form.parse(text, stated, path.name)

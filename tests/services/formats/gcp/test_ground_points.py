@@ -252,7 +252,7 @@ def test_pixels_of_a_csv_count_from_the_origin_that_its_first_line_states(
         ("invented_copernicus.json", '"ID": "12"', '"ID": "11"', "GCP 2: ID 11 has longitude"),
         ("invented_copernicus.json", '"ID": "12"', '"ID": null', "GCP 2: ID: expected a name"),
         ("invented_copernicus.json", '"GCP":', '"GCPS":', "expected GCP_DB with a list GCP"),
-        ("invented.csv", "12.2912345678", "12,29", "line 3: expected 12 fields "),
+        ("invented.csv", "12.2912345678", "12,29", "line 3: expected 12 fields, .* found 13"),
         ("invented.csv", "12.2912345678", "east", "line 3: lon: expected a number, found 'east'"),
         ("invented.csv", "12.2912345678", "", "line 3: expected lon and lat, found an empty field"),
         ("invented.csv", "=centre", "=middle", "line 1: pixel-origin: expected one of centre, corner"),
@@ -260,6 +260,7 @@ def test_pixels_of_a_csv_count_from_the_origin_that_its_first_line_states(
         ("invented.csv", ",line,", ",row,", "expected both columns line and sample"),
         ("invented.csv", "0.5,0.75,1.5", "0.5,-0.75,1.5", "point 11: sigmas: expected positive metres"),
         ("invented_mapped.csv", "E;", "X;", "expected a column 'E' for x, found N, X, ALT"),
+        ("invented_opf.json", '"id": "12"', '"id": null', "gcp 2: id: expected a name, found None"),
         ("invented_ecef.gcp", "1.0 2.0 3.0", "1.0 0.0 3.0", "line 1: sigmas .* found 1.0 0.0 3.0"),
         ("invented_ecef.gcp", " 41.93", " 141.93", "line 1: expected a latitude within 90 degrees"),
     ],
@@ -274,8 +275,28 @@ def test_what_does_not_fit_is_refused_by_its_place(
 
 
 def test_a_csv_on_a_map_without_its_system_is_refused() -> None:
-    with pytest.raises(InputError, match=r"does not state the reference system of x and y.*--crs"):
+    with pytest.raises(InputError, match=r"one reference system of x and y, found none; .*--crs"):
         parse_csv(TEXTS["invented_mapped.csv"], CsvLayout(MAPPED.columns), "ellipsoid")
+
+
+def test_a_csv_may_state_its_system_itself_but_only_once(tmp_path: Path) -> None:
+    layout = CsvLayout(MAPPED.columns)
+    path = written(tmp_path, "map.csv", "# crs=EPSG:32633\n" + TEXTS["invented_mapped.csv"])
+    points = read_ground_points(path, StatedByCaller("ellipsoid", csv=layout))
+    assert np.abs(points.lon_lat_h - truth().lon_lat_h)[:, :2].max() < a_nanodegree
+    with pytest.raises(InputError, match="found EPSG:32633 and EPSG:32633"):
+        read_ground_points(path, STATED["invented_mapped.csv"])
+    with pytest.raises(InputError, match=r"has lon and lat, degrees .*; leave --crs out"):
+        read_ground_points(
+            GOLDEN / "invented.csv", StatedByCaller("ellipsoid", csv=CsvLayout({}, "EPSG:32633"))
+        )
+
+
+def test_what_is_stated_for_another_format_is_refused() -> None:
+    with pytest.raises(InputError, match="--columns and --crs are for CSV, found USGS GCPLib"):
+        read_ground_points(GOLDEN / "invented_gcplib.txt", STATED["invented_mapped.csv"])
+    with pytest.raises(InputError, match="--sigma-axes is for ASP, found CSV"):
+        read_ground_points(GOLDEN / "invented.csv", StatedByCaller("ellipsoid", "ecef"))
 
 
 @pytest.mark.parametrize("columns", ["lon", "lon=", "east=X", "lon=A,lon=B", ""])
