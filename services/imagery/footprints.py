@@ -23,14 +23,14 @@ def footprint_on_ground(shape: shapely.Geometry) -> shapely.Geometry:
     azimuthal plane of the pole, unless a corner lies at the pole itself; a ring around a pole includes
     it.
     """
-    parts = [_part_on_ground(part) for part in shapely.get_parts(shape)]
-    return parts[0] if len(parts) == 1 else shapely.multipolygons(parts)
+    parts = [_part_on_ground(part) for part in shapely.get_parts(shape) if not part.is_empty]
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
 
 
 def _part_on_ground(polygon: shapely.Geometry) -> shapely.Geometry:
     lon_lat = shapely.get_coordinates(polygon)
     latitude = np.abs(lon_lat[:, 1])
-    if latitude.max() >= 90.0 or not len(lon_lat):
+    if latitude.max() >= 90.0:
         return shapely.force_2d(polygon)
     if latitude.max() > _POLAR_LATITUDE_DEG and np.ptp(lon_lat[:, 1]) < 90.0 - _POLAR_LATITUDE_DEG:
         return _polar_part(polygon)

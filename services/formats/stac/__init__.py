@@ -1,0 +1,1 @@
+"""Catalogues of images as STAC: items in files, folders, linked catalogues and search APIs."""

@@ -1,0 +1,232 @@
+"""The images of a STAC catalogue, with their masks, and the items themselves for later."""
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from typing import IO, Any
+
+import numpy as np
+import shapely
+
+from services.errors import FormatError
+from services.formats.stac.documents import Documents, absolute_address, json_bytes
+from services.formats.stac.items import StacImage, parse_item, parse_polygons
+from services.formats.stac.walk import walk
+from services.formats.text_files import load_json
+from services.imagery.catalogue import ImageCatalogue
+from services.imagery.footprints import footprint_on_ground
+from services.types import Progress, no_progress
+
+MOST_PROBLEMS = 20
+"""Number of problems whose words are kept; all are counted."""
+_REPORTED_EVERY = 500
+_LON_LAT_CRS = ("CRS84", "4326")
+
+
+@dataclass(frozen=True)
+class StacCatalogue:
+    """What was read of a catalogue.
+
+    Attributes:
+        images: of the n items that can be used.
+        items: their JSON.
+        older: number of items before the first time asked for.
+        bad: number of items that cannot be used.
+        problems: words for the first of them.
+        other_masks: number of masks that are no GeoJSON and were not read.
+    """
+
+    images: ImageCatalogue
+    items: "ItemStore"
+    older: int
+    bad: int
+    problems: tuple[str, ...]
+    other_masks: int
+
+
+class ItemStore:
+    """The JSON of items in a temporary file, so that a large catalogue does not fill the memory."""
+
+    def __init__(self) -> None:
+        # It lives as long as the store, which no block of code encloses.
+        self._file: IO[bytes] = tempfile.TemporaryFile(prefix="amers-items-")  # noqa: SIM115
+        self._start: list[int] = []
+        self._end = 0
+
+    def add(self, item: dict[str, Any], base: str) -> None:
+        """Append an item; its addresses become absolute."""
+        assets, links = item.get("assets"), item.get("links")
+        members = list(assets.values()) if isinstance(assets, dict) else []
+        for member in members + (links if isinstance(links, list) else []):
+            if isinstance(member, dict) and isinstance(member.get("href"), str):
+                member["href"] = absolute_address(member["href"], base)
+        self._start.append(self._end)
+        self._end += self._file.write(json_bytes(item))
+
+    def read(self, rows: Iterable[int]) -> Iterator[dict[str, Any]]:
+        """The items of some rows."""
+        for row in rows:
+            self._file.seek(self._start[row])
+            yield load_json(self._file.readline().decode(), "an item of the catalogue")
+
+
+def read_catalogue(
+    source: str,
+    box: tuple[float, float, float, float] | None = None,
+    since: datetime | None = None,
+    progress: Progress = no_progress,
+) -> StacCatalogue:
+    """The images of a STAC catalogue; items that cannot be used are left out and counted.
+
+    Args:
+        source: path of a folder or a file, or address of an API or a catalogue on a server.
+        box: west, south, east, north, which a search API is asked for; required with such an API.
+        since: items before are left out.
+        progress: receives 0 and a message with the number of items.
+
+    Raises:
+        FormatError: the source is no catalogue, or none of its items can be used.
+    """
+    query = {} if box is None else {"bbox": ",".join(f"{value:.6f}" for value in box)}
+    if since is not None:
+        query["datetime"] = f"{since:%Y-%m-%dT%H:%M:%SZ}/.."
+    reader = _Reader(since)
+    with ExitStack() as stack:
+        documents = stack.enter_context(Documents(source))
+        for count, found in enumerate(walk(documents, query)):
+            reader.take(documents, found.source, found.base, found.item)
+            if count % _REPORTED_EVERY == 0:
+                progress(0.0, f"{count} items read")
+    return reader.catalogue(source)
+
+
+class _Reader:
+    """Collects the items of a catalogue."""
+
+    def __init__(self, since: datetime | None) -> None:
+        self._since = since
+        self._items = ItemStore()
+        self._images: list[StacImage] = []
+        self._masks: list[shapely.Geometry | None] = []
+        self._keys: set[tuple[str, str]] = set()
+        self._problems: list[str] = []
+        self._bad = 0
+        self._older = 0
+
+    def take(self, documents: Documents, source: str, base: str, item: Any) -> None:
+        """Keep an item, or the reason why it cannot be used."""
+        try:
+            if isinstance(item, FormatError):
+                raise item
+            image = parse_item(item, source)
+            if image.key in self._keys:
+                raise FormatError(f"{source}: id: {image.key[1]!r:.80} found twice, unique ids expected")
+            if self._since is not None and image.acquired < self._since:
+                self._older += 1
+                return
+            mask = read_masks(documents, image, base)
+        except FormatError as error:
+            self._bad += 1
+            if len(self._problems) < MOST_PROBLEMS:
+                self._problems.append(str(error))
+            return
+        self._keys.add(image.key)
+        self._images.append(image)
+        self._masks.append(mask)
+        self._items.add(item, base)
+
+    def catalogue(self, source: str) -> StacCatalogue:
+        """All that was collected."""
+        if not self._images:
+            if self._bad:
+                raise FormatError(
+                    f"{source}: none of {self._bad} items can be used; the first: {self._problems[0]}"
+                )
+            older = f" ({self._older} are before the first time asked for)" if self._older else ""
+            raise FormatError(
+                f"{source}: no STAC item found{older}; a folder, an item, an item collection, a "
+                "catalog, lines of items (.ndjson) or the address of a search API expected"
+            )
+        other_masks = sum(image.other_masks for image in self._images)
+        return StacCatalogue(
+            as_catalogue(self._images, self._masks),
+            self._items,
+            self._older,
+            self._bad,
+            tuple(self._problems),
+            other_masks,
+        )
+
+
+def as_catalogue(images: list[StacImage], masks: list[shapely.Geometry | None]) -> ImageCatalogue:
+    """Images as columns."""
+
+    def objects(values: list[Any]) -> Any:
+        out = np.empty(len(values), dtype=object)
+        out[:] = values
+        return out
+
+    numbers = {
+        name: np.array([getattr(image, name) for image in images], dtype=np.float64)
+        for name in (
+            "cloud_percent",
+            "snow_percent",
+            "incidence_deg",
+            "azimuth_deg",
+            "sun_elevation_deg",
+            "sun_azimuth_deg",
+        )
+    }
+    acquired = [image.acquired.replace(tzinfo=None) for image in images]
+    return ImageCatalogue(
+        id=objects([image.key[1] for image in images]),
+        footprint=objects([image.footprint for image in images]),
+        mask=objects(masks),
+        acquired=np.array(acquired, dtype="datetime64[ms]"),
+        platform=objects([image.platform for image in images]),
+        orbit=np.array([image.orbit for image in images], dtype=np.int64),
+        **numbers,
+    )
+
+
+def read_masks(documents: Documents, image: StacImage, base: str) -> shapely.Geometry | None:
+    """All that hides the ground of an image, as a multipolygon; None where the item has no mask.
+
+    Raises:
+        FormatError: a mask cannot be read.
+    """
+    if not image.masks:
+        return None
+    polygons: list[shapely.Geometry] = []
+    for written in image.masks:
+        address = documents.resolved(written, base)
+        polygons += parse_mask(documents.read(address), address)
+    return shapely.MultiPolygon(polygons)
+
+
+def parse_mask(document: Any, source: str) -> list[shapely.Geometry]:
+    """The polygons of a mask in GeoJSON, valid, with continuous longitudes.
+
+    Raises:
+        FormatError: it has other geometries, or other coordinates than longitude and latitude.
+    """
+    kind = document.get("type") if isinstance(document, dict) else None
+    crs = str(document.get("crs") or "CRS84") if isinstance(document, dict) else ""
+    if crs and not any(name in crs for name in _LON_LAT_CRS):
+        raise FormatError(f"{source}: crs: {crs:.120} found, longitude and latitude (CRS84) expected")
+    if kind == "FeatureCollection":
+        features = document.get("features")
+        if not isinstance(features, list):
+            raise FormatError(f"{source}: features: {features!r:.80} found, a list expected")
+        geometries = [f.get("geometry") if isinstance(f, dict) else f for f in features]
+    else:
+        geometries = [document.get("geometry") if kind == "Feature" else document]
+    polygons = []
+    for geometry in geometries:
+        if geometry is not None:
+            shape = footprint_on_ground(parse_polygons(geometry, source))
+            parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(shape)))
+            polygons += [part for part in parts if part.geom_type == "Polygon" and not part.is_empty]
+    return polygons

@@ -1,0 +1,149 @@
+"""JSON documents of a catalogue, from files or one server, within limits of size, time and number.
+
+A catalogue in files stays in files, and one on a server stays on that server: links that lead elsewhere
+are not followed.
+"""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import unquote, urljoin, urlsplit
+
+from services.errors import FormatError
+from services.formats.text_files import load_json
+
+LARGEST_DOCUMENT_BYTES = 512_000_000
+LARGEST_REPLY_BYTES = 64_000_000
+TIMEOUT_S = 30.0
+_MOST_REDIRECTS = 5
+
+
+def is_address(source: str) -> bool:
+    """Whether a source is the address of a server, not a path."""
+    return urlsplit(source).scheme in ("http", "https")
+
+
+class Documents:
+    """A reader of the documents of one catalogue; a context manager.
+
+    Attributes:
+        source: path or address of the catalogue.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._client: Any = None
+        if is_address(source):
+            import httpx  # imported here because only catalogues on servers need it
+
+            self._client = httpx.Client(timeout=TIMEOUT_S, transport=httpx.HTTPTransport(retries=2))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._client is not None:
+            self._client.close()
+
+    def resolved(self, address: str, base: str) -> str:
+        """The absolute form of an address in a document.
+
+        Raises:
+            FormatError: it leads away from the files or the server of the catalogue.
+        """
+        if is_address(base):
+            absolute = urljoin(base, address)
+            if self._client is not None and _origin(absolute) == _origin(self.source):
+                return absolute
+        elif not is_address(address) and urlsplit(address).scheme in ("", "file"):
+            path = Path(unquote(urlsplit(address).path if address.startswith("file:") else address))
+            return str(path if path.is_absolute() else (Path(base).parent / path).resolve())
+        raise FormatError(
+            f"{base}: {address:.200} leads away from the catalogue; links there are not read"
+        )
+
+    def read(self, address: str, body: dict[str, Any] | None = None) -> Any:
+        """The JSON of a file or a reply.
+
+        Args:
+            address: absolute, as `resolved` gives it.
+            body: of a POST; None makes a GET.
+
+        Raises:
+            FormatError: it cannot be read, or is no JSON, or exceeds the limits.
+        """
+        if self._client is None:
+            return load_json(_file_text(Path(address)), address)
+        return load_json(self._reply(address, body).decode("utf-8", "replace"), address)
+
+    def _reply(self, address: str, body: dict[str, Any] | None) -> bytes:
+        import httpx
+
+        request = self._client.build_request(
+            "GET" if body is None else "POST",
+            address,
+            headers={"Accept": "application/geo+json, application/json"},
+            json=body,
+        )
+        try:
+            for _ in range(_MOST_REDIRECTS):
+                reply = self._client.send(request, stream=True)
+                if not reply.has_redirect_location:
+                    return _content(reply, address)
+                reply.close()
+                request = reply.next_request
+                self.resolved(str(request.url), address)
+        except httpx.HTTPError as error:
+            raise FormatError(f"{address}: no reply ({error or type(error).__name__})") from None
+        raise FormatError(f"{address}: more than {_MOST_REDIRECTS} redirects")
+
+
+def absolute_address(address: str, base: str) -> str:
+    """The absolute form of an address in a document, wherever it leads."""
+    if urlsplit(address).scheme:
+        return address
+    return urljoin(base, address) if is_address(base) else str((Path(base).parent / address).resolve())
+
+
+def json_bytes(value: Any) -> bytes:
+    """One line of compact JSON."""
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
+
+
+def _content(reply: Any, address: str) -> bytes:
+    try:
+        if reply.status_code != 200:
+            raise FormatError(f"{address}: status {reply.status_code} found, 200 expected")
+        content = bytearray()
+        for piece in reply.iter_bytes():
+            content += piece
+            if len(content) > LARGEST_REPLY_BYTES:
+                raise FormatError(f"{address}: reply of more than {LARGEST_REPLY_BYTES} bytes")
+        return bytes(content)
+    finally:
+        reply.close()
+
+
+def _file_text(path: Path) -> str:
+    try:
+        if not path.is_file() or path.stat().st_size > LARGEST_DOCUMENT_BYTES:
+            raise FormatError(
+                f"{path}: expected an existing file of at most {LARGEST_DOCUMENT_BYTES} bytes; larger "
+                "catalogues are read as lines of items (.ndjson)"
+            )
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: expected text in UTF-8") from None
+
+
+def _origin(address: str) -> tuple[str, str]:
+    parts = urlsplit(address)
+    return parts.scheme, parts.netloc
