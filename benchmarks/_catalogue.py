@@ -14,6 +14,7 @@ SECONDS_PER_SCENE = 8.7
 FIRST_DAY = np.datetime64("2022-01-01")
 DAYS = 4 * 365
 PLATFORMS = ("alpha-1", "alpha-2", "alpha-3")
+CENTRE_LON_LAT = np.array([15.0, 0.0])
 HEADING_DEG = 190.0
 """Direction of flight of a descending pass."""
 
@@ -37,7 +38,7 @@ def simulate_catalogue(
 ) -> ImageCatalogue:
     """Images of passes over a square around 15 E, 0 N."""
     half = side_km / 2.0 / KM_PER_DEGREE
-    centre = np.array([15.0, 0.0])
+    centre = CENTRE_LON_LAT
     heading = np.radians(HEADING_DEG)
     along = np.array([np.sin(heading), np.cos(heading)])
     across = np.array([along[1], -along[0]])

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.image_selection import select
 from app.cli.output import AsJson, show_one
 from app.cli.production_points import points as make_known_points
 from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
@@ -20,6 +21,7 @@ from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
 app = typer.Typer(no_args_is_help=True)
+app.command()(select)
 app.command(name="points")(make_known_points)
 
 _DEFAULT = ProductionOptions()

@@ -40,6 +40,14 @@ class GroundGrid:
         """Height of a row, degrees of latitude."""
         return 180.0 / self.rows
 
+    def cell_of(self, lon_lat: Array) -> IntArray:
+        """Number (n,) of the cell of each place (n, 2)."""
+        row = np.floor((lon_lat[:, 1] + 90.0) / self.row_deg).astype(np.int64)
+        row = np.clip(row, 0, self.rows - 1)
+        columns = np.diff(self.first)[row]
+        column = np.floor((lon_lat[:, 0] + 180.0) / 360.0 * columns).astype(np.int64) % columns
+        return np.asarray(self.first[row] + column)
+
     def boxes(self, cell: IntArray) -> tuple[Array, Array]:
         """South-west and north-east corners (n, 2) of cells (n,), degrees."""
         row = np.searchsorted(self.first, cell, side="right") - 1

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from services.errors import CoverageError
+from services.errors import CoverageError, InputError
 from services.imagery.catalogue import ImageCatalogue, Shapes
 from services.production.ground_cells import (
     EARTH_RADIUS_M,
@@ -31,12 +31,14 @@ from services.production.multi_cover import (
     lower_bound,
     without_excess,
 )
-from services.types import BoolArray, IntArray, Progress, no_progress
+from services.types import Array, BoolArray, IntArray, Progress, no_progress
 
 CELLS_ACROSS = 12.0
 """Cells along the side of a square footprint of median area."""
 NEAR_VERTICAL_DEG = 10.0
 """Images of a smaller incidence are views from above, whatever their azimuth."""
+MOST_VIEWS = 200_000_000
+"""Cells of all footprints together; the selection needs about 60 bytes for each."""
 UNUSABLE = -1
 _BOUND_STEPS = 3000
 _LEAST_WEIGHT = 0.1
@@ -168,13 +170,16 @@ def select_images(
 
     Raises:
         CoverageError: no footprint lies in the area, or no cell's centre in a footprint.
+        InputError: the cells are too small for so much ground.
     """
     catalogue = with_cloud_from_masks(catalogue)
     duplicate = duplicates(catalogue)
     step = image_steps(catalogue, options)
     step[duplicate] = UNUSABLE
     progress(0.0, "ground in footprints")
-    grid = ground_grid(options.cell_m or default_cell_m(catalogue))
+    cell_m = options.cell_m or default_cell_m(catalogue)
+    _refuse_small_cells(catalogue, cell_m)
+    grid = ground_grid(cell_m)
     seen = seen_cells(catalogue.footprint, catalogue.mask, grid)
     cell = np.unique(seen.cell)
     if area is not None:
@@ -188,7 +193,7 @@ def select_images(
     if not len(cell):
         raise CoverageError(
             f"no cell of {grid.row_deg:.3g} degrees has its centre in one of {len(catalogue)} "
-            "footprints; state smaller cells (--cell-m)"
+            "footprints; state smaller cells (--cell-km)"
         )
     problem, cell_step, available = _cover_problem(catalogue, options, step, seen, cell)
     progress(0.2, "first selection")
@@ -212,10 +217,24 @@ def select_images(
 
 def default_cell_m(catalogue: ImageCatalogue) -> float:
     """Side of a cell, metres: a twelfth of the side of a square of the footprints' median area."""
+    return float(np.sqrt(np.median(_area_m2(catalogue)))) / CELLS_ACROSS
+
+
+def _area_m2(catalogue: ImageCatalogue) -> Array:
+    """Area (n,) of the footprints, to a few percent."""
     bounds = shapely.bounds(catalogue.footprint)
     latitude = np.radians((bounds[:, 1] + bounds[:, 3]) / 2.0)
-    steradian = np.radians(1.0) ** 2 * shapely.area(catalogue.footprint) * np.cos(latitude)
-    return float(EARTH_RADIUS_M * np.sqrt(np.median(steradian)) / CELLS_ACROSS)
+    radian = EARTH_RADIUS_M * np.radians(1.0)
+    return np.asarray(radian**2 * shapely.area(catalogue.footprint) * np.cos(latitude))
+
+
+def _refuse_small_cells(catalogue: ImageCatalogue, cell_m: float) -> None:
+    views = float(_area_m2(catalogue).sum()) / cell_m**2
+    if views > MOST_VIEWS:
+        raise InputError(
+            f"cells of {cell_m / 1000.0:.3g} km make {views:,.0f} views of {len(catalogue)} images, "
+            f"{MOST_VIEWS:,} at most expected; state larger cells (--cell-km)"
+        )
 
 
 def image_steps(catalogue: ImageCatalogue, options: SelectionOptions) -> IntArray:
@@ -328,7 +347,7 @@ def _cell_steps(
         available[is_open] += more[is_open]
         cell_step[is_open & (available >= options.min_views)] = step
         is_open &= available < options.min_views
-    return cell_step, available.astype(np.int16)
+    return cell_step, np.minimum(available, np.iinfo(np.int16).max).astype(np.int16)
 
 
 def _use(

@@ -12,6 +12,7 @@ from html import escape
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from services.types import Array
 
@@ -218,7 +219,13 @@ class Panel:
     def image(self, grey: Array, opaque: Array) -> None:
         """Fill the panel with an image (h, w) of 0 to 255, transparent where it is not opaque."""
         layers = (grey,) if opaque.all() else (grey, grey, grey, 255.0 * opaque)
-        _, encoded = cv2.imencode(".png", np.stack(layers, axis=-1).astype(np.uint8))
+        self.picture(np.stack(layers, axis=-1).astype(np.uint8))
+
+    def picture(self, pixels: npt.NDArray[np.uint8]) -> None:
+        """Fill the panel with pixels (h, w, k): grey, or red, green and blue with or without opacity."""
+        if pixels.shape[2] > 1:
+            pixels = pixels[:, :, [2, 1, 0, 3][: pixels.shape[2]]]
+        _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels))
         uri = base64.b64encode(encoded.tobytes()).decode("ascii")
         self.figure.parts.append(
             f'<image x="{self.left:.2f}" y="{self.top:.2f}" width="{self.width:.2f}" '

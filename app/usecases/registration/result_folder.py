@@ -67,7 +67,8 @@ def older_result(folder: Path) -> OlderResult | None:
 def replacing(folder: Path) -> Iterator[Path]:
     """A new empty folder, which takes the place of `folder` at the end of the context.
 
-    An exception leaves `folder` as it is.
+    Its report.json must state what the result is of (the scene, or the catalogue of a selection) and the
+    verdict. An exception leaves `folder` as it is.
 
     Raises:
         InputError: the folder cannot be written or replaced.
@@ -236,7 +237,7 @@ def _write_manifest(folder: Path) -> None:
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     document = {
         "format": RESULT_FORMAT,
-        "scene": report["scene"]["name"],
+        "scene": report["scene"]["name"] if "scene" in report else report["catalogue"],
         "verdict": report["verdict"],
         "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": {

@@ -140,13 +140,17 @@ class _Reader:
     def catalogue(self, source: str) -> StacCatalogue:
         """All that was collected."""
         if not self._images:
+            if self._older:
+                raise FormatError(
+                    f"{source}: no item to choose from: {self._older} are before the first time asked for, "
+                    f"{self._bad} cannot be used; state an earlier time (--since)"
+                )
             if self._bad:
                 raise FormatError(
                     f"{source}: none of {self._bad} items can be used; the first: {self._problems[0]}"
                 )
-            older = f" ({self._older} are before the first time asked for)" if self._older else ""
             raise FormatError(
-                f"{source}: no STAC item found{older}; a folder, an item, an item collection, a "
+                f"{source}: no STAC item found; a folder, an item, an item collection, a "
                 "catalog, lines of items (.ndjson) or the address of a search API expected"
             )
         other_masks = sum(image.other_masks for image in self._images)
@@ -212,21 +216,42 @@ def parse_mask(document: Any, source: str) -> list[shapely.Geometry]:
     Raises:
         FormatError: it has other geometries, or other coordinates than longitude and latitude.
     """
-    kind = document.get("type") if isinstance(document, dict) else None
-    crs = str(document.get("crs") or "CRS84") if isinstance(document, dict) else ""
-    if crs and not any(name in crs for name in _LON_LAT_CRS):
+    return _valid_polygons([footprint_on_ground(shape) for shape in _geojson_shapes(document, source)])
+
+
+def parse_area(document: Any, source: str) -> shapely.Geometry:
+    """The polygons of an area in GeoJSON, exactly as written: an area may go round the Earth.
+
+    Raises:
+        FormatError: it has no polygons, or other coordinates than longitude and latitude.
+    """
+    polygons = _valid_polygons(_geojson_shapes(document, source))
+    if not polygons:
+        raise FormatError(f"{source}: no polygon found, the area as GeoJSON polygons expected")
+    return shapely.MultiPolygon(polygons)
+
+
+def _geojson_shapes(document: Any, source: str) -> list[shapely.Geometry]:
+    """All polygons and multipolygons of a GeoJSON document."""
+    if not isinstance(document, dict):
+        raise FormatError(f"{source}: {document!r:.80} found, GeoJSON expected")
+    crs = str(document.get("crs") or _LON_LAT_CRS[0])
+    if not any(name in crs for name in _LON_LAT_CRS):
         raise FormatError(f"{source}: crs: {crs:.120} found, longitude and latitude (CRS84) expected")
-    if kind == "FeatureCollection":
-        features = document.get("features")
+    features = [document]
+    if document.get("type") == "FeatureCollection":
+        features = document.get("features")  # type: ignore[assignment]
         if not isinstance(features, list):
             raise FormatError(f"{source}: features: {features!r:.80} found, a list expected")
-        geometries = [f.get("geometry") if isinstance(f, dict) else f for f in features]
-    else:
-        geometries = [document.get("geometry") if kind == "Feature" else document]
-    polygons = []
-    for geometry in geometries:
+    shapes = []
+    for feature in features:
+        is_feature = isinstance(feature, dict) and feature.get("type") == "Feature"
+        geometry = feature.get("geometry") if is_feature else feature
         if geometry is not None:
-            shape = footprint_on_ground(parse_polygons(geometry, source))
-            parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(shape)))
-            polygons += [part for part in parts if part.geom_type == "Polygon" and not part.is_empty]
-    return polygons
+            shapes.append(parse_polygons(geometry, source))
+    return shapes
+
+
+def _valid_polygons(shapes: list[shapely.Geometry]) -> list[shapely.Geometry]:
+    parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(np.array(shapes, dtype=object))))
+    return [part for part in parts if part.geom_type == "Polygon" and not part.is_empty]

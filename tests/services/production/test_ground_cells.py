@@ -45,6 +45,13 @@ def test_the_cells_of_a_footprint_are_those_whose_centre_it_contains(seed):
     assert cells_of(shape, grid)[0] == set(expected.tolist())
 
 
+def test_the_centre_of_a_cell_lies_in_it_on_every_turn():
+    grid = ground_grid(50_000.0)
+    every = np.arange(grid.first[-1])
+    for turn in (-360.0, 0.0, 360.0):
+        assert (grid.cell_of(grid.centres(every) + [turn, 0.0]) == every).all()
+
+
 def test_footprints_side_by_side_share_no_cell_and_leave_none_out():
     grid = ground_grid(10_000.0)
     both, _ = cells_of(shapely.box(0, 0, 4, 3), grid)
