@@ -1,10 +1,10 @@
 """Images for a block out of 50,000: enough clear views everywhere, near the lower bound, in minutes.
 
 A catalogue of three satellites over 2,000 x 2,000 km around 15 E, 0 N is simulated: passes of 60 km
-scenes over four years, rolled and pitched, with clouds by place and season, masks, and gaps in what is stated.
-It is written as lines of STAC items with a GeoJSON mask each. Then `read_catalogue` and `select_images`
-run as `amers production select` runs them. Counted again with shapely, at random places that are not the
-centres of cells: the views of the chosen images, and those of all usable ones.
+scenes over four years, rolled and pitched, with clouds by place and season, masks, and gaps in what is
+stated. It is written as lines of STAC items with a GeoJSON mask each. Then `read_catalogue` and
+`select_images` run as `amers production select` runs them. Counted again with shapely, at random places
+that are not the centres of cells: the views of the chosen images, and those of all usable ones.
 
 Run: python -m benchmarks.image_selection [--images 50000] [--side-km 2000] [--places 2000]
 """

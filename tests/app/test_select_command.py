@@ -1,4 +1,4 @@
-"""`amers production select`: from a catalogue to a folder with the selection, or an error and no folder."""
+"""`amers production select`: from a catalogue to a folder with the selection, or no folder."""
 
 import json
 import sys
@@ -151,7 +151,7 @@ def test_options_change_what_is_asked(select, catalogue, area, tmp_path):
         (("--cloud-limits", "15,120"), "rising numbers up to 100"),
         (("--cloud-limits", "much"), "rising numbers up to 100"),
         (("--cell-km", "0.01"), "state larger cells (--cell-km)"),
-        (("--since", "2100-01-01"), "before the first time asked for"),
+        (("--since", "2100-01-01"), "before the first time asked for, 2 cannot be used"),
     ],
 )
 def test_what_cannot_be_done_is_refused_and_nothing_written(select, catalogue, tmp_path, words, message):

@@ -142,8 +142,8 @@ class _Reader:
         if not self._images:
             if self._older:
                 raise FormatError(
-                    f"{source}: no item to choose from: {self._older} are before the first time asked for, "
-                    f"{self._bad} cannot be used; state an earlier time (--since)"
+                    f"{source}: no item to choose from: {self._older} are before the first time asked "
+                    f"for, {self._bad} cannot be used; state an earlier time (--since)"
                 )
             if self._bad:
                 raise FormatError(
