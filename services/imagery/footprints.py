@@ -23,6 +23,13 @@ def footprint_on_ground(shape: shapely.Geometry) -> shapely.Geometry:
     azimuthal plane of the pole, unless a corner lies at the pole itself; a ring around a pole includes
     it.
     """
+    lon_lat = shapely.get_coordinates(shape)
+    if (
+        len(lon_lat)
+        and np.ptp(lon_lat[:, 0]) <= 180.0
+        and np.abs(lon_lat[:, 1]).max() <= _POLAR_LATITUDE_DEG
+    ):
+        return shapely.force_2d(shape)
     parts = [_part_on_ground(part) for part in shapely.get_parts(shape) if not part.is_empty]
     return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
 

@@ -253,5 +253,9 @@ def _geojson_shapes(document: Any, source: str) -> list[shapely.Geometry]:
 
 
 def _valid_polygons(shapes: list[shapely.Geometry]) -> list[shapely.Geometry]:
-    parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(np.array(shapes, dtype=object))))
+    parts = shapely.get_parts(np.array(shapes, dtype=object))
+    is_valid = shapely.is_valid(parts)
+    if not is_valid.all():
+        mended = shapely.make_valid(parts[~is_valid])
+        parts = np.concatenate([parts[is_valid], shapely.get_parts(shapely.get_parts(mended))])
     return [part for part in parts if part.geom_type == "Polygon" and not part.is_empty]

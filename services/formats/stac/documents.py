@@ -5,6 +5,7 @@ are not followed.
 """
 
 import json
+import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -62,8 +63,8 @@ class Documents:
             if self._client is not None and _origin(absolute) == _origin(self.source):
                 return absolute
         elif not is_address(address) and urlsplit(address).scheme in ("", "file"):
-            path = Path(unquote(urlsplit(address).path if address.startswith("file:") else address))
-            return str(path if path.is_absolute() else (Path(base).parent / path).resolve())
+            path = unquote(urlsplit(address).path if address.startswith("file:") else address)
+            return _beside(base, path)
         raise FormatError(
             f"{base}: {address:.200} leads away from the catalogue; links there are not read"
         )
@@ -108,7 +109,12 @@ def absolute_address(address: str, base: str) -> str:
     """The absolute form of an address in a document, wherever it leads."""
     if urlsplit(address).scheme:
         return address
-    return urljoin(base, address) if is_address(base) else str((Path(base).parent / address).resolve())
+    return urljoin(base, address) if is_address(base) else _beside(base, unquote(address))
+
+
+def _beside(base: str, path: str) -> str:
+    """The absolute form of a path in a file."""
+    return os.path.abspath(os.path.join(os.path.dirname(base), path))
 
 
 def json_bytes(value: Any) -> bytes:
