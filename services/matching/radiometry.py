@@ -38,8 +38,9 @@ def gradient_image(pixels: FloatImage) -> FloatImage:
     Returns:
         (r - 2, c - 2); NaN beside missing pixels.
     """
-    down = pixels[2:, 1:-1] - pixels[:-2, 1:-1]
-    right = pixels[1:-1, 2:] - pixels[1:-1, :-2]
+    with np.errstate(invalid="ignore"):  # between saturated pixels
+        down = pixels[2:, 1:-1] - pixels[:-2, 1:-1]
+        right = pixels[1:-1, 2:] - pixels[1:-1, :-2]
     return np.asarray(cv2.sqrt(cv2.magnitude(right, down)))
 
 
