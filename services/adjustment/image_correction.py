@@ -225,7 +225,7 @@ def adjust_scene(
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
-    local_px2 = shared.likely_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
+    local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
     return SceneAdjustment(
         correction=correction,
         order=order,

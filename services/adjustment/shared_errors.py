@@ -29,6 +29,8 @@ _MIDDLE = 5
 """Of the cases: the middle share over the middle length."""
 _INDEPENDENT = 0.35
 """A priori probability that the errors are independent; the other cases share the rest."""
+_UNCLEAR = 0.2
+"""Probability that the errors are independent from which on nothing is clearly correlated."""
 _STATED_IS_TRUE = 0.3
 """A priori probability that the stated sigmas are true, rather than off by a factor of up to ten."""
 _CLIP = 2.2
@@ -51,12 +53,13 @@ class SharedErrors:
     Attributes:
         factor: variance, at least 1.
         correlated: (l,) the part of it that is correlated over each of the lengths, mean of the cases.
-        likely_share: that is correlated, median of the cases: 0 where errors are rather independent.
+        clear_share: that is correlated, mean of the cases, as far as it is clear that a share is: 0 where
+            errors may well be independent.
     """
 
     factor: float
     correlated: Array
-    likely_share: float
+    clear_share: float
 
     def covariance(self, position: Array, overlapping: Array) -> Array:
         """Covariance (n, n) of normalised errors.
@@ -194,14 +197,8 @@ def likeliest_shared_errors(
     return SharedErrors(
         factor=float(weight @ [one.factor for one in told]),
         correlated=np.asarray(np.bincount(lengths, part, len(_LENGTHS)), dtype=np.float64),
-        likely_share=_weighted_median(shares, weight),
+        clear_share=float(weight @ shares) * max(0.0, 1.0 - float(weight[0]) / _UNCLEAR),
     )
-
-
-def _weighted_median(values: Array, weight: Array) -> float:
-    """The median of values (n,) with weights (n,) of sum 1."""
-    order = np.argsort(values)
-    return float(values[order][np.searchsorted(np.cumsum(weight[order]), 0.5)])
 
 
 @dataclass(frozen=True)
