@@ -53,7 +53,7 @@ class SharedErrors:
     Attributes:
         factor: variance, at least 1.
         correlated: (l,) the part of it that is correlated over each of the lengths, mean of the cases.
-        clear_share: that is correlated, mean of the cases, as far as it is clear that a share is: 0 where
+        clear_share: that is correlated, mean of the cases, as far as it is clear that one is: 0 where
             errors may well be independent.
     """
 
