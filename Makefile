@@ -29,7 +29,7 @@ test-fast: $(READY)
 test-security: postgis
 	$(BIN)/python -m pytest -m security --attacks full -n auto --dist loadfile --no-loadscope-reorder
 
-# Repeated kills, cuts and floods, bombs, further real views: about ten minutes.
+# Repeated kills, cuts and floods, bombs, further real views.
 test-endurance: postgis
 	$(BIN)/python -m pytest -m endurance -n auto --dist load
 

@@ -21,7 +21,13 @@ from services.matching.multi_image import (
 from services.matching.predict import rank_in_group
 from services.matching.tie_points import FeatureOptions, find_tie_points
 from services.production.block_frame import block_frame
-from services.production.point_views import chips_of, point_views, shows_chip, surface_heights
+from services.production.point_views import (
+    check_image_names,
+    chips_of,
+    point_views,
+    shows_chip,
+    surface_heights,
+)
 from services.types import (
     Array,
     BoolArray,
@@ -180,14 +186,9 @@ def produce_points(
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
-    names = [scene.acquisition.image_id for scene in scenes]
-    if len(names) < 2:
-        raise InputError(f"{len(names)} image given, at least 2 needed to make points")
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
-            "one of them"
-        )
+    if len(scenes) < 2:
+        raise InputError(f"{len(scenes)} image given, at least 2 needed to make points")
+    check_image_names(scenes)
 
 
 def _adjust(

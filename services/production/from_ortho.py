@@ -15,7 +15,7 @@ from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import Window, block_means
 from services.matching.multi_image import chip_inside
 from services.production.detail_points import detail_points, detail_saliency
-from services.production.point_views import chips_of
+from services.production.point_views import check_image_names, chips_of
 from services.production.view_agreement import agreed_views
 from services.terrain import Terrain
 from services.types import (
@@ -207,12 +207,7 @@ class _Corner:
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
-    names = [scene.acquisition.image_id for scene in scenes]
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
-            "one of them"
-        )
+    check_image_names(scenes)
     for scene in scenes:
         if scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, 2].any():
             raise InputError(

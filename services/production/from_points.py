@@ -11,7 +11,7 @@ from services.geodesy import box_around
 from services.imagery.scene import Scene, scene_gsd_m, view_direction
 from services.matching.multi_image import chip_inside
 from services.production.detail_points import detail_points, detail_saliency
-from services.production.point_views import chips_of
+from services.production.point_views import check_image_names, chips_of
 from services.production.view_agreement import AgreedViews, agreed_views
 from services.types import (
     Array,
@@ -172,12 +172,7 @@ def _check(ground: GroundPoints, scenes: Sequence[Scene]) -> None:
             f"no sigma {', '.join(axes)}: state it (--point-sigma-m HORIZONTAL,UP); for an ASP file, "
             "state the axes of its sigmas (--sigma-axes) where you know them"
         )
-    names = [scene.acquisition.image_id for scene in scenes]
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
-            "one of them"
-        )
+    check_image_names(scenes)
 
 
 def _gsds_m(scenes: Sequence[Scene], options: KnownPointOptions) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from services.errors import InputError
 from services.imagery.scene import Scene, view_direction
 from services.imagery.source import render_chip
 from services.matching.multi_image import chip_inside, nearly_whole, stored_chip
@@ -17,6 +18,16 @@ from services.types import (
     SurfaceHeights,
     Views,
 )
+
+
+def check_image_names(scenes: Sequence[Scene]) -> None:
+    """Raise `InputError` when two images of a block have one name."""
+    names = [scene.acquisition.image_id for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"the images of a block must have different names, found {', '.join(sorted(names))}: rename "
+            "one of them"
+        )
 
 
 def shows_chip(
