@@ -18,6 +18,7 @@ PATIENCE_S = 10.0
 FORWARDED = b"X-Forwarded-For: 192.0.2.7\r\nX-Forwarded-Proto: https\r\n"
 HEAD = b"GET %b HTTP/1.1\r\nHost: localhost\r\n" + FORWARDED + b"\r\n"
 SLOW = b"/slow"
+ENDS = (b" http", b" https")
 
 
 @contextmanager
@@ -53,10 +54,18 @@ def server(**settings: object) -> Iterator[int]:
 
 
 def ask(line: socket.socket, path: bytes = b"/") -> bytes:
-    """The reply on a connection; empty when the server has closed it."""
+    """The whole reply on a connection; empty when the server has closed it.
+
+    Head and body of a reply may come in two pieces.
+    """
     try:
         line.sendall(HEAD % path)
-        return line.recv(4096)
+        reply = line.recv(4096)
+        while reply and not reply.endswith(ENDS):
+            piece = line.recv(4096)
+            assert piece, f"the reply broke off: {reply!r}"
+            reply += piece
+        return reply
     except ConnectionError:
         return b""
 

@@ -82,6 +82,7 @@ export interface CorrectionRecord {
   shift_m: number | null;
   words: string[];
   sigma0: number | null;
+  local_sigma_px: Numbers[];
 }
 
 export interface CorrelationOptions {
