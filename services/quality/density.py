@@ -1,15 +1,21 @@
 """Density of control points on the ground, in cells of 0.1 degree."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from services.geodesy import WGS84_B, WGS84_E2
-from services.types import Array, IntArray
+from services.types import Array, BoolArray, IntArray
 
 CELLS_PER_DEGREE = 10
+_SAMPLES_PER_SIDE = 64
+"""Positions along each side of the part of a cell inside an outline at which a mask is asked."""
+
+GroundMask = Callable[[Array], BoolArray]
+"""Which positions (n, 2) of longitude and latitude a mask covers."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +53,55 @@ def density_cells(lon_lat: Array, outline: Array) -> DensityCells:
     corner = (grid + low) / CELLS_PER_DEGREE
     opposite = (grid + low + 1) / CELLS_PER_DEGREE
     area_km2 = _area_inside_km2(corner, opposite, outline)
-    lon = lon_lat[:, 0] + 360.0 * np.ceil((outline[:, 0].min() - lon_lat[:, 0]) / 360.0)
-    # Points on the last edge of the outline belong to its last cell.
-    cell = np.floor(np.column_stack([lon, lon_lat[:, 1]]) * CELLS_PER_DEGREE).astype(np.int64) - low
-    cell = np.clip(cell, 0, shape - 1)
-    count = np.bincount(cell[:, 0] * shape[1] + cell[:, 1], minlength=len(grid)).astype(np.int64)
     inside = area_km2 > 0.0
-    return DensityCells(corner[inside], area_km2[inside], count[inside])
+    cells = DensityCells(corner[inside], area_km2[inside], np.zeros(int(inside.sum()), dtype=np.int64))
+    row = cell_of_points(cells, lon_lat)
+    return replace(cells, points=np.bincount(row[row >= 0], minlength=len(cells.points)).astype(np.int64))
+
+
+def cell_of_points(cells: DensityCells, lon_lat: Array) -> IntArray:
+    """The row (m,) of the cell of each point (m, 2); -1 for points in none of the cells.
+
+    Points on the last edge of the cells belong to the last of them.
+    """
+    corner = np.round(cells.lon_lat * CELLS_PER_DEGREE).astype(np.int64)
+    low, high = corner.min(axis=0), corner.max(axis=0)
+    middle = float(low[0] + high[0] + 1) / (2 * CELLS_PER_DEGREE)
+    lon = middle + (lon_lat[:, 0] - middle + 180.0) % 360.0 - 180.0
+    place = np.column_stack([lon, lon_lat[:, 1]]) * CELLS_PER_DEGREE
+    cell = np.floor(np.where(np.abs(place - high - 1) < 1e-9, high, place)).astype(np.int64) - low
+    known = ((cell >= 0) & (cell <= high - low)).all(axis=1)
+    table = np.full(tuple(high - low + 1), -1, dtype=np.int64)
+    table[tuple((corner - low).T)] = np.arange(len(corner))
+    row = np.full(len(lon_lat), -1, dtype=np.int64)
+    row[known] = table[cell[known, 0], cell[known, 1]]
+    return row
+
+
+def covered_area_km2(cells: DensityCells, outline: Array, mask: GroundMask) -> Array:
+    """Area (n,) of the cells inside an outline that a mask covers.
+
+    The mask is asked at 64 x 64 positions of the box around the part of each cell inside the outline.
+
+    Args:
+        cells: of the outline.
+        outline: as for `density_cells`.
+        mask: covers ground.
+    """
+    polygon = shapely.Polygon(outline)
+    step = (np.arange(_SAMPLES_PER_SIDE) + 0.5) / _SAMPLES_PER_SIDE
+    unit = np.stack(np.meshgrid(step, step, indexing="ij"), axis=-1).reshape(-1, 2)
+    share = np.zeros(len(cells.points))
+    for row, (west, south) in enumerate(cells.lon_lat.tolist()):
+        side = 1.0 / CELLS_PER_DEGREE
+        part = shapely.intersection(polygon, shapely.box(west, south, west + side, south + side))
+        low, high = np.array(part.bounds).reshape(2, 2)
+        place = low + unit * (high - low)
+        place = place[shapely.contains_xy(part, place[:, 0], place[:, 1])]
+        if len(place):
+            place[:, 0] = (place[:, 0] + 180.0) % 360.0 - 180.0
+            share[row] = mask(place).mean()
+    return np.asarray(share * cells.area_km2)
 
 
 def share_reaching(cells: DensityCells, points_per_km2: float) -> float:
