@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import bdtr, erf, gammaincinv, ndtri
 
-from services.types import Array
+from services.types import Array, IntArray
 
 MIN_CHECK_POINTS = 30
 """Smallest number of check points by ASPRS (Positional Accuracy Standards, edition 2)."""
@@ -111,7 +111,7 @@ def statistics(values: Array) -> Statistics:
     return Statistics(n, float(finite.mean()), std, float(np.sqrt(np.mean(finite**2))))
 
 
-def sample_quantile(values: Array) -> Quantile:
+def sample_quantile(values: Array, effective: float | None = None) -> Quantile:
     """The 90 % quantile of a sample and its distribution-free confidence interval.
 
     The number of values below the true quantile is binomial for any distribution, so order statistics
@@ -122,33 +122,69 @@ def sample_quantile(values: Array) -> Quantile:
 
     Args:
         values: (n,) any order; values that are not finite are left out.
+        effective: number of independent values that the sample is worth (`effective_number`); None for
+            all of them.
     """
     probability, confidence = QUANTILE_PROBABILITY, QUANTILE_CONFIDENCE
     ordered = np.sort(values[np.isfinite(values)])
     n = len(ordered)
     if n == 0:
         return Quantile(np.nan, np.nan, np.nan, 0, probability, confidence, "no points")
+    worth = n if effective is None else max(1, min(n, int(effective)))
     risk = (1.0 - confidence) / 2.0
-    less_than = np.concatenate([[0.0], bdtr(np.arange(n), n, probability)])
+    less_than = np.concatenate([[0.0], bdtr(np.arange(worth), worth, probability)])
     first = int(np.flatnonzero(less_than <= risk)[-1])
     enough = np.flatnonzero(1.0 - less_than <= risk)
     last = int(enough[0]) if len(enough) else 0
+
+    def bound(rank: int) -> float:
+        """The value of a rank among the independent values; NaN for rank 0."""
+        share = rank / (worth + 1.0)
+        return float(np.quantile(ordered, share, method="weibull")) if rank else float("nan")
+
     return Quantile(
         value=float(np.quantile(ordered, probability, method="median_unbiased")),
-        lower=float(ordered[first - 1]) if first > 0 else float("nan"),
-        upper=float(ordered[last - 1]) if last > 0 else float("nan"),
+        lower=bound(first),
+        upper=bound(last),
         n=n,
         probability=probability,
         confidence=confidence,
-        note=_small_sample_note(n, bounded=last > 0),
+        note=_small_sample_note(n, worth, bounded=last > 0),
     )
 
 
-def _small_sample_note(n: int, bounded: bool) -> str:
-    """The limits of a sample of n values, as a sentence."""
-    if n >= MIN_CHECK_POINTS:
-        return "" if bounded else f"{n} points do not bound the quantile from above"
-    note = f"{n} points; {MIN_CHECK_POINTS} are needed for a statement of accuracy"
+def effective_number(error: Array, group: IntArray) -> float:
+    """Number of independent errors that a sample is worth whose groups share a part of their errors.
+
+    Kish (1965), Survey sampling: n over 1 + (m - 1) r, with the size m of the groups, mean weighted by
+    the size, and the share r of the variance that lies between groups, by analysis of variance. With one
+    group nothing shows r, and all n errors count.
+
+    Args:
+        error: (n, k).
+        group: (n,) any numbers.
+    """
+    n = len(error)
+    _, member, size = np.unique(group, return_inverse=True, return_counts=True)
+    groups = len(size)
+    if groups < 2 or n <= groups:
+        return float(n)
+    means = np.stack([np.bincount(member, column) / size for column in error.T], axis=1)
+    within = float(((error - means[member]) ** 2).sum()) / (n - groups)
+    between = float((size * ((means - error.mean(axis=0)) ** 2).sum(axis=1)).sum()) / (groups - 1)
+    mean_size = float((size**2).sum()) / n
+    shared = max(0.0, between - within) / ((n - mean_size) / (groups - 1))
+    share = shared / max(shared + within, 1e-300)
+    return n / (1.0 + (mean_size - 1.0) * share)
+
+
+def _small_sample_note(n: int, worth: int, bounded: bool) -> str:
+    """The limits of a sample of n values that are worth fewer independent ones, as a sentence."""
+    points = f"{n} points" if worth == n else f"{n} points that share errors, worth {worth},"
+    if worth >= MIN_CHECK_POINTS:
+        return "" if bounded else f"{points} do not bound the quantile from above"
+    note = f"{n} points" if worth == n else f"{n} points that share errors and are worth {worth}"
+    note = f"{note}; {MIN_CHECK_POINTS} are needed for a statement of accuracy"
     return note if bounded else f"{note}; so few do not bound the quantile from above"
 
 

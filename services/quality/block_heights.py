@@ -1,0 +1,263 @@
+"""Heights of the points of a block against a terrain or surface model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.quality.accuracy import (
+    LINEAR_LE90,
+    NormalisedError,
+    Quantile,
+    effective_number,
+    normalised_error,
+    sample_quantile,
+    statistics,
+)
+from services.quality.density import GroundMask
+from services.terrain import Terrain
+from services.types import Array, BoolArray, ControlPoints, IntArray
+
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal law over its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class HeightModel:
+    """Heights that points are compared with.
+
+    Attributes:
+        terrain: heights of the ground, or of the surface.
+        sigma_m: of the heights, one standard deviation, independent from point to point.
+        frame_sigma_m: of the error that all the heights share, such as that of their datum; 0 when
+            unknown.
+        excluded: ground where they are not to be trusted, such as filled voids and towns.
+    """
+
+    terrain: Terrain
+    sigma_m: float
+    frame_sigma_m: float = 0.0
+    excluded: GroundMask | None = None
+
+
+@dataclass(frozen=True)
+class HeightErrors:
+    """Heights of m points of a block minus those of a height model.
+
+    Attributes:
+        row: (m,) of the points.
+        lon_lat: (m, 2).
+        error_m: (m,).
+        variance_m2: (m,) stated for the errors: of the point, relative to the frame of its block, and of
+            the model.
+        of_surface: (m,) whether the height of the surface was compared, not that of the point.
+        excluded: points on excluded ground.
+        outside: points where the model has no height.
+    """
+
+    row: IntArray
+    lon_lat: Array
+    error_m: Array
+    variance_m2: Array
+    of_surface: BoolArray
+    excluded: int
+    outside: int
+
+
+@dataclass(frozen=True)
+class HeightAccuracy:
+    """Accuracy of heights against a height model.
+
+    Attributes:
+        n: points.
+        bias_m: mean error.
+        median_m: median error.
+        std_m: about the mean; null below two points.
+        rmse_m: about zero.
+        nmad_m: median absolute deviation from the median, times 1.4826: the standard deviation of a
+            normal law that outliers do not move.
+        le90_m: 90 % of the absolute errors.
+    """
+
+    n: int
+    bias_m: float
+    median_m: float
+    std_m: float
+    rmse_m: float
+    nmad_m: float
+    le90_m: Quantile
+
+
+@dataclass(frozen=True)
+class HeightCell:
+    """The heights in a cell of one degree.
+
+    Attributes:
+        west, south: degrees.
+        accuracy: of the heights in it.
+    """
+
+    west: float
+    south: float
+    accuracy: HeightAccuracy
+
+
+@dataclass(frozen=True)
+class HeightClass:
+    """The heights on ground of one land cover.
+
+    Attributes:
+        name: of the land cover.
+        accuracy: of the heights on it.
+    """
+
+    name: str
+    accuracy: HeightAccuracy
+
+
+@dataclass(frozen=True)
+class HeightQuality:
+    """The heights of a block against a height model.
+
+    Attributes:
+        against: name of the model.
+        surfaces: points whose surface height was compared; of the others it was the height of the point.
+        excluded: points on excluded ground.
+        outside: points where the model has no height.
+        on_the_earth: all errors.
+        relative: without the median error, which the points share as an error of their frame does.
+        declared_le90_m: of the median point, relative to the frame, and of the model.
+        normalised: the errors without their mean, in units of what is declared for them.
+        typical_ratio: the same without the influence of outliers, as a ratio: their NMAD.
+        normalised_frame: the median error in units of the declared frame of the block and of the model;
+            n is 0 when nobody declared the frame.
+        cells: by cell of one degree.
+        land_cover: by land cover; empty when it is not given.
+    """
+
+    against: str
+    surfaces: int
+    excluded: int
+    outside: int
+    on_the_earth: HeightAccuracy
+    relative: HeightAccuracy
+    declared_le90_m: float
+    normalised: NormalisedError
+    typical_ratio: float
+    normalised_frame: NormalisedError
+    cells: tuple[HeightCell, ...]
+    land_cover: tuple[HeightClass, ...]
+
+
+def height_errors(points: ControlPoints, model: HeightModel) -> HeightErrors:
+    """Heights of points minus those of a height model.
+
+    A point has two heights. Its own is that of the content of its chip, which registration searches. The
+    height of the surface at the centre of the chip is a statement for elevation models: where a point
+    states it, it is the one that is compared. A horizontal error of a point moves it along the slope of
+    the model.
+
+    Args:
+        points: of a block.
+        model: heights, with their sigma.
+    """
+    lon_lat = points.lon_lat_h[:, :2]
+    height_m = points.lon_lat_h[:, 2]
+    of_surface = np.zeros(len(points), dtype=np.bool_)
+    variance_m2 = points.covariance_m2[:, 2, 2].copy()
+    if points.surface is not None:
+        of_surface = np.isfinite(points.surface.height_m)
+        height_m = np.where(of_surface, points.surface.height_m, height_m)
+        variance_m2 = np.where(of_surface, points.surface.sigma_m**2, variance_m2)
+    covered = np.zeros(len(points), dtype=np.bool_)
+    if model.excluded is not None:
+        covered = model.excluded(lon_lat)
+    error_m = height_m - model.terrain.height_m(lon_lat)
+    known = np.isfinite(error_m)
+    rows = np.flatnonzero(known & ~covered)
+    slope = np.nan_to_num(model.terrain.slope(lon_lat[rows]))
+    covariance = points.covariance_m2[rows]
+    along_slope = np.einsum("ni,nij,nj->n", slope, covariance[:, :2, :2], slope)
+    # The height of a surface is a measure of its own; that of a point goes with its position.
+    common = -2.0 * np.einsum("ni,ni->n", slope, covariance[:, :2, 2])
+    variance_m2 = variance_m2[rows] + along_slope + np.where(of_surface[rows], 0.0, common)
+    return HeightErrors(
+        row=rows,
+        lon_lat=lon_lat[rows],
+        error_m=error_m[rows],
+        variance_m2=variance_m2 + model.sigma_m**2,
+        of_surface=of_surface[rows],
+        excluded=int(covered.sum()),
+        outside=int((~known & ~covered).sum()),
+    )
+
+
+def height_quality(
+    errors: HeightErrors,
+    points: ControlPoints,
+    model: HeightModel,
+    against: str,
+    land_cover: Sequence[str] | None = None,
+) -> HeightQuality:
+    """The heights of a block against a height model: found, and declared against found.
+
+    Args:
+        errors: of the points of the block.
+        points: of the block; all have the first frame.
+        model: that they were compared with.
+        against: name of the model.
+        land_cover: name of the land cover at each error; None when it is not given.
+    """
+    error_m = errors.error_m
+    degree = np.floor(errors.lon_lat).astype(np.int64)
+    cells, cell = np.unique(degree, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    median_m = float(np.median(error_m)) if len(error_m) else float("nan")
+    n = len(error_m)
+    # A mean out of n errors takes a part of each: n - 1 are free.
+    freed = (error_m - error_m.mean()) * np.sqrt(n / (n - 1.0)) if n > 1 else error_m[:0]
+    scaled = freed / np.sqrt(errors.variance_m2[: len(freed)])
+    declared_m = np.sqrt(errors.variance_m2)
+    frame_m2 = points.frames[0].covariance_m2[2:, 2:] + model.frame_sigma_m**2
+    names = np.array([] if land_cover is None else list(land_cover), dtype=np.str_)
+    return HeightQuality(
+        against=against,
+        surfaces=int(errors.of_surface.sum()),
+        excluded=errors.excluded,
+        outside=errors.outside,
+        on_the_earth=height_accuracy(error_m, cell),
+        relative=height_accuracy(error_m - median_m, cell),
+        declared_le90_m=LINEAR_LE90 * float(np.median(declared_m)) if n else float("nan"),
+        normalised=normalised_error(freed[:, None], errors.variance_m2[: len(freed), None, None]),
+        typical_ratio=nmad(scaled),
+        normalised_frame=normalised_error(np.array([[median_m]]), frame_m2[None]),
+        cells=tuple(
+            HeightCell(float(west), float(south), height_accuracy(error_m[cell == k]))
+            for k, (west, south) in enumerate(cells.tolist())
+        ),
+        land_cover=tuple(
+            HeightClass(str(name), height_accuracy(error_m[names == name])) for name in np.unique(names)
+        ),
+    )
+
+
+def height_accuracy(error_m: Array, group: IntArray | None = None) -> HeightAccuracy:
+    """Accuracy of heights with errors (n,); errors of one group (n,) share a part of theirs."""
+    figures = statistics(error_m)
+    effective = None if group is None else effective_number(error_m[:, None], group)
+    return HeightAccuracy(
+        n=figures.n,
+        bias_m=figures.mean,
+        median_m=float(np.median(error_m)) if len(error_m) else float("nan"),
+        std_m=figures.std,
+        rmse_m=figures.rms,
+        nmad_m=nmad(error_m),
+        le90_m=sample_quantile(np.abs(error_m), effective),
+    )
+
+
+def nmad(values: Array) -> float:
+    """Median absolute deviation of (n,) values from their median, times 1.4826; NaN without values."""
+    if not len(values):
+        return float("nan")
+    return NORMAL_MAD * float(np.median(np.abs(values - np.median(values))))
