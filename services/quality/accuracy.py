@@ -188,21 +188,29 @@ def _small_sample_note(n: int, worth: int, bounded: bool) -> str:
     return note if bounded else f"{note}; so few do not bound the quantile from above"
 
 
-def accuracy(error_m: Array) -> Accuracy:
+def accuracy(error_m: Array, group: IntArray | None = None) -> Accuracy:
     """Accuracy of points with known errors.
 
     Args:
         error_m: (n, 2) east, north or (n, 3) east, north, up; rows with a NaN are left out.
+        group: (n,) any numbers: errors of one group share a part of theirs; None for independent ones.
     """
-    error_m = error_m[np.isfinite(error_m).all(axis=1)]
+    finite = np.isfinite(error_m).all(axis=1)
+    error_m = error_m[finite]
+
+    def worth(columns: slice) -> float | None:
+        return None if group is None else effective_number(error_m[:, columns], group[finite])
+
     axes = [statistics(column) for column in error_m.T]
     return Accuracy(
         n=len(error_m),
         bias_m=tuple(axis.mean for axis in axes),
         std_m=tuple(axis.std for axis in axes),
         rmse_m=tuple(axis.rms for axis in axes),
-        ce90_m=sample_quantile(np.hypot(error_m[:, 0], error_m[:, 1])),
-        le90_m=sample_quantile(np.abs(error_m[:, 2])) if error_m.shape[1] > 2 else None,
+        ce90_m=sample_quantile(np.hypot(error_m[:, 0], error_m[:, 1]), worth(slice(2))),
+        le90_m=sample_quantile(np.abs(error_m[:, 2]), worth(slice(2, 3)))
+        if error_m.shape[1] > 2
+        else None,
     )
 
 

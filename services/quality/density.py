@@ -56,7 +56,9 @@ def density_cells(lon_lat: Array, outline: Array) -> DensityCells:
     inside = area_km2 > 0.0
     cells = DensityCells(corner[inside], area_km2[inside], np.zeros(int(inside.sum()), dtype=np.int64))
     row = cell_of_points(cells, lon_lat)
-    return replace(cells, points=np.bincount(row[row >= 0], minlength=len(cells.points)).astype(np.int64))
+    return replace(
+        cells, points=np.bincount(row[row >= 0], minlength=len(cells.points)).astype(np.int64)
+    )
 
 
 def cell_of_points(cells: DensityCells, lon_lat: Array) -> IntArray:

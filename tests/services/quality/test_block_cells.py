@@ -39,7 +39,9 @@ def test_the_one_cell_that_misses_its_density_is_named_with_what_it_lacks():
     assert missing[poor[0]] == int(0.5 * cells.density.area_km2[poor[0]]) - 25
     assert (cells.missing_points(0.2) == 0).all()
     assert cells.short_of_views.sum() == 0
-    assert (block_cells(points_at(lon_lat), outline, 4, NOW).short_of_views == cells.density.points).all()
+    assert (
+        block_cells(points_at(lon_lat), outline, 4, NOW).short_of_views == cells.density.points
+    ).all()
     assert (cells.images == 3.0).all()
 
 

@@ -102,7 +102,7 @@ def test_a_degree_cell_and_a_land_cover_with_larger_errors_are_told_apart():
     assert_allclose([west.accuracy.bias_m, eastern.accuracy.bias_m], [0.0, 4.0], atol=five_percent)
     assert [kind.name for kind in quality.land_cover] == ["fields", "forest"]
     assert_allclose(quality.land_cover[1].accuracy.median_m, 4.0, atol=five_percent)
-    # Two cells that share errors of 4 m are worth a few independent ones: nothing bounds LE90 from above.
+    # Two cells, each with an error of its own, are worth a few points: nothing bounds LE90 from above.
     assert np.isnan(quality.on_the_earth.le90_m.upper)
 
 
