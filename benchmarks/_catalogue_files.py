@@ -11,8 +11,8 @@ from services.imagery.catalogue import ImageCatalogue
 
 
 def write_catalogue(catalogue: ImageCatalogue, folder: Path) -> Path:
-    """Write items and masks into a new folder; returns the file of the items."""
-    (folder / "masks").mkdir(parents=True)
+    """Write items and masks into a folder; returns the file of the items."""
+    (folder / "masks").mkdir(parents=True, exist_ok=True)
     path = folder / "items.ndjson"
     with path.open("w", encoding="utf-8") as out:
         for row in range(len(catalogue)):

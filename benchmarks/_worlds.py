@@ -97,7 +97,6 @@ def world_of(place: Place) -> World:
         place.size_m,
         place.posting_m,
         place.relief_m,
-        lowest_m=150.0,
         smallest_hill_m=smallest_hill_m(place),
         patterned_share=place.patterned_share,
     )

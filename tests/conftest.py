@@ -110,3 +110,12 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.fail(f"AMERS_REAL_DATA names {named}, which is not a folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_continent(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A small `benchmarks._continent.Continent`: a simulated archive as files, and its truth."""
+    # Not with the others: NumPy is first imported after this file.
+    from benchmarks.continent import make
+
+    return make(tmp_path_factory.mktemp("continent"), "small", seed=1)

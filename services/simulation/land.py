@@ -30,6 +30,12 @@ ESTATE_LOT_M = 24.0
 
 FIELDS, WOOD, VILLAGE, WORKS, ORCHARD, ESTATE = 0, 1, 2, 3, 4, 5
 """Kinds of blocks."""
+
+WATER = 65535
+"""Parcel of water: its albedo changes with the date, and nothing grows on it."""
+
+_WOODED, _BUILT_UP = 0.9, -1.1
+"""Values of the regions beyond which blocks are mostly wood, and mostly built up."""
 _LOT_M = np.array([95.0, 400.0, 27.0, 75.0, 400.0, ESTATE_LOT_M])
 _TREES = np.array([0.012, 0.85, 0.22, 0.03, 0.0, 0.0])
 _TEXTURE = np.array([0.09, 0.22, 0.16, 0.10, 0.05, 0.05])
@@ -43,11 +49,13 @@ class LandNoise(NamedTuple):
         texture: (t, t) noise of unit standard deviation, repeated; the side of the world is a multiple
             of t.
         blotches: (b, b) coarse noise of unit standard deviation, stretched over the world.
+        regions: (k, k) the same of blocks: high where they are mostly wood, low where mostly built up.
     """
 
     warp: FloatImage
     texture: FloatImage
     blotches: FloatImage
+    regions: FloatImage
 
 
 class LandCover(NamedTuple):
@@ -173,12 +181,16 @@ def _split(
 
 
 @njit(cache=True)
-def _kind(h: np.uint64, patterned_share: float) -> int:
-    """The kind of a block."""
+def _kind(h: np.uint64, patterned_share: float, region: float) -> int:
+    """The kind of a block in a region."""
     draw = _part(_mix(h, 11), 0)
     if draw < patterned_share:
         return ORCHARD if draw < 0.5 * patterned_share else ESTATE
     draw = _part(h, 3)
+    if region > _WOODED:
+        return WOOD if draw < 0.85 else FIELDS
+    if region < _BUILT_UP:
+        return FIELDS if draw < 0.10 else VILLAGE if draw < 0.85 else WORKS
     if draw < 0.50:
         return FIELDS
     if draw < 0.64:
@@ -292,7 +304,7 @@ def _cover(
     cover: LandCover,
 ) -> None:
     """Fill the land cover of all cells."""
-    warp, texture, blotches = noise
+    warp, texture, blotches, regions = noise
     seed, patterned_share = seed_and_patterned_share
     albedo, roof, parcel = cover
     n = len(terrain)
@@ -311,7 +323,8 @@ def _cover(
             bu, bv = int(np.floor(u / cells)), int(np.floor(v / cells))
             p, q = (u - bu * cells) * posting, (v - bv * cells) * posting
             block = _mix(_mix(seed, bu % blocks), bv % blocks)
-            kind = _kind(block, patterned_share)
+            region = regions[bv % blocks * len(regions) // blocks, bu % blocks * len(regions) // blocks]
+            kind = _kind(block, patterned_share, region)
             grain = texture[r % tile, c % tile]
             blotch = 1.0 + 0.12 * bilinear(blotches, c * coarse, r * coarse)
             edge = min(min(p, side - p), min(q, side - q))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from numba import njit
 
 from services.imagery.source import BLUR_PER_RATIO
-from services.simulation.land import NO_ROOF
+from services.simulation.land import NO_ROOF, WATER
 from services.simulation.world import World, natural_noise
 from services.types import BoolArray, FloatImage
 
@@ -34,7 +34,7 @@ class Day(NamedTuple):
 
     Attributes:
         stage: (65536,) factor of the albedo of each field.
-        grain: (t, t) factor of the albedo of all open ground, repeated: growth since another season.
+        grain: (t, t) factor of the albedo of all open land, repeated: growth since another season.
         sun: (3,) unit vector to the sun, east, north, up.
         reach: length of the shadow of the highest roof, cells.
         shaded: whether a shadow may reach each square of 16 x 16 cells.
@@ -198,7 +198,8 @@ def _reflect(ground: _Ground, posting: float, day: Day, first: tuple[int, int], 
             facing = sun[2]
             grown = np.float32(1.0)
             if height == NO_ROOF:
-                grown = grain[r % tile, c % tile]
+                if parcel[r, c] != WATER:
+                    grown = grain[r % tile, c % tile]
                 height = terrain[r, c]
                 east = (terrain[r, right] - terrain[r, left]) / (2.0 * posting)
                 north = (terrain[above, c] - terrain[below, c]) / (2.0 * posting)

@@ -66,7 +66,7 @@ class ViewGeometry:
     Attributes:
         plan: the specification.
         true_model: the true sensor model.
-        rpc: RPC fitted to the true model within `RPC_ERROR_PX`.
+        rpc: RPC fitted within `RPC_ERROR_PX` to the true model without its jitter, which no RPC shows.
         delivered: RPC with an error, as a provider would deliver it.
         error: from positions of `rpc` to positions of `delivered`.
         acquisition: time, viewing direction and sun.
@@ -120,22 +120,26 @@ def plan_geometry(
         error_px: (2, 3) additional error as `ImageCorrection.parameters`: shift, drift, affine.
 
     Raises:
-        ComputationError: no RPC fits the true model or the error.
+        ComputationError: no RPC fits the true model without its jitter, or the error.
     """
     lon_lat = np.array(plan.lon_lat)
     ground = np.append(lon_lat, world.height_m(lon_lat[None, :]))
     low, high = world.height_range_m
     heights_m = (low - _HEIGHT_MARGIN_M, high + _HEIGHT_MARGIN_M)
-    true_model = pushbroom_over(
-        ground,
-        plan.shape,
-        plan.gsd_m,
-        (plan.incidence_deg, plan.azimuth_deg),
-        heights_m,
-        jitter_px=plan.jitter_px,
-        rng=rng,
-    )
-    rpc = _fitted(true_model, plan.shape, heights_m)
+    direction_deg = plan.incidence_deg, plan.azimuth_deg
+    steady = pushbroom_over(ground, plan.shape, plan.gsd_m, direction_deg, heights_m)
+    true_model = steady
+    if plan.jitter_px > 0.0:
+        true_model = pushbroom_over(
+            ground,
+            plan.shape,
+            plan.gsd_m,
+            direction_deg,
+            heights_m,
+            jitter_px=plan.jitter_px,
+            rng=rng,
+        )
+    rpc = _fitted(steady, plan.shape, heights_m)
     parameters = np.zeros((2, 3)) if error_px is None else np.array(error_px, dtype=np.float64)
     derivative = true_model.project_derivative(ground[None, :])[0]
     parameters[:, 0] += derivative[:, :2] @ np.array(ground_error_m)

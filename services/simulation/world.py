@@ -11,7 +11,7 @@ from scipy import fft
 
 from services.geodesy import metres_per_degree, wrapped_degrees
 from services.simulation.grid import bilinear_values
-from services.simulation.land import NO_ROOF, LandNoise, cover_land
+from services.simulation.land import NO_ROOF, WATER, LandNoise, cover_land
 from services.types import Array, FloatImage
 
 Parcels = npt.NDArray[np.uint16]
@@ -19,7 +19,11 @@ Parcels = npt.NDArray[np.uint16]
 _TEXTURE_TILE = 2048
 _TERRAIN_NODES = 512
 _WARP_NODES = 256
+_REGION_NODES = 128
 _STRIP_ROWS = 1024
+_WATER_ALBEDO = 0.05
+_LOWEST_M = 150.0
+"""Height of the lowest ground above the ellipsoid."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +112,9 @@ def make_world(
     relief_m: float = 60.0,
     *,
     centre_lon_lat: tuple[float, float] = (5.4, 43.6),
-    lowest_m: float = 150.0,
     smallest_hill_m: float = 350.0,
     patterned_share: float = 0.0,
+    region_m: float | None = None,
 ) -> World:
     """A random world: hills, fields between roads, woods, villages with buildings, trees.
 
@@ -120,9 +124,9 @@ def make_world(
         posting_m: distance of the nodes.
         relief_m: difference between the lowest and the highest ground.
         centre_lon_lat: centre of the square, degrees.
-        lowest_m: height of the lowest ground above the ellipsoid.
         smallest_hill_m: wavelength below which the terrain is smooth; larger values make slopes gentler.
         patterned_share: share of the blocks that are orchards and housing estates, whose details repeat.
+        region_m: size of forests and towns; None for the same mixture everywhere.
     """
     tiles = max(1, round(size_m / posting_m / _TEXTURE_TILE))
     tile = fft.next_fast_len(round(size_m / posting_m / tiles))
@@ -131,15 +135,19 @@ def make_world(
     terrain = _stretch(natural_noise(rng, min(n, _TERRAIN_NODES), 2.6, smallest_hill_m / size_m), n)
     terrain -= terrain.min()
     terrain *= relief_m / terrain.max()
-    terrain += np.float32(lowest_m)
+    terrain += np.float32(_LOWEST_M)
     warp_m = 40.0 * min(1.0, size_m / 2000.0 + 0.3)
     warp = np.stack(
         [warp_m / posting_m * natural_noise(rng, _WARP_NODES, 3.0, 300.0 / size_m) for _ in range(2)]
     )
     texture = natural_noise(rng, tile, 1.0, 0.0)
     blotches = natural_noise(rng, _WARP_NODES, 1.5, 0.0)
-    cover = cover_land(terrain, LandNoise(warp, texture, blotches), posting_m, seed, patterned_share)
-    east_m, north_m = metres_per_degree(centre_lon_lat[1], lowest_m + relief_m / 2.0)
+    regions = np.zeros((1, 1), dtype=np.float32)
+    if region_m is not None:
+        regions = natural_noise(rng, _REGION_NODES, 1.5, 0.35 * region_m / size_m)
+    noise = LandNoise(warp, texture, blotches, regions)
+    cover = cover_land(terrain, noise, posting_m, seed, patterned_share)
+    east_m, north_m = metres_per_degree(centre_lon_lat[1], _LOWEST_M + relief_m / 2.0)
     step = np.array([posting_m / east_m, posting_m / north_m])
     origin = np.array(centre_lon_lat) + (n - 1) / 2.0 * step * [-1.0, 1.0]
     return World(
@@ -152,6 +160,21 @@ def make_world(
         albedo=cover.albedo,
         parcel=cover.parcel,
     )
+
+
+def flood(world: World, share: float) -> None:
+    """Put the lowest share of a world under water: level, dark, without anything that stands on it.
+
+    The arrays of the world change in place.
+    """
+    level = np.float32(np.quantile(world.terrain_m[::8, ::8], share))
+    for first in range(0, len(world.terrain_m), _STRIP_ROWS):
+        strip = slice(first, first + _STRIP_ROWS)
+        wet = world.terrain_m[strip] < level
+        world.terrain_m[strip][wet] = level
+        world.roof_m[strip][wet] = NO_ROOF
+        world.albedo[strip][wet] = _WATER_ALBEDO
+        world.parcel[strip][wet] = WATER
 
 
 def with_smoother_terrain(world: World, spacing_m: float) -> World:

@@ -1,0 +1,96 @@
+"""A simulated continent in small: an archive of images over years, control, and the truth apart.
+
+`make` writes what a user has (see `benchmarks._continent`): 40 images of 11 km from 6 passes over 22 x
+22 km, with clouds, seasons, changes on the ground, location errors of 5 m that a pass shares, drifts and
+jitter; an older block, an elevation model and ortho-images as control; 20 later images that no
+production sees. Existing files are kept: an interrupted run goes on where it was.
+
+Run: python -m benchmarks.continent make FOLDER [--size small] [--seed 1] [--jobs 2]
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+from rich.console import Console
+
+from benchmarks._continent import SIZES, Continent, make_truth, open_continent
+from benchmarks._continent_archive import write_archive_catalogue, write_image
+from benchmarks._measuring import memory_mib
+
+
+def main() -> None:
+    """Make a continent and print what it took."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("command", choices=["make"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", choices=[*SIZES], default="continent")
+    parser.add_argument("--seed", type=int, default=1, help="of the random numbers (%(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (%(default)s)")
+    arguments = parser.parse_args()
+    make(arguments.folder, arguments.size, arguments.seed, arguments.jobs, Console().print)
+
+
+def make(
+    folder: Path,
+    size: str = "continent",
+    seed: int = 1,
+    jobs: int = 1,
+    say: Callable[[str], object] = lambda words: None,
+) -> Continent:
+    """The continent in a folder, after making the files that are missing.
+
+    Args:
+        folder: of all files.
+        size: "continent" or "small".
+        seed: of everything.
+        jobs: processes that render.
+        say: receives what is done and what it took.
+
+    Raises:
+        InputError: the folder has a continent of another size or seed.
+    """
+    started = time.monotonic()
+    continent = make_truth(folder, size, seed)
+    write_archive_catalogue(continent)
+    say(f"world and catalogue: {time.monotonic() - started:.0f} s, {memory_mib('VmHWM'):.0f} MiB")
+    names = [f"archive/images/{name}.tif" for name in continent.views]
+    names += [f"later/{name}.tif" for name in continent.later]
+    missing = [name for name in names if not (folder / name).exists()]
+    work = partial(_write, folder)
+    if jobs == 1:
+        peaks = [work(name) for name in missing]
+    else:
+        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            peaks = list(pool.map(work, missing))
+    seconds = time.monotonic() - started
+    peak_mib = max([*peaks, memory_mib("VmHWM")])
+    say(f"{len(missing)} images: {seconds:.0f} s from the start, at most {peak_mib:.0f} MiB a process")
+    _keep_costs(continent, seconds, peak_mib, len(missing))
+    return continent
+
+
+def _write(folder: Path, name: str) -> float:
+    """Write one image; returns the largest memory of the process so far, MiB."""
+    cv2.setNumThreads(1)
+    continent = open_continent(folder)
+    path = folder / name
+    views = continent.later if path.parent.name == "later" else continent.views
+    write_image(continent, views[path.stem], path)
+    return memory_mib("VmHWM")
+
+
+def _keep_costs(continent: Continent, seconds: float, peak_mib: float, images: int) -> None:
+    costs = {"seconds": round(seconds), "peak_mib_a_process": round(peak_mib), "images": images}
+    if images:
+        (continent.truth / "costs.json").write_text(json.dumps(costs, indent=1))
+
+
+if __name__ == "__main__":
+    main()

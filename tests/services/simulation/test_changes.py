@@ -1,0 +1,82 @@
+"""The ground changes on its day, by the share asked for, and water does not."""
+
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+
+from services.simulation.changes import Change, apply_changes, draw_changes, scatter_things
+from services.simulation.land import NO_ROOF, WATER
+from services.simulation.world import World, flood, make_world
+
+FIRST, LAST = date(2020, 1, 1), date(2024, 1, 1)
+a_percent_a_year = 0.01
+years = 4.0
+
+
+@pytest.fixture
+def world() -> World:
+    made = make_world(np.random.default_rng(2), 1500.0, 2.0, 40.0, region_m=700.0)
+    flood(made, 0.1)
+    return made
+
+
+def copy_of(world: World) -> World:
+    layers = ("terrain_m", "roof_m", "albedo", "parcel")
+    return replace(world, **{name: getattr(world, name).copy() for name in layers})
+
+
+def test_water_is_level_dark_and_bare_and_covers_its_share(world: World) -> None:
+    wet = world.parcel == WATER
+    assert 0.08 < wet.mean() < 0.12
+    assert np.ptp(world.terrain_m[wet]) == 0.0
+    assert world.terrain_m[wet].max() <= world.terrain_m[~wet].min()
+    assert (world.roof_m[wet] == NO_ROOF).all()
+    assert np.ptp(world.albedo[wet]) == 0.0
+
+
+def test_the_share_of_the_ground_that_changes_is_the_one_asked_for(world: World) -> None:
+    changes = draw_changes(world, np.random.default_rng(3), FIRST, LAST, a_percent_a_year)
+    cells = sum(change.shape[0] * change.shape[1] for change in changes)
+    wanted = a_percent_a_year * years * world.albedo.size
+    assert wanted <= cells < wanted + max(c.shape[0] * c.shape[1] for c in changes)
+    assert [change.day for change in changes] == sorted(change.day for change in changes)
+    assert changes[0].day >= FIRST
+    assert changes[-1].day <= LAST
+
+
+def test_ground_changes_on_its_day_and_nowhere_else(world: World) -> None:
+    before = copy_of(world)
+    day = date(2021, 5, 1)
+    change = Change(day, (100, 200), (40, 60), None)
+    early = apply_changes(copy_of(world), [change], date(2021, 4, 30))
+    np.testing.assert_array_equal(early.albedo, before.albedo)
+    late = apply_changes(copy_of(world), [change], day)
+    inside = np.zeros(world.albedo.shape, dtype=bool)
+    inside[100:140, 200:260] = True
+    dry = inside & (before.parcel != WATER)
+    assert dry.sum() > 500
+    np.testing.assert_array_equal(late.albedo[~dry], before.albedo[~dry])
+    assert (late.albedo[dry] != before.albedo[dry]).mean() > 0.99
+    assert (late.roof_m[dry] == NO_ROOF).all()
+
+
+def test_buildings_that_are_copied_stand_on_the_ground(world: World) -> None:
+    changes = draw_changes(world, np.random.default_rng(4), FIRST, LAST, 0.1)
+    later = apply_changes(copy_of(world), changes, LAST)
+    built = later.roof_m > NO_ROOF
+    new = built & (world.roof_m == NO_ROOF)
+    assert new.sum() > 1000
+    assert (later.roof_m[new] >= later.terrain_m[new] + 3.0).all()
+    assert later.roof_clearance_m < 60.0
+
+
+def test_things_come_in_their_number_on_open_ground_only(world: World) -> None:
+    before = copy_of(world)
+    places = scatter_things(world, np.random.default_rng(5), 400.0)
+    area_km2 = world.albedo.size * world.posting_m**2 * 1e-6
+    assert len(places) == pytest.approx(400.0 * area_km2, rel=0.15)
+    changed = world.albedo != before.albedo
+    assert (before.roof_m[changed] == NO_ROOF).all()
+    assert len(places) < changed.sum() < 30 * len(places)
