@@ -1,4 +1,4 @@
-"""`report.json`: the report as a document, and the JSON Schema that describes it.
+"""`report.json` and `block_quality.json`: reports as documents, and the JSON Schemas that describe them.
 
 Both follow the dataclasses of the report: a field is a member of the same name, a value that could not
 be computed is null, and the descriptions are those of the docstrings.
@@ -15,15 +15,16 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from services.docstrings import attribute_descriptions
+from services.reports.block_quality import BLOCK_QUALITY_FORMAT, BlockQualityReport
 from services.reports.failure import FAILURE_FORMAT, FailureReport
 from services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
-Report = RegistrationReport | FailureReport
+Report = RegistrationReport | FailureReport | BlockQualityReport
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
 
 
 def format_report(report: Report) -> str:
-    """The text of `report.json`."""
+    """The text of a report's document."""
     return json.dumps(report_document(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -64,6 +65,11 @@ def report_schema() -> dict[str, Any]:
 def failure_schema() -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of the `report.json` of a registration that failed."""
     return _schema(FailureReport, "Amers registration failure", FAILURE_FORMAT)
+
+
+def block_quality_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of `block_quality.json`."""
+    return _schema(BlockQualityReport, "Amers block quality", BLOCK_QUALITY_FORMAT)
 
 
 def _schema(kind: type, title: str, document_format: str) -> dict[str, Any]:
