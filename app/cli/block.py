@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.block_quality import quality, quality_row
 from app.cli.output import AsJson, Row, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
@@ -20,9 +21,10 @@ from app.usecases.blocks.export import ExportBlock, select_points, write_selecte
 from app.usecases.blocks.lifecycle import Published
 from app.usecases.damage import open_chips
 from services.quality.accuracy_statement import accuracy_document
-from services.quality.block import BlockQuality, Distribution, quality_document
+from services.quality.block import quality_document
 
 app = typer.Typer(no_args_is_help=True)
+app.command()(quality)
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 
@@ -51,7 +53,7 @@ def ingest(
         record = {**_record(block), **accuracy_document(ingested.stated)}
         print_json({"block": record, "quality": quality_document(ingested.quality)})
         return
-    show_one({**_record(block), **ingested.stated.words, **_figures(ingested.quality)}, as_json=False)
+    show_one({**_record(block), **ingested.stated.words, **quality_row(ingested.quality)}, as_json=False)
 
 
 @app.command("list")
@@ -72,24 +74,6 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
         stated = lifecycle.block_report(connection, block).stated
     accuracy = accuracy_document(stated) if as_json else stated.words
     show_one({**_record(block), **accuracy}, as_json=as_json)
-
-
-@app.command()
-def quality(reference: Reference, as_json: AsJson = False) -> None:
-    """Show the quality figures of a block; --json adds the density of every cell."""
-    with transaction() as connection:
-        report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
-    if as_json:
-        accuracy = [vars(figure) for figure in report.accuracy]
-        stated = accuracy_document(report.stated)
-        print_json({**stated, **quality_document(report.quality), "accuracy": accuracy})
-        return
-    accuracy_lines = {
-        f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
-        for figure in report.accuracy
-    }
-    rows = {**report.stated.words, **_figures(report.quality), **accuracy_lines}
-    show_one(rows, as_json=False)
 
 
 @app.command()
@@ -181,23 +165,3 @@ def _record(block: Block) -> Row:
         "created_at": block.created_at,
         "state_changed_at": block.state_changed_at,
     }
-
-
-def _figures(quality: BlockQuality) -> Row:
-    return {
-        "area": f"{quality.area_km2:,.1f} km2",
-        "density": f"{quality.points_per_km2:.3f} points/km2",
-        "cells with 1 / 2 km2": f"{100.0 * quality.share_reaching_half:.1f} %",
-        "cells with 1 / 4 km2": f"{100.0 * quality.share_reaching_quarter:.1f} %",
-        "images per point": _distribution(quality.images_per_point, ".1f"),
-        "chips per point": _distribution(quality.views_per_point, ".1f"),
-        "sigma horizontal, m": _distribution(quality.sigma_horizontal_m, ".2f"),
-        "sigma up, m": _distribution(quality.sigma_up_m, ".2f"),
-    }
-
-
-def _distribution(values: Distribution, form: str) -> str:
-    return (
-        f"median {values.median:{form}}, mean {values.mean:{form}}, 90 % below {values.p90:{form}}, "
-        f"from {values.minimum:{form}} to {values.maximum:{form}}"
-    )

@@ -202,6 +202,23 @@ def points_of_ids(connection: Connection, ids: Sequence[int]) -> StoredPoints:
     return _with_views(connection, _points_of_ids(), {"ids": list(ids)})
 
 
+def points_of_block(connection: Connection, number: int) -> StoredPoints:
+    """All points of a block in any state, with their views, as arrays, in the order of their ids.
+
+    Heights of the surface are left out.
+    """
+    return _with_views(connection, _points_of_block(), {"number": number})
+
+
+@cache
+def _points_of_block() -> HotStatement:
+    number, bits = bindparam("number", None, BigInteger()), integer_constant(ID_BITS)
+    first = cast(number, BigInteger()).op("<<")(bits)
+    last = (cast(number, BigInteger()) + integer_constant(1)).op("<<")(bits)
+    rows = _select_arrays(POINT_ARRAYS).where(point.c.id >= first, point.c.id < last)
+    return hot(CopyOut(rows.order_by(point.c.id), "binary"))
+
+
 @cache
 def _points_inside() -> HotStatement:
     return hot(CopyOut(_select_inside().order_by(point.c.id), "binary"))

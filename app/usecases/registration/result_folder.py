@@ -64,11 +64,15 @@ def older_result(folder: Path) -> OlderResult | None:
 
 
 @contextmanager
-def replacing(folder: Path) -> Iterator[Path]:
+def replacing(folder: Path, report: str = "report.json") -> Iterator[Path]:
     """A new empty folder, which takes the place of `folder` at the end of the context.
 
-    Its report.json must state what the result is of (the scene, or the catalogue of a selection) and the
-    verdict. An exception leaves `folder` as it is.
+    Its report must state what the result is of (the scene, the block, or the catalogue of a selection)
+    and the verdict. An exception leaves `folder` as it is.
+
+    Args:
+        folder: that the result takes.
+        report: name of the report in it, a JSON document.
 
     Raises:
         InputError: the folder cannot be written or replaced.
@@ -79,7 +83,7 @@ def replacing(folder: Path) -> Iterator[Path]:
             (work / _NEW).mkdir()
         yield work / _NEW
         with _refusing(folder):
-            _write_manifest(work / _NEW)
+            _write_manifest(work / _NEW, report)
             _sync_files(work / _NEW)
             # The registration took its time: somebody may have put a file into the folder.
             has_older = _replaceable(folder) is not None
@@ -232,12 +236,12 @@ def _listed(names: list[str]) -> str:
     return ", ".join(names[:5]) + more
 
 
-def _write_manifest(folder: Path) -> None:
+def _write_manifest(folder: Path, report_name: str) -> None:
     """Write the manifest of a new result: its scene, verdict and time, and its files."""
-    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    report = json.loads((folder / report_name).read_text(encoding="utf-8"))
     document = {
         "format": RESULT_FORMAT,
-        "scene": report["scene"]["name"] if "scene" in report else report["catalogue"],
+        "scene": _subject(report),
         "verdict": report["verdict"],
         "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
         "files": {
@@ -246,6 +250,18 @@ def _write_manifest(folder: Path) -> None:
         },
     }
     (folder / MANIFEST).write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+def _subject(report: dict[str, Any]) -> str:
+    """What a report is on: a scene, a block or a catalogue."""
+    name: str
+    if "scene" in report:
+        name = report["scene"]["name"]
+    elif "block" in report:
+        name = report["block"]["id"]
+    else:
+        name = report["catalogue"]
+    return name
 
 
 def _read_manifest(folder: Path) -> dict[str, Any] | None:

@@ -1,0 +1,207 @@
+"""`amers block quality`: the quality of a block of the store, or of a folder, against references."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from app.cli.exit_status import NO_RESULT
+from app.cli.output import AsJson, Row, print_json, show_one
+from app.cli.progress import shown_progress
+from app.cli.transaction import transaction
+from app.config import read_settings
+from app.db.engine import opened
+from app.errors import InputError
+from app.storage import open_storage
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.quality import (
+    HeightFiles,
+    QualityReferences,
+    RequiredQuality,
+    SiteFile,
+    assess_folder,
+    write_quality,
+)
+from app.usecases.blocks.stored_quality import assess_stored
+from app.usecases.terrain_file import TerrainFile
+from services.formats.block.document_json import BLOCK_JSON
+from services.quality.accuracy_statement import accuracy_document
+from services.quality.block import BlockQuality, Distribution, quality_document
+from services.reports.block_quality import BlockQualityReport
+from services.reports.block_quality_pages import quality_tables
+from services.reports.document import report_document
+
+_TABLE_WIDTH = 110
+_Files = list[Path] | None
+
+
+def quality(
+    block: Annotated[str, typer.Argument(help="Folder, or number, ID or ID@VERSION of a stored block.")],
+    *,
+    site: Annotated[
+        _Files, typer.Option(help="Reference ortho-image on a map, for checks only; repeat for others.")
+    ] = None,
+    control_site: Annotated[
+        _Files, typer.Option(help="The same of a place that the production used as control; repeat.")
+    ] = None,
+    site_sigma_m: Annotated[
+        float | None,
+        typer.Option(help="Accuracy of these images, one sigma a coordinate, metres.", min=0.001),
+    ] = None,
+    search_m: Annotated[
+        float | None,
+        typer.Option(help="Largest shift searched at sites; by default 3 sigma of what is declared."),
+    ] = None,
+    images: Annotated[
+        _Files,
+        typer.Option(help="Image of the block (folders only), to be compared with the sites; repeat."),
+    ] = None,
+    dem: Annotated[Path | None, typer.Option(help="GeoTIFF with heights to compare with.")] = None,
+    vertical: Annotated[
+        str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    dem_sigma_m: Annotated[
+        float | None,
+        typer.Option(help="Sigma of these heights, metres; by default 0.1 of their step.", min=0.001),
+    ] = None,
+    dem_frame_sigma_m: Annotated[
+        float | None, typer.Option(help="Sigma of the error that all of them share, metres.", min=0.001)
+    ] = None,
+    exclude: Annotated[
+        _Files,
+        typer.Option(
+            help="Ground without points, such as water: GeoJSON, or image other than 0; repeat."
+        ),
+    ] = None,
+    exclude_heights: Annotated[
+        _Files, typer.Option(help="Ground where --dem is not to be trusted; the same; repeat.")
+    ] = None,
+    land_cover: Annotated[
+        Path | None, typer.Option(help="Image of land cover classes, to tell heights apart.")
+    ] = None,
+    points_per_km2: Annotated[
+        float | None, typer.Option(help="Required density; by default that of the block.", min=1e-6)
+    ] = None,
+    min_share: Annotated[
+        float, typer.Option(help="Ground that shall have it, percent.", min=0.0, max=100.0)
+    ] = 100.0 * RequiredQuality.min_share,
+    min_views: Annotated[
+        int | None, typer.Option(help="Required images of a point; by default as specified.", min=1)
+    ] = None,
+    ce90_m: Annotated[
+        float | None, typer.Option(help="Required CE90 on the Earth, metres.", min=0.001)
+    ] = None,
+    le90_m: Annotated[
+        float | None, typer.Option(help="Required LE90 on the Earth, metres.", min=0.001)
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder of the report, JSON and HTML.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the quality of a block: density, and accuracy against ortho-images and heights.
+
+    A stored block without any option shows the figures kept since its ingestion. Exit status 3: the
+    block misses its specification.
+    """
+    references = QualityReferences(
+        heights=None
+        if dem is None
+        else HeightFiles(
+            TerrainFile(dem, vertical, geoid),
+            dem_sigma_m,
+            dem_frame_sigma_m,
+            tuple(exclude_heights or ()),
+            land_cover,
+        ),
+        sites=(
+            *(SiteFile(path) for path in site or ()),
+            *(SiteFile(path, is_control=True) for path in control_site or ()),
+        ),
+        site_sigma_m=site_sigma_m,
+        reach_m=search_m,
+        images=tuple(images or ()),
+        excluded=tuple(exclude or ()),
+    )
+    required = RequiredQuality(points_per_km2, min_share / 100.0, min_views, ce90_m, le90_m)
+    if dem is None and (exclude_heights or land_cover or vertical or geoid):
+        raise InputError(
+            "--exclude-heights, --land-cover, --vertical, --geoid: of the heights of --dem, which is "
+            "missing; add it"
+        )
+    is_folder = (Path(block) / BLOCK_JSON).is_file()
+    if (
+        not is_folder
+        and output is None
+        and (references, required)
+        == (
+            QualityReferences(),
+            RequiredQuality(),
+        )
+    ):
+        _show_kept(block, as_json=as_json)
+        return
+    with shown_progress() as progress:
+        if is_folder:
+            report = assess_folder(Path(block), references, required, progress)
+        else:
+            settings = read_settings()
+            with opened(settings) as database:
+                storage = open_storage(settings)
+                report = assess_stored(database, storage, block, references, required, progress=progress)
+    if output is not None:
+        write_quality(report, output)
+    _show_report(report, output, as_json=as_json)
+    if report.verdict == "missed":
+        raise typer.Exit(NO_RESULT)
+
+
+def _show_report(report: BlockQualityReport, output: Path | None, *, as_json: bool) -> None:
+    if as_json:
+        print_json(report_document(report))
+        return
+    console = Console(width=None if Console().is_terminal else _TABLE_WIDTH)
+    for table in quality_tables(report):
+        console.print(table)
+    typer.echo(f"{report.verdict}: {report.verdict_words}")
+    if output is not None:
+        typer.echo(str(output / "block_quality.html"))
+
+
+def _show_kept(reference: str, *, as_json: bool) -> None:
+    """Show the figures of a stored block that were computed when it was ingested."""
+    with transaction() as connection:
+        report = lifecycle.block_report(connection, lifecycle.find_block(connection, reference))
+    if as_json:
+        accuracy = [vars(figure) for figure in report.accuracy]
+        stated = accuracy_document(report.stated)
+        print_json({**stated, **quality_document(report.quality), "accuracy": accuracy})
+        return
+    accuracy_lines = {
+        f"{figure.kind} {figure.name}": f"{figure.value:g} ({figure.count} against {figure.against})"
+        for figure in report.accuracy
+    }
+    show_one({**report.stated.words, **quality_row(report.quality), **accuracy_lines}, as_json=False)
+
+
+def quality_row(quality: BlockQuality) -> Row:
+    """The figures of a block from its own points, by their names."""
+    return {
+        "area": f"{quality.area_km2:,.1f} km2",
+        "density": f"{quality.points_per_km2:.3f} points/km2",
+        "cells with 1 / 2 km2": f"{100.0 * quality.share_reaching_half:.1f} %",
+        "cells with 1 / 4 km2": f"{100.0 * quality.share_reaching_quarter:.1f} %",
+        "images per point": _distribution(quality.images_per_point, ".1f"),
+        "chips per point": _distribution(quality.views_per_point, ".1f"),
+        "sigma horizontal, m": _distribution(quality.sigma_horizontal_m, ".2f"),
+        "sigma up, m": _distribution(quality.sigma_up_m, ".2f"),
+    }
+
+
+def _distribution(values: Distribution, form: str) -> str:
+    return (
+        f"median {values.median:{form}}, mean {values.mean:{form}}, 90 % below {values.p90:{form}}, "
+        f"from {values.minimum:{form}} to {values.maximum:{form}}"
+    )

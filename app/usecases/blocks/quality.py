@@ -1,0 +1,303 @@
+"""Measure the quality of a block against references, and write its report."""
+
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from app.errors import InputError
+from app.usecases.registration.reference_source import ReferenceFiles, read_reference
+from app.usecases.registration.result_folder import replacing
+from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
+from services.formats.block.check import check_block
+from services.formats.block.document import BlockMetadata
+from services.formats.block.reader import FolderChips, block_member
+from services.formats.ground_masks import any_of, read_ground_mask, read_land_cover
+from services.formats.images.scenes import read_scene
+from services.imagery.scene import Scene
+from services.quality.block_cells import block_cells
+from services.quality.block_heights import HeightErrors, HeightModel, HeightQuality
+from services.quality.block_heights import height_errors as compare_heights
+from services.quality.block_heights import height_quality as summarise_heights
+from services.quality.block_requirements import BlockRequirements
+from services.quality.planimetry import PlanimetricQuality, planimetric_quality
+from services.quality.site_errors import Site, SiteErrors, expected_reach_m, point_errors
+from services.quality.site_images import image_errors, least_inclined
+from services.reports.block_quality import (
+    BlockIdentification,
+    BlockQualityReport,
+    Measured,
+    MeasuredErrors,
+    block_quality_report,
+)
+from services.reports.block_quality_pages import format_block_quality_html
+from services.reports.document import format_report
+from services.types import ChipSource, ControlPoints, Progress, no_progress, part_of
+
+LEAST_INCLINED = 10
+"""Images that are compared with the ortho-image of a site."""
+DOCUMENT, PAGE = "block_quality.json", "block_quality.html"
+
+
+@dataclass(frozen=True)
+class HeightFiles:
+    """Heights that those of the points are compared with.
+
+    Attributes:
+        terrain: a terrain or surface model.
+        sigma_m: of its heights, one standard deviation, independent from point to point; by default a
+            tenth of the distance of its nodes.
+        frame_sigma_m: of the error that all its heights share; None when unknown.
+        excluded: masks of ground where its heights are not to be trusted.
+        land_cover: image on a map with the classes of the ground.
+    """
+
+    terrain: TerrainFile
+    sigma_m: float | None = None
+    frame_sigma_m: float | None = None
+    excluded: tuple[Path, ...] = ()
+    land_cover: Path | None = None
+
+
+@dataclass(frozen=True)
+class SiteFile:
+    """A reference ortho-image.
+
+    Attributes:
+        image: on a map.
+        is_control: whether the production used it as control.
+    """
+
+    image: Path
+    is_control: bool = False
+
+
+@dataclass(frozen=True)
+class QualityReferences:
+    """What a block is measured against.
+
+    Attributes:
+        heights: None compares no heights.
+        sites: places with ortho-images.
+        site_sigma_m: accuracy of the ortho-images on the Earth, one standard deviation a coordinate;
+            None when unknown.
+        reach_m: largest shift between the block and the ortho-images; None takes three standard
+            deviations of both.
+        images: of the block, to be compared with the ortho-images; their adjusted models are those of
+            the block.
+        excluded: masks of ground where no points are expected.
+    """
+
+    heights: HeightFiles | None = None
+    sites: tuple[SiteFile, ...] = ()
+    site_sigma_m: float | None = None
+    reach_m: float | None = None
+    images: tuple[Path, ...] = ()
+    excluded: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class RequiredQuality:
+    """Requirements that replace those that the block itself specifies.
+
+    Attributes:
+        points_per_km2: density of every cell of 0.1 degree; None takes that of the block.
+        min_share: share of the ground, by cells, that shall reach the density, 0 to 1.
+        min_views: number of images that shall show every point; None takes that of the block.
+        ce90_m, le90_m: largest CE90 and LE90 on the Earth; None requires nothing.
+    """
+
+    points_per_km2: float | None = None
+    min_share: float = BlockRequirements.min_share
+    min_views: int | None = None
+    ce90_m: float | None = None
+    le90_m: float | None = None
+
+    def of_block(self, metadata: BlockMetadata) -> BlockRequirements:
+        """The requirements of a block."""
+        specified = metadata.specification
+        return BlockRequirements(
+            points_per_km2=self.points_per_km2 or specified.points_per_km2,
+            min_share=self.min_share,
+            min_views=self.min_views or specified.min_views,
+            ce90_m=self.ce90_m,
+            le90_m=self.le90_m,
+        )
+
+
+@dataclass(frozen=True)
+class BlockToAssess:
+    """A block with its points and chips, from a folder or from the store.
+
+    Attributes:
+        metadata: of the block.
+        points: all of them.
+        chips: of the points.
+        models: file with the adjusted model of each image, None where the block has none, by the name of
+            the image; empty for a block of the store, which keeps no models.
+    """
+
+    metadata: BlockMetadata
+    points: ControlPoints
+    chips: ChipSource
+    models: Mapping[str, Path | None]
+
+
+def assess_folder(
+    folder: Path,
+    references: QualityReferences,
+    required: RequiredQuality,
+    progress: Progress = no_progress,
+) -> BlockQualityReport:
+    """The quality of a block in a folder, which is checked completely first.
+
+    Raises:
+        FormatError: the block breaks its format.
+        InputError: a reference cannot be used.
+    """
+    contents = check_block(folder, part_of(progress, 0.0, 0.1))
+    with FolderChips(folder) as chips:
+        document = contents.document
+        models = {
+            image.image_id: None if name is None else block_member(folder, name)
+            for image, name in zip(document.images, document.models, strict=True)
+        }
+        block = BlockToAssess(document.metadata, contents.points, chips, models)
+        return assess_block(block, references, required, part_of(progress, 0.1, 0.9))
+
+
+def assess_block(
+    block: BlockToAssess,
+    references: QualityReferences,
+    required: RequiredQuality,
+    progress: Progress = no_progress,
+) -> BlockQualityReport:
+    """The quality of a block: from its own points, and against references.
+
+    Raises:
+        InputError: a reference cannot be used.
+    """
+    started, now = time.monotonic(), datetime.now(UTC)
+    points, metadata = block.points, block.metadata
+    requirements = required.of_block(metadata)
+    excluded = any_of([read_ground_mask(path) for path in references.excluded])
+    progress(0.0, "density")
+    cells = block_cells(points, metadata.extent, requirements.min_views, now, excluded)
+    heights, height_errors = None, None
+    if references.heights is not None:
+        progress(0.1, "heights")
+        heights, height_errors = _measure_heights(points, references.heights)
+    planimetry, errors = _measure_sites(block, references, part_of(progress, 0.3, 0.7))
+    progress(1.0, "done")
+    return block_quality_report(
+        BlockIdentification(metadata.id, metadata.version, metadata.title, metadata.created),
+        points,
+        cells,
+        requirements,
+        Measured(heights, planimetry, MeasuredErrors(metadata.extent, height_errors, errors)),
+        assessed_at=now,
+        seconds=time.monotonic() - started,
+        software_version=version("amers"),
+    )
+
+
+def write_quality(report: BlockQualityReport, folder: Path) -> None:
+    """Write the document and the page of a report into a folder; an older result there is replaced.
+
+    Raises:
+        InputError: the folder cannot be written or replaced.
+    """
+    with replacing(folder, DOCUMENT) as new:
+        write_quality_files(report, new)
+
+
+def write_quality_files(report: BlockQualityReport, folder: Path) -> dict[str, Path]:
+    """Write the document and the page of a report into an existing folder; returns the files by name."""
+    files = {DOCUMENT: format_report(report), PAGE: format_block_quality_html(report)}
+    for name, content in files.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    return {name: folder / name for name in files}
+
+
+def _measure_heights(points: ControlPoints, files: HeightFiles) -> tuple[HeightQuality, HeightErrors]:
+    terrain = read_terrain(files.terrain)
+    model = HeightModel(
+        terrain,
+        files.sigma_m or HEIGHT_SIGMA_POSTINGS * terrain.posting_m,
+        files.frame_sigma_m or 0.0,
+        any_of([read_ground_mask(path) for path in files.excluded]),
+    )
+    errors = compare_heights(points, model)
+    cover = None
+    if files.land_cover is not None:
+        cover = read_land_cover(files.land_cover)(errors.lon_lat)
+    return summarise_heights(errors, points, model, files.terrain.dem.name, cover), errors
+
+
+def _measure_sites(
+    block: BlockToAssess, references: QualityReferences, progress: Progress
+) -> tuple[tuple[PlanimetricQuality, ...], tuple[SiteErrors, ...]]:
+    """The planimetry of the points at sites, then that of the images where there are any."""
+    sites = _read_sites(references)
+    if not sites:
+        return (), ()
+    frame, share = block.points.frames[0], (0.5 if references.images else 1.0) / len(sites)
+    of_points = []
+    for k, site in enumerate(sites):
+        part = part_of(progress, k * share, share)
+        of_points.append(point_errors(block.points, block.chips, site, references.reach_m, part))
+    planimetry = [planimetric_quality(of_points, "points", frame)]
+    of_images = _measure_images(block, references, sites, part_of(progress, 0.5, 0.5))
+    if of_images:
+        planimetry.append(planimetric_quality(of_images, "images", frame))
+    return tuple(planimetry), (*of_points, *of_images)
+
+
+def _read_sites(references: QualityReferences) -> list[Site]:
+    names = [file.image.stem for file in references.sites]
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise InputError(f"sites: two files are named {repeated}: name each site by a file of its own")
+    if references.images and not names:
+        raise InputError("images: no site to compare them with; add reference ortho-images (--site)")
+    return [
+        Site(
+            file.image.stem,
+            file.is_control,
+            read_reference(ReferenceFiles(file.image, None, references.site_sigma_m)),
+        )
+        for file in references.sites
+    ]
+
+
+def _measure_images(
+    block: BlockToAssess, references: QualityReferences, sites: list[Site], progress: Progress
+) -> list[SiteErrors]:
+    """The errors of the least inclined of some images of the block, at each site."""
+    heights = references.heights
+    terrain = None if heights is None else read_terrain(heights.terrain)
+    errors = []
+    with ExitStack() as stack:
+        scenes = []
+        for path in references.images:
+            scenes.append(_read_adjusted(block, path))
+            stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
+        for k, site in enumerate(sites if scenes else ()):
+            reach_m = references.reach_m or expected_reach_m(block.points, site)
+            for scene in least_inclined(scenes, site, terrain, LEAST_INCLINED):
+                progress(k / len(sites), f"{scene.acquisition.image_id} at {site.name}")
+                errors.append(image_errors(scene, site, terrain, reach_m))
+    return errors
+
+
+def _read_adjusted(block: BlockToAssess, path: Path) -> Scene:
+    """An image of the block with its adjusted model; with its own map where the block has none."""
+    if path.stem not in block.models:
+        names = ", ".join(sorted(block.models))
+        raise InputError(
+            f"{path}: {path.stem[:100]} is no image of the block; expected one of {names[:300]}"
+        )
+    return read_scene(path, block.models[path.stem], sigma_m=1.0)
