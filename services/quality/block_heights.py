@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from services.quality.accuracy import (
 )
 from services.quality.density import GroundMask
 from services.terrain import Terrain
-from services.types import Array, BoolArray, ControlPoints, IntArray
+from services.types import Array, ControlPoints, IntArray
+
+Compared = Literal["surface", "point"]
+"""The height of the surface at a point, or that of the point, which is that of its chip's content."""
 
 NORMAL_MAD = 1.4826
 """Standard deviation of a normal law over its median absolute deviation."""
@@ -50,7 +54,8 @@ class HeightErrors:
         error_m: (m,).
         variance_m2: (m,) stated for the errors: of the point, relative to the frame of its block, and of
             the model.
-        of_surface: (m,) whether the height of the surface was compared, not that of the point.
+        compared: which of its two heights a point was compared by.
+        unstated: points that do not state that height.
         excluded: points on excluded ground.
         outside: points where the model has no height.
     """
@@ -59,7 +64,8 @@ class HeightErrors:
     lon_lat: Array
     error_m: Array
     variance_m2: Array
-    of_surface: BoolArray
+    compared: Compared
+    unstated: int
     excluded: int
     outside: int
 
@@ -121,7 +127,11 @@ class HeightQuality:
 
     Attributes:
         against: name of the model.
-        surfaces: points whose surface height was compared; of the others it was the height of the point.
+        compared: "surface" where the block states heights of surfaces for comparison with elevation
+            models, else "point".
+        unstated: points without a height of their surface, which were left out.
+        point_heights: the heights of all points themselves, for information; null where these were
+            compared.
         excluded: points on excluded ground.
         outside: points where the model has no height.
         on_the_earth: all errors.
@@ -136,7 +146,9 @@ class HeightQuality:
     """
 
     against: str
-    surfaces: int
+    compared: Compared
+    unstated: int
+    point_heights: HeightAccuracy | None
     excluded: int
     outside: int
     on_the_earth: HeightAccuracy
@@ -149,26 +161,32 @@ class HeightQuality:
     land_cover: tuple[HeightClass, ...]
 
 
-def height_errors(points: ControlPoints, model: HeightModel) -> HeightErrors:
+def height_errors(
+    points: ControlPoints, model: HeightModel, compared: Compared | None = None
+) -> HeightErrors:
     """Heights of points minus those of a height model.
 
     A point has two heights. Its own is that of the content of its chip, which registration searches. The
-    height of the surface at the centre of the chip is a statement for elevation models: where a point
-    states it, it is the one that is compared. A horizontal error of a point moves it along the slope of
-    the model.
+    height of the surface at the centre of the chip is a statement for elevation models. A horizontal
+    error of a point moves it along the slope of the model.
 
     Args:
         points: of a block.
         model: heights, with their sigma.
+        compared: which height; by default that of the surface if any point states it, else that of the
+            point.
     """
+    surface = points.surface
+    if compared is None:
+        has_surface = surface is not None and bool(np.isfinite(surface.height_m).any())
+        compared = "surface" if has_surface else "point"
     lon_lat = points.lon_lat_h[:, :2]
-    height_m = points.lon_lat_h[:, 2]
-    of_surface = np.zeros(len(points), dtype=np.bool_)
-    variance_m2 = points.covariance_m2[:, 2, 2].copy()
-    if points.surface is not None:
-        of_surface = np.isfinite(points.surface.height_m)
-        height_m = np.where(of_surface, points.surface.height_m, height_m)
-        variance_m2 = np.where(of_surface, points.surface.sigma_m**2, variance_m2)
+    height_m, variance_m2 = points.lon_lat_h[:, 2], points.covariance_m2[:, 2, 2]
+    if compared == "surface":
+        unknown = np.full(len(points), np.nan)
+        height_m = unknown if surface is None else surface.height_m
+        variance_m2 = unknown if surface is None else surface.sigma_m**2
+    stated = np.isfinite(height_m)
     covered = np.zeros(len(points), dtype=np.bool_)
     if model.excluded is not None:
         covered = model.excluded(lon_lat)
@@ -178,17 +196,18 @@ def height_errors(points: ControlPoints, model: HeightModel) -> HeightErrors:
     slope = np.nan_to_num(model.terrain.slope(lon_lat[rows]))
     covariance = points.covariance_m2[rows]
     along_slope = np.einsum("ni,nij,nj->n", slope, covariance[:, :2, :2], slope)
-    # The height of a surface is a measure of its own; that of a point goes with its position.
-    common = -2.0 * np.einsum("ni,ni->n", slope, covariance[:, :2, 2])
-    variance_m2 = variance_m2[rows] + along_slope + np.where(of_surface[rows], 0.0, common)
+    if compared == "point":
+        # The height of a surface is a measure of its own; that of a point goes with its position.
+        along_slope -= 2.0 * np.einsum("ni,ni->n", slope, covariance[:, :2, 2])
     return HeightErrors(
         row=rows,
         lon_lat=lon_lat[rows],
         error_m=error_m[rows],
-        variance_m2=variance_m2 + model.sigma_m**2,
-        of_surface=of_surface[rows],
-        excluded=int(covered.sum()),
-        outside=int((~known & ~covered).sum()),
+        variance_m2=variance_m2[rows] + along_slope + model.sigma_m**2,
+        compared=compared,
+        unstated=int((~stated).sum()),
+        excluded=int((covered & stated).sum()),
+        outside=int((~known & stated & ~covered).sum()),
     )
 
 
@@ -222,7 +241,11 @@ def height_quality(
     names = np.array([] if land_cover is None else list(land_cover), dtype=np.str_)
     return HeightQuality(
         against=against,
-        surfaces=int(errors.of_surface.sum()),
+        compared=errors.compared,
+        unstated=errors.unstated,
+        point_heights=None
+        if errors.compared == "point"
+        else height_accuracy(height_errors(points, model, "point").error_m),
         excluded=errors.excluded,
         outside=errors.outside,
         on_the_earth=height_accuracy(error_m, cell),

@@ -135,7 +135,7 @@ def _density(limit: float, min_share: float, cells: BlockCells) -> BlockCriterio
     note = f"{poor} of {all_cells} cells lack {int(missing.sum())} points" if poor else ""
     return BlockCriterion(
         name="density",
-        label=f"Ground with {limit:g} points/km2",
+        label=f"Ground with {limit:.3g} points/km2",
         value=100.0 * share,
         comparison="at least",
         limit=100.0 * min_share,

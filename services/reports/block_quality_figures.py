@@ -13,7 +13,7 @@ from services.reports.plot import INK, QUIET, SMALL_TEXT, WIDTH, Figure, Panel, 
 from services.types import Array, IntArray
 
 _LEGEND = 20.0
-_TALLEST = 420.0
+_TALLEST = 300.0
 _PIXELS_ACROSS = 900
 _LOW, _MIDDLE, _HIGH = "#b2453c", "#e6c35c", "#7fb2e5"
 _ABOVE, _BELOW = "#c0392b", "#2f6fb0"
@@ -34,11 +34,11 @@ def views_map(report: BlockQualityReport) -> Figure:
     """The median number of images of the points in each cell of 0.1 degree."""
     images = np.array([cell.images for cell in report.density.cells])
     needed = report.requirements.min_views
-    shades = ("#7b241c", "#b2453c", "#e6c35c", "#b9d4ee", "#7fb2e5", "#2f6fb0")
-    edges = np.array([1.0, max(2.0, needed), needed + 2.0, needed + 4.0, needed + 8.0])
+    shades = ("#7b241c", "#d9776c", "#cfe0f1", "#9fc4e8", "#5f9bd6", "#23588f")
+    edges = np.array([1.0, needed, needed + 2.0, needed + 4.0, needed + 8.0])
     kind = np.where(np.isnan(images), 0, np.searchsorted(edges, images, side="right"))
     figure = _cell_map(report, kind, shades)
-    texts = ["no points", *(f"{edge:.0f} or more" for edge in edges)]
+    texts = ["no points", f"below {needed}", *(f"{edge:.0f} or more" for edge in edges[1:])]
     shown = [k for k in range(len(shades)) if (kind == k).any()]
     _legend(figure, [(texts[k], shades[k]) for k in shown])
     return figure

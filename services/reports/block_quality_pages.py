@@ -155,7 +155,10 @@ def _height_table(report: BlockQualityReport) -> Table:
     table = _table(title, "", "points", "bias, m", "median, m", "NMAD, m", "LE90")
     of_cells = [(degree_words(c.west, c.south), c.accuracy) for c in heights.cells]
     of_classes = [(c.name, c.accuracy) for c in heights.land_cover]
-    for name, one in [("all", heights.on_the_earth), *of_cells, *of_classes]:
+    rows = [(f"{heights.compared} heights", heights.on_the_earth), *of_cells, *of_classes]
+    if heights.point_heights is not None:
+        rows.append(("points themselves", heights.point_heights))
+    for name, one in rows:
         figures = (number(one.bias_m), number(one.median_m), number(one.nmad_m))
         table.add_row(name, str(one.n), *figures, quantile(one.le90_m))
     return table

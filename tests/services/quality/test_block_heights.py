@@ -106,18 +106,23 @@ def test_a_degree_cell_and_a_land_cover_with_larger_errors_are_told_apart():
     assert np.isnan(quality.on_the_earth.le90_m.upper)
 
 
-def test_the_height_of_the_surface_is_compared_where_a_point_states_it():
+def test_where_a_block_states_surfaces_they_are_compared_and_its_points_told_apart():
     terrain = sloping_terrain()
     points = true_points(terrain, 300, Frame.from_sigmas(1.0, 2.0))
+    points.lon_lat_h[:, 2] += 7.0
     stated = np.arange(300) % 3 == 0
-    points.lon_lat_h[:, 2] += np.where(stated, 7.0, 0.0)
     surface_m = np.where(stated, 100.25, np.nan)
     points = replace(points, surface=SurfaceHeights(surface_m, np.where(stated, 0.3, np.nan)))
-    errors = height_errors(points, HeightModel(terrain, 0.4))
-    assert errors.of_surface.sum() == 100
-    assert_allclose(errors.error_m[stated], 0.25, atol=a_millimetre)
-    assert_allclose(errors.error_m[~stated], 0.0, atol=a_millimetre)
-    assert_allclose(errors.variance_m2[stated], 0.3**2 + 0.4**2, atol=a_millimetre)
+    model = HeightModel(terrain, 0.4)
+    errors = height_errors(points, model)
+    assert (errors.compared, errors.unstated, len(errors.row)) == ("surface", 200, 100)
+    assert_allclose(errors.error_m, 0.25, atol=a_millimetre)
+    assert_allclose(errors.variance_m2, 0.3**2 + 0.4**2, atol=a_millimetre)
+    quality = height_quality(errors, points, model, "flat")
+    assert quality.point_heights is not None
+    assert_allclose(quality.point_heights.median_m, 7.0, atol=a_millimetre)
+    nowhere = replace(points, surface=SurfaceHeights(np.full(300, np.nan), np.full(300, np.nan)))
+    assert height_errors(nowhere, model).compared == "point"
 
 
 def test_excluded_ground_and_ground_without_heights_are_counted_apart():
