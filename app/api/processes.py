@@ -186,8 +186,8 @@ def inlined(schema: Any, definitions: dict[str, Any]) -> Any:
 def _file_schema(request: Request, name: str) -> dict[str, Any]:
     """The JSON Schema of a file of the results."""
     kind = media_type(name)
-    if name == "report.json":
-        return {"$ref": f"{request.base_url}schemas/report.json", "contentMediaType": kind}
+    if name in ("report.json", "block_quality.json"):
+        return {"$ref": f"{request.base_url}schemas/{name}", "contentMediaType": kind}
     if kind in (JSON, "application/geo+json"):
         return {"type": "object", "contentMediaType": kind}
     encoding = {} if kind.startswith("text/") else {"contentEncoding": "base64"}

@@ -101,6 +101,17 @@ def failure_schema() -> JSONResponse:
     return JSONResponse(document.failure_schema(), media_type=SCHEMA_JSON)
 
 
+@router.get(
+    "/schemas/block_quality.json",
+    dependencies=[Public],
+    response_class=Response,
+    responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
+)
+def block_quality_schema() -> JSONResponse:
+    """Return the JSON Schema of `block_quality.json`, the report on the quality of a block."""
+    return JSONResponse(document.block_quality_schema(), media_type=SCHEMA_JSON)
+
+
 def _result_file(here: str, file: results.ResultFile) -> ResultFile:
     return ResultFile(href=f"{here}/results/{file.name}", type=file.media_type, title=file.name)
 

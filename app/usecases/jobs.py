@@ -28,13 +28,15 @@ from app.storage import Storage, open_storage
 from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
 from app.usecases.blocks.ingestion import INGEST_BLOCK
+from app.usecases.blocks.quality_job import ASSESS_BLOCK
 from app.usecases.damage import report_damage
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work, WorkFailed
 from app.usecases.registration.job import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
-    process.id: process for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK)
+    process.id: process
+    for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK, ASSESS_BLOCK)
 }
 LONGEST_KEY = 200
 LARGEST_INPUTS_BYTES = 64 << 10

@@ -51,6 +51,7 @@ def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "ingest-block": {"path": "block"},
         "export-block": {"block": "flat"},
+        "assess-block": {"block": "flat"},
     }
 
 
