@@ -5,7 +5,7 @@
 | 0 | success |
 | 1 | any other failure: a service does not answer, a process was killed, a bug |
 | 2 | the input or the installation cannot be used |
-| 3 | the scene could not be registered, or its registration has the verdict failed |
+| 3 | the scene could not be registered, or its verdict is failed; the block misses its specification |
 | 130 | interrupted |
 """
 
