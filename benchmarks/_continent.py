@@ -14,12 +14,15 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from datetime import date
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from services.errors import InputError
+from services.geodesy import metres_per_degree
 from services.simulation.archive import (
     CENTRE_LON_LAT,
     CONTINENT,
@@ -72,6 +75,13 @@ class Continent:
         """Folder that no production reads."""
         return self.folder / "truth"
 
+    @property
+    def area(self) -> shapely.Polygon:
+        """The ground that the archive is about."""
+        per_degree = np.array(metres_per_degree(CENTRE_LON_LAT[1], 300.0))
+        half = self.size.area_m / 2.0 / per_degree
+        return shapely.box(*(np.array(CENTRE_LON_LAT) - half), *(np.array(CENTRE_LON_LAT) + half))
+
     @cached_property
     def views(self) -> Mapping[str, ArchiveView]:
         """The images of the archive, by name."""
@@ -102,9 +112,13 @@ class Continent:
         """The world before all changes, whose arrays the caller may change."""
         return open_world(self.truth / "world")
 
+    def world_on(self, day: date) -> World:
+        """The world on a day, without things that come and go."""
+        return apply_changes(self.fresh_world(), self.changes, day)
+
     def world_of(self, view: ArchiveView) -> World:
         """The world as an image shows it: on its day, with the things that are there during its pass."""
-        world = apply_changes(self.fresh_world(), self.changes, view.day)
+        world = self.world_on(view.day)
         scatter_things(world, np.random.default_rng([self.seed, 5, view.orbit]), THINGS_PER_KM2)
         return world
 

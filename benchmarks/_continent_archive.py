@@ -14,11 +14,10 @@ from rasterio.windows import Window as RasterWindow
 from benchmarks._catalogue_files import write_catalogue
 from benchmarks._continent import Continent
 from services.formats.images.raster import gdal_rpc
-from services.geodesy import metres_per_degree
 from services.imagery.catalogue import ImageCatalogue
 from services.imagery.source import Window
 from services.sensors.rpc import RpcModel
-from services.simulation.archive import CENTRE_LON_LAT, ArchiveView
+from services.simulation.archive import ArchiveView
 from services.simulation.conditions import clouds_over
 from services.simulation.tiles import TILE_PX
 from services.types import Array
@@ -78,13 +77,10 @@ def delivered_model(continent: Continent, view: ArchiveView) -> RpcModel:
 def write_archive_catalogue(continent: Continent) -> Path:
     """Write items and masks of the images, and the area; returns the file of the items."""
     folder = continent.folder / "archive"
-    half_m = continent.size.area_m / 2.0
-    half = half_m / np.array(metres_per_degree(CENTRE_LON_LAT[1], 300.0))
-    area = shapely.box(*(np.array(CENTRE_LON_LAT) - half), *(np.array(CENTRE_LON_LAT) + half))
     feature = {
         "type": "Feature",
         "properties": {},
-        "geometry": json.loads(shapely.to_geojson(area)),
+        "geometry": json.loads(shapely.to_geojson(continent.area)),
     }
     (continent.folder / "area.geojson").write_text(json.dumps(feature))
     return write_catalogue(archive_catalogue(continent), folder)
