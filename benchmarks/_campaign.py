@@ -23,7 +23,7 @@ from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World, with_smoother_terrain
-from services.types import Array, ControlPoints
+from services.types import Array, ChipSource, ControlPoints
 
 WRONG = 3.0
 """A result is wrong when its CE90 exceeds the predicted CE90 this many times."""
@@ -145,18 +145,20 @@ def attempt(
 ) -> Outcome:
     """The outcome of registering the scene of a trial."""
     prepared = prepare(place, trial, block, seed)
+    return registered(prepared, replace(block, points=prepared.points), options)[0]
+
+
+def registered(
+    prepared: Prepared, chips: ChipSource, options: RegistrationOptions
+) -> tuple[Outcome, Registration | None]:
+    """The outcome of registering a scene, and the registration; None when it is refused."""
     start_s = time.process_time()
     try:
-        registration = register_scene(
-            prepared.scene,
-            prepared.points,
-            replace(block, points=prepared.points),
-            options,
-        )
+        registration = register_scene(prepared.scene, prepared.points, chips, options)
     except AmersError as error:
         cpu_s = time.process_time() - start_s
-        return Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
-    return _judged(prepared, registration, time.process_time() - start_s)
+        return Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s), None
+    return _judged(prepared, registration, time.process_time() - start_s), registration
 
 
 def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:

@@ -220,3 +220,24 @@ def _stretch(noise: FloatImage, n: int) -> FloatImage:
     affine = np.array([[scale, 0.0, margin], [0.0, scale, margin]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(padded, affine, (n, n), flags=flags))
+
+
+def part_of_world(world: World, lon_lat: Array, margin_m: float) -> World:
+    """The ground around positions (n, 2) as a small world, which has nothing else."""
+    column_row = world.column_row(np.array(lon_lat, dtype=np.float64))
+    margin = margin_m / world.posting_m
+    first = np.floor(column_row.min(axis=0) - margin).astype(np.int64)
+    last = np.ceil(column_row.max(axis=0) + margin).astype(np.int64)
+    column, row = (np.arange(low, high) for low, high in zip(first, last, strict=True))
+    rows, columns = world.terrain_m.shape
+    cells = np.ix_(row % rows, column % columns)
+    return World(
+        world.seed,
+        world.lon_lat(first[None, :].astype(np.float64))[0],
+        world.step_deg,
+        world.posting_m,
+        world.terrain_m[cells],
+        world.roof_m[cells],
+        world.albedo[cells],
+        world.parcel[cells],
+    )
