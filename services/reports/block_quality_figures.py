@@ -21,11 +21,17 @@ _ABOVE, _BELOW = "#c0392b", "#2f6fb0"
 
 
 def density_map(report: BlockQualityReport) -> Figure:
-    """The density of the cells of 0.1 degree: below 1 point / 4 km2, below 1 / 2 km2, or more."""
+    """The density of the cells of 0.1 degree against what is specified, else 1 point / 2 and / 4 km2."""
     density = np.array([cell.points_per_km2 for cell in report.density.cells])
-    kind = (density >= QUARTER_PER_KM2).astype(int) + (density >= HALF_PER_KM2)
+    required = report.requirements.points_per_km2
+    if required is None:
+        kind = (density >= QUARTER_PER_KM2).astype(int) + (density >= HALF_PER_KM2)
+        names = ("below 1 / 4 km²", "below 1 / 2 km²", "1 / 2 km² or more")
+    else:
+        met = np.array([cell.outcome == "met" for cell in report.density.cells], dtype=bool)
+        kind = np.where(met, 2, (density >= required / 2.0).astype(int))
+        names = ("below half of it", "below it", f"specified {required:.3g} / km² reached")
     figure = _cell_map(report, kind, (_LOW, _MIDDLE, _HIGH))
-    names = ("below 1 / 4 km²", "below 1 / 2 km²", "1 / 2 km² or more")
     _legend(figure, list(zip(names, (_LOW, _MIDDLE, _HIGH), strict=True)))
     return figure
 

@@ -307,10 +307,25 @@ def test_an_administrator_withdraws_a_block_and_publishes_it_again(
     assert served() == points_of_the_block
 
 
-def test_only_administrators_see_the_button_to_publish(visit, secret):
+def test_an_administrator_has_the_quality_of_a_block_assessed(visit, administrator):
+    page = visit("#/block/1", administrator)
+    page.get_by_text("Assess its quality").click()
+    page.get_by_label("Required density").fill("100000")
+    page.screenshot(path=ARTEFACTS / "block-assess.png")
+    page.get_by_role("button", name="Assess").click()
+    expect(page.locator(".badge")).to_have_text("successful")
+    expect(page.get_by_text("Specification: missed.")).to_be_visible()
+    expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+    page.screenshot(path=ARTEFACTS / "block-assessed.png")
+    page.get_by_role("link", name="Blocks").first.click()
+    expect(page.locator("#panel h1")).to_have_text("Blocks")
+
+
+def test_only_administrators_see_the_buttons_to_publish_and_to_assess(visit, secret):
     page = visit("#/block/1", secret)
     expect(page.locator(".badge")).to_have_text("published")
     assert page.get_by_role("button", name="Withdraw").count() == 0
+    assert page.get_by_text("Assess its quality").count() == 0
 
 
 def test_a_point_shows_all_its_chips(visit, secret):

@@ -46,6 +46,7 @@ export const showBlock: ShowView = async (place, number) => {
     h("h1", { tabindex: -1 }, properties.title || properties.id),
     h("p", {}, badge(properties.state), " ", h("span", { class: "quiet" }, `since ${when(properties.state_changed_at)}`)),
     scopes.includes("admin") ? h("p", {}, act) : null,
+    scopes.includes("admin") ? assessmentForm(number) : null,
     message,
     accuracy(quality),
     facts({
@@ -110,6 +111,63 @@ function ingestionForm({ signal }: Place): HTMLElement {
       button.disabled = false;
     }
   }
+}
+
+/** A form that starts a job: the quality of a block against files on the server. */
+function assessmentForm(number: string): HTMLElement {
+  const field = (id: string, type = "text") => h("input", { id, type, ...(type === "number" ? { min: "0", step: "any" } : {}) });
+  const sites = field("sites");
+  const controlSites = field("control-sites");
+  const dem = field("dem");
+  const vertical = field("vertical");
+  const density = field("density", "number");
+  const ce90 = field("ce90", "number");
+  const le90 = field("le90", "number");
+  const button = h("button", { type: "submit", class: "strong" }, "Assess");
+  const state = h("div");
+  const form = h(
+    "form",
+    { onsubmit: (event) => void submit(event) },
+    h("p", { class: "quiet" }, "Files lie below the reference folder of the server. Nothing is required; what is missing is not measured."),
+    ...labelled(sites, "Reference ortho-images", "for checks only; names, separated by commas"),
+    ...labelled(controlSites, "Ortho-images used as control", "told apart"),
+    ...labelled(dem, "Height model", "GeoTIFF"),
+    ...labelled(vertical, "Its vertical datum", "ellipsoid, EGM96, EPSG:…"),
+    ...labelled(density, "Required density", "points per km²; by default that of the block"),
+    ...labelled(ce90, "Required CE90", "metres, on the Earth"),
+    ...labelled(le90, "Required LE90", "metres, on the Earth"),
+    button,
+    state,
+  );
+  return h("details", { class: "card" }, h("summary", {}, "Assess its quality"), form);
+
+  async function submit(event: Event): Promise<void> {
+    event.preventDefault();
+    button.disabled = true;
+    const amount = (input: HTMLInputElement) => (input.value ? Number(input.value) : null);
+    const inputs = {
+      block: number,
+      sites: names(sites.value),
+      control_sites: names(controlSites.value),
+      dem: dem.value.trim() || null,
+      vertical: vertical.value.trim() || null,
+      required: { points_per_km2: amount(density), ce90_m: amount(ce90), le90_m: amount(le90) },
+    };
+    try {
+      go(`#/job/${(await post<StatusInfo>("processes/assess-block/execution", { inputs })).jobID}`);
+    } catch (error) {
+      state.replaceChildren(problem(error));
+      button.disabled = false;
+    }
+  }
+}
+
+function labelled(input: HTMLInputElement, label: string, hint: string): HTMLElement[] {
+  return [h("label", { for: input.id }, label, h("span", { class: "quiet" }, ` ${hint}`)), input];
+}
+
+function names(text: string): string[] {
+  return text.split(",").map((name) => name.trim()).filter(Boolean);
 }
 
 function row({ id, properties: block }: Block): HTMLElement {

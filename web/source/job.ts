@@ -20,7 +20,7 @@ export const showJob: ShowView = async (place, id) => {
   const back = h("a", { href: "#/scenes" }, "← Scenes");
   fill(panel, h("p", {}, back), heading, body);
   let job = await find(id, signal);
-  if (job.processID === "ingest-block") {
+  if (["ingest-block", "assess-block"].includes(job.processID)) {
     back.href = "#/blocks";
     back.textContent = "← Blocks";
   }
@@ -97,7 +97,7 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
   const reportFile = results["report.json"];
   const pointsFile = results["control_points.geojson"];
   if (!reportFile || !pointsFile) {
-    fill(body, outcome(job), blockLink(results), await downloads(results, signal));
+    fill(body, outcome(job), assessment(results), blockLink(results), await downloads(results, signal));
     return;
   }
   const [report, points] = await Promise.all([
@@ -113,6 +113,12 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
   atlas.fit(footprint, 17);
+}
+
+/** What the assessment of a block found, in words. */
+function assessment({ specification, words }: Record<string, unknown>): HTMLElement | null {
+  if (typeof specification !== "string") return null;
+  return h("p", {}, h("b", {}, `Specification: ${specification}. `), String(words));
 }
 
 /** A link to the block that a job has ingested. */
@@ -159,7 +165,7 @@ function criterion({ label, value, comparison, limit, unit, needed_for, met, cal
 /** Links to the files of the results. The page fetches them, because a plain link cannot send the token. */
 async function downloads(results: Results, signal: AbortSignal): Promise<HTMLElement> {
   const files = Object.values(results).filter((result) => typeof result === "object" && result?.href);
-  const page = files.find(({ title }) => title === "report.html");
+  const page = files.find(({ title }) => title === "report.html" || title === "block_quality.html");
   const open = page ? h("p", {}, h("a", { class: "button strong", target: "_blank", href: await blobUrl(page.href, signal) }, "Open the report")) : null;
   const rows = files.map((file) => {
     const link = h("a", { href: "#", role: "button", onclick: (event) => void save(event, file, link) }, file.title);
