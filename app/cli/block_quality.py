@@ -51,7 +51,9 @@ def quality(
     ] = None,
     search_m: Annotated[
         float | None,
-        typer.Option(help="Largest shift searched at sites; by default 3 sigma of what is declared."),
+        typer.Option(
+            help="Largest shift searched at sites; by default 3 sigma of what is declared.", min=0.01
+        ),
     ] = None,
     images: Annotated[
         _Files,

@@ -35,6 +35,7 @@ class QualityWorld:
         image: that the block was made of.
         site: ortho-image that shows everything shifted.
         control_site: one that does not.
+        far: one of other ground.
         dem: heights below the points, with a bias and noise.
         lake: GeoJSON of the southern half.
     """
@@ -43,6 +44,7 @@ class QualityWorld:
     image: Path
     site: Path
     control_site: Path
+    far: Path
     dem: Path
     lake: Path
 
@@ -71,6 +73,7 @@ def make_quality_world(folder: Path) -> QualityWorld:
         image=image,
         site=site,
         control_site=control_site,
+        far=_write(folder / "far.tif", land[:100, :100], -90_000, 0),
         dem=_write_dem(folder / "dem.tif", rng),
         lake=_write_lake(folder / "lake.geojson"),
     )

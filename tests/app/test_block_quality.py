@@ -192,6 +192,7 @@ def test_a_specification_that_nothing_was_measured_for_is_not_shown(world: Quali
         (("--site", "{site}", "--control-site", "{site}"), "two files are named airport"),
         (("--site", "{dem}x"), "dem.tifx"),
         (("--exclude", "{block}/block.json"), "Polygon or MultiPolygon expected"),
+        (("--site", "{far}", "--images", "{image}"), "none of 1 shows the middle of a site"),
     ],
 )
 def test_references_that_cannot_be_used_are_refused(
@@ -200,6 +201,26 @@ def test_references_that_cannot_be_used_are_refused(
     given = [word.format(**vars(world)) for word in words]
     with pytest.raises(InputError, match=message):
         run(world.block, *given)
+
+
+def test_a_site_elsewhere_is_told_to_show_nothing(world: QualityWorld, tmp_path: Path) -> None:
+    words = ("--site", world.far, "--ce90-m", 3, "--exclude", world.lake, "--points-per-km2", 15)
+    status, text = run(world.block, *words, "-o", tmp_path / "out", "--json")
+    assert status == 0
+    document = json.loads(text)
+    (site,) = document["planimetry"][0]["sites"]
+    assert (site["tried"], site["accuracy"]["n"], site["lon"]) == (0, 0, None)
+    assert document["verdict"] == "not shown"
+    assert "nothing was measured" in (tmp_path / "out" / "block_quality.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("required", "message"),
+    [({"ce90_m": -1.0}, "ce90_m"), ({"min_share": 2.0}, "min_share"), ({"min_views": 0}, "min_views")],
+)
+def test_requirements_that_mean_nothing_are_refused(required: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RequiredQuality(**required)  # type: ignore[arg-type]
 
 
 def test_a_stored_block_is_assessed_by_a_job_on_files_of_the_server(

@@ -116,6 +116,15 @@ class RequiredQuality:
     ce90_m: float | None = None
     le90_m: float | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse requirements that are no lengths, numbers or shares."""
+        for name in ("points_per_km2", "min_views", "ce90_m", "le90_m"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError(f"{name}: {value:g} found, more than 0 expected")
+        if not 0.0 <= self.min_share <= 1.0:
+            raise InputError(f"min_share: {self.min_share:g} found, a share of 0 to 1 expected")
+
     def of_block(self, metadata: BlockMetadata) -> BlockRequirements:
         """The requirements of a block."""
         specified = metadata.specification
@@ -290,6 +299,11 @@ def _measure_images(
             for scene in least_inclined(scenes, site, terrain, LEAST_INCLINED):
                 progress(k / len(sites), f"{scene.acquisition.image_id} at {site.name}")
                 errors.append(image_errors(scene, site, terrain, reach_m))
+    if references.images and not errors:
+        raise InputError(
+            f"images: none of {len(references.images)} shows the middle of a site where heights are "
+            "known; give other images, or heights of the sites (--dem)"
+        )
     return errors
 
 
