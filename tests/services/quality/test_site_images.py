@@ -1,4 +1,4 @@
-"""Images of a block at a site: their errors, laid over the terrain, against the ortho-image."""
+"""Points and images at a simulated site with relief and buildings: the true errors are found."""
 
 from dataclasses import replace
 
@@ -7,14 +7,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from services.errors import InputError
+from services.geodesy import metres_per_degree_at
 from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage, sample_image
 from services.quality.planimetry import planimetric_quality
-from services.quality.site_errors import Site
+from services.quality.site_errors import Site, point_errors
 from services.quality.site_images import image_errors, least_inclined
 from services.sensors.correction import CorrectedModel, no_correction
+from services.simulation.view import simulate_view, true_ground
 from services.types import Frame
-from tests.services.registration.test_on_reference import reference, terrain
-from tests.services.simulated import block_views
+from tests.services.registration.test_on_reference import grid, positions, reference, terrain
+from tests.services.simulated import block, block_views, plan, production, world
 
 SHIFT_PX = np.array([2.0, -3.0])
 a_tenth_of_a_pixel_m = 0.1
@@ -62,3 +65,33 @@ def test_the_least_inclined_images_come_first() -> None:
 def test_images_with_a_parallax_need_a_terrain() -> None:
     with pytest.raises(InputError, match="terrain"):
         image_errors(view(1, np.zeros(2)), site(), None, 8.0)
+
+
+def vertical_ortho() -> Site:
+    """A site with an ortho-image of a vertical view, which shows no walls."""
+    geometry = plan("nadir", incidence_deg=0.0, shape=(1000, 1000))
+    nadir = simulate_view(world(), geometry, np.random.default_rng(3))
+    pixels = grid(1.0)
+    lon_lat = pixels.lon_lat(positions(pixels).astype(float))
+    ground = np.column_stack([lon_lat, world().height_m(lon_lat)])
+    seen = nadir.geometry.true_model.project(ground).reshape(*pixels.shape, 2)
+    image = ArrayImage(sample_image(nadir.image, seen, 1.0))
+    exact = replace(reference(), image=image, sigma_m=0.1, frame=Frame.from_sigmas(0.1, 0.1))
+    return Site("nadir", False, exact)
+
+
+def test_points_of_inclined_views_lie_as_far_off_as_they_truly_do() -> None:
+    points, chips = block()
+    true_m = []
+    for model, seen in zip(production().adjustment.models, block_views(), strict=True):
+        shown = true_ground(seen, world(), model.project(points.lon_lat_h))
+        off_deg = points.lon_lat_h[:, :2] - shown[:, :2]
+        true_m.append(np.nanmedian(off_deg * metres_per_degree_at(points.lon_lat_h), axis=0))
+    errors = point_errors(points, chips, vertical_ortho())
+    assert len(errors.error_m) == errors.tried == len(points)
+    quality = planimetric_quality([errors], "points", points.frames[0])
+    shift_m = np.array([quality.shift_east_m, quality.shift_north_m])
+    print(f"true {np.median(true_m, axis=0)}, found {shift_m}, {quality.relative.ce90_m.value:.2f} m")
+    assert_allclose(shift_m, np.median(true_m, axis=0), atol=2 * a_tenth_of_a_pixel_m)
+    assert quality.relative.ce90_m.value < quality.declared_ce90_m
+    assert quality.normalised_frame.mean_square < quality.normalised_frame.upper
