@@ -132,7 +132,7 @@ def _density(limit: float, min_share: float, cells: BlockCells) -> BlockCriterio
     area_km2 = cells.density.area_km2
     share = float(area_km2[missing == 0].sum() / area_km2.sum()) if len(area_km2) else 0.0
     poor, all_cells = int((missing > 0).sum()), len(missing)
-    note = f"{poor} of {all_cells} cells lack {int(missing.sum())} points" if poor else ""
+    note = f"{poor:,} of {all_cells:,} cells lack {int(missing.sum()):,} points" if poor else ""
     return BlockCriterion(
         name="density",
         label=f"Ground with {limit:.3g} points/km2",
@@ -157,7 +157,7 @@ def _views(limit: int, fewest: int, cells: BlockCells) -> BlockCriterion:
         unit="",
         decimals=0,
         outcome="met" if fewest >= limit else "missed",
-        note=f"{short} points have fewer" if fewest < limit else "",
+        note=f"{short:,} points have fewer" if fewest < limit else "",
     )
 
 

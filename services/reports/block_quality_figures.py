@@ -30,7 +30,7 @@ def density_map(report: BlockQualityReport) -> Figure:
     else:
         met = np.array([cell.outcome == "met" for cell in report.density.cells], dtype=bool)
         kind = np.where(met, 2, (density >= required / 2.0).astype(int))
-        names = ("below half of it", "below it", f"specified {required:.3g} / km² reached")
+        names = (f"below {required / 2.0:.3g} / km²", f"below {required:.3g} / km²", "as specified")
     figure = _cell_map(report, kind, (_LOW, _MIDDLE, _HIGH))
     _legend(figure, list(zip(names, (_LOW, _MIDDLE, _HIGH), strict=True)))
     return figure
