@@ -1,13 +1,13 @@
 """What a block shall reach, criterion by criterion: met, missed, or not shown by what was measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from services.quality.accuracy import MIN_CHECK_POINTS, Quantile
 from services.quality.block_cells import BlockCells
 from services.quality.block_heights import HeightQuality
-from services.quality.planimetry import PlanimetricQuality, SiteGroup
+from services.quality.planimetry import CHECK_ONLY, CONTROL, PlanimetricQuality, SiteGroup
 
 Outcome = Literal["met", "not shown", "missed"]
 BlockVerdict = Literal["met", "not shown", "missed", "not specified"]
@@ -53,7 +53,8 @@ class BlockCriterion:
         unit: of both.
         decimals: digits after the point that are worth showing.
         outcome: "met"; "missed"; "not shown" when nothing was measured, when fewer than 30 points were,
-            or when the confidence interval of the figure includes the limit.
+            when the confidence interval of the figure includes the limit, or when the limit is met at
+            control sites only.
         note: how the outcome came about, one sentence; "" where that is plain.
     """
 
@@ -93,7 +94,11 @@ def block_criteria(
         measured = None if group is None else group.accuracy.ce90_m
         label = "CE90 on the Earth" if group is None else f"CE90 on the Earth, {group.name}"
         why = "no reference ortho-images were given (--site)"
-        criteria.append(_accuracy("ce90_m", label, measured, requirements.ce90_m, why))
+        criterion = _accuracy("ce90_m", label, measured, requirements.ce90_m, why)
+        if group is not None and group.name == CONTROL and criterion.outcome == "met":
+            note = "all sites were used as control: add check-only ones (--site)"
+            criterion = replace(criterion, outcome="not shown", note=note)
+        criteria.append(criterion)
     if requirements.le90_m is not None:
         measured = None if heights is None else heights.on_the_earth.le90_m
         why = "no height model was given (--dem)"
@@ -114,8 +119,8 @@ def block_verdict(criteria: Sequence[BlockCriterion], requirements: BlockRequire
 
 
 def checking_group(quality: PlanimetricQuality) -> SiteGroup:
-    """The sites that judge a block: the check-only ones, else all."""
-    return next((g for g in quality.groups if g.name == "check-only sites"), quality.groups[0])
+    """The sites that judge a block: the check-only ones where there are any."""
+    return next((g for g in quality.groups if g.name == CHECK_ONLY), quality.groups[0])
 
 
 def outcome_of(measured: Quantile | None, limit: float) -> Outcome:
@@ -157,7 +162,7 @@ def _views(limit: int, fewest: int, cells: BlockCells) -> BlockCriterion:
         unit="",
         decimals=0,
         outcome="met" if fewest >= limit else "missed",
-        note=f"{short:,} points have fewer" if fewest < limit else "",
+        note=f"{short:,} points have fewer" if short else "",
     )
 
 

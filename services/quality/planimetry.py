@@ -17,6 +17,7 @@ from services.quality.site_errors import POINTS, SiteErrors
 from services.types import Array, Frame, IntArray
 
 Source = Literal["points", "images"]
+CHECK_ONLY, CONTROL = "check-only sites", "control sites"
 _CHI_MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))
 """Median length of a normal error of unit sigma a coordinate."""
 
@@ -85,7 +86,7 @@ class PlanimetricQuality:
         source: "points" when the chips of the points were searched in the ortho-images, "images" when
             images of the block were.
         sites: each of them.
-        groups: all sites; check-only and control sites, where there are both.
+        groups: all sites, check-only sites, control sites; one group where there is only one kind.
         relative: all sites, without the median shift, which the block shares as an error of its frame.
         declared_ce90_m: of the median point, relative to the frame, with the measure; null for images.
         normalised: the errors without their mean, in units of what is declared for them; n is 0 for
@@ -175,16 +176,17 @@ def _site_quality(errors: Sequence[SiteErrors]) -> SiteQuality:
 
 
 def _groups(error_m: Array, site: IntArray, is_control: np.ndarray) -> tuple[SiteGroup, ...]:
-    """All sites; check-only and control sites apart, where there are both."""
+    """All sites, named by their kind where there is only one; else also each kind."""
 
     def group(name: str, of_group: np.ndarray) -> SiteGroup:
         rows = of_group[site]
         return SiteGroup(name, len(np.unique(site[rows])), accuracy(error_m[rows], site[rows]))
 
-    together = group("all sites", np.ones(len(is_control), dtype=np.bool_))
+    everything = np.ones(len(is_control), dtype=np.bool_)
     if is_control.all() or not is_control.any():
-        return (together,)
-    return together, group("check-only sites", ~is_control), group("control sites", is_control)
+        return (group(CONTROL if is_control.all() else CHECK_ONLY, everything),)
+    kinds = group(CHECK_ONLY, ~is_control), group(CONTROL, is_control)
+    return group("all sites", everything), *kinds
 
 
 def _typical_ratio(error_m: Array, covariance_m2: Array) -> float:

@@ -214,6 +214,27 @@ def test_a_site_elsewhere_is_told_to_show_nothing(world: QualityWorld, tmp_path:
     assert "nothing was measured" in (tmp_path / "out" / "block_quality.html").read_text()
 
 
+def test_control_sites_alone_do_not_show_that_an_accuracy_is_met(world: QualityWorld) -> None:
+    required = RequiredQuality(ce90_m=3.0)
+    at_control = QualityReferences(sites=(SiteFile(world.control_site, is_control=True),))
+    report = assess_folder(world.block, at_control, required)
+    judged = report.criteria[-1]
+    assert (judged.label, judged.outcome) == ("CE90 on the Earth, control sites", "not shown")
+    assert "--site" in judged.note
+    checked = assess_folder(
+        world.block, QualityReferences(sites=(SiteFile(world.control_site),)), required
+    )
+    assert checked.criteria[-1].outcome == "met"
+    assert (
+        assess_folder(
+            world.block, QualityReferences(sites=(SiteFile(world.site, is_control=True),)), required
+        )
+        .criteria[-1]
+        .outcome
+        == "missed"
+    )
+
+
 @pytest.mark.parametrize(
     ("required", "message"),
     [({"ce90_m": -1.0}, "ce90_m"), ({"min_share": 2.0}, "min_share"), ({"min_views": 0}, "min_views")],
