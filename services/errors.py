@@ -9,6 +9,7 @@ AmersError
     ├── NotEnoughPoints
     ├── NoConsensus
     ├── UndeterminedCorrection
+    ├── DisconnectedBlock
     └── NoConvergence
 
 Every message states the values found and expected.
@@ -60,6 +61,10 @@ class NoConsensus(ComputationError):
 
 class UndeterminedCorrection(ComputationError):
     """The points leave a part of the correction open that the user asks for."""
+
+
+class DisconnectedBlock(ComputationError):
+    """Images of one block that nothing ties together."""
 
 
 class NoConvergence(ComputationError):

@@ -25,7 +25,7 @@ from services.production.from_ortho import (
     OrthoPoints,
     produce_ortho_points,
 )
-from services.sensors.correction import fold_into_rpc
+from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel
 from services.types import Array, ControlPoints, Progress, no_progress, part_of
 
@@ -179,11 +179,12 @@ def refuse_existing(folder: Path) -> None:
 
 
 def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:
-    """The adjusted model of every image, by the image's name."""
+    """The adjusted model of every image that an RPC expresses, by the image's name."""
     models = {}
     for scene, corrected in zip(scenes, production.adjustment.models, strict=True):
-        assert isinstance(corrected.base, RpcModel)
-        models[scene.acquisition.image_id] = fold_into_rpc(corrected.base, corrected.correction)
+        refined = refined_rpc(corrected, scene.image.shape).model
+        if refined is not None:
+            models[scene.acquisition.image_id] = refined
     return models
 
 

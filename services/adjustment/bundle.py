@@ -1,38 +1,21 @@
-"""Bundle adjustment: the corrections of all images of a block, from tie points."""
+"""Bundle adjustment: the parameters of all images of a block, from tie points and control."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-from scipy.special import gammaincinv
 
-from services.adjustment.intersection import intersect, residuals_and_derivatives
-from services.adjustment.robust import cauchy_weights
-from services.errors import NoConvergence, NotEnoughPoints
-from services.geodesy import move_metres
-from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
-from services.types import Array, BoolArray, IntArray, Observations
-
-
-@dataclass(frozen=True)
-class BlockOptions:
-    """How a block is adjusted.
-
-    Attributes:
-        tolerance: an observation is deactivated at the end when its residual exceeds this many standard
-            deviations.
-        max_iterations: the adjustment fails when it has not converged after this many iterations.
-        converged_px: the adjustment has converged when no correction changes by more than this.
-        min_points: smallest number of tie points.
-    """
-
-    tolerance: float = 4.0
-    max_iterations: int = 100
-    converged_px: float = 1e-3
-    min_points: int = 6
+from services.adjustment.block_accuracy import block_frames, point_covariances
+from services.adjustment.block_problem import BlockOptions, BlockProblem
+from services.adjustment.block_scale import check_scale, posterior_scale
+from services.adjustment.block_solution import checked_gauge, least_squares
+from services.adjustment.control_check import agreeing_control
+from services.adjustment.control_ground import NO_CONTROL, ControlGround
+from services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
+from services.adjustment.robust_start import active_observations, robust_start
+from services.errors import NoConsensus
+from services.sensors.correction import CorrectedModel
+from services.types import Array, BoolArray, Frame, IntArray, Observations
 
 
 @dataclass(frozen=True)
@@ -41,268 +24,160 @@ class BlockAdjustment:
 
     Attributes:
         models: the images' models with their corrections.
-        covariance_px2: (2 n, 2 n) of the shifts, line and sample, image after image.
-        lon_lat_h: (p, 3) the tie points; NaN where they cannot be intersected.
-        point_covariance_m2: (p, 3, 3) east, north, up, for exact corrections: it is relative to the
-            frame of the block.
+        values: (n, k) parameters of the images; 0 where an image has fewer.
+        covariance: (n k, n k) of the parameters, image after image, with the doubt about the frame.
+        slope_factor: standard deviation of drifts and skews over what was stated, by the residuals.
+        lon_lat_h: (p, 3) the points; NaN where they cannot be intersected.
+        point_covariance_m2: (p, 3, 3) east, north, up, relative to the frame of the point's group: with
+            the errors that points take over from images.
+        group: (n,) group of images that points tie together; -1 for images without an observation.
+        frames: of the groups, on the Earth. The error of a point on the Earth is that of its frame plus
+            its own; the two are independent.
         residual_px: (m, 2) observed minus computed.
         active: (m,) observations within tolerance, of points with at least two such observations.
+        control_active: (c,) control points that agree.
+        control_misfit_m: (c, 3) known minus computed, east, north, up; NaN for unknown coordinates.
         sigma_px: a posteriori standard deviation of an observation with an a priori sigma of one.
         iterations: number of iterations.
     """
 
     models: tuple[CorrectedModel, ...]
-    covariance_px2: Array
+    values: Array
+    covariance: Array
+    slope_factor: float
     lon_lat_h: Array
     point_covariance_m2: Array
+    group: IntArray
+    frames: tuple[Frame, ...]
     residual_px: Array
     active: BoolArray
+    control_active: BoolArray
+    control_misfit_m: Array
     sigma_px: float
     iterations: int
 
 
-class _Linearised(NamedTuple):
-    """The observation equations at the current shifts and points; a named tuple, for compiled functions.
-
-    Attributes:
-        point, image: (m,) the point and the image of every observation; points ascending.
-        residual: (m, 2) observed minus computed, pixels.
-        derivative: (m, 2, 3) pixels per metre east, north, up.
-        weight: (m,) per px^2; 0 for observations that do not count.
-    """
-
-    point: IntArray
-    image: IntArray
-    residual: Array
-    derivative: Array
-    weight: Array
-
-
-class _PointSolution(NamedTuple):
-    """The part of the normal equations that concerns each point alone.
-
-    Attributes:
-        inverse: (p, 3, 3) inverse normal matrices; NaN where a point is undetermined.
-        right: (p, 3) right sides.
-    """
-
-    inverse: Array
-    right: Array
+_LEAST_SCALE = 0.5
+"""Sigmas are scaled by the residuals, at least by this: those of two rays only show the errors across
+the epipolar line, so that the scale may be too small."""
+_SLOPE_OBSERVATIONS = 1.0
+"""Drifts and skews that what is stated of them counts for, when their variance is estimated."""
+_ROUNDS = 15
+_SETTLED = 0.02
+"""Relative change of the scales at which they have settled."""
 
 
 def adjust_block(
-    models: Sequence[SensorModel],
-    shapes: Sequence[tuple[int, int]],
+    images: Sequence[ImageParameters],
     observations: Observations,
-    sigma_px: Array,
+    *,
+    control: ControlGround = NO_CONTROL,
+    passes: Sequence[BoolArray] = (),
     options: BlockOptions = BlockOptions(),
 ) -> BlockAdjustment:
-    """The shift of every image for which the rays of the tie points intersect.
+    """The parameters of every image for which the rays of the points intersect, on the known ground.
 
-    Gauss-Newton on image residuals. The points are eliminated (Schur complement), and Cauchy weights are
-    renewed in every iteration with the robust scale of the residuals. The a priori sigmas of the images
-    determine what tie points cannot: the frame of the whole block, and the parallax of pairs.
+    Gauss-Newton on image residuals with the points eliminated (Schur complement). It begins robustly:
+    every point is where most of its rays intersect, and Cauchy weights of a falling scale join images.
+    Least squares on what agrees follow. The a priori sigmas and the frames of control determine what tie
+    points cannot: the frame of the whole block, and the parallax of pairs.
 
     Args:
-        models: one per image, as delivered.
-        shapes: lines and samples of the images.
-        observations: m image positions of tie points, by point.
-        sigma_px: (n,) a priori standard deviation of the shift of each image, pixels.
+        images: with what may move.
+        observations: m image positions of points, by point.
+        control: known ground positions of some of the points.
+        passes: masks (n,) of images that may share errors, as those of one pass do; nobody states how
+            much, and the frames cover every share.
         options: thresholds.
 
     Raises:
-        NotEnoughPoints: too few tie points can be intersected.
-        NoConvergence: the corrections still change after the last iteration.
+        NotEnoughPoints: too few points can be intersected.
+        NoConsensus: the residuals are too large for the sigmas of the observations, or most control
+            points disagree.
+        DisconnectedBlock: groups of images without common points, and without control of each.
+        NoConvergence: the parameters still change after the last iteration.
     """
+    priors = block_priors(images, passes, [frame.covariance_m2 for frame in control.frames])
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
-    lon_lat_h = intersect(models, observations, n_points).lon_lat_h
-    intersected = int(np.isfinite(lon_lat_h[:, 0]).sum())
-    if intersected < options.min_points:
-        raise NotEnoughPoints(
-            intersected, options.min_points, f"tie points between {len(models)} images"
+    problem = BlockProblem(images, observations, control, options, n_points, priors.size)
+    state, scale, active, control_active = robust_start(problem, priors)
+    slope_factor = 1.0
+    for _ in range(_ROUNDS):
+        weight = problem.weights(active / max(scale, _LEAST_SCALE) ** 2, control_active)
+        gauge = checked_gauge(problem, problem.equations(state.values, state.lon_lat_h, weight))
+        solved = least_squares(problem, priors, gauge, state, weight)
+        state, covariance = solved.state, solved.system.inverse()
+        used, previous = active, (scale, slope_factor)
+        square = problem.squares(state.values, state.lon_lat_h)
+        determined = _determined(priors, covariance)
+        computed = used & np.isfinite(square)
+        scale = posterior_scale(square[computed], observations.point[computed], float(determined.sum()))
+        check_scale(scale)
+        factor = _slope_factor(state.values.ravel(), priors, determined, slope_factor)
+        active = active_observations(problem, square, used, options.tolerance * scale, control_active)
+        used_control, control_active = (
+            control_active,
+            agreeing_control(problem, solved.equations, solved.points, covariance, control_active),
         )
-    shift_px = np.zeros((len(models), 2))
-    change_px = np.inf
-    iterations = 0
-    while change_px > options.converged_px:
-        if iterations == options.max_iterations:
-            raise NoConvergence(
-                f"the block of {len(models)} images still moves by {change_px:.2g} px "
-                f"after {iterations} iterations"
-            )
-        iterations += 1
-        linearised = _linearised(models, shift_px, observations, lon_lat_h)
-        step_px, step_m, normal = _schur_step(linearised, shift_px, sigma_px, n_points)
-        shift_px = shift_px + step_px
-        lon_lat_h = move_metres(lon_lat_h, np.where(np.isfinite(step_m), step_m, 0.0))
-        change_px = float(np.abs(step_px).max())
-    corrected = tuple(_shifted(m, s, v) for m, s, v in zip(models, shapes, shift_px, strict=True))
-    residual, _ = residuals_and_derivatives(corrected, observations, lon_lat_h)
-    scale = _scale(residual, observations)
-    active = _within_tolerance(residual, observations, options.tolerance * scale)
-    used = replace(observations.take(active), sigma_px=observations.sigma_px[active] * scale)
-    final = intersect(corrected, used, n_points)
-    final_residual, _ = residuals_and_derivatives(corrected, observations, final.lon_lat_h)
+        settled = np.array_equal(active, used) and np.array_equal(control_active, used_control)
+        if settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED):
+            break
+        priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
+    _check_control(control, used_control)
+    frames, frame_m2, move = block_frames(solved.system, gauge, priors, images, passes)
+    of_points = np.full(n_points, -1)
+    of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]
+    relative_m2 = point_covariances(
+        solved.equations, solved.points, covariance, move, frame_m2[of_points]
+    )
+    intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
+    residual = problem.equations(state.values, state.lon_lat_h).residual
+    misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)
+    n_images = len(images)
     return BlockAdjustment(
-        models=corrected,
-        covariance_px2=np.asarray(np.linalg.inv(normal)),
-        lon_lat_h=final.lon_lat_h,
-        point_covariance_m2=final.covariance_m2,
-        residual_px=np.where(np.isfinite(final_residual), final_residual, residual),
-        active=active,
+        models=tuple(
+            image.corrected(found[: len(image.sigma)])
+            for image, found in zip(images, state.values[:n_images], strict=True)
+        ),
+        values=state.values[:n_images],
+        covariance=covariance[: n_images * priors.size, : n_images * priors.size],
+        slope_factor=slope_factor,
+        lon_lat_h=np.where(intersected[:, None], state.lon_lat_h, np.nan),
+        point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
+        group=gauge.group[:n_images],
+        frames=frames,
+        residual_px=problem.image_rows(residual) * observations.sigma_px[:, None],
+        active=used & intersected[observations.point],
+        control_active=used_control,
+        control_misfit_m=np.where(control.known, misfit_m, np.nan),
         sigma_px=scale,
-        iterations=iterations,
+        iterations=state.iterations,
     )
 
 
-def _linearised(
-    models: Sequence[SensorModel], shift_px: Array, observations: Observations, lon_lat_h: Array
-) -> _Linearised:
-    residual, derivative = residuals_and_derivatives(models, observations, lon_lat_h)
-    residual = residual - shift_px[observations.image]
-    weight = _weights(residual, observations, _scale(residual, observations))
-    # Rows without a weight must not bring their NaN into the sums.
-    residual, derivative = np.nan_to_num(residual), np.nan_to_num(derivative)
-    return _Linearised(observations.point, observations.image, residual, derivative, weight)
+def _determined(priors: BlockPriors, covariance: Array) -> Array:
+    """Share (K,) of every parameter that observations determine, the rest being its prior."""
+    return np.clip(1.0 - np.diagonal(covariance) * (priors.locating.diagonal() + priors.shape), 0.0, 1.0)
 
 
-def _magnitude(residual: Array, observations: Observations) -> tuple[Array, Array, IntArray]:
-    """Sizes of residuals in units that do not depend on the number of rays of a point.
-
-    A point with k rays takes three of their 2 k values: the residuals of a pair are small and
-    perpendicular to the rays, whatever the error was.
-
-    Returns:
-        (m,) normalised size of every observation's residual, near 1 on average for true sigmas;
-        (p,) chi2 of every point and (p,) its degrees of freedom.
-    """
-    chi2 = (residual**2).sum(axis=1) / observations.sigma_px**2
-    finite = np.isfinite(chi2)
-    n_points = int(observations.point[-1]) + 1
-    rays = np.bincount(observations.point[finite], minlength=n_points)
-    point_chi2 = np.bincount(observations.point[finite], chi2[finite], n_points).astype(np.float64)
-    redundancy = np.maximum(2 * rays - 3, 1) / np.maximum(rays, 1)
-    freedom = (2 * rays - 3).astype(np.int64)
-    return np.asarray(np.sqrt(chi2 / redundancy[observations.point])), point_chi2, freedom
+def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far: float) -> float:
+    """By how much the standard deviation of drifts and skews changes (MacKay's fixed point)."""
+    slopes = priors.shape > 0.0
+    if not slopes.any():
+        return 1.0
+    stated = priors.shape[slopes] * so_far**2
+    found = float((values[slopes] ** 2 * stated).sum())
+    freedom = _SLOPE_OBSERVATIONS + float(determined[slopes].sum())
+    # Few slopes tell their variance badly: regions of Student's law, relative to the normal law's.
+    few = freedom * (0.1 ** (-2.0 / freedom) - 1.0) / (2.0 * np.log(10.0))
+    return float(np.sqrt((_SLOPE_OBSERVATIONS + found) / freedom * few) / so_far)
 
 
-def _scale(residual: Array, observations: Observations) -> float:
-    """Robust standard deviation of the observations in units of their sigmas."""
-    _, point_chi2, freedom = _magnitude(residual, observations)
-    redundant = freedom > 0
-    typical = 2.0 * gammaincinv(freedom[redundant] / 2.0, 0.5)  # the median of the chi-square law
-    median = np.median(np.sqrt(point_chi2[redundant] / typical))
-    return max(float(median), 1e-6)
-
-
-def _weights(residual: Array, observations: Observations, scale: float) -> Array:
-    magnitude, _, _ = _magnitude(residual, observations)
-    weight = cauchy_weights(magnitude / scale) / (scale * observations.sigma_px) ** 2
-    return np.where(np.isfinite(weight), weight, 0.0)
-
-
-def _within_tolerance(residual: Array, observations: Observations, tolerance: float) -> BoolArray:
-    """Observations (m,) within a tolerance, of points with at least two such observations."""
-    magnitude, point_chi2, _ = _magnitude(residual, observations)
-    within = np.nan_to_num(magnitude, nan=np.inf) <= tolerance
-    rays = np.bincount(observations.point[within], minlength=len(point_chi2))
-    return np.asarray(within & (rays[observations.point] >= 2))
-
-
-def _shifted(model: SensorModel, shape: tuple[int, int], shift_px: Array) -> CorrectedModel:
-    frame = no_correction(shape)
-    parameters = np.column_stack([shift_px, np.zeros((2, 2))])
-    return CorrectedModel(model, ImageCorrection(parameters, frame.centre, frame.half_size))
-
-
-@njit(cache=True)
-def _eliminated(equations: _Linearised, n_points: int) -> _PointSolution:
-    """The normal equations of every point alone, solved."""
-    point, residual, derivative = equations.point, equations.residual, equations.derivative
-    weight = equations.weight
-    own = np.zeros((n_points, 3, 3))
-    right = np.zeros((n_points, 3))
-    for i in range(len(point)):
-        if weight[i] > 0.0:
-            own[point[i]] += weight[i] * (derivative[i].T @ derivative[i])
-            right[point[i]] += weight[i] * (derivative[i].T @ residual[i])
-    for p in range(n_points):
-        scale = np.trace(own[p])
-        if scale > 0.0 and np.linalg.det(own[p] / scale) > 1e-13:
-            own[p] = np.linalg.inv(own[p])
-        else:
-            own[p] = np.nan
-    return _PointSolution(own, right)
-
-
-@njit(cache=True)
-def _reduced(equations: _Linearised, points: _PointSolution, n_images: int) -> tuple[Array, Array]:
-    """Normal matrix (2 n, 2 n) and right side (2 n,) of the shifts, with the points eliminated."""
-    point, image, residual = equations.point, equations.image, equations.residual
-    derivative, weight = equations.derivative, equations.weight
-    normal = np.zeros((2 * n_images, 2 * n_images))
-    right = np.zeros(2 * n_images)
-    first = 0
-    for i in range(len(point)):
-        if point[i] != point[first]:
-            first = i
-        p = point[i]
-        if weight[i] == 0.0 or np.isnan(points.inverse[p, 0, 0]):
-            continue
-        a = 2 * image[i]
-        across = weight[i] * (derivative[i] @ points.inverse[p])
-        right[a : a + 2] += weight[i] * residual[i] - across @ points.right[p]
-        normal[a, a] += weight[i]
-        normal[a + 1, a + 1] += weight[i]
-        j = first
-        while j < len(point) and point[j] == p:
-            if weight[j] > 0.0:
-                b = 2 * image[j]
-                normal[a : a + 2, b : b + 2] -= weight[j] * (across @ derivative[j].T)
-            j += 1
-    return normal, right
-
-
-def _translation_free(equations: _Linearised, n_images: int) -> Array:
-    """Projector (2 n, 2 n) that removes the shifts that a translation of the whole block would cause.
-
-    Tie points do not determine the position of a block. Its images see it under slightly different
-    angles from edge to edge, though, and a distortion of 0.1 px would pass for a translation by metres:
-    such a translation is left to the a priori sigmas alone.
-    """
-    moves = np.zeros((n_images, 2, 3))
-    np.add.at(moves, equations.image, equations.derivative * equations.weight[:, None, None])
-    total = np.bincount(equations.image, equations.weight, n_images)
-    directions = (moves / np.maximum(total, 1e-300)[:, None, None]).reshape(-1, 3)
-    return np.asarray(np.eye(2 * n_images) - directions @ np.linalg.pinv(directions))
-
-
-def _schur_step(
-    equations: _Linearised, shift_px: Array, sigma_px: Array, n_points: int
-) -> tuple[Array, Array, Array]:
-    """One Gauss-Newton step with the points eliminated.
-
-    Args:
-        equations: at the current shifts and points.
-        shift_px: (n, 2) current shifts.
-        sigma_px: (n,) their a priori standard deviations.
-        n_points: number of points.
-
-    Returns:
-        Steps of the shifts (n, 2) in pixels and of the points (p, 3) in metres, and the reduced normal
-        matrix (2 n, 2 n).
-    """
-    n_images = len(sigma_px)
-    points = _eliminated(equations, n_points)
-    normal, right = _reduced(equations, points, n_images)
-    projector = _translation_free(equations, n_images)
-    prior = np.repeat(sigma_px, 2) ** -2.0
-    normal = projector @ normal @ projector + np.diag(prior)
-    right = projector @ right
-    step_px = np.linalg.solve(normal, right - prior * shift_px.ravel()).reshape(-1, 2).astype(np.float64)
-    moved = equations.weight[:, None] * np.einsum(
-        "mij,mi->mj", equations.derivative, step_px[equations.image]
-    )
-    point_right = points.right
-    np.subtract.at(point_right, equations.point, moved)
-    return step_px, np.einsum("pij,pj->pi", points.inverse, point_right), normal
+def _check_control(control: ControlGround, active: BoolArray) -> None:
+    if active.sum() * 2 < len(control):
+        names = ", ".join(name for name, agrees in zip(control.names, active, strict=True) if not agrees)
+        raise NoConsensus(
+            f"{len(control) - active.sum()} of {len(control)} control points disagree with the block "
+            f"and with each other: {names}. State larger sigmas or a larger frame, or "
+            "remove wrong points"
+        )

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from services.adjustment.bundle import BlockAdjustment, BlockOptions, adjust_block
-from services.adjustment.intersection import Intersection, intersect
+from services.adjustment.block_problem import BlockOptions
+from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.intersection import intersect
+from services.adjustment.parameters import image_parameters
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around, continuous, east_north_up
@@ -20,7 +22,7 @@ from services.matching.multi_image import (
 )
 from services.matching.predict import rank_in_group
 from services.matching.tie_points import FeatureOptions, find_tie_points
-from services.production.block_frame import block_frame
+from services.production.image_passes import image_passes
 from services.production.point_views import (
     check_image_names,
     chips_of,
@@ -57,6 +59,8 @@ class ProductionOptions:
         min_saliency: smallest saliency of a point's chip.
         max_sigma_m: largest horizontal standard deviation of a point within the block.
         max_sigma_up_m: largest vertical standard deviation of a point within the block.
+        slope: a priori standard deviation of drift and skew of an image, pixels per pixel; the block
+            corrects it by what it finds.
         features, block, refinement: of the stages.
     """
 
@@ -69,6 +73,7 @@ class ProductionOptions:
     min_saliency: float = 0.05
     max_sigma_m: float = 3.0
     max_sigma_up_m: float = 10.0
+    slope: float = 1e-4
     features: FeatureOptions = field(default_factory=FeatureOptions)
     block: BlockOptions = field(default_factory=BlockOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
@@ -159,25 +164,20 @@ def produce_points(
     progress(0.9, "adjusting the block on its chips")
     adjustment = _adjust(scenes, measures, options)
     active = measures.take(adjustment.active)
-    intersection = intersect(
-        adjustment.models, _with_scaled_sigma(active, adjustment.sigma_px), len(candidates)
-    )
     adjusted = _with_models(scenes, adjustment)
-    shown = active.take(shows_chip(adjusted, active, intersection.lon_lat_h, options.fine_gsd_m))
-    rows, saliency = _select_points(adjusted, intersection, shown, options)
-    acquisitions = [scene.acquisition for scene in scenes]
-    frame = block_frame(adjustment, acquisitions, _prior_sigma_px(scenes))
+    shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
+    rows, saliency = _select_points(adjusted, adjustment, shown, options)
     shown = shown.take(np.isin(shown.point, rows))
     shown = replace(shown, point=np.searchsorted(rows, shown.point))
-    views = point_views(adjusted, shown, intersection.lon_lat_h[rows], options.gsds_m)
-    points = _control_points(intersection, rows, frame, saliency, views)
+    views = point_views(adjusted, shown, adjustment.lon_lat_h[rows], options.gsds_m)
+    points = _control_points(adjustment, rows, saliency, views)
     points = replace(points, surface=surface_heights(adjusted, points, options.fine_gsd_m))
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
         before_px=_median_px(before.residual_px),
         after_px=_median_px(tied.residual_px),
         refined_px=_median_px(adjustment.residual_px[adjustment.active]),
-        frame=frame,
+        frame=adjustment.frames[0],
     )
     progress(1.0, f"{len(points)} points")
 
@@ -195,28 +195,23 @@ def _adjust(
     scenes: Sequence[Scene], observations: Observations, options: ProductionOptions
 ) -> BlockAdjustment:
     """The block adjustment of scenes with their models as delivered."""
-    models = [scene.model for scene in scenes]
-    shapes = [scene.image.shape for scene in scenes]
-    return adjust_block(models, shapes, observations, _prior_sigma_px(scenes), options.block)
-
-
-def _prior_sigma_px(scenes: Sequence[Scene]) -> Array:
-    """A priori standard deviation (n,) of the shift of each scene, pixels."""
-    return np.array([scene.sigma_m / scene_gsd_m(scene) for scene in scenes])
+    images = [
+        image_parameters(
+            scene.acquisition.image_id,
+            scene.model,
+            scene.image.shape,
+            shift_px=scene.sigma_m / scene_gsd_m(scene),
+            slope_px=options.slope * max(scene.image.shape) / 2.0,
+        )
+        for scene in scenes
+    ]
+    passes = image_passes([scene.acquisition for scene in scenes])
+    return adjust_block(images, observations, passes=passes, options=options.block)
 
 
 def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:
     """The scenes with their adjusted models."""
     return [replace(scene, model=model) for scene, model in zip(scenes, adjustment.models, strict=True)]
-
-
-def _with_scaled_sigma(observations: Observations, scale: float) -> Observations:
-    """Observations with their sigmas scaled by the sigma of the adjustment, at least by one half.
-
-    The residuals of two rays only show the errors across the epipolar line, so that the scale may be too
-    small.
-    """
-    return replace(observations, sigma_px=observations.sigma_px * max(scale, 0.5))
 
 
 def _median_px(residual: Array) -> float:
@@ -270,13 +265,13 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
 
 
 def _select_points(
-    scenes: Sequence[Scene], points: Intersection, shown: Observations, options: ProductionOptions
+    scenes: Sequence[Scene], points: BlockAdjustment, shown: Observations, options: ProductionOptions
 ) -> tuple[IntArray, Array]:
     """Row (n,), ascending, and saliency (n,) of the best point of every square of ground.
 
     `shown` are the measures in images that show the whole fine chip: those that become views.
     """
-    sigma_m = np.sqrt(np.diagonal(points.covariance_m2, 0, 1, 2))
+    sigma_m = np.sqrt(np.diagonal(points.point_covariance_m2, 0, 1, 2))
     views = np.bincount(shown.point, minlength=len(points.lon_lat_h))
     usable = np.isfinite(points.lon_lat_h[:, 0]) & (views >= options.min_views)
     rows = np.flatnonzero(usable & _precise(sigma_m, options))
@@ -297,16 +292,16 @@ def _select_points(
 
 
 def _control_points(
-    intersection: Intersection, rows: IntArray, frame: Frame, saliency: Array, views: Views
+    adjustment: BlockAdjustment, rows: IntArray, saliency: Array, views: Views
 ) -> ControlPoints:
-    """The selected rows of an intersection as control points of one chip file."""
+    """The selected rows of an adjustment as control points of one chip file."""
     n = len(rows)
     return ControlPoints(
         id=np.arange(n, dtype=np.int64),
-        lon_lat_h=intersection.lon_lat_h[rows],
-        covariance_m2=intersection.covariance_m2[rows],
+        lon_lat_h=adjustment.lon_lat_h[rows],
+        covariance_m2=adjustment.point_covariance_m2[rows],
         block=np.zeros(n, dtype=np.int64),
-        frames=(frame,),
+        frames=adjustment.frames,
         saliency=saliency,
         health=np.ones(n),
         views=views,

@@ -1,7 +1,6 @@
 """The frame of a block: known from the models of its images, weaker in height, weaker within a pass."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 
@@ -9,8 +8,9 @@ import numpy as np
 import pytest
 
 from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.parameters import image_parameters
 from services.geodesy import move_metres
-from services.production.block_frame import block_frame
+from services.production.image_passes import image_passes
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.simulation.view import ViewGeometry
@@ -58,12 +58,16 @@ def observed(count: int, rng: np.random.Generator) -> Observations:
     )
 
 
-def adjusted(errors_px: Array, rng: np.random.Generator) -> BlockAdjustment:
+def adjusted(
+    errors_px: Array, rng: np.random.Generator, acquisitions: Sequence[Acquisition] = ()
+) -> BlockAdjustment:
     """The block of images (n,) delivered with shifts (n, 2)."""
     count = len(errors_px)
-    delivered = [shifted(g.rpc, e) for g, e in zip(geometries(count), errors_px, strict=True)]
-    sigma_px = np.full(count, SIGMA_M / GSD_M)
-    return adjust_block(delivered, [SHAPE] * count, observed(count, rng), sigma_px)
+    images = [
+        image_parameters(f"image_{k}", shifted(g.rpc, e), SHAPE, shift_px=SIGMA_M / GSD_M, slope_px=0.5)
+        for k, (g, e) in enumerate(zip(geometries(count), errors_px, strict=True))
+    ]
+    return adjust_block(images, observed(count, rng), passes=image_passes(acquisitions))
 
 
 def shifted(model: SensorModel, shift_px: Array) -> SensorModel:
@@ -79,9 +83,8 @@ def acquired(count: int, every: timedelta, sensor: str = "satellite") -> list[Ac
 
 def frame_covariance_m2(acquisitions: Sequence[Acquisition]) -> Array:
     count = len(acquisitions)
-    adjustment = adjusted(np.zeros((count, 2)), np.random.default_rng(6))
-    sigma_px = np.full(count, SIGMA_M / GSD_M)
-    return block_frame(adjustment, acquisitions, sigma_px).covariance_m2
+    adjustment = adjusted(np.zeros((count, 2)), np.random.default_rng(6), acquisitions)
+    return adjustment.frames[0].covariance_m2
 
 
 def frame_sigmas_m(acquisitions: Sequence[Acquisition]) -> Array:
@@ -133,15 +136,6 @@ def test_the_frame_of_a_pass_covers_errors_that_its_images_share_or_not(shared: 
     assert (mean_square < 1.5).all()
     held = mean_square[:2] if shared else mean_square[2:]
     assert (held > 0.6).all()
-
-
-def test_points_that_are_not_intersected_do_not_matter() -> None:
-    adjustment = adjusted(np.zeros((5, 2)), np.random.default_rng(6))
-    without = adjustment.lon_lat_h.copy()
-    without[[0, 7]] = np.nan
-    acquisitions, sigma_px = acquired(5, three_days), np.full(5, SIGMA_M / GSD_M)
-    frame = block_frame(replace(adjustment, lon_lat_h=without), acquisitions, sigma_px)
-    np.testing.assert_allclose([frame.sigma_m, frame.sigma_up_m], ring_m[1:], rtol=a_percent)
 
 
 def test_images_are_of_one_pass_unless_their_platforms_or_times_differ() -> None:

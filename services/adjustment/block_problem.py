@@ -1,0 +1,181 @@
+"""The observation equations of a block: tie points and control, at given parameters and points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from services.adjustment.control_ground import ControlGround
+from services.adjustment.normal_equations import Equations, seen_together
+from services.adjustment.parameters import ImageParameters
+from services.geodesy import metres_per_degree_at, wrapped_degrees
+from services.types import Array, BoolArray, IntArray, Observations
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """How a block is adjusted.
+
+    Attributes:
+        tolerance: an observation is deactivated at the end when its residual exceeds this many standard
+            deviations.
+        max_iterations: the adjustment fails when it has not converged after this many iterations.
+        converged_px: the adjustment has converged when no parameter changes by more than this.
+        min_points: smallest number of tie points.
+    """
+
+    tolerance: float = 4.0
+    max_iterations: int = 100
+    converged_px: float = 1e-3
+    min_points: int = 6
+
+
+@dataclass(frozen=True)
+class BlockProblem:
+    """What is observed, in one list of rows by point: image positions, and two rows a control point.
+
+    Attributes:
+        images: the n images.
+        observations: m image positions of points.
+        control: known ground positions; may be empty.
+        options: thresholds.
+        n_points: number of points.
+        size: number of parameters in a block.
+    """
+
+    images: Sequence[ImageParameters]
+    observations: Observations
+    control: ControlGround
+    options: BlockOptions
+    n_points: int
+    size: int
+
+    @property
+    def n_blocks(self) -> int:
+        """Images, and behind them the frames of the control."""
+        return len(self.images) + len(self.control.frames)
+
+    @cached_property
+    def _order(self) -> IntArray:
+        rows = np.concatenate([self.observations.point, np.repeat(self.control.point, 2)])
+        return np.argsort(rows, kind="stable").astype(np.int64)
+
+    @cached_property
+    def place(self) -> IntArray:
+        """Rows (m + 2 c,) of the list: where each image position, then each half of a control is."""
+        place = np.empty_like(self._order)
+        place[self._order] = np.arange(len(self._order))
+        return place
+
+    @cached_property
+    def point(self) -> IntArray:
+        """Point of each row."""
+        rows = np.concatenate([self.observations.point, np.repeat(self.control.point, 2)])
+        return np.asarray(rows[self._order])
+
+    @cached_property
+    def block(self) -> IntArray:
+        """Block of parameters of each row."""
+        frames = len(self.images) + np.repeat(self.control.source, 2)
+        return np.asarray(np.concatenate([self.observations.image, frames])[self._order])
+
+    @cached_property
+    def rows_of_images(self) -> list[IntArray]:
+        """Rows of the observations of every image."""
+        order = np.argsort(self.observations.image, kind="stable")
+        ends = np.cumsum(np.bincount(self.observations.image, minlength=len(self.images)))
+        return np.split(order, ends[:-1])
+
+    @cached_property
+    def slots(self) -> tuple[IntArray, int]:
+        """Number (n, n) of every pair of blocks that have a point in common, -1 for others; how many."""
+        together = seen_together(self.point, self.block, self.n_blocks)
+        slot = np.full(together.shape, -1, dtype=np.int64)
+        slot[together] = np.arange(together.sum())
+        return slot, int(together.sum())
+
+    def start(self) -> Array:
+        """Points (p, 3) on the first ray of each, at the middle height of its model, or where known."""
+        lon_lat_h = np.full((self.n_points, 3), np.nan)
+        first = np.unique(self.observations.point, return_index=True)[1]
+        for i, image in enumerate(self.images):
+            rows = first[self.observations.image[first] == i]
+            height_m = np.full(len(rows), np.mean(image.model.height_range_m))
+            lon_lat_h[self.observations.point[rows]] = image.model.locate(
+                self.observations.line_sample[rows], height_m
+            )
+        known = np.isfinite(np.diagonal(self.control.covariance_m2, 0, 1, 2)) & np.isfinite(
+            self.control.lon_lat_h
+        )
+        started = lon_lat_h[self.control.point]
+        lon_lat_h[self.control.point] = np.where(known, self.control.lon_lat_h, started)
+        return lon_lat_h
+
+    def equations(self, values: Array, lon_lat_h: Array, weight: Array | None = None) -> Equations:
+        """The rows at parameters (n, k) and points (p, 3); weights (m + 2 c,) of the list, 1 by default.
+
+        Rows that cannot be computed get no weight.
+        """
+        m, c = len(self.observations), len(self.control)
+        residual, by_ground = np.empty((m + 2 * c, 2)), np.zeros((m + 2 * c, 2, 3))
+        by_parameters = np.zeros((m + 2 * c, 2, self.size))
+        for i, (image, rows) in enumerate(zip(self.images, self.rows_of_images, strict=True)):
+            ground = lon_lat_h[self.observations.point[rows]]
+            computed = image.model.project(ground)
+            design, k = image.design(computed), len(image.sigma)
+            sigma = self.observations.sigma_px[rows, None]
+            moved = design @ values[i, :k]
+            residual[rows] = (self.observations.line_sample[rows] - computed - moved) / sigma
+            by_ground[rows] = image.model.project_derivative(ground) / sigma[:, :, None]
+            by_parameters[rows, :, :k] = design / sigma[:, :, None]
+        if c:
+            whitening = self.control.whitening()
+            misfit = self.control_misfit_m(values, lon_lat_h)
+            misfit = np.where(whitening.any(axis=1), misfit, 0.0)
+            halves = np.zeros((c, 4, 3))
+            halves[:, :3] = whitening
+            residual[m:] = (halves @ misfit[:, :, None])[:, :, 0].reshape(-1, 2)
+            by_ground[m:] = halves.reshape(-1, 2, 3)
+            by_parameters[m:, :, :3] = halves.reshape(-1, 2, 3)
+        residual, by_ground = residual[self._order], by_ground[self._order]
+        by_parameters = by_parameters[self._order]
+        weight = np.ones(m + 2 * c) if weight is None else weight
+        usable = np.isfinite(residual).all(axis=1) & np.isfinite(by_ground[:, 0, 0])
+        usable &= np.isfinite(by_parameters).all(axis=(1, 2))
+        if not usable.all():
+            weight = np.where(usable, weight, 0.0)
+            residual, by_ground, by_parameters = (
+                np.nan_to_num(part) for part in (residual, by_ground, by_parameters)
+            )
+        return Equations(self.point, self.block, residual, by_ground, by_parameters, weight)
+
+    def squares(self, values: Array, lon_lat_h: Array) -> Array:
+        """Squared lengths (m,) of residuals in units of their stated sigmas; NaN where unknown."""
+        equations = self.equations(values, lon_lat_h)
+        square = (equations.residual**2).sum(axis=1)
+        return self.image_rows(np.where(equations.weight > 0.0, square, np.nan))
+
+    def control_misfit_m(self, values: Array, lon_lat_h: Array) -> Array:
+        """Known minus computed ground (c, 3), metres east, north, up, with the errors of the frames."""
+        if not len(self.control):
+            return np.empty((0, 3))
+        computed = lon_lat_h[self.control.point]
+        difference = self.control.lon_lat_h - computed
+        difference[:, 0] = wrapped_degrees(difference[:, 0])
+        difference[:, :2] *= metres_per_degree_at(np.nan_to_num(computed))
+        return np.asarray(difference - values[len(self.images) + self.control.source, :3])
+
+    def image_rows(self, per_row: Array) -> Array:
+        """What belongs to the m image positions, of values of the list."""
+        return np.asarray(per_row[self.place[: len(self.observations)]])
+
+    def control_rows(self, per_row: Array) -> Array:
+        """What belongs to the c control points, (c, 2, ...), of values of the list."""
+        rows = self.place[len(self.observations) :]
+        return np.asarray(per_row[rows].reshape(len(self.control), 2, *per_row.shape[1:]))
+
+    def weights(self, of_observations: Array | BoolArray, of_control: Array | BoolArray) -> Array:
+        """Weights of the list, of weights (m,) of image positions and (c,) of control points."""
+        together = np.concatenate([of_observations, np.repeat(of_control, 2)]).astype(np.float64)
+        return np.asarray(together[self._order])

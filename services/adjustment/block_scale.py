@@ -1,0 +1,104 @@
+"""Size of residuals relative to their stated sigmas, where a third of the observations may be wrong."""
+
+import numpy as np
+
+from services.errors import NoConsensus
+from services.types import Array, BoolArray, IntArray
+
+MAX_SCALE = 5.0
+"""Residuals so many times as large as stated are not those of the observations that were stated."""
+
+_LOW = 0.2
+"""Quantile of the residuals that a third of blunders, and what they spoil in a pair, leaves alone."""
+_REACH = 3.5
+"""Residuals up to so many standard deviations tell the scale."""
+
+
+def magnitude(square: Array, point: IntArray, active: BoolArray) -> Array:
+    """Sizes (m,) of residuals, near 1 on average for true sigmas whatever the number of rays.
+
+    A point with k rays takes three of their 2 k values: the residuals of a pair are small and
+    perpendicular to the rays, whatever the error was.
+
+    Args:
+        square: (m,) squared length of the residuals in units of their sigmas.
+        point: (m,) of the observations.
+        active: (m,) observations that the points were intersected from.
+    """
+    rays = np.bincount(point[active], minlength=int(point.max(initial=-1)) + 1)[point]
+    redundancy = np.where(active & (rays >= 2), (2.0 * rays - 3.0) / np.maximum(rays, 2), 1.0)
+    return np.asarray(np.sqrt(square / redundancy))
+
+
+def low_scale(square: Array, point: IntArray) -> float:
+    """Standard deviation of observations in units of their sigmas, by the smallest residuals.
+
+    Within a factor of two where a third of the observations are wrong, also in pairs, of which half are
+    then spoilt; and never drawn up by them.
+
+    Args:
+        square: (m,) squared length of the residuals after a robust intersection; NaN where unusable.
+        point: (m,) of the observations.
+    """
+    usable = np.isfinite(square)
+    rays = np.bincount(point[usable], minlength=int(point.max(initial=-1)) + 1)[point]
+    several = usable & (rays >= 2)
+    if not several.any():
+        return 1.0
+    low = np.quantile(square[several] / (1.0 - 1.5 / rays[several]), _LOW)
+    return float(np.sqrt(max(low / (-2.0 * np.log(1.0 - _LOW)), 1e-12)))
+
+
+def robust_scale(square: Array, point: IntArray) -> float:
+    """Standard deviation of observations in units of their sigmas, from those within its reach.
+
+    From the smallest residuals on, the variance of what lies within its reach moves until it agrees with
+    itself. Blunders spread over a hundred standard deviations add little within three.
+
+    Args:
+        square: (m,) squared length of the residuals after a robust intersection; NaN where unusable.
+        point: (m,) of the observations.
+    """
+    scale2 = low_scale(square, point) ** 2
+    for _ in range(50):
+        within = np.nan_to_num(square, nan=np.inf) <= _REACH**2 * scale2
+        rays = np.bincount(point[within], minlength=int(point.max(initial=-1)) + 1)
+        counted = within & (rays[point] >= 2)
+        freedom = float((2 * rays - 3)[rays >= 2].sum())
+        if freedom <= 0.0:
+            break
+        last, scale2 = scale2, square[counted].sum() / freedom / _WITHIN_REACH
+        if abs(scale2 - last) <= 1e-3 * last:
+            break
+    return float(np.sqrt(max(scale2, 1e-12)))
+
+
+_WITHIN_REACH = 1.0 - (_REACH**2 / 2.0) * np.exp(-(_REACH**2) / 2.0) / (1.0 - np.exp(-(_REACH**2) / 2.0))
+"""Variance of a normal law in the plane, cut off at the reach."""
+
+
+def posterior_scale(square: Array, point: IntArray, parameters: float) -> float:
+    """A posteriori standard deviation of unit weight of active observations.
+
+    Args:
+        square: (m,) squared length of their residuals in units of their sigmas.
+        point: (m,) of the observations.
+        parameters: number of parameters that they determine besides their points.
+    """
+    n_points = len(np.unique(point))
+    freedom = max(2.0 * len(point) - 3.0 * n_points - parameters, 1.0)
+    return float(np.sqrt(max(square.sum() / freedom, 1e-12)))
+
+
+def check_scale(scale: float) -> None:
+    """Refuse a scale that no noise of the stated observations has.
+
+    Raises:
+        NoConsensus: it exceeds `MAX_SCALE`.
+    """
+    if scale > MAX_SCALE:
+        raise NoConsensus(
+            f"the residuals of the tie points are {scale:.1f} times as large as their sigmas say, at "
+            f"most {MAX_SCALE:g} is credible: state larger sigmas, allow drifts of the images, or "
+            "remove wrong tie points"
+        )

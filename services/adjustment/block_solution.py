@@ -1,0 +1,114 @@
+"""Gauss-Newton steps of a block with its points eliminated."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.adjustment.block_gauge import MIN_COMMON, Gauge, block_gauge, connected_groups
+from services.adjustment.block_problem import BlockProblem
+from services.adjustment.normal_equations import Equations, Points, eliminated, moved_points, reduced
+from services.adjustment.parameters import BlockPriors
+from services.adjustment.reduced_system import ReducedSystem, reduced_system
+from services.errors import DisconnectedBlock, NoConvergence
+from services.geodesy import move_metres
+from services.types import Array
+
+_FARTHEST_M = 2000.0
+"""Longest step of a point: rays that are nearly parallel promise more."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where an adjustment stands.
+
+    Attributes:
+        values: (n, k) parameters of images and frames.
+        lon_lat_h: (p, 3) points.
+        iterations: done so far.
+    """
+
+    values: Array
+    lon_lat_h: Array
+    iterations: int = 0
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A step, with the equations it was computed from.
+
+    Attributes:
+        state: after the step.
+        change_px: largest change of a parameter.
+        equations, points, system: before it.
+    """
+
+    state: State
+    change_px: float
+    equations: Equations
+    points: Points
+    system: ReducedSystem
+
+
+def step(
+    problem: BlockProblem, priors: BlockPriors, gauge: Gauge, state: State, equations: Equations
+) -> Solved:
+    """One Gauss-Newton step with the points eliminated."""
+    points = eliminated(equations, problem.n_points)
+    slot, n_slots = problem.slots
+    values, right = reduced(equations, points, slot, n_slots)
+    system = reduced_system(values, slot, priors, gauge)
+    at = state.values.ravel()
+    right_side = system.projected(right.ravel() - priors.shape * at) - priors.locating @ at
+    change = system.solve(right_side).reshape(state.values.shape)
+    step_m = np.clip(np.nan_to_num(moved_points(equations, points, change)), -_FARTHEST_M, _FARTHEST_M)
+    state = State(state.values + change, move_metres(state.lon_lat_h, step_m), state.iterations + 1)
+    return Solved(state, float(np.abs(change).max()), equations, points, system)
+
+
+def least_squares(
+    problem: BlockProblem, priors: BlockPriors, gauge: Gauge, state: State, weight: Array
+) -> Solved:
+    """The solution of given weights, with the equations of its last step."""
+    while True:
+        solved = step(
+            problem, priors, gauge, state, problem.equations(state.values, state.lon_lat_h, weight)
+        )
+        state = solved.state
+        if solved.change_px <= problem.options.converged_px:
+            return solved
+        if state.iterations >= problem.options.max_iterations:
+            raise unsettled(problem, solved.change_px, state)
+
+
+def moved(equations: Equations, state: State, step_m: Array) -> tuple[Equations, State]:
+    """The equations and the state after steps (p, 3) of the points; NaN leaves a point where it is."""
+    step_m = np.clip(np.nan_to_num(step_m), -_FARTHEST_M, _FARTHEST_M)
+    moved = np.einsum("mrc,mc->mr", equations.by_ground, step_m[equations.point])
+    state = replace(state, lon_lat_h=move_metres(state.lon_lat_h, step_m))
+    return equations._replace(residual=equations.residual - moved), state
+
+
+def checked_gauge(problem: BlockProblem, equations: Equations, refuse: bool = True) -> Gauge:
+    """The translations of the groups; refuses groups that nothing holds together."""
+    n = len(problem.images)
+    group = connected_groups(equations, n, problem.n_blocks)
+    known = [np.isfinite(frame.covariance_m2).any() for frame in problem.control.frames]
+    held = set(group[n:][np.array(known, dtype=np.bool_)])
+    number = int(group.max(initial=-1)) + 1
+    if refuse and number > 1 and len(held) < number:
+        names = [
+            ", ".join(image.name for image, its in zip(problem.images, group, strict=False) if its == g)
+            for g in range(number)
+        ]
+        raise DisconnectedBlock(
+            f"the images fall into {number} groups without {MIN_COMMON} tie points between them: "
+            f"{' | '.join(names)}. Make a block of each, or give control points to each"
+        )
+    return block_gauge(equations, group)
+
+
+def unsettled(problem: BlockProblem, change_px: float, state: State) -> NoConvergence:
+    return NoConvergence(
+        f"the block of {len(problem.images)} images still moves by {change_px:.2g} px after "
+        f"{state.iterations} iterations"
+    )

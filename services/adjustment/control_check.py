@@ -1,0 +1,124 @@
+"""Which control points agree with the block and with each other."""
+
+import numpy as np
+from numba import njit
+from scipy.stats import chi2
+
+from services.adjustment.block_problem import BlockProblem
+from services.adjustment.normal_equations import Equations, Points, eliminated
+from services.adjustment.robust import CAUCHY_TUNING
+from services.types import Array, BoolArray, IntArray
+
+_AGREES = 0.9999
+"""Probability with which a control point as good as stated stays."""
+
+
+def robust_control(
+    problem: BlockProblem, equations: Equations, weight: Array
+) -> tuple[Array, BoolArray]:
+    """Weights (c,) of control points while the block moves, and whether (c,) they are near the others.
+
+    Misfits are relative to the sigmas of the known ground and of the rays, in units of their own median:
+    frames may be far off at first.
+
+    Args:
+        problem: the block.
+        equations: at the current state.
+        weight: (m,) of the image positions.
+    """
+    if not len(problem.control):
+        return np.ones(0), np.ones(0, dtype=np.bool_)
+    alone = equations._replace(weight=problem.weights(weight, np.zeros(len(problem.control))))
+    rays = eliminated(alone, problem.n_points).inverse[problem.control.point]
+    # Points of one ray follow their known ground: they do not contradict it.
+    rays = np.where(np.isfinite(rays), rays, 1e12 * np.eye(3))
+    halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
+    residual = problem.control_rows(equations.residual).reshape(-1, 4)
+    spread = np.eye(4) + halves @ rays @ halves.transpose(0, 2, 1)
+    square = (residual * np.linalg.solve(spread, residual[:, :, None])[:, :, 0]).sum(axis=1)
+    freedom = problem.control.known_coordinates()
+    size = np.sqrt(square / freedom)
+    scale = max(1.0, float(np.median(size)))
+    near = square <= chi2.ppf(_AGREES, freedom) * scale**2
+    return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2), near
+
+
+def agreeing_control(
+    problem: BlockProblem, equations: Equations, points: Points, covariance: Array, active: BoolArray
+) -> BoolArray:
+    """The control points (c,) that agree, after the worst has left or the best has come back.
+
+    The misfit of a point is judged by its own covariance and by that of what all others predict: a point
+    that takes part has drawn the block towards itself.
+
+    Args:
+        problem: the block.
+        equations: at the solution.
+        points: eliminated from them.
+        covariance: of the parameters.
+        active: (c,) that took part in the solution.
+    """
+    if not len(problem.control):
+        return active
+    first = problem.place[len(problem.observations) :: 2]
+    predicted = _predicted_covariance(equations, points, covariance, problem.control.point, first)
+    halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
+    residual = problem.control_rows(equations.residual).reshape(-1, 4)
+    freedom = problem.control.known_coordinates()
+    limit = chi2.ppf(_AGREES, freedom)
+    ratio = np.full(len(active), np.inf)
+    for i in range(len(active)):
+        fitted = halves[i] @ predicted[i] @ halves[i].T
+        if not np.isfinite(fitted).all():
+            continue
+        spread = np.eye(4) - fitted if active[i] else np.eye(4) + fitted
+        values, vectors = np.linalg.eigh(spread)
+        # What nothing else predicts cannot be checked.
+        checked = values > 1e-6
+        part = vectors[:, checked].T @ residual[i]
+        ratio[i] = float((part**2 / values[checked]).sum()) / limit[i]
+    out = active.copy()
+    worst = int(np.argmax(np.where(active, ratio, -np.inf)))
+    best = int(np.argmin(np.where(active, np.inf, ratio)))
+    if active[worst] and ratio[worst] > 1.0:
+        out[worst] = False
+    elif not active[best] and ratio[best] < 1.0:
+        out[best] = True
+    return out
+
+
+@njit(cache=True)
+def _predicted_covariance(
+    equations: Equations, points: Points, covariance: Array, point: IntArray, rows: IntArray
+) -> Array:
+    """Covariance (c, 3, 3) of the computed ground of control points with the errors of their frames."""
+    k = equations.by_parameters.shape[2]
+    out = np.empty((len(point), 3, 3))
+    for c in range(len(point)):
+        p = point[c]
+        # Rows of the point are together.
+        first = rows[c]
+        while first > 0 and equations.point[first - 1] == p:
+            first -= 1
+        last = rows[c]
+        while last < len(equations.point) and equations.point[last] == p:
+            last += 1
+        by_block = np.zeros((last - first + 1, 3, k))
+        block = np.empty(last - first + 1, dtype=np.int64)
+        for i in range(first, last):
+            w = equations.weight[i]
+            block[i - first] = equations.block[i]
+            if w > 0.0:
+                cross = equations.by_ground[i].T @ equations.by_parameters[i]
+                by_block[i - first] = -w * (points.inverse[p] @ cross)
+        block[last - first] = equations.block[rows[c]]
+        for a in range(3):
+            by_block[last - first, a, a] = 1.0
+        total = points.inverse[p].copy()
+        for i in range(len(block)):
+            for j in range(len(block)):
+                a, b = block[i] * k, block[j] * k
+                part = np.ascontiguousarray(covariance[a : a + k, b : b + k])
+                total += by_block[i] @ part @ by_block[j].T
+        out[c] = total
+    return out

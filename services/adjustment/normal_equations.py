@@ -1,0 +1,315 @@
+"""The normal equations of a block, compiled: points are eliminated, images and their pairs remain."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from services.adjustment.robust import CAUCHY_TUNING
+from services.types import Array, BoolArray, IntArray
+
+_SINGULAR = 1e-13
+_PARALLEL = 1e-8
+"""Determinant of a normal matrix of unit trace below which two rays do not choose between others."""
+
+
+class Equations(NamedTuple):
+    """Observation equations at the current parameters and points, in units of standard deviations.
+
+    Attributes:
+        point, block: (m,) the point and the block of parameters of every observation; points ascending.
+        residual: (m, 2) observed minus computed.
+        by_ground: (m, 2, 3) derivatives by metres east, north, up.
+        by_parameters: (m, 2, k).
+        weight: (m,) 0 for observations that do not count.
+    """
+
+    point: IntArray
+    block: IntArray
+    residual: Array
+    by_ground: Array
+    by_parameters: Array
+    weight: Array
+
+
+class Points(NamedTuple):
+    """The part of the normal equations that concerns each point alone.
+
+    Attributes:
+        inverse: (p, 3, 3) inverse normal matrices; NaN where a point is undetermined.
+        right: (p, 3) right sides.
+    """
+
+    inverse: Array
+    right: Array
+
+
+@njit(cache=True)
+def _invert(n: Array, limit: float) -> bool:
+    """Invert a symmetric (3, 3) matrix in place, unless it is nearly singular."""
+    scale = n[0, 0] + n[1, 1] + n[2, 2]
+    if not scale > 0.0:
+        return False
+    a, b, c = n[0, 0] / scale, n[0, 1] / scale, n[0, 2] / scale
+    d, e, f = n[1, 1] / scale, n[1, 2] / scale, n[2, 2] / scale
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    if not determinant > limit:
+        return False
+    one = 1.0 / (determinant * scale)
+    n[0, 0], n[1, 1], n[2, 2] = (d * f - e * e) * one, (a * f - c * c) * one, (a * d - b * b) * one
+    n[0, 1] = n[1, 0] = (c * e - b * f) * one
+    n[0, 2] = n[2, 0] = (b * e - c * d) * one
+    n[1, 2] = n[2, 1] = (b * c - a * e) * one
+    return True
+
+
+@njit(cache=True)
+def _add(normal: Array, right: Array, derivative: Array, residual: Array, weight: float) -> None:
+    for a in range(3):
+        for r in range(2):
+            scaled = weight * derivative[r, a]
+            right[a] += scaled * residual[r]
+            for b in range(3):
+                normal[a, b] += scaled * derivative[r, b]
+
+
+@njit(cache=True)
+def robust_points(
+    equations: Equations, n_images: int, n_points: int, scale: float
+) -> tuple[Array, Array]:
+    """Step (p, 3) of every point to where most of its rays intersect, and robust weights (m,).
+
+    Every two rays of a point propose a position, and the one with the smallest Cauchy cost over all rays
+    wins: with three rays or more a wrong one does not move the point. Re-weighted least squares from
+    there give the weights, relative to what three unknowns leave of the residuals. Rows that are not of
+    images do not count. A step is NaN where fewer than two rays are usable, or none intersect.
+    """
+    step = np.full((n_points, 3), np.nan)
+    weight = np.where(equations.weight > 0.0, 1.0, 0.0)
+    usable = (equations.weight > 0.0) & (equations.block < n_images)
+    best = np.empty(3)
+    first = 0
+    for last in range(1, len(equations.point) + 1):
+        if last < len(equations.point) and equations.point[last] == equations.point[first]:
+            continue
+        rays = np.flatnonzero(usable[first:last]) + first
+        if len(rays) >= 2:
+            if _best_pair(equations, rays, scale, best):
+                _reweight(equations, rays, scale, best, weight)
+                step[equations.point[first]] = best
+            else:
+                weight[rays] = 0.0
+        first = last
+    return step, weight
+
+
+@njit(cache=True)
+def _best_pair(equations: Equations, rays: IntArray, scale: float, best: Array) -> bool:
+    """Fill in the step (3,) that two rays propose and all like best; False where no two intersect."""
+    normal, right, x = np.empty((3, 3)), np.empty(3), np.empty(3)
+    lowest = np.inf
+    limit = _PARALLEL if len(rays) > 2 else _SINGULAR
+    for i in range(0, len(rays), 1 + len(rays) // 12):
+        for j in range(i + 1, len(rays)):
+            normal[:] = 0.0
+            right[:] = 0.0
+            for ray in (rays[i], rays[j]):
+                _add(normal, right, equations.by_ground[ray], equations.residual[ray], 1.0)
+            if not _invert(normal, limit):
+                continue
+            _multiply(normal, right, x)
+            cost = 0.0
+            for ray in rays:
+                square = _square(equations.residual[ray], equations.by_ground[ray], x)
+                cost += np.log1p(square / scale**2)
+            if cost < lowest:
+                lowest = cost
+                best[:] = x
+    return lowest < np.inf
+
+
+@njit(cache=True)
+def _multiply(matrix: Array, vector: Array, out: Array) -> None:
+    for a in range(3):
+        out[a] = matrix[a, 0] * vector[0] + matrix[a, 1] * vector[1] + matrix[a, 2] * vector[2]
+
+
+@njit(cache=True)
+def _square(residual: Array, derivative: Array, x: Array) -> float:
+    total = 0.0
+    for r in range(2):
+        v = residual[r] - derivative[r, 0] * x[0] - derivative[r, 1] * x[1] - derivative[r, 2] * x[2]
+        total += v * v
+    return total
+
+
+@njit(cache=True)
+def _reweight(equations: Equations, rays: IntArray, scale: float, x: Array, weight: Array) -> None:
+    """Re-weighted least squares of one point from a start, which moves; its weights are filled in."""
+    normal, right = np.empty((3, 3)), np.empty(3)
+    effective = float(len(rays))
+    for _ in range(6):
+        reach = (2.0 * effective - 3.0) / effective * (CAUCHY_TUNING * scale) ** 2
+        effective = 0.0
+        normal[:] = 0.0
+        right[:] = 0.0
+        for ray in rays:
+            square = _square(equations.residual[ray], equations.by_ground[ray], x)
+            weight[ray] = 1.0 / (1.0 + square / reach)
+            effective += weight[ray]
+            _add(normal, right, equations.by_ground[ray], equations.residual[ray], weight[ray])
+        effective = max(effective, 2.0)
+        if not _invert(normal, _SINGULAR):
+            break
+        _multiply(normal, right, x)
+
+
+@njit(cache=True)
+def eliminated(equations: Equations, n_points: int) -> Points:
+    """The normal equations of every point alone, solved."""
+    own = np.zeros((n_points, 3, 3))
+    right = np.zeros((n_points, 3))
+    for i in range(len(equations.point)):
+        p = equations.point[i]
+        if equations.weight[i] > 0.0:
+            _add(own[p], right[p], equations.by_ground[i], equations.residual[i], equations.weight[i])
+    for p in range(n_points):
+        if not _invert(own[p], _SINGULAR):
+            own[p] = np.nan
+    return Points(own, right)
+
+
+@njit(cache=True)
+def seen_together(point: IntArray, block: IntArray, n_blocks: int) -> BoolArray:
+    """Which blocks of parameters (n, n), the smaller first, have a point in common."""
+    together = np.zeros((n_blocks, n_blocks), dtype=np.bool_)
+    for a in range(n_blocks):
+        together[a, a] = True
+    first = 0
+    for i in range(len(point)):
+        if point[i] != point[first]:
+            first = i
+        for j in range(first, i):
+            together[min(block[i], block[j]), max(block[i], block[j])] = True
+    return together
+
+
+@njit(cache=True)
+def reduced(equations: Equations, points: Points, slot: IntArray, n_slots: int) -> tuple[Array, Array]:
+    """Normal matrix in blocks (s, k, k) and right side (n, k) of the parameters, points eliminated.
+
+    Args:
+        equations: the observations.
+        points: eliminated from them.
+        slot: (n, n) number of the block of every pair of images, the smaller first; -1 for none.
+        n_slots: number of pairs.
+    """
+    k = equations.by_parameters.shape[2]
+    values = np.zeros((n_slots, k, k))
+    right = np.zeros((slot.shape[0], k))
+    across, through = np.empty((len(equations.point), k, 3)), np.empty((k, 3))
+    first = 0
+    for i in range(len(equations.point)):
+        if equations.point[i] != equations.point[first]:
+            first = i
+        w, p, a = equations.weight[i], equations.point[i], equations.block[i]
+        if w == 0.0 or np.isnan(points.inverse[p, 0, 0]):
+            continue
+        design = equations.by_parameters[i]
+        _add_parameters(values[slot[a, a]], right[a], design, equations.residual[i], w)
+        for q in range(k):
+            for c in range(3):
+                of_ground = equations.by_ground[i]
+                across[i, q, c] = w * (design[0, q] * of_ground[0, c] + design[1, q] * of_ground[1, c])
+            _multiply(points.inverse[p], across[i, q], through[q])
+            for c in range(3):
+                right[a, q] -= through[q, c] * points.right[p, c]
+        for j in range(first, i + 1):
+            if equations.weight[j] > 0.0:
+                b = equations.block[j]
+                _subtract_pair(values[slot[min(a, b), max(a, b)]], through, across[j], b - a, j < i)
+    return values, right
+
+
+@njit(cache=True)
+def _add_parameters(normal: Array, right: Array, design: Array, residual: Array, weight: float) -> None:
+    for q in range(len(right)):
+        for r in range(2):
+            scaled = weight * design[r, q]
+            right[q] += scaled * residual[r]
+            for s in range(len(right)):
+                normal[q, s] += scaled * design[r, s]
+
+
+@njit(cache=True)
+def _subtract_pair(normal: Array, through: Array, across: Array, order: int, two_rows: bool) -> None:
+    """What two rows of a point take from the block of their images, which lie `order` apart."""
+    for q in range(len(through)):
+        for s in range(len(through)):
+            part = 0.0
+            for c in range(3):
+                part += through[q, c] * across[s, c]
+            if order >= 0:
+                normal[q, s] -= part
+            if order < 0 or (order == 0 and two_rows):
+                normal[s, q] -= part
+
+
+@njit(cache=True)
+def moved_points(equations: Equations, points: Points, change: Array) -> Array:
+    """Steps (p, 3) of the points, metres, for steps (n, k) of the parameters."""
+    right = points.right.copy()
+    for i in range(len(equations.point)):
+        w = equations.weight[i]
+        if w == 0.0:
+            continue
+        for r in range(2):
+            moved = 0.0
+            for q in range(change.shape[1]):
+                moved += equations.by_parameters[i, r, q] * change[equations.block[i], q]
+            for c in range(3):
+                right[equations.point[i], c] -= w * equations.by_ground[i, r, c] * moved
+    step = np.empty_like(right)
+    for p in range(len(right)):
+        step[p] = points.inverse[p] @ right[p]
+    return step
+
+
+@njit(cache=True)
+def shared_covariance(
+    equations: Equations, points: Points, covariance: Array, move: Array
+) -> tuple[Array, Array]:
+    """What points take over from the parameters.
+
+    Args:
+        equations: at the solution.
+        points: eliminated from them.
+        covariance: (n k, n k) of the parameters.
+        move: (n k, 3) change of the parameters when their group moves by a metre east, north, up.
+
+    Returns:
+        (p, 3, 3) what the covariance adds to that of every point, and (p, 3, 3) how far every point goes
+        when its group moves: nearly the unit matrix.
+    """
+    k = equations.by_parameters.shape[2]
+    added, carried = np.zeros_like(points.inverse), np.zeros_like(points.inverse)
+    by_block = np.zeros((len(equations.point), 3, k))
+    first = 0
+    for i in range(len(equations.point)):
+        if equations.point[i] != equations.point[first]:
+            first = i
+        w, p = equations.weight[i], equations.point[i]
+        if w == 0.0:
+            continue
+        by_block[i] = points.inverse[p] @ (equations.by_ground[i].T @ equations.by_parameters[i]) * w
+        a = equations.block[i] * k
+        carried[p] += by_block[i] @ move[a : a + k]
+        for j in range(first, i + 1):
+            if equations.weight[j] == 0.0:
+                continue
+            b = equations.block[j] * k
+            part = by_block[i] @ np.ascontiguousarray(covariance[a : a + k, b : b + k]) @ by_block[j].T
+            added[p] += part
+            if j < i:
+                added[p] += part.T
+    return added, carried

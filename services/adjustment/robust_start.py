@@ -1,0 +1,84 @@
+"""The robust solution of a block, of which a third of the observations may be wrong."""
+
+import numpy as np
+
+from services.adjustment.block_problem import BlockProblem
+from services.adjustment.block_scale import check_scale, low_scale, magnitude, robust_scale
+from services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
+from services.adjustment.control_check import robust_control
+from services.adjustment.normal_equations import robust_points
+from services.adjustment.parameters import BlockPriors
+from services.errors import NotEnoughPoints
+from services.types import Array, BoolArray
+
+_NEARLY_PX = 0.02
+"""Change of the parameters at which least squares take over."""
+
+
+def robust_start(
+    problem: BlockProblem, priors: BlockPriors
+) -> tuple[State, float, BoolArray, BoolArray]:
+    """The robust solution: state, scale of the observations, observations and control that agree.
+
+    The scale of the Cauchy weights falls from what the images may be off to the smallest residuals, by
+    half in every step, so that wrong observations lose their weight before images settle on them.
+
+    Raises:
+        NotEnoughPoints: too few points can be intersected.
+        NoConsensus: the residuals are too large for the sigmas of the observations.
+        NoConvergence: the parameters still change after the last iteration.
+    """
+    point, n = problem.observations.point, len(problem.images)
+    state = State(np.zeros((problem.n_blocks, problem.size)), problem.start())
+    scale, change_px = _falling_scale(problem), np.inf
+    falling = scale
+    while True:
+        equations = problem.equations(state.values, state.lon_lat_h)
+        step_m, weight = robust_points(equations, n, problem.n_points, max(scale, falling))
+        _check_points(problem, step_m)
+        equations, state = moved(equations, state, step_m)
+        square = problem.image_rows((equations.residual**2).sum(axis=1))
+        square = np.where(np.isfinite(step_m[point, 0]), square, np.nan)
+        scale = low_scale(square, point)
+        weight = problem.image_rows(weight * (equations.weight > 0)) / max(scale, falling) ** 2
+        control_weight, near = robust_control(problem, equations, weight)
+        if change_px <= _NEARLY_PX and falling <= scale:
+            break
+        if state.iterations == problem.options.max_iterations:
+            raise unsettled(problem, change_px, state)
+        equations = equations._replace(weight=problem.weights(weight, control_weight))
+        solved = step(problem, priors, checked_gauge(problem, equations, refuse=False), state, equations)
+        state, change_px = solved.state, solved.change_px
+        falling *= 0.5
+    scale = robust_scale(square, point)
+    check_scale(scale)
+    tolerance = problem.options.tolerance * scale
+    active = active_observations(problem, square, square <= tolerance**2, tolerance, near)
+    return state, scale, active, near
+
+
+def _falling_scale(problem: BlockProblem) -> float:
+    """What images may be off, in units of the sigmas of the observations."""
+    sigmas = np.concatenate([image.sigma[image.locating] for image in problem.images])
+    observed_px = problem.observations.sigma_px
+    return float(np.sqrt(np.mean(sigmas**2)) / np.median(observed_px)) if len(observed_px) else 1.0
+
+
+def _check_points(problem: BlockProblem, step_m: Array) -> None:
+    intersected = int(np.isfinite(step_m[:, 0]).sum())
+    if intersected < problem.options.min_points:
+        raise NotEnoughPoints(
+            intersected, problem.options.min_points, f"tie points between {len(problem.images)} images"
+        )
+
+
+def active_observations(
+    problem: BlockProblem, square: Array, active: BoolArray, tolerance: float, control_active: BoolArray
+) -> BoolArray:
+    """Observations (m,) within a tolerance, of points with two such rays, or one and known ground."""
+    point = problem.observations.point
+    size = magnitude(square, point, active)
+    within = np.nan_to_num(size, nan=np.inf) <= tolerance
+    rays = np.bincount(point[within], minlength=problem.n_points)
+    rays[problem.control.point[control_active]] += 1
+    return np.asarray(within & (rays[point] >= 2))
