@@ -101,6 +101,7 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size)
     state, scale, active, control_active = robust_start(problem, priors)
+    _check_control(control, control_active)
     slope_factor = 1.0
     for _ in range(_ROUNDS):
         weight = problem.weights(active / max(scale, _LEAST_SCALE) ** 2, control_active)

@@ -12,6 +12,9 @@ from services.types import Array, BoolArray, IntArray
 _AGREES = 0.9999
 """Probability with which a control point as good as stated stays."""
 
+_NEAR = 2.0
+"""Least squares begin with control points up to so many times that far; those that agree stay."""
+
 
 def robust_control(
     problem: BlockProblem, equations: Equations, weight: Array
@@ -39,8 +42,8 @@ def robust_control(
     freedom = problem.control.known_coordinates()
     size = np.sqrt(square / freedom)
     scale = max(1.0, float(np.median(size)))
-    near = square <= chi2.ppf(_AGREES, freedom) * scale**2
-    return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2), near
+    near = square <= chi2.ppf(_AGREES, freedom) * _NEAR**2
+    return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2, near
 
 
 def agreeing_control(

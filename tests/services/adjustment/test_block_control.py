@@ -1,0 +1,90 @@
+"""Known ground places a block as precisely as its frame is known, and wrong points leave by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.block_coverage import Case, draw
+from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.control_ground import ControlGround
+from services.errors import NoConsensus
+from services.geodesy import move_metres
+from services.types import UNKNOWN_FRAME, Array, Frame
+from tests.services.ties import difference_m
+
+point_sigma_m = 0.3
+frame_sigma_m = 0.8
+count = 12
+trials = 12
+CASE = Case("ring", 0.3, 0.0)
+FRAME = Frame.from_sigmas(frame_sigma_m, frame_sigma_m)
+
+
+def known_ground(truth: Array, rng: np.random.Generator, wrong: int = 0) -> ControlGround:
+    """Points with their own errors and one of their frame; the first `wrong` are 15 m off besides."""
+    error_m = rng.normal(0.0, point_sigma_m, (count, 3)) + rng.normal(0.0, frame_sigma_m, 3)
+    error_m[:wrong] += rng.choice([-15.0, 15.0], (wrong, 3))
+    return ControlGround(
+        point=np.arange(count, dtype=np.int64),
+        lon_lat_h=move_metres(truth[:count], error_m),
+        covariance_m2=np.tile(np.eye(3) * point_sigma_m**2, (count, 1, 1)),
+        source=np.zeros(count, dtype=np.int64),
+        frames=(FRAME,),
+        names=tuple(f"P{k + 1}" for k in range(count)),
+    )
+
+
+def frame_error_m(block: BlockAdjustment, truth: Array) -> Array:
+    return np.asarray(np.nanmedian(difference_m(block.lon_lat_h, truth[: len(block.lon_lat_h)]), axis=0))
+
+
+def test_the_frame_is_that_of_the_control_and_covers_the_truth() -> None:
+    normalised = []
+    for trial in range(trials):
+        rng = np.random.default_rng([3, trial])
+        truth, images, observations = draw(CASE, rng)
+        block = adjust_block(images, observations, control=known_ground(truth, rng, wrong=2))
+        assert not block.control_active[:2].any()
+        assert block.control_active[2:].all()
+        covariance = block.frames[0].covariance_m2
+        # Images of 3 m help a little; 0.3 m of ten points add a little.
+        assert (np.sqrt(np.diagonal(covariance)) < 1.15 * frame_sigma_m).all()
+        error_m = frame_error_m(block, truth)
+        normalised.append(error_m @ np.linalg.solve(covariance, error_m) / 3.0)
+    assert 0.4 < np.mean(normalised) < 1.8
+
+
+def test_known_planimetry_places_the_position_alone() -> None:
+    rng = np.random.default_rng(4)
+    truth, images, observations = draw(CASE, rng)
+    control = known_ground(truth, rng)
+    flat = control.covariance_m2.copy()
+    flat[:, 2, 2] = np.inf
+    free = adjust_block(images, observations)
+    placed = adjust_block(images, observations, control=replace(control, covariance_m2=flat))
+    assert placed.frames[0].sigma_m < 0.75 * free.frames[0].sigma_m
+    assert placed.frames[0].sigma_up_m > 0.6 * free.frames[0].sigma_up_m
+    assert np.isnan(placed.control_misfit_m[:, 2]).all()
+
+
+def test_control_whose_frame_is_unknown_does_not_place_the_block() -> None:
+    rng = np.random.default_rng(5)
+    truth, images, observations = draw(CASE, rng)
+    control = replace(known_ground(truth, rng), frames=(UNKNOWN_FRAME,))
+    free, shaped = (
+        adjust_block(images, observations),
+        adjust_block(images, observations, control=control),
+    )
+    np.testing.assert_allclose(
+        shaped.frames[0].covariance_m2, free.frames[0].covariance_m2, rtol=0.05, atol=0.05
+    )
+
+
+def test_control_that_mostly_disagrees_is_refused_by_name() -> None:
+    rng = np.random.default_rng(6)
+    truth, images, observations = draw(CASE, rng)
+    control = known_ground(truth, rng)
+    scattered = move_metres(control.lon_lat_h, rng.uniform(-40.0, 40.0, (count, 3)))
+    with pytest.raises(NoConsensus, match=r"of 12 control points disagree .*P\d"):
+        adjust_block(images, observations, control=replace(control, lon_lat_h=scattered))
