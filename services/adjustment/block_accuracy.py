@@ -1,6 +1,7 @@
 """What an adjusted block knows: its frame on the Earth, and its points relative to that frame."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,38 +15,49 @@ from services.adjustment.parameters import (
     shift_rows,
 )
 from services.adjustment.reduced_system import ReducedSystem
-from services.types import Array, BoolArray, Frame
+from services.types import Array, BoolArray, Frame, IntArray
 
 
-def block_frames(
-    system: ReducedSystem,
-    gauge: Gauge,
-    priors: BlockPriors,
-    images: Sequence[ImageParameters],
-    passes: Sequence[BoolArray],
-) -> tuple[tuple[Frame, ...], Array, Array]:
-    """The frames of the groups of a block on the Earth.
+@dataclass(frozen=True)
+class BlockAccuracy:
+    """The covariance of a block in two independent parts: that of its frames, and the rest.
+
+    The doubt about the frame may be a hundred thousand times that of the points in it, as squares ten
+    digits: the parts are computed apart, as no difference of the two would leave anything.
+
+    Attributes:
+        frame_m2: (3 g, 3 g) of the translations of the groups, without the doubt about passes.
+        move: (n k, 3 g) change of all parameters, the frames of control included, when the images of a
+            group move by a metre.
+        relative: (n k, n k) of the parameters, for exact frames.
+    """
+
+    frame_m2: Array
+    move: Array
+    relative: Array
+
+    def covariance(self) -> Array:
+        """Of the parameters (n k, n k), with the doubt about the frame."""
+        return np.asarray(self.relative + self.move @ self.frame_m2 @ self.move.T)
+
+    def variance(self) -> Array:
+        """Its diagonal (n k,)."""
+        of_frame = ((self.move @ self.frame_m2) * self.move).sum(axis=1)
+        return np.asarray(np.diagonal(self.relative) + of_frame)
+
+
+def block_accuracy(system: ReducedSystem, gauge: Gauge, of_images: int) -> BlockAccuracy:
+    """The accuracy of a solution.
 
     The frame is the translation t that fits the errors of the images' parameters best, with D the effect
     of a translation on them and M the inverse of their covariance: F = (D^T M D)^-1. It is the most
-    precise of all means of the block, hence independent of how points lie relative to it.
-
-    Images of one pass share orbit, attitude and clock, to an extent that nobody states: shared errors
-    weaken the position and strengthen the height. With the covariance F0 for images that share nothing
-    and F1 for images that share all, the frame is F0 + (F1 - F0)+, which covers both.
+    precise of all means of the block, hence independent of what is left: M^-1 = D F D^T + R.
 
     Args:
         system: normal equations at the solution.
         gauge: translations of the groups.
-        priors: of the parameters.
-        images: with their own priors.
-        passes: masks (n,) of images that may share errors.
-
-    Returns:
-        The frames; the covariances (g, 3, 3) without the doubt about passes; the change (n k, 3 g) of
-        all parameters, the frames of control included, when the images of a group move by a metre.
+        of_images: number of parameters of images; those of the frames of control are behind.
     """
-    of_images = len(images) * priors.size
     move = gauge.move.copy()
     move[of_images:] = 0.0
     if len(gauge.move) > of_images:
@@ -54,34 +66,68 @@ def block_frames(
         corner[of_images:] = np.eye(len(move) - of_images)
         own = system.times(corner)[of_images:]
         move[of_images:] = -np.linalg.solve(own, system.times(move)[of_images:])
-    together = np.linalg.inv(move.T @ system.times(move))
-    gain = together @ (priors.locating @ move).T
-    doubted = together.copy()
+    weight = system.times(move)
+    frame_m2 = np.linalg.inv(move.T @ weight)
+    # M + (a - 1) M D F D^T M has the inverse R + D F D^T / a: taking off a small F loses nothing.
+    stiffer = max(1.0, float(np.trace(frame_m2)) / len(frame_m2) / _LITTLE_M**2)
+    root = np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(frame_m2)
+    relative = system.inverse(root) - move @ (frame_m2 / stiffer) @ move.T
+    return BlockAccuracy(np.asarray(frame_m2), move, np.asarray(relative))
+
+
+_LITTLE_M = 0.1
+"""Standard deviation of a frame that is taken off without loss."""
+
+
+def earth_frames(
+    accuracy: BlockAccuracy,
+    priors: BlockPriors,
+    images: Sequence[ImageParameters],
+    passes: Sequence[BoolArray],
+) -> tuple[Frame, ...]:
+    """The frames of the groups of a block on the Earth.
+
+    Images of one pass share orbit, attitude and clock, to an extent that nobody states: shared errors
+    weaken the position and strengthen the height. With the covariance F0 for images that share nothing
+    and F1 for images that share all, the frame is F0 + (F1 - F0)+, which covers both.
+
+    Args:
+        accuracy: of the block.
+        priors: of the parameters.
+        images: with their own priors.
+        passes: masks (n,) of images that may share errors.
+    """
+    gain = accuracy.frame_m2 @ (priors.locating @ accuracy.move).T
+    doubted = accuracy.frame_m2.copy()
     for members in passes:
         rows = shift_rows(images, members, priors.size)
         weighted = gain[:, rows]
         none, half, full = (sharing_covariance(images, members, s) for s in (0.0, PASS_SHARE, 1.0))
         doubted += weighted @ (none - half) @ weighted.T
         doubted += positive_part(weighted @ (full - none) @ weighted.T)
-    own_blocks = [np.s_[3 * g : 3 * g + 3] for g in range(len(together) // 3)]
-    frames = tuple(Frame((doubted[b, b] + doubted[b, b].T) / 2.0) for b in own_blocks)
-    return frames, np.stack([together[b, b] for b in own_blocks]), move
+    return tuple(Frame((own + own.T) / 2.0) for own in _of_groups(doubted))
+
+
+def _of_groups(covariance: Array) -> list[Array]:
+    """Diagonal blocks (3, 3)."""
+    return [covariance[i : i + 3, i : i + 3] for i in range(0, len(covariance), 3)]
 
 
 def point_covariances(
-    equations: Equations, points: Points, covariance: Array, move: Array, frame_m2: Array
+    equations: Equations, points: Points, accuracy: BlockAccuracy, group: IntArray
 ) -> Array:
-    """Covariance (p, 3, 3) of the points relative to the frames of their groups (p, 3, 3).
+    """Covariance (p, 3, 3) of the points relative to the frames of their groups (p,).
 
-    Their own part is that of their rays. The other is taken over from the images, less the frame: with
-    the covariance A of what a point takes over and how far T it goes when its group moves by a metre,
-    A - T F - F T^T + F.
+    Their own part is that of their rays. The other is what they take over from the images: with how far
+    T a point goes when its group moves by a metre, nearly the unit matrix, the frame F adds
+    (T - I) F (T - I)^T.
     """
     # Each image belongs to one group.
-    of_group = move.reshape(len(move), -1, 3).sum(axis=1)
-    added, carried = shared_covariance(equations, points, covariance, of_group)
-    with_frame = carried @ frame_m2
-    return np.asarray(points.inverse + added - with_frame - with_frame.transpose(0, 2, 1) + frame_m2)
+    of_group = accuracy.move.reshape(len(accuracy.move), -1, 3).sum(axis=1)
+    added, carried = shared_covariance(equations, points, accuracy.relative, of_group)
+    turned = carried - np.eye(3)
+    frame_m2 = np.stack(_of_groups(accuracy.frame_m2))[group]
+    return np.asarray(points.inverse + added + turned @ frame_m2 @ turned.transpose(0, 2, 1))
 
 
 def positive_part(matrix: Array) -> Array:

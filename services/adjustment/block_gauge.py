@@ -1,5 +1,6 @@
-"""What tie points leave open: the place of every connected group of images, left to the priors alone."""
+"""What tie points leave open: place and linear shape of connected images, left to the priors alone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,8 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from services.adjustment.normal_equations import Equations
-from services.types import Array, IntArray
+from services.geodesy import continuous
+from services.types import Array, BoolArray, IntArray
 
 MIN_COMMON = 3
 """Number of points in common that ties two images: as many as a translation has coordinates."""
@@ -16,16 +18,18 @@ MIN_COMMON = 3
 
 @dataclass(frozen=True)
 class Gauge:
-    """The translations of the groups of a block.
+    """What the observations of a block do not tell, as changes of its parameters.
 
     Attributes:
         group: (n,) int64, of every block of parameters; -1 for those without an observation.
         move: (n k, 3 g) change of the parameters when a group moves by a metre east, north, up.
-        basis: (n k, r) orthonormal, of the same space.
+        moves: (n k, t) orthonormal, of the same space.
+        basis: (n k, r) orthonormal, of that space and of the linear deformations of groups.
     """
 
     group: IntArray
     move: Array
+    moves: Array
     basis: Array
 
 
@@ -59,14 +63,41 @@ def _common_points(point: IntArray, block: IntArray, n_blocks: int) -> IntArray:
     return common
 
 
-def block_gauge(equations: Equations, group: IntArray) -> Gauge:
-    """The effect of a translation of each group on its parameters.
+def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deformable: BoolArray) -> Gauge:
+    """The effect of translations and linear deformations of each group on its parameters.
 
     Tie points do not determine the position of a block. Its images see it under slightly different
     angles from edge to edge, though, and a distortion of 0.1 px would pass for a translation by metres:
-    what observations seem to tell of a translation is not used.
+    what observations seem to tell of a translation is not used. The same holds for a ground that is
+    sheared, stretched or tilted as a whole, where the images may drift and skew: all of them would
+    together, and only relief, seen under different angles, shows it.
+
+    Args:
+        equations: the observations.
+        group: (n,) of every block of parameters.
+        lon_lat_h: (p, 3) the points.
+        deformable: (n,) blocks of parameters that follow linear deformations. A group does when all of
+            its members do: known ground tells how it is deformed.
     """
-    k, n = equations.by_parameters.shape[2], len(group)
+    n, groups = len(group), int(group.max()) + 1
+    used = equations.weight > 0.0
+    east_north = continuous(lon_lat_h[equations.point[used], :2])
+    east_north -= east_north.mean(axis=0)
+    place = np.zeros((len(used), 2))
+    place[used] = east_north / (2.0 * east_north.std(axis=0) + 1e-12)
+    east, north = place.T[:, :, None, None]
+    ground = equations.by_ground
+    move, *linear = (_fitted(equations, n, part) for part in (ground, ground * east, ground * north))
+    of_groups = np.stack([group == g for g in range(groups)])
+    bends = [members for members in of_groups if deformable[members].all()]
+    columns = _by_group(move, of_groups)
+    bent = [_by_group(mode, bends) for mode in linear]
+    return Gauge(group, columns, _orthonormal(columns), _orthonormal(np.hstack([columns, *bent])))
+
+
+def _fitted(equations: Equations, n: int, displaced: Array) -> Array:
+    """Change (n, k, 3) of the parameters that explains displacements (m, 2, 3) of observations best."""
+    k = equations.by_parameters.shape[2]
     normal, right = np.zeros((n, k, k)), np.zeros((n, k, 3))
     weighted = equations.by_parameters * equations.weight[:, None, None]
     for q in range(k):
@@ -74,14 +105,19 @@ def block_gauge(equations: Equations, group: IntArray) -> Gauge:
             product = (weighted[:, :, q] * equations.by_parameters[:, :, s]).sum(axis=1)
             normal[:, q, s] = np.bincount(equations.block, product, n)
         for c in range(3):
-            product = (weighted[:, :, q] * equations.by_ground[:, :, c]).sum(axis=1)
+            product = (weighted[:, :, q] * displaced[:, :, c]).sum(axis=1)
             right[:, q, c] = np.bincount(equations.block, product, n)
     ridge = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None, None] * 1e-9
-    move = np.linalg.solve(normal + ridge * np.eye(k), right).reshape(n * k, 3)
-    groups = int(group.max()) + 1
-    columns = np.zeros((n * k, 3 * groups))
-    for g in range(groups):
-        rows = np.repeat(group == g, k)
-        columns[rows, 3 * g : 3 * g + 3] = move[rows]
+    return np.asarray(np.linalg.solve(normal + ridge * np.eye(k), right))
+
+
+def _by_group(change: Array, members: Sequence[BoolArray] | BoolArray) -> Array:
+    """Columns (n k, 3 g) of changes (n, k, 3), three for each group."""
+    n, k, _ = change.shape
+    parts = [np.where(own[:, None, None], change, 0.0).reshape(n * k, 3) for own in members]
+    return np.hstack([np.zeros((n * k, 0)), *parts])
+
+
+def _orthonormal(columns: Array) -> Array:
     u, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return Gauge(group, columns, u[:, values > 1e-9 * values[0]])
+    return np.asarray(u[:, values > 1e-9 * values[0]])

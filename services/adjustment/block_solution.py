@@ -57,8 +57,7 @@ def step(
     slot, n_slots = problem.slots
     values, right = reduced(equations, points, slot, n_slots)
     system = reduced_system(values, slot, priors, gauge)
-    at = state.values.ravel()
-    right_side = system.projected(right.ravel() - priors.shape * at) - priors.locating @ at
+    right_side = system.right_side(right.ravel(), state.values.ravel())
     change = system.solve(right_side).reshape(state.values.shape)
     step_m = np.clip(np.nan_to_num(moved_points(equations, points, change)), -_FARTHEST_M, _FARTHEST_M)
     state = State(state.values + change, move_metres(state.lon_lat_h, step_m), state.iterations + 1)
@@ -88,8 +87,10 @@ def moved(equations: Equations, state: State, step_m: Array) -> tuple[Equations,
     return equations._replace(residual=equations.residual - moved), state
 
 
-def checked_gauge(problem: BlockProblem, equations: Equations, refuse: bool = True) -> Gauge:
-    """The translations of the groups; refuses groups that nothing holds together."""
+def checked_gauge(
+    problem: BlockProblem, equations: Equations, lon_lat_h: Array, refuse: bool = True
+) -> Gauge:
+    """The gauge of the groups; refuses groups that nothing holds together."""
     n = len(problem.images)
     group = connected_groups(equations, n, problem.n_blocks)
     known = [np.isfinite(frame.covariance_m2).any() for frame in problem.control.frames]
@@ -104,7 +105,9 @@ def checked_gauge(problem: BlockProblem, equations: Equations, refuse: bool = Tr
             f"the images fall into {number} groups without {MIN_COMMON} tie points between them: "
             f"{' | '.join(names)}. Make a block of each, or give control points to each"
         )
-    return block_gauge(equations, group)
+    deformable = np.zeros(problem.n_blocks, dtype=np.bool_)
+    deformable[:n] = [image.free.all() for image in problem.images]
+    return block_gauge(equations, group, lon_lat_h, deformable)
 
 
 def unsettled(problem: BlockProblem, change_px: float, state: State) -> NoConvergence:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.block_accuracy import block_frames, point_covariances
+from services.adjustment.block_accuracy import block_accuracy, earth_frames, point_covariances
 from services.adjustment.block_problem import BlockOptions, BlockProblem
 from services.adjustment.block_scale import check_scale, posterior_scale
 from services.adjustment.block_solution import checked_gauge, least_squares
@@ -105,12 +105,13 @@ def adjust_block(
     slope_factor = 1.0
     for _ in range(_ROUNDS):
         weight = problem.weights(active / max(scale, _LEAST_SCALE) ** 2, control_active)
-        gauge = checked_gauge(problem, problem.equations(state.values, state.lon_lat_h, weight))
+        equations = problem.equations(state.values, state.lon_lat_h, weight)
+        gauge = checked_gauge(problem, equations, state.lon_lat_h)
         solved = least_squares(problem, priors, gauge, state, weight)
-        state, covariance = solved.state, solved.system.inverse()
+        state, accuracy = solved.state, block_accuracy(solved.system, gauge, len(images) * priors.size)
         used, previous = active, (scale, slope_factor)
         square = problem.squares(state.values, state.lon_lat_h)
-        determined = _determined(priors, covariance)
+        determined = _determined(priors, accuracy.variance())
         computed = used & np.isfinite(square)
         scale = posterior_scale(square[computed], observations.point[computed], float(determined.sum()))
         check_scale(scale)
@@ -118,19 +119,18 @@ def adjust_block(
         active = active_observations(problem, square, used, options.tolerance * scale, control_active)
         used_control, control_active = (
             control_active,
-            agreeing_control(problem, solved.equations, solved.points, covariance, control_active),
+            agreeing_control(
+                problem, solved.equations, solved.points, accuracy.covariance(), control_active
+            ),
         )
         settled = np.array_equal(active, used) and np.array_equal(control_active, used_control)
         if settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED):
             break
         priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
     _check_control(control, used_control)
-    frames, frame_m2, move = block_frames(solved.system, gauge, priors, images, passes)
     of_points = np.full(n_points, -1)
     of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]
-    relative_m2 = point_covariances(
-        solved.equations, solved.points, covariance, move, frame_m2[of_points]
-    )
+    relative_m2 = point_covariances(solved.equations, solved.points, accuracy, of_points)
     intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
     residual = problem.equations(state.values, state.lon_lat_h).residual
     misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)
@@ -141,12 +141,12 @@ def adjust_block(
             for image, found in zip(images, state.values[:n_images], strict=True)
         ),
         values=state.values[:n_images],
-        covariance=covariance[: n_images * priors.size, : n_images * priors.size],
+        covariance=accuracy.covariance()[: n_images * priors.size, : n_images * priors.size],
         slope_factor=slope_factor,
         lon_lat_h=np.where(intersected[:, None], state.lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
         group=gauge.group[:n_images],
-        frames=frames,
+        frames=earth_frames(accuracy, priors, images, passes),
         residual_px=problem.image_rows(residual) * observations.sigma_px[:, None],
         active=used & intersected[observations.point],
         control_active=used_control,
@@ -156,9 +156,9 @@ def adjust_block(
     )
 
 
-def _determined(priors: BlockPriors, covariance: Array) -> Array:
+def _determined(priors: BlockPriors, variance: Array) -> Array:
     """Share (K,) of every parameter that observations determine, the rest being its prior."""
-    return np.clip(1.0 - np.diagonal(covariance) * (priors.locating.diagonal() + priors.shape), 0.0, 1.0)
+    return np.clip(1.0 - variance * (priors.locating.diagonal() + priors.shape), 0.0, 1.0)
 
 
 def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far: float) -> float:

@@ -47,7 +47,8 @@ def robust_start(
         if state.iterations == problem.options.max_iterations:
             raise unsettled(problem, change_px, state)
         equations = equations._replace(weight=problem.weights(weight, control_weight))
-        solved = step(problem, priors, checked_gauge(problem, equations, refuse=False), state, equations)
+        gauge = checked_gauge(problem, equations, state.lon_lat_h, refuse=False)
+        solved = step(problem, priors, gauge, state, equations)
         state, change_px = solved.state, solved.change_px
         falling *= 0.5
     scale = robust_scale(square, point)

@@ -166,6 +166,32 @@ def test_points_are_as_good_as_they_say_but_for_the_frame(trials: list[Trial]) -
     assert np.mean(square > 4.0) < 0.01
 
 
+def test_points_in_a_vague_frame_have_a_covariance_that_rounding_does_not_spoil() -> None:
+    pair = ring_of_geometries(2)
+    ties = make_ties(pair, np.random.default_rng(5), 300, NOISE_PX, 0.0).observations
+    turned = replace(ties, image=1 - ties.image)
+    order = np.lexsort((turned.image, turned.point))
+    one = adjusted(pair, ties, np.full(2, 1000.0))
+    other = adjusted(pair[::-1], turned.take(order), np.full(2, 1000.0))
+    assert one.frames[0].sigma_up_m > 1000.0
+    found = np.isfinite(one.lon_lat_h[:, 0])
+    assert (np.linalg.eigvalsh(one.point_covariance_m2[found]) > 0.0).all()
+    np.testing.assert_allclose(
+        one.point_covariance_m2[found], other.point_covariance_m2[found], rtol=1e-3, atol=1e-4
+    )
+
+
+def test_a_few_large_residuals_do_not_make_the_precision_of_all(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(6)
+    ties = make_ties(five, rng, 300, NOISE_PX, 0.0)
+    clean = adjusted(five, ties.observations)
+    # One of twenty is out by what the tolerance lets pass.
+    some = rng.random(len(ties.observations)) < 0.05
+    off_px = np.where(some[:, None], rng.choice([-2.5, 2.5], (len(some), 2)) * NOISE_PX, 0.0)
+    longer = replace(ties.observations, line_sample=ties.observations.line_sample + off_px)
+    assert adjusted(five, longer).sigma_px < 1.15 * clean.sigma_px
+
+
 def test_without_blunders_points_are_exactly_as_good_as_they_say(five: list[ViewGeometry]) -> None:
     trial = tried(five, 100, blunders=0.0)
     error_m, covariance = point_errors(trial)
