@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.adjustment.block_gauge import Gauge
-from services.adjustment.normal_equations import Equations, Points, shared_covariance
+from services.adjustment.normal_equations import Equations, Pairs, Points, shared_covariance
 from services.adjustment.parameters import (
     PASS_SHARE,
     BlockPriors,
@@ -29,24 +29,33 @@ class BlockAccuracy:
         frame_m2: (3 g, 3 g) of the translations of the groups, without the doubt about passes.
         move: (n k, 3 g) change of all parameters, the frames of control included, when the images of a
             group move by a metre.
-        relative: (n k, n k) of the parameters, for exact frames.
+        pairs: of images (and frames) that have a point in common.
+        relative: (s, k, k) of the parameters of pairs, for exact frames.
     """
 
     frame_m2: Array
     move: Array
+    pairs: Pairs
     relative: Array
 
     def covariance(self) -> Array:
-        """Of the parameters (n k, n k), with the doubt about the frame."""
-        return np.asarray(self.relative + self.move @ self.frame_m2 @ self.move.T)
+        """Of the parameters of pairs (s, k, k), with the doubt about the frame."""
+        return np.asarray(self.relative + _of_pairs(self.pairs, self.move, self.frame_m2))
 
     def variance(self) -> Array:
-        """Its diagonal (n k,)."""
-        of_frame = ((self.move @ self.frame_m2) * self.move).sum(axis=1)
-        return np.asarray(np.diagonal(self.relative) + of_frame)
+        """Of the parameters (n k,), with the doubt about the frame."""
+        own = np.diagonal(self.relative[self.pairs.start[:-1]], 0, 1, 2).ravel()
+        return np.asarray(own + ((self.move @ self.frame_m2) * self.move).sum(axis=1))
 
 
-def block_accuracy(system: ReducedSystem, gauge: Gauge, of_images: int) -> BlockAccuracy:
+def _of_pairs(pairs: Pairs, move: Array, frame_m2: Array) -> Array:
+    """Blocks (s, k, k) of what frames add to the covariance of the parameters."""
+    by_block = move.reshape(len(pairs.start) - 1, -1, len(frame_m2))
+    first = np.repeat(np.arange(len(by_block)), np.diff(pairs.start))
+    return np.asarray((by_block @ frame_m2)[first] @ by_block[pairs.other].transpose(0, 2, 1))
+
+
+def block_accuracy(system: ReducedSystem, pairs: Pairs, gauge: Gauge, of_images: int) -> BlockAccuracy:
     """The accuracy of a solution.
 
     The frame is the translation t that fits the errors of the images' parameters best, with D the effect
@@ -55,6 +64,7 @@ def block_accuracy(system: ReducedSystem, gauge: Gauge, of_images: int) -> Block
 
     Args:
         system: normal equations at the solution.
+        pairs: of images (and frames) that have a point in common.
         gauge: translations of the groups.
         of_images: number of parameters of images; those of the frames of control are behind.
     """
@@ -67,12 +77,12 @@ def block_accuracy(system: ReducedSystem, gauge: Gauge, of_images: int) -> Block
         own = system.times(corner)[of_images:]
         move[of_images:] = -np.linalg.solve(own, system.times(move)[of_images:])
     weight = system.times(move)
-    frame_m2 = np.linalg.inv(move.T @ weight)
+    frame_m2 = np.asarray(np.linalg.inv(move.T @ weight), dtype=np.float64)
     # M + (a - 1) M D F D^T M has the inverse R + D F D^T / a: taking off a small F loses nothing.
     stiffer = max(1.0, float(np.trace(frame_m2)) / len(frame_m2) / _LITTLE_M**2)
     root = np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(frame_m2)
-    relative = system.inverse(root) - move @ (frame_m2 / stiffer) @ move.T
-    return BlockAccuracy(np.asarray(frame_m2), move, np.asarray(relative))
+    relative = system.inverse(pairs, root) - _of_pairs(pairs, move, frame_m2 / stiffer)
+    return BlockAccuracy(frame_m2, move, pairs, relative)
 
 
 _LITTLE_M = 0.1
@@ -124,7 +134,7 @@ def point_covariances(
     """
     # Each image belongs to one group.
     of_group = accuracy.move.reshape(len(accuracy.move), -1, 3).sum(axis=1)
-    added, carried = shared_covariance(equations, points, accuracy.relative, of_group)
+    added, carried = shared_covariance(equations, points, accuracy.pairs, accuracy.relative, of_group)
     turned = carried - np.eye(3)
     frame_m2 = np.stack(_of_groups(accuracy.frame_m2))[group]
     return np.asarray(points.inverse + added + turned @ frame_m2 @ turned.transpose(0, 2, 1))

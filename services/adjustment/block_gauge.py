@@ -8,7 +8,7 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from services.adjustment.normal_equations import Equations
+from services.adjustment.normal_equations import Equations, common_pairs
 from services.geodesy import continuous
 from services.types import Array, BoolArray, IntArray
 
@@ -36,31 +36,17 @@ class Gauge:
 def connected_groups(equations: Equations, n_images: int, n_blocks: int) -> IntArray:
     """Group (n,) of images and frames of control that points tie together; -1 for the unseen."""
     used = equations.weight > 0.0
-    common = _common_points(equations.point[used], equations.block[used], n_blocks)
-    tied = common >= MIN_COMMON
-    tied[n_images:] = tied[:, n_images:] = False
-    tied[:n_images, n_images:] = common[:n_images, n_images:] > 0
-    count, label = connected_components(sparse.csr_matrix(tied), directed=False)
-    seen = np.diagonal(common) > 0
+    keys, common = common_pairs(equations.point[used], equations.block[used], n_blocks)
+    first, second = keys // n_blocks, keys % n_blocks
+    tied = np.where(second < n_images, common >= MIN_COMMON, first < n_images)
+    graph = sparse.coo_matrix((np.ones(tied.sum()), (first[tied], second[tied])), (n_blocks, n_blocks))
+    count, label = connected_components(graph, directed=False)
+    seen = np.bincount(equations.block[used], minlength=n_blocks) > 0
     number = np.full(count, -1)
     for i in np.flatnonzero(seen):
         if number[label[i]] < 0:
             number[label[i]] = number.max() + 1
     return np.where(seen, number[label], -1).astype(np.int64)
-
-
-@njit(cache=True)
-def _common_points(point: IntArray, block: IntArray, n_blocks: int) -> IntArray:
-    common = np.zeros((n_blocks, n_blocks), dtype=np.int64)
-    first = 0
-    for i in range(len(point)):
-        if point[i] != point[first]:
-            first = i
-        common[block[i], block[i]] += 1
-        for j in range(first, i):
-            if block[i] != block[j]:
-                common[min(block[i], block[j]), max(block[i], block[j])] += 1
-    return common
 
 
 def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deformable: BoolArray) -> Gauge:
@@ -85,9 +71,10 @@ def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deforma
     east_north -= east_north.mean(axis=0)
     place = np.zeros((len(used), 2))
     place[used] = east_north / (2.0 * east_north.std(axis=0) + 1e-12)
-    east, north = place.T[:, :, None, None]
-    ground = equations.by_ground
-    move, *linear = (_fitted(equations, n, part) for part in (ground, ground * east, ground * north))
+    normal, right = _sums(equations, place, n)
+    ridge = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None, None] * 1e-9
+    change = np.linalg.solve(normal + ridge * np.eye(normal.shape[1]), right)
+    move, *linear = np.split(change, 3, axis=2)
     of_groups = np.stack([group == g for g in range(groups)])
     bends = [members for members in of_groups if deformable[members].all()]
     columns = _by_group(move, of_groups)
@@ -95,20 +82,29 @@ def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deforma
     return Gauge(group, columns, _orthonormal(columns), _orthonormal(np.hstack([columns, *bent])))
 
 
-def _fitted(equations: Equations, n: int, displaced: Array) -> Array:
-    """Change (n, k, 3) of the parameters that explains displacements (m, 2, 3) of observations best."""
+@njit(cache=True)
+def _sums(equations: Equations, place: Array, n: int) -> tuple[Array, Array]:
+    """Normal matrices (n, k, k) and right sides (n, k, 9) of the parameters that follow the ground best.
+
+    It moves by a metre east, north and up; then by so much times each coordinate of the place (m, 2).
+    """
     k = equations.by_parameters.shape[2]
-    normal, right = np.zeros((n, k, k)), np.zeros((n, k, 3))
-    weighted = equations.by_parameters * equations.weight[:, None, None]
-    for q in range(k):
-        for s in range(k):
-            product = (weighted[:, :, q] * equations.by_parameters[:, :, s]).sum(axis=1)
-            normal[:, q, s] = np.bincount(equations.block, product, n)
-        for c in range(3):
-            product = (weighted[:, :, q] * displaced[:, :, c]).sum(axis=1)
-            right[:, q, c] = np.bincount(equations.block, product, n)
-    ridge = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None, None] * 1e-9
-    return np.asarray(np.linalg.solve(normal + ridge * np.eye(k), right))
+    normal, right = np.zeros((n, k, k)), np.zeros((n, k, 9))
+    for i in range(len(equations.point)):
+        w, b = equations.weight[i], equations.block[i]
+        if w == 0.0:
+            continue
+        for r in range(2):
+            for q in range(k):
+                scaled = w * equations.by_parameters[i, r, q]
+                for s in range(k):
+                    normal[b, q, s] += scaled * equations.by_parameters[i, r, s]
+                for c in range(3):
+                    moved = scaled * equations.by_ground[i, r, c]
+                    right[b, q, c] += moved
+                    right[b, q, 3 + c] += moved * place[i, 0]
+                    right[b, q, 6 + c] += moved * place[i, 1]
+    return normal, right
 
 
 def _by_group(change: Array, members: Sequence[BoolArray] | BoolArray) -> Array:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from services.adjustment.control_ground import ControlGround
-from services.adjustment.normal_equations import Equations, seen_together
+from services.adjustment.normal_equations import Equations, Pairs, seen_pairs
 from services.adjustment.parameters import ImageParameters
 from services.geodesy import metres_per_degree_at, wrapped_degrees
 from services.types import Array, BoolArray, IntArray, Observations
@@ -88,12 +88,9 @@ class BlockProblem:
         return np.split(order, ends[:-1])
 
     @cached_property
-    def slots(self) -> tuple[IntArray, int]:
-        """Number (n, n) of every pair of blocks that have a point in common, -1 for others; how many."""
-        together = seen_together(self.point, self.block, self.n_blocks)
-        slot = np.full(together.shape, -1, dtype=np.int64)
-        slot[together] = np.arange(together.sum())
-        return slot, int(together.sum())
+    def pairs(self) -> Pairs:
+        """The blocks of parameters that have a point in common."""
+        return seen_pairs(self.point, self.block, self.n_blocks)
 
     def start(self) -> Array:
         """Points (p, 3) on the first ray of each, at the middle height of its model, or where known."""

@@ -54,9 +54,8 @@ def step(
 ) -> Solved:
     """One Gauss-Newton step with the points eliminated."""
     points = eliminated(equations, problem.n_points)
-    slot, n_slots = problem.slots
-    values, right = reduced(equations, points, slot, n_slots)
-    system = reduced_system(values, slot, priors, gauge)
+    values, right = reduced(equations, points, problem.pairs)
+    system = reduced_system(values, problem.pairs, priors, gauge)
     right_side = system.right_side(right.ravel(), state.values.ravel())
     change = system.solve(right_side).reshape(state.values.shape)
     step_m = np.clip(np.nan_to_num(moved_points(equations, points, change)), -_FARTHEST_M, _FARTHEST_M)

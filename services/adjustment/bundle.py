@@ -5,7 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.block_accuracy import block_accuracy, earth_frames, point_covariances
+from services.adjustment.block_accuracy import (
+    BlockAccuracy,
+    block_accuracy,
+    earth_frames,
+    point_covariances,
+)
 from services.adjustment.block_problem import BlockOptions, BlockProblem
 from services.adjustment.block_scale import check_scale, posterior_scale
 from services.adjustment.block_solution import checked_gauge, least_squares
@@ -25,7 +30,7 @@ class BlockAdjustment:
     Attributes:
         models: the images' models with their corrections.
         values: (n, k) parameters of the images; 0 where an image has fewer.
-        covariance: (n k, n k) of the parameters, image after image, with the doubt about the frame.
+        accuracy: covariance of the parameters, with and without the doubt about the frame.
         slope_factor: standard deviation of drifts and skews over what was stated, by the residuals.
         lon_lat_h: (p, 3) the points; NaN where they cannot be intersected.
         point_covariance_m2: (p, 3, 3) east, north, up, relative to the frame of the point's group: with
@@ -43,7 +48,7 @@ class BlockAdjustment:
 
     models: tuple[CorrectedModel, ...]
     values: Array
-    covariance: Array
+    accuracy: BlockAccuracy
     slope_factor: float
     lon_lat_h: Array
     point_covariance_m2: Array
@@ -108,7 +113,8 @@ def adjust_block(
         equations = problem.equations(state.values, state.lon_lat_h, weight)
         gauge = checked_gauge(problem, equations, state.lon_lat_h)
         solved = least_squares(problem, priors, gauge, state, weight)
-        state, accuracy = solved.state, block_accuracy(solved.system, gauge, len(images) * priors.size)
+        state = solved.state
+        accuracy = block_accuracy(solved.system, problem.pairs, gauge, len(images) * priors.size)
         used, previous = active, (scale, slope_factor)
         square = problem.squares(state.values, state.lon_lat_h)
         determined = _determined(priors, accuracy.variance())
@@ -119,9 +125,7 @@ def adjust_block(
         active = active_observations(problem, square, used, options.tolerance * scale, control_active)
         used_control, control_active = (
             control_active,
-            agreeing_control(
-                problem, solved.equations, solved.points, accuracy.covariance(), control_active
-            ),
+            agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
         )
         settled = np.array_equal(active, used) and np.array_equal(control_active, used_control)
         if settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED):
@@ -141,7 +145,7 @@ def adjust_block(
             for image, found in zip(images, state.values[:n_images], strict=True)
         ),
         values=state.values[:n_images],
-        covariance=accuracy.covariance()[: n_images * priors.size, : n_images * priors.size],
+        accuracy=accuracy,
         slope_factor=slope_factor,
         lon_lat_h=np.where(intersected[:, None], state.lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),

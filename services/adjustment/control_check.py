@@ -4,8 +4,9 @@ import numpy as np
 from numba import njit
 from scipy.stats import chi2
 
+from services.adjustment.block_accuracy import BlockAccuracy
 from services.adjustment.block_problem import BlockProblem
-from services.adjustment.normal_equations import Equations, Points, eliminated
+from services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
 from services.adjustment.robust import CAUCHY_TUNING
 from services.types import Array, BoolArray, IntArray
 
@@ -47,7 +48,11 @@ def robust_control(
 
 
 def agreeing_control(
-    problem: BlockProblem, equations: Equations, points: Points, covariance: Array, active: BoolArray
+    problem: BlockProblem,
+    equations: Equations,
+    points: Points,
+    accuracy: BlockAccuracy,
+    active: BoolArray,
 ) -> BoolArray:
     """The control points (c,) that agree, after the worst has left or the best has come back.
 
@@ -58,13 +63,14 @@ def agreeing_control(
         problem: the block.
         equations: at the solution.
         points: eliminated from them.
-        covariance: of the parameters.
+        accuracy: of the parameters.
         active: (c,) that took part in the solution.
     """
     if not len(problem.control):
         return active
-    first = problem.place[len(problem.observations) :: 2]
-    predicted = _predicted_covariance(equations, points, covariance, problem.control.point, first)
+    covariance = accuracy.covariance()
+    point = problem.control.point
+    predicted = _predicted_covariance(equations, points, problem.pairs, covariance, point)
     halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
     residual = problem.control_rows(equations.residual).reshape(-1, 4)
     freedom = problem.control.known_coordinates()
@@ -92,20 +98,15 @@ def agreeing_control(
 
 @njit(cache=True)
 def _predicted_covariance(
-    equations: Equations, points: Points, covariance: Array, point: IntArray, rows: IntArray
+    equations: Equations, points: Points, pairs: Pairs, covariance: Array, point: IntArray
 ) -> Array:
     """Covariance (c, 3, 3) of the computed ground of control points with the errors of their frames."""
     k = equations.by_parameters.shape[2]
     out = np.empty((len(point), 3, 3))
     for c in range(len(point)):
         p = point[c]
-        # Rows of the point are together.
-        first = rows[c]
-        while first > 0 and equations.point[first - 1] == p:
-            first -= 1
-        last = rows[c]
-        while last < len(equations.point) and equations.point[last] == p:
-            last += 1
+        first = np.searchsorted(equations.point, p)
+        last = np.searchsorted(equations.point, p, side="right")
         by_block = np.zeros((last - first + 1, 3, k))
         block = np.empty(last - first + 1, dtype=np.int64)
         for i in range(first, last):
@@ -114,14 +115,17 @@ def _predicted_covariance(
             if w > 0.0:
                 cross = equations.by_ground[i].T @ equations.by_parameters[i]
                 by_block[i - first] = -w * (points.inverse[p] @ cross)
-        block[last - first] = equations.block[rows[c]]
+        # The rows of known ground are the last ones of their point.
+        block[last - first] = equations.block[last - 1]
         for a in range(3):
             by_block[last - first, a, a] = 1.0
         total = points.inverse[p].copy()
         for i in range(len(block)):
             for j in range(len(block)):
-                a, b = block[i] * k, block[j] * k
-                part = np.ascontiguousarray(covariance[a : a + k, b : b + k])
-                total += by_block[i] @ part @ by_block[j].T
+                of_pair = covariance[pair_row(pairs, block[i], block[j])]
+                if block[i] <= block[j]:
+                    total += by_block[i] @ of_pair @ by_block[j].T
+                else:
+                    total += by_block[i] @ of_pair.T @ by_block[j].T
         out[c] = total
     return out

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from services.adjustment.robust import CAUCHY_TUNING
-from services.types import Array, BoolArray, IntArray
+from services.types import Array, IntArray
 
 _SINGULAR = 1e-13
 _PARALLEL = 1e-8
@@ -179,34 +179,73 @@ def eliminated(equations: Equations, n_points: int) -> Points:
     return Points(own, right)
 
 
+class Pairs(NamedTuple):
+    """The pairs of blocks of parameters that have a point in common, and every block with itself.
+
+    Attributes:
+        start: (n + 1,) rows of `other` where the pairs of every block begin.
+        other: (s,) the second block of each pair, ascending, not smaller than the first.
+    """
+
+    start: IntArray
+    other: IntArray
+
+
+def seen_pairs(point: IntArray, block: IntArray, n_blocks: int) -> Pairs:
+    """The pairs of a list of observations."""
+    alone = np.arange(n_blocks) * (n_blocks + 1)
+    keys = np.unique(np.concatenate([alone, common_pairs(point, block, n_blocks)[0]]))
+    start = np.searchsorted(keys, np.arange(n_blocks + 1) * n_blocks)
+    return Pairs(start.astype(np.int64), keys % n_blocks)
+
+
+def common_pairs(point: IntArray, block: IntArray, n_blocks: int) -> tuple[IntArray, IntArray]:
+    """Keys (s,), first times n plus second, of pairs of rows of one point, and how many (s,) of each."""
+    if not len(point):
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    keys, counts = np.unique(_pair_keys(point, block, n_blocks), return_counts=True)
+    return keys, counts.astype(np.int64)
+
+
 @njit(cache=True)
-def seen_together(point: IntArray, block: IntArray, n_blocks: int) -> BoolArray:
-    """Which blocks of parameters (n, n), the smaller first, have a point in common."""
-    together = np.zeros((n_blocks, n_blocks), dtype=np.bool_)
-    for a in range(n_blocks):
-        together[a, a] = True
-    first = 0
+def _pair_keys(point: IntArray, block: IntArray, n_blocks: int) -> IntArray:
+    count, first = 0, 0
     for i in range(len(point)):
         if point[i] != point[first]:
             first = i
-        for j in range(first, i):
-            together[min(block[i], block[j]), max(block[i], block[j])] = True
-    return together
+        count += i - first + 1
+    keys = np.empty(count, dtype=np.int64)
+    at, first = 0, 0
+    for i in range(len(point)):
+        if point[i] != point[first]:
+            first = i
+        for j in range(first, i + 1):
+            keys[at] = min(block[i], block[j]) * n_blocks + max(block[i], block[j])
+            at += 1
+    return keys
 
 
 @njit(cache=True)
-def reduced(equations: Equations, points: Points, slot: IntArray, n_slots: int) -> tuple[Array, Array]:
-    """Normal matrix in blocks (s, k, k) and right side (n, k) of the parameters, points eliminated.
+def pair_row(pairs: Pairs, a: int, b: int) -> int:
+    """Row of the pair of two blocks."""
+    if a > b:
+        a, b = b, a
+    low, high = pairs.start[a], pairs.start[a + 1]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if pairs.other[middle] <= b:
+            low = middle
+        else:
+            high = middle
+    return int(low)
 
-    Args:
-        equations: the observations.
-        points: eliminated from them.
-        slot: (n, n) number of the block of every pair of images, the smaller first; -1 for none.
-        n_slots: number of pairs.
-    """
+
+@njit(cache=True)
+def reduced(equations: Equations, points: Points, pairs: Pairs) -> tuple[Array, Array]:
+    """Normal matrix (s, k, k) of pairs and right side (n, k) of the parameters, points eliminated."""
     k = equations.by_parameters.shape[2]
-    values = np.zeros((n_slots, k, k))
-    right = np.zeros((slot.shape[0], k))
+    values = np.zeros((len(pairs.other), k, k))
+    right = np.zeros((len(pairs.start) - 1, k))
     across, through = np.empty((len(equations.point), k, 3)), np.empty((k, 3))
     first = 0
     for i in range(len(equations.point)):
@@ -216,7 +255,7 @@ def reduced(equations: Equations, points: Points, slot: IntArray, n_slots: int) 
         if w == 0.0 or np.isnan(points.inverse[p, 0, 0]):
             continue
         design = equations.by_parameters[i]
-        _add_parameters(values[slot[a, a]], right[a], design, equations.residual[i], w)
+        _add_parameters(values[pair_row(pairs, a, a)], right[a], design, equations.residual[i], w)
         for q in range(k):
             for c in range(3):
                 of_ground = equations.by_ground[i]
@@ -227,7 +266,7 @@ def reduced(equations: Equations, points: Points, slot: IntArray, n_slots: int) 
         for j in range(first, i + 1):
             if equations.weight[j] > 0.0:
                 b = equations.block[j]
-                _subtract_pair(values[slot[min(a, b), max(a, b)]], through, across[j], b - a, j < i)
+                _subtract_pair(values[pair_row(pairs, a, b)], through, across[j], b - a, j < i)
     return values, right
 
 
@@ -277,14 +316,15 @@ def moved_points(equations: Equations, points: Points, change: Array) -> Array:
 
 @njit(cache=True)
 def shared_covariance(
-    equations: Equations, points: Points, covariance: Array, move: Array
+    equations: Equations, points: Points, pairs: Pairs, covariance: Array, move: Array
 ) -> tuple[Array, Array]:
     """What points take over from the parameters.
 
     Args:
         equations: at the solution.
         points: eliminated from them.
-        covariance: (n k, n k) of the parameters.
+        pairs: of blocks that have a point in common.
+        covariance: (s, k, k) of their parameters.
         move: (n k, 3) change of the parameters when their group moves by a metre east, north, up.
 
     Returns:
@@ -307,8 +347,12 @@ def shared_covariance(
         for j in range(first, i + 1):
             if equations.weight[j] == 0.0:
                 continue
-            b = equations.block[j] * k
-            part = by_block[i] @ np.ascontiguousarray(covariance[a : a + k, b : b + k]) @ by_block[j].T
+            b = equations.block[j]
+            of_pair = covariance[pair_row(pairs, equations.block[i], b)]
+            if equations.block[i] <= b:
+                part = by_block[i] @ of_pair @ by_block[j].T
+            else:
+                part = by_block[i] @ of_pair.T @ by_block[j].T
             added[p] += part
             if j < i:
                 added[p] += part.T

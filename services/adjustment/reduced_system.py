@@ -6,11 +6,13 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, lapack
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from services.adjustment.block_gauge import Gauge
+from services.adjustment.normal_equations import Pairs
 from services.adjustment.parameters import BlockPriors
-from services.types import Array, IntArray
+from services.adjustment.selected_inverse import selected_inverse
+from services.types import Array
 
 DENSE_ROWS = 2000
 """Largest matrix that is solved densely."""
@@ -67,48 +69,61 @@ class ReducedSystem:
         left, right = self._removed
         return np.asarray(self._whole @ columns - left @ (right.T @ columns))
 
-    def solve(self, right: Array) -> Array:
-        """The solution (K,)."""
-        if len(right) <= DENSE_ROWS:
-            return np.asarray(cho_solve(cho_factor(self.dense()), right))
-        factor = splu(
+    @cached_property
+    def _factor(self) -> SuperLU:
+        return splu(
             self._whole,
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )
+
+    def solve(self, right: Array) -> Array:
+        """The solution (K,)."""
+        if len(right) <= DENSE_ROWS:
+            return np.asarray(cho_solve(cho_factor(self.dense()), right))
         # Woodbury for the few columns of the gauge.
         left, other = self._removed
-        solved = factor.solve(np.column_stack([right, left]))
+        solved = self._factor.solve(np.column_stack([right, left]))
         inner = np.eye(left.shape[1]) - other.T @ solved[:, 1:]
         return np.asarray(solved[:, 0] + solved[:, 1:] @ np.linalg.solve(inner, other.T @ solved[:, 0]))
 
-    def inverse(self, root: Array) -> Array:
-        """The inverse (K, K), dense, of the matrix and the squares of columns (K, c) together."""
-        factor, failed = lapack.dpotrf((self.dense() + root @ root.T).T, lower=1, overwrite_a=1)
-        inverse, failed_too = lapack.dpotri(factor, lower=1, overwrite_c=1)
-        if failed or failed_too:
-            raise np.linalg.LinAlgError(
-                "the reduced normal matrix of the block is not positive definite"
-            )
-        lower = np.tril(inverse, -1)
-        inverse = np.tril(inverse)
-        inverse += lower.T
-        return np.asarray(inverse)
+    def inverse(self, pairs: Pairs, root: Array) -> Array:
+        """Blocks (s, k, k) of the inverse of the matrix and the squares of columns (K, c) together."""
+        k, first = self.priors.size, np.repeat(np.arange(len(pairs.start) - 1), np.diff(pairs.start))
+        if len(root) <= DENSE_ROWS:
+            inverse = _dense_inverse(self.dense() + root @ root.T).reshape(len(root) // k, k, -1, k)
+            return np.asarray(inverse[first, :, pairs.other])
+        left, other = (np.hstack(part) for part in zip(self._removed, (-root, root), strict=True))
+        solved, other_solved = self._factor.solve(left), self._factor.solve(other)
+        inner = np.linalg.inv(np.eye(left.shape[1]) - other.T @ solved)
+        blocks = selected_inverse(self._factor, pairs, k)
+        one, two = (
+            (solved @ inner).reshape(-1, k, left.shape[1]),
+            other_solved.reshape(-1, k, left.shape[1]),
+        )
+        return np.asarray(blocks + one[first] @ two[pairs.other].transpose(0, 2, 1))
 
 
-def reduced_system(values: Array, slot: IntArray, priors: BlockPriors, gauge: Gauge) -> ReducedSystem:
+def _dense_inverse(matrix: Array) -> Array:
+    factor, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)
+    inverse, failed_too = lapack.dpotri(factor, lower=1, overwrite_c=1)
+    if failed or failed_too:
+        raise np.linalg.LinAlgError("the reduced normal matrix of the block is not positive definite")
+    return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
+
+
+def reduced_system(values: Array, pairs: Pairs, priors: BlockPriors, gauge: Gauge) -> ReducedSystem:
     """The system of blocks (s, k, k) of the normal matrix.
 
     Args:
         values: of every pair of images.
-        slot: (n, n) rows of `values`, the smaller image first; -1 where two have nothing in common.
+        pairs: rows of `values`.
         priors: of the parameters.
         gauge: of the block.
     """
-    first, second = np.nonzero(slot >= 0)
-    n, k = len(slot), priors.size
-    ordered = values[slot[first, second]]
+    n, k = len(pairs.start) - 1, priors.size
+    first, second, ordered = np.repeat(np.arange(n), np.diff(pairs.start)), pairs.other, values
     apart = first != second
     rows = np.concatenate([first, second[apart]])
     columns = np.concatenate([second, first[apart]])

@@ -65,7 +65,7 @@ def test_points_differ_from_the_truth_by_one_translation(
 def test_adjusted_models_agree_like_the_true_models(made: Production, true_points: Intersection) -> None:
     # The rays of the true sensors through the positions of the adjusted models intersect as well, but
     # for drifts that 50 points tell as precisely as stated: two of them over the image in each position.
-    stated_px = np.sqrt(np.diagonal(made.adjustment.covariance)).reshape(-1, 2, 3)[:, :, 1:]
+    stated_px = np.sqrt(made.adjustment.accuracy.variance()).reshape(-1, 2, 3)[:, :, 1:]
     assert stated_px.max() < a_tenth_of_a_pixel / 2.0
     assert np.abs(true_points.residual_px).max() < a_tenth_of_a_pixel
     rms_px = np.sqrt((true_points.residual_px**2).mean())
