@@ -8,7 +8,7 @@ READY := .venv/ready
 PAGE := app/web/built/index.html
 # Tests of services wait for them: half as many processes again as there are cores.
 WORKERS := $(shell expr $$(nproc) \* 3 / 2)
-LONG := continent faults image_selection load stress throughput
+LONG := continent faults image_selection load stress throughput block_adjustment
 
 .PHONY: demo test test-fast test-security test-endurance check docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 

@@ -1,0 +1,242 @@
+"""The block adjustment beside Ceres and scipy, and how it grows with the number of images.
+
+* Ceres (pyceres, the extra `peers`): the same least squares, images and points, from the same start. Its
+  residuals are called in Python, so that its own C++ part, the linear solver, is told apart.
+* scipy `least_squares` with its robust losses: a ring of five images, 30 % of the observations wrong.
+* growth: passes side by side, each size in a process of its own, CPU time and peak memory; powers of the
+  number of images fitted from 500 on project 10,000 and 75,000 images.
+
+Run: python -m benchmarks.block_adjustment [--images 100] [--sizes 125,250,500,1000,2000]
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy import sparse
+from scipy.optimize import least_squares as scipy_least_squares
+
+from benchmarks._large_block import large_block
+from benchmarks._measuring import keep, memory_mib
+from benchmarks.block_coverage import Case, draw
+from services.adjustment.block_gauge import Gauge
+from services.adjustment.block_problem import BlockOptions, BlockProblem
+from services.adjustment.block_solution import State, least_squares
+from services.adjustment.bundle import adjust_block
+from services.adjustment.control_ground import NO_CONTROL
+from services.adjustment.normal_equations import Equations
+from services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
+from services.geodesy import metres_per_degree, move_metres
+from services.types import Array, Observations
+
+PER_IMAGE = 300
+LOSSES = ("soft_l1", "cauchy")
+LARGE = (10_000, 75_000)
+console = Console()
+
+
+def main() -> None:
+    """Print the tables and keep their figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--images", type=int, default=100, help="beside Ceres (%(default)s)")
+    parser.add_argument("--sizes", default="125,250,500,1000,2000", help="images (%(default)s)")
+    parser.add_argument(
+        "--one", type=int, help="adjust one block of so many images and print its figures"
+    )
+    parser.add_argument("--per-image", type=int, default=PER_IMAGE, help="points (%(default)s)")
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(grown(arguments.one, arguments.per_image)))
+        return
+    outcome = {
+        "ceres": beside_ceres(arguments.images),
+        "scipy": [beside_scipy(blunders) for blunders in (0.0, 0.3)],
+        "growth": growth([int(size) for size in arguments.sizes.split(",")], arguments.per_image),
+    }
+    keep("block_adjustment", outcome)
+
+
+def plain_problem(
+    images: list[ImageParameters], observations: Observations, n_points: int
+) -> tuple[BlockProblem, BlockPriors, State]:
+    """Least squares of all observations and priors, without control, and where they begin."""
+    priors = block_priors(images, [])
+    options = BlockOptions(converged_px=1e-6)
+    problem = BlockProblem(images, observations, NO_CONTROL, options, n_points, priors.size)
+    return problem, priors, State(np.zeros((len(images), priors.size)), problem.start())
+
+
+def cost(problem: BlockProblem, priors: BlockPriors, values: Array, lon_lat_h: Array) -> float:
+    """Half the sum of squares of residuals and parameters in units of their sigmas."""
+    weight = priors.shape + priors.locating.diagonal()
+    residual = problem.equations(values, lon_lat_h).residual
+    return float(0.5 * ((residual**2).sum() + (weight * values.ravel() ** 2).sum()))
+
+
+def beside_ceres(n_images: int) -> dict[str, Any]:
+    """Cost and time of both solvers on one problem."""
+    truth, images, observations, _ = large_block(n_images, PER_IMAGE, seed=1)
+    problem, priors, start = plain_problem(images, observations, len(truth))
+    # Ceres knows no gauge: here the observations tell all they seem to.
+    rows = len(start.values) * priors.size
+    free = Gauge(np.zeros(n_images, dtype=np.int64), *(np.zeros((rows, c)) for c in (3, 0, 0)))
+    weight = np.ones(len(observations))
+    least_squares(problem, priors, free, start, weight)
+    begun = time.process_time()
+    state = least_squares(problem, priors, free, start, weight).state
+    outcome: dict[str, Any] = {
+        "images": n_images,
+        "points": len(truth),
+        "observations": len(observations),
+        "cost": cost(problem, priors, state.values, state.lon_lat_h),
+        "cpu_s": time.process_time() - begun,
+        "iterations": state.iterations,
+    }
+    try:
+        from benchmarks._ceres import solved_by_ceres
+    except ImportError:
+        console.print("pyceres is not installed (pip install '.[peers]'): Ceres is left out")
+        return outcome
+    outcome["ceres"] = solved_by_ceres(problem, priors, start)
+    table = Table(title=f"{n_images} images, {len(truth):,} points, {len(observations):,} observations")
+    for name in ("", "cost", "CPU s", "of it linear solver", "iterations"):
+        table.add_column(name)
+    ceres = outcome["ceres"]
+    own = (f"{outcome['cost']:.4f}", f"{outcome['cpu_s']:.2f}", "", str(outcome["iterations"]))
+    table.add_row("Amers", *own)
+    solver = f"{ceres['linear_solver_s']:.2f}"
+    table.add_row(
+        "Ceres", f"{ceres['cost']:.4f}", f"{ceres['cpu_s']:.2f}", solver, str(ceres["iterations"])
+    )
+    console.print(table)
+    return outcome
+
+
+def beside_scipy(blunders: float) -> dict[str, Any]:
+    """Median error of the points, relative to the block, of both robust adjustments of a ring."""
+    truth, images, observations = draw(Case("ring", 0.3, blunders), np.random.default_rng(7))
+    outcome: dict[str, Any] = {"blunders": blunders, "observations": len(observations)}
+    adjust_block(images, observations)
+    begun = time.process_time()
+    found = adjust_block(images, observations).lon_lat_h
+    outcome["cpu_s"] = time.process_time() - begun
+    outcome["error_m"] = relative_error_m(found, truth)
+    console.print(f"ring, {blunders:.0%} wrong: Amers {in_words(outcome)}")
+    for loss in LOSSES:
+        begun = time.process_time()
+        found, message = by_scipy(images, observations, len(found), loss)
+        outcome[loss] = {
+            "cpu_s": time.process_time() - begun,
+            "error_m": relative_error_m(found, truth),
+            "message": message,
+        }
+        console.print(f"  scipy, {loss}: {in_words(outcome[loss])} ({message})")
+    return outcome
+
+
+def in_words(outcome: dict[str, Any]) -> str:
+    """Error and time."""
+    return f"{outcome['error_m']:.2f} m in {outcome['cpu_s']:.2f} s"
+
+
+def relative_error_m(found: Array, truth: Array) -> float:
+    """Median distance of points from the truth, but for a translation."""
+    east, north = metres_per_degree(float(truth[0, 1]), float(truth[0, 2]))
+    error_m = (found - truth[: len(found)]) * [east, north, 1.0]
+    return float(np.nanmedian(np.linalg.norm(error_m - np.nanmedian(error_m, axis=0), axis=1)))
+
+
+def by_scipy(
+    images: list[ImageParameters], observations: Observations, n_points: int, loss: str
+) -> tuple[Array, str]:
+    """The points (p, 3) of scipy's robust least squares with analytic sparse derivatives."""
+    problem, priors, start = plain_problem(images, observations, n_points)
+    seen = np.unique(observations.point)
+    n_values, weight = start.values.size, np.sqrt(priors.shape + priors.locating.diagonal())
+
+    def equations(x: Array) -> Equations:
+        moved = np.zeros((n_points, 3))
+        moved[seen] = x[n_values:].reshape(-1, 3)
+        values = x[:n_values].reshape(start.values.shape)
+        return problem.equations(values, move_metres(start.lon_lat_h, moved))
+
+    def residual(x: Array) -> Array:
+        return np.concatenate([equations(x).residual.ravel(), weight * x[:n_values]])
+
+    def derivative(x: Array) -> sparse.csr_matrix:
+        at = equations(x)
+        row = np.arange(2 * len(at.point)).reshape(-1, 2, 1)
+        k = at.by_parameters.shape[2]
+        of_images = (at.block * k)[:, None, None] + np.arange(k)
+        of_points = n_values + 3 * np.searchsorted(seen, at.point)[:, None, None] + np.arange(3)
+        parts = [
+            sparse.coo_matrix(
+                (-part.ravel(), [np.broadcast_to(a, part.shape).ravel() for a in (row, column)]),
+                (2 * len(at.point), len(x)),
+            )
+            for part, column in ((at.by_parameters, of_images), (at.by_ground, of_points))
+        ]
+        own = sparse.hstack([sparse.diags(weight), sparse.csr_matrix((n_values, 3 * len(seen)))])
+        return sparse.vstack([parts[0] + parts[1], own]).tocsr()
+
+    begin = np.zeros(n_values + 3 * len(seen))
+    found = scipy_least_squares(residual, begin, derivative, x_scale="jac", loss=loss, max_nfev=200)
+    moved = np.full((n_points, 3), np.nan)
+    moved[seen] = found.x[n_values:].reshape(-1, 3)
+    return move_metres(start.lon_lat_h, moved), str(found.message)
+
+
+def growth(sizes: list[int], per_image: int) -> dict[str, Any]:
+    """Figures of every size, and the powers that project them."""
+    table = Table(title="growth of the whole adjustment, robust start and covariances included")
+    for name in ("images", "points", "observations", "CPU s", "peak MiB", "iterations"):
+        table.add_column(name)
+    rows = []
+    for size in sizes:
+        command = [sys.executable, "-m", "benchmarks.block_adjustment", "--one", str(size)]
+        command += ["--per-image", str(per_image)]
+        rows.append(json.loads(subprocess.run(command, check=True, capture_output=True).stdout))
+        names = ("images", "points", "observations", "cpu_s", "peak_mib", "iterations")
+        table.add_row(*(f"{rows[-1][name]:,.0f}" for name in names))
+    console.print(table)
+    last = [row for row in rows if row["images"] >= 500] or rows
+    projected = {}
+    for name, taken in (("cpu_s", 0.0), ("peak_mib", float(last[0]["before_mib"]))):
+        images = np.log([row["images"] for row in last])
+        power, factor = np.polyfit(images, np.log([row[name] - taken for row in last]), 1)
+        projected[name] = {
+            "power": float(power),
+            **{str(n): float(taken + np.exp(factor + power * np.log(n))) for n in LARGE},
+        }
+    console.print(projected)
+    return {"measured": rows, "projected": projected}
+
+
+def grown(n_images: int, per_image: int) -> dict[str, float]:
+    """Figures of one block in a process of its own, with compiled code loaded before."""
+    _, *warm = large_block(400, 20, seed=0)
+    adjust_block(warm[0], warm[1], passes=warm[2])
+    _, images, observations, passes = large_block(n_images, per_image, seed=1, blunders=0.05)
+    before_mib = memory_mib("VmRSS")
+    begun = time.process_time()
+    block = adjust_block(images, observations, passes=passes)
+    return {
+        "images": n_images,
+        "points": int(np.isfinite(block.lon_lat_h[:, 0]).sum()),
+        "observations": len(observations),
+        "cpu_s": time.process_time() - begun,
+        "before_mib": before_mib,
+        "peak_mib": memory_mib("VmHWM"),
+        "iterations": block.iterations,
+        "scale": block.sigma_px,
+    }
+
+
+if __name__ == "__main__":
+    main()
