@@ -1,6 +1,6 @@
 """Points measured by chip matching in all the images that see them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,8 +17,6 @@ from services.types import (
     ChipArray,
     FloatImage,
     Observations,
-    Progress,
-    no_progress,
 )
 
 _CORE_PX = 51
@@ -47,85 +45,96 @@ class RefinementOptions:
     )
 
 
+@dataclass(frozen=True)
+class ChipMeasures:
+    """Points measured on chips.
+
+    Attributes:
+        observations: image positions of the points that two images or more measure; `point` is the row
+            of the point.
+        saliency: (n,) of the chips; 0 where fewer than two images show a whole one.
+    """
+
+    observations: Observations
+    saliency: Array
+
+
 def refine_on_chips(
     scenes: Sequence[Scene],
     lon_lat_h: Array,
     gsd_m: float,
     options: RefinementOptions = RefinementOptions(),
-    progress: Progress = no_progress,
-) -> Observations:
+) -> ChipMeasures:
     """Positions of points in every image that shows their whole chip, measured by chip matching.
 
-    The view closest to the vertical gives the chip, which is searched in the other images, rendered into
-    the geometry of the chip.
+    The view closest to the vertical that shows the point gives the chip, which is searched in the other
+    images, rendered into the geometry of the chip.
 
     Args:
         scenes: the images, with models that are consistent with each other to a few chip pixels.
         lon_lat_h: (n, 3) the points.
         gsd_m: ground sampling of the chips, metres.
         options: thresholds.
-        progress: receives the fraction of the points done.
-
-    Returns:
-        Image positions of the points that two images or more measure; `point` is the row of `lon_lat_h`.
     """
     whole = np.stack([chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for scene in scenes])
     by_incidence = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
     point, image, line_sample, sigma = [], [], [], []
+    saliency = np.zeros(len(lon_lat_h))
     for row, ground in enumerate(lon_lat_h):
-        if row % 64 == 0:
-            progress(row / len(lon_lat_h), f"measuring {len(lon_lat_h)} points on chips")
         seen_by = [int(i) for i in by_incidence if whole[i, row]]
-        measures = _measure_point(scenes, seen_by, ground, gsd_m, options)
-        if len(measures) < 2:
+        if len(seen_by) < 2:
             continue
-        for i, position, sigma_px in measures:
+        reference, chip = _reference_chip(scenes, seen_by, ground, gsd_m)
+        saliency[row] = chip_saliency(chip)
+        others = {i: scenes[i] for i in seen_by if i != reference}
+        measures = _measures(others, ground, chip, gsd_m, options)
+        if not measures:
+            continue
+        # The reference defines the detail: its position is as precise as the best of the others.
+        position = scenes[reference].model.project(ground[None, :])[0]
+        measures[reference] = position, min(sigma_px for _, sigma_px in measures.values())
+        for i, (position, sigma_px) in measures.items():
             point.append(row)
             image.append(i)
             line_sample.append(position)
-            sigma.append(sigma_px)
-    return Observations(
+            sigma.append(sigma_px * gsd_m / image_gsd_m(scenes[i].model, ground))
+    observations = Observations(
         np.array(point, dtype=np.int64),
         np.array(image, dtype=np.int64),
         np.array(line_sample).reshape(-1, 2),
         np.array(sigma),
     )
+    return ChipMeasures(observations, saliency)
 
 
-def _measure_point(
-    scenes: Sequence[Scene],
-    seen_by: list[int],
+def _reference_chip(
+    scenes: Sequence[Scene], seen_by: Sequence[int], ground: Array, gsd_m: float
+) -> tuple[int, FloatImage]:
+    """The first image that shows a point (3,) without clouds or gaps, or else the last; its chip."""
+    for i in seen_by:
+        chip = render_chip(scenes[i].image, scenes[i].model, ground, gsd_m)
+        if nearly_whole(chip):
+            break
+    return i, chip
+
+
+def _measures(
+    scenes: Mapping[int, Scene],
     ground: Array,
+    chip: FloatImage,
     gsd_m: float,
     options: RefinementOptions,
-) -> list[tuple[int, Array, float]]:
-    """Image, position (2,) and sigma, in pixels, of one point (3,) in the images that show its chip.
-
-    The first image of `seen_by` gives the chip. Its own position, the last one returned, is the
-    projection of the point.
-    """
-    if len(seen_by) < 2:
-        return []
-    first = scenes[seen_by[0]]
-    chip = render_chip(first.image, first.model, ground, gsd_m)
-    measures = []
-    best_sigma_px = np.inf
-    for i in seen_by[1:]:
-        scene = scenes[i]
+) -> dict[int, tuple[Array, float]]:
+    """Image position (2,) and sigma, chip pixels, of a point (3,) in the images that show its chip."""
+    found = {}
+    for i, scene in scenes.items():
         patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
         peak = find_chip(patch, chip, options.correlation)
-        if peak.reason != FOUND:
-            continue
-        displacement_m = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
-        position = scene.model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]
-        sigma_px = max(peak.sigma_px, options.min_sigma_px)
-        best_sigma_px = min(best_sigma_px, sigma_px)
-        measures.append((i, position, sigma_px * gsd_m / image_gsd_m(scene.model, ground)))
-    if measures:
-        # The first view defines the detail: its position is as precise as the best of the others.
-        scale = gsd_m / image_gsd_m(first.model, ground)
-        measures.append((seen_by[0], first.model.project(ground[None, :])[0], best_sigma_px * scale))
-    return measures
+        if peak.reason == FOUND:
+            displacement_m = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
+            position = scene.model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]
+            found[i] = position, max(peak.sigma_px, options.min_sigma_px)
+    return found
 
 
 def chip_inside(

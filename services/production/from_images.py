@@ -13,23 +13,14 @@ from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
 from services.geodesy import box_around, continuous, east_north_up
 from services.imagery.scene import Scene, scene_gsd_m
-from services.imagery.source import render_chip
-from services.matching.multi_image import (
-    RefinementOptions,
-    chip_inside,
-    chip_saliency,
-    refine_on_chips,
-)
+from services.matching.ground_features import FeatureOptions
+from services.matching.multi_image import RefinementOptions, chip_inside
 from services.matching.predict import rank_in_group
-from services.matching.tie_points import FeatureOptions, find_tie_points
+from services.production.ground_parts import CutPoints, cut_points, measure_points
 from services.production.image_passes import image_passes
-from services.production.point_views import (
-    check_image_names,
-    chips_of,
-    point_views,
-    shows_chip,
-    surface_heights,
-)
+from services.production.point_views import check_image_names, shows_chip
+from services.production.tie_points import find_tie_points
+from services.tasks import Work
 from services.types import (
     Array,
     BoolArray,
@@ -39,7 +30,6 @@ from services.types import (
     IntArray,
     Observations,
     Progress,
-    Views,
     no_progress,
     part_of,
 )
@@ -127,6 +117,7 @@ def produce_points(
     scenes: Sequence[Scene],
     options: ProductionOptions = ProductionOptions(),
     progress: Progress = no_progress,
+    work: Work | None = None,
 ) -> Production:
     """Control points with chips, produced from overlapping images alone.
 
@@ -138,40 +129,51 @@ def produce_points(
         scenes: two or more, with models as delivered.
         options: of the block.
         progress: receives the fraction done.
+        work: computes the tasks and keeps their results; by default in this process, in memory.
 
     Raises:
         InputError: fewer than two scenes, or two of the same name.
         NotEnoughPoints: the images have too little in common.
     """
     _check_scenes(scenes)
-    ties = find_tie_points(scenes, options.features, part_of(progress, 0.0, 0.5))
+    work = work or Work()
+    passes = image_passes([scene.acquisition for scene in scenes])
+    ties = find_tie_points(scenes, passes, options.features, work, part_of(progress, 0.0, 0.5))
     if len(ties) == 0:
         raise NotEnoughPoints(
             0, options.block.min_points, "tie points: the images have nothing in common"
         )
     progress(0.5, "adjusting the block")
-    tied = _adjust(scenes, ties, options)
+    tied = _adjust(scenes, passes, ties, options)
     before = intersect([scene.model for scene in scenes], ties, int(ties.point[-1]) + 1)
 
     candidates = _candidates(_with_models(scenes, tied), tied, ties, options)
-    measures = refine_on_chips(
+    measures, saliency = measure_points(
         _with_models(scenes, tied),
         candidates,
         options.fine_gsd_m,
         options.refinement,
-        part_of(progress, 0.5, 0.4),
+        work=work,
+        progress=part_of(progress, 0.5, 0.3),
     )
-    progress(0.9, "adjusting the block on its chips")
-    adjustment = _adjust(scenes, measures, options)
+    progress(0.8, "adjusting the block on its chips")
+    adjustment = _adjust(scenes, passes, measures, options)
     active = measures.take(adjustment.active)
     adjusted = _with_models(scenes, adjustment)
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
-    rows, saliency = _select_points(adjusted, adjustment, shown, options)
+    saliency = saliency[: len(adjustment.lon_lat_h)]
+    rows = _select_points(adjustment, saliency, shown, options)
     shown = shown.take(np.isin(shown.point, rows))
     shown = replace(shown, point=np.searchsorted(rows, shown.point))
-    views = point_views(adjusted, shown, adjustment.lon_lat_h[rows], options.gsds_m)
-    points = _control_points(adjustment, rows, saliency, views)
-    points = replace(points, surface=surface_heights(adjusted, points, options.fine_gsd_m))
+    cut = cut_points(
+        adjusted,
+        adjustment.lon_lat_h[rows],
+        shown,
+        options.gsds_m,
+        work=work,
+        progress=part_of(progress, 0.8, 0.2),
+    )
+    points = _control_points(adjustment, rows, saliency[rows], cut)
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
         before_px=_median_px(before.residual_px),
@@ -180,9 +182,7 @@ def produce_points(
         frame=adjustment.frames[0],
     )
     progress(1.0, f"{len(points)} points")
-
-    chips = chips_of(adjusted, points)
-    return Production(points, chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
+    return Production(points, cut.chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
@@ -192,7 +192,10 @@ def _check_scenes(scenes: Sequence[Scene]) -> None:
 
 
 def _adjust(
-    scenes: Sequence[Scene], observations: Observations, options: ProductionOptions
+    scenes: Sequence[Scene],
+    passes: Sequence[BoolArray],
+    observations: Observations,
+    options: ProductionOptions,
 ) -> BlockAdjustment:
     """The block adjustment of scenes with their models as delivered."""
     images = [
@@ -205,7 +208,6 @@ def _adjust(
         )
         for scene in scenes
     ]
-    passes = image_passes([scene.acquisition for scene in scenes])
     return adjust_block(images, observations, passes=passes, options=options.block)
 
 
@@ -221,7 +223,7 @@ def _median_px(residual: Array) -> float:
 def _candidates(
     scenes: Sequence[Scene], block: BlockAdjustment, ties: Observations, options: ProductionOptions
 ) -> Array:
-    """Ground positions (n, 3) of the tie points to try: the best of every square of ground."""
+    """Ground positions (n, 3) of the tie points to try, the best of every square, square by square."""
     active = ties.take(block.active)
     rays = np.bincount(active.point, minlength=len(block.lon_lat_h))
     residual = np.linalg.norm(block.residual_px[block.active], axis=1)
@@ -243,7 +245,8 @@ def _candidates(
         )
     square = _squares(block.lon_lat_h[rows], options)
     preference = n_whole - largest_residual[rows]
-    return block.lon_lat_h[rows[rank_in_group(square, preference) < options.candidates]]
+    best = rank_in_group(square, preference) < options.candidates
+    return block.lon_lat_h[rows[best][np.argsort(square[best], kind="stable")]]
 
 
 def _precise(sigma_m: Array, options: ProductionOptions) -> BoolArray:
@@ -265,34 +268,28 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
 
 
 def _select_points(
-    scenes: Sequence[Scene], points: BlockAdjustment, shown: Observations, options: ProductionOptions
-) -> tuple[IntArray, Array]:
-    """Row (n,), ascending, and saliency (n,) of the best point of every square of ground.
+    points: BlockAdjustment, saliency: Array, shown: Observations, options: ProductionOptions
+) -> IntArray:
+    """Row (n,), ascending, of the best point of every square of ground.
 
-    `shown` are the measures in images that show the whole fine chip: those that become views.
+    `saliency` is that of all points; `shown` are the measures in images that show the whole fine chip:
+    those that become views.
     """
     sigma_m = np.sqrt(np.diagonal(points.point_covariance_m2, 0, 1, 2))
     views = np.bincount(shown.point, minlength=len(points.lon_lat_h))
     usable = np.isfinite(points.lon_lat_h[:, 0]) & (views >= options.min_views)
+    usable &= saliency >= options.min_saliency
     rows = np.flatnonzero(usable & _precise(sigma_m, options))
-    saliency = np.zeros(len(rows))
-    for number, row in enumerate(rows):
-        scene = scenes[shown.image[shown.point == row][0]]
-        chip = render_chip(scene.image, scene.model, points.lon_lat_h[row], options.fine_gsd_m)
-        saliency[number] = chip_saliency(chip)
-    salient = saliency >= options.min_saliency
-    rows, saliency = rows[salient], saliency[salient]
     if len(rows) < options.block.min_points:
         raise NotEnoughPoints(
-            len(rows), options.block.min_points, f"salient points out of {len(views)} candidates"
+            len(rows), options.block.min_points, f"salient points out of {len(saliency)} candidates"
         )
     square = _squares(points.lon_lat_h[rows], options)
-    best = np.flatnonzero(rank_in_group(square, views[rows] + saliency) == 0)
-    return rows[best], saliency[best]
+    return rows[rank_in_group(square, views[rows] + saliency[rows]) == 0]
 
 
 def _control_points(
-    adjustment: BlockAdjustment, rows: IntArray, saliency: Array, views: Views
+    adjustment: BlockAdjustment, rows: IntArray, saliency: Array, cut: CutPoints
 ) -> ControlPoints:
     """The selected rows of an adjustment as control points of one chip file."""
     n = len(rows)
@@ -304,8 +301,9 @@ def _control_points(
         frames=adjustment.frames,
         saliency=saliency,
         health=np.ones(n),
-        views=views,
+        views=cut.views,
         chip_file=np.zeros(n, dtype=np.int64),
-        chip_row=views.start[:-1].copy(),
+        chip_row=cut.views.start[:-1].copy(),
         chip_files=("chips",),
+        surface=cut.surface,
     )

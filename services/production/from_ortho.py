@@ -189,7 +189,7 @@ def produce_ortho_points(
     views = replace(points.views, incidence_deg=vertical, azimuth_deg=vertical)
     return OrthoPoints(
         points=replace(points, views=views),
-        chips=chips_of(agreed.scenes, points),
+        chips=chips_of(agreed.scenes, points.lon_lat_h, points.views),
         gsds_m=(fine_m, coarse_m),
         outline=box_around(points.lon_lat_h),
         shift_m=agreed.shift_m,

@@ -151,7 +151,7 @@ def produce_known_points(
     progress(1.0, f"{len(points)} points")
     return KnownPoints(
         points=points,
-        chips=chips_of(agreed.scenes, points),
+        chips=chips_of(agreed.scenes, points.lon_lat_h, points.views),
         gsds_m=(fine_m, coarse_m),
         outline=box_around(points.lon_lat_h),
         scenes=agreed.scenes,

@@ -13,7 +13,6 @@ from services.types import (
     Array,
     BoolArray,
     ChipArray,
-    ControlPoints,
     Observations,
     SurfaceHeights,
     Views,
@@ -111,18 +110,19 @@ def views_at_levels(
     )
 
 
-def chips_of(scenes: Sequence[Scene], points: ControlPoints) -> Callable[[int], ChipArray]:
+def chips_of(scenes: Sequence[Scene], lon_lat_h: Array, views: Views) -> Callable[[int], ChipArray]:
     """From the row of a point to the chips of its views, (views, 101, 101), cut when asked for.
 
     Args:
         scenes: the images of the views, with the models that the points refer to.
-        points: with their views.
+        lon_lat_h: (n, 3) the points.
+        views: of the points.
     """
 
     def cut(row: int) -> ChipArray:
-        views = slice(points.views.start[row], points.views.start[row + 1])
-        of_views = zip(points.views.image[views], points.views.gsd_m[views], strict=True)
-        ground = points.lon_lat_h[row]
+        rows = slice(views.start[row], views.start[row + 1])
+        of_views = zip(views.image[rows], views.gsd_m[rows], strict=True)
+        ground = lon_lat_h[row]
         return np.stack(
             [
                 stored_chip(render_chip(scenes[i].image, scenes[i].model, ground, float(gsd_m)))
@@ -133,19 +133,21 @@ def chips_of(scenes: Sequence[Scene], points: ControlPoints) -> Callable[[int], 
     return cut
 
 
-def surface_heights(scenes: Sequence[Scene], points: ControlPoints, gsd_m: float) -> SurfaceHeights:
+def surface_heights(
+    scenes: Sequence[Scene], lon_lat_h: Array, views: Views, gsd_m: float
+) -> SurfaceHeights:
     """The surface at the centres of the fine chips, each in its steepest view.
 
     Args:
         scenes: the images of the views, with adjusted models.
-        points: with their views.
+        lon_lat_h: (n, 3) the points.
+        views: of the points.
         gsd_m: ground sampling of the fine chips, metres.
     """
-    views = points.views
-    above_m, sigma_m = np.full(len(points), np.nan), np.full(len(points), np.nan)
-    for row, ground in enumerate(points.lon_lat_h):
+    above_m, sigma_m = np.full(len(lon_lat_h), np.nan), np.full(len(lon_lat_h), np.nan)
+    for row, ground in enumerate(lon_lat_h):
         of_point = np.arange(*views.start[row : row + 2])
         of_point = of_point[views.gsd_m[of_point] == gsd_m]
         steepest_first = views.image[of_point[np.argsort(views.incidence_deg[of_point])]]
         above_m[row], sigma_m[row] = surface_height([scenes[i] for i in steepest_first], ground, gsd_m)
-    return SurfaceHeights(points.lon_lat_h[:, 2] + above_m, sigma_m)
+    return SurfaceHeights(lon_lat_h[:, 2] + above_m, sigma_m)

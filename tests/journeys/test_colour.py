@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.image_production import ProductionImages, run_production
+from app.usecases.production import BlockIdentity
 from services.formats.block.check import check_block
 from services.formats.block.reader import FolderChips
 from services.formats.images.scenes import read_scene
@@ -53,7 +54,7 @@ def block(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("colour") / "ventoux"
     images = [folder / "left_image.tif", folder / "right_image.tif"]
     options = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=1.0)
-    run_production(images, made, BlockIdentity("ventoux"), options)
+    run_production(ProductionImages(tuple(images)), made, BlockIdentity("ventoux"), options)
     return made
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from services.matching.tie_points import FeatureOptions
+from services.matching.ground_features import FeatureOptions
 from services.types import Array, FloatImage, Observations
 
 LARGEST_PX = 12.0

@@ -31,6 +31,11 @@ class MaskedImage:
         """Lines and samples."""
         return self.image.shape
 
+    def close(self) -> None:
+        """Close both files."""
+        self.image.close()
+        self.mask.close()
+
     def read(self, window: Window) -> FloatImage:
         """Pixels of a window; NaN beyond the image, where nodata, and under the mask."""
         pixels = self.image.read(window)

@@ -5,7 +5,7 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,10 @@ class RasterImage:
         """Close the file; it cannot be read afterwards."""
         self.dataset.close()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process the file is opened again."""
+        return _opened_again, (self.path.resolve(), self.mix, self.codes)
+
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
         if len(self.mix.bands) == 1:
             self._fill_band(out, self.band, window)
@@ -179,6 +183,10 @@ def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
             dataset.close()
             raise
     return image
+
+
+def _opened_again(path: Path, mix: BandMix, codes: PixelCodes) -> RasterImage:
+    return replace(open_raster(path, mix), codes=codes)
 
 
 def map_grid_of(image: RasterImage) -> MapGrid | None:

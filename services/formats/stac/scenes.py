@@ -1,0 +1,85 @@
+"""Scenes of STAC items: their image files, with what the items state of them."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import shapely
+
+from services.errors import FormatError
+from services.formats.images.scenes import read_scene
+from services.formats.stac.items import Json, parse_item
+from services.imagery.hidden import without_hidden_ground
+from services.imagery.scene import Scene
+
+_IMAGE_TYPES = ("image/tiff", "image/jp2", "application/vnd.nitf")
+_IMAGE_NAMES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf")
+
+
+def read_item_scene(
+    item: Any, source: str, hidden: shapely.Geometry | None = None, *, sigma_m: float | None = None
+) -> Scene:
+    """The scene of an item's image, without the ground that its masks hide.
+
+    Its name is that of the item; platform and time are the item's where it states them.
+
+    Args:
+        item: JSON of a STAC item, with absolute addresses.
+        source: where it stands, for messages.
+        hidden: polygons of clouds and the like; None hides nothing.
+        sigma_m: accuracy of the model, see `read_scene`.
+
+    Raises:
+        FormatError: the item has no image in a file, or the image cannot be used.
+    """
+    stated = parse_item(item, source)
+    name = stated.key[1]
+    path = image_path(item, f"{source}: item {name!r:.80}")
+    scene = without_hidden_ground(read_scene(path, sigma_m=sigma_m), hidden)
+    acquisition = replace(
+        scene.acquisition,
+        image_id=name,
+        sensor=stated.platform or scene.acquisition.sensor,
+        acquired_at=stated.acquired,
+        sun_elevation_deg=stated.sun_elevation_deg,
+        sun_azimuth_deg=stated.sun_azimuth_deg,
+    )
+    return replace(scene, acquisition=acquisition)
+
+
+def image_path(item: Json, source: str) -> Path:
+    """The image file of an item: the asset with the role data, or the only image.
+
+    Raises:
+        FormatError: there is none, there are several, or it is on another machine.
+    """
+    assets = item.get("assets")
+    images = {
+        name: asset
+        for name, asset in (assets.items() if isinstance(assets, dict) else ())
+        if isinstance(asset, dict) and _is_image(asset)
+    }
+    data = {name: asset for name, asset in images.items() if "data" in (asset.get("roles") or ())}
+    chosen = data or images
+    if len(chosen) != 1:
+        found = ", ".join(sorted(chosen)) or "none"
+        raise FormatError(
+            f"{source}: assets: {found} found as images, one GeoTIFF, JPEG 2000 or NITF expected; give "
+            'it the role "data"'
+        )
+    address = str(next(iter(chosen.values()))["href"])
+    parts = urlsplit(address)
+    if parts.scheme not in ("", "file") or parts.netloc:
+        raise FormatError(
+            f"{source}: {address:.200}: a file on this machine or in a shared folder expected"
+        )
+    return Path(unquote(parts.path) if parts.scheme else address)
+
+
+def _is_image(asset: Json) -> bool:
+    address = asset.get("href")
+    if not isinstance(address, str):
+        return False
+    kind = str(asset.get("type") or "").split(";")[0].strip()
+    return kind in _IMAGE_TYPES or (not kind and address.lower().endswith(_IMAGE_NAMES))

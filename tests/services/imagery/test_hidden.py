@@ -1,0 +1,37 @@
+"""Ground that a catalogue says is hidden has no pixels."""
+
+import numpy as np
+import shapely
+
+from services.imagery.hidden import OutlinedImage, without_hidden_ground
+from services.imagery.source import ArrayImage, Window
+from tests.services.production.test_image_pairs import SIDE, strip
+
+
+def test_pixels_inside_outlines_are_missing_in_every_window() -> None:
+    image = ArrayImage(np.ones((50, 60), dtype=np.float32))
+    triangle = np.array([[10.0, 10.0], [10.0, 30.0], [30.0, 10.0]])
+    whole = OutlinedImage(image, (triangle,)).read(Window(0, 0, 50, 60))
+    assert np.isnan(whole[15, 15])
+    assert not np.isnan(whole[29, 29])
+    assert abs(np.isnan(whole).sum() - 200.0) < 40.0
+    part = OutlinedImage(image, (triangle,)).read(Window(12, 5, 20, 20))
+    np.testing.assert_array_equal(np.isnan(part), np.isnan(whole[12:32, 5:25]))
+
+
+def test_a_cloud_of_the_catalogue_hides_its_ground() -> None:
+    scene = strip(0, 0.0)
+    corners = np.array([[20.0, 20.0], [20.0, 40.0], [40.0, 40.0], [40.0, 20.0]])
+    lon_lat = scene.model.locate(corners, np.zeros(4))[:, :2]
+    pixels = without_hidden_ground(scene, shapely.MultiPolygon([shapely.Polygon(lon_lat)])).image.read(
+        Window(0, 0, SIDE, SIDE)
+    )
+    assert np.isnan(pixels[30, 30])
+    assert abs(np.isnan(pixels).sum() - 441) <= 42
+    assert not np.isnan(pixels[45:, :]).any()
+
+
+def test_nothing_hidden_leaves_the_scene_as_it_is() -> None:
+    scene = strip(0, 0.0)
+    assert without_hidden_ground(scene, None) is scene
+    assert without_hidden_ground(scene, shapely.MultiPolygon()) is scene

@@ -1,0 +1,78 @@
+"""Which pairs of images are matched: neighbours, across passes, and far fewer than all."""
+
+import numpy as np
+import pytest
+
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.map_grid import MapGrid
+from services.production.image_pairs import PARTNERS, image_pairs
+from services.sensors.ortho import OrthoModel
+from services.types import Acquisition, BoolArray, IntArray
+
+GSD_M = 10.0
+SIDE = 100
+
+
+def strip(number: int, east_m: float, north_m: float = 0.0) -> Scene:
+    """An image of one square kilometre on the map."""
+    grid = MapGrid(
+        "EPSG:32631",
+        np.array([500_000.0 + east_m, 4_800_000.0 - north_m]),
+        np.array([[0.0, GSD_M], [-GSD_M, 0.0]]),
+        (SIDE, SIDE),
+    )
+    pixels = np.zeros((SIDE, SIDE), dtype=np.float32)
+    return Scene(ArrayImage(pixels), OrthoModel(grid), Acquisition(f"image_{number}"), 5.0)
+
+
+def row_of(count: int, step_m: float) -> list[Scene]:
+    return [strip(i, i * step_m) for i in range(count)]
+
+
+def connected(pairs: IntArray, count: int) -> bool:
+    group = np.arange(count)
+    for one, other in pairs.tolist():
+        group[group == group[one]] = group[other]
+    return len(np.unique(group)) == 1
+
+
+def test_images_without_common_ground_are_no_pair() -> None:
+    pairs = image_pairs(row_of(5, 600.0), [])
+    np.testing.assert_array_equal(pairs, [[0, 1], [1, 2], [2, 3], [3, 4]])
+
+
+def test_few_images_are_all_matched_with_each_other() -> None:
+    assert len(image_pairs(row_of(6, 50.0), [])) == 15
+
+
+def test_many_images_of_one_place_have_a_bounded_number_of_partners() -> None:
+    count = 60
+    pairs = image_pairs(row_of(count, 5.0), [])
+    assert len(pairs) <= count * PARTNERS
+    assert connected(pairs, count)
+
+
+def passes_of(count: int, per_pass: int) -> list[BoolArray]:
+    of_pass = np.arange(count) // per_pass
+    return [of_pass == number for number in range(count // per_pass)]
+
+
+def test_every_pass_is_tied_to_the_others() -> None:
+    """Twelve images each of four passes, which all see the same place."""
+    scenes = [strip(i, 20.0 * (i % 12)) for i in range(48)]
+    passes = passes_of(48, 12)
+    pairs = image_pairs(scenes, passes)
+    for one in range(4):
+        for other in range(one + 1, 4):
+            across = passes[one][pairs[:, 0]] & passes[other][pairs[:, 1]]
+            assert across.sum() >= 12, (one, other)
+
+
+@pytest.mark.parametrize("count", [2, 30])
+def test_pairs_do_not_depend_on_the_order_of_the_images(count: int) -> None:
+    scenes = row_of(count, 37.0)
+    order = np.random.default_rng(0).permutation(count)
+    here = {tuple(sorted(pair)) for pair in image_pairs(scenes, []).tolist()}
+    shuffled = image_pairs([scenes[i] for i in order], [])
+    assert {tuple(sorted((int(order[i]), int(order[j])))) for i, j in shuffled.tolist()} == here
