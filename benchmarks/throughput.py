@@ -25,7 +25,8 @@ from typing import Any
 import httpx
 import numpy as np
 
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.image_production import ProductionImages, run_production
+from app.usecases.production import BlockIdentity
 from app.usecases.registration import deliverables, register
 from app.usecases.registration.control_sources import points_of_block
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
@@ -33,7 +34,6 @@ from benchmarks._measuring import keep
 from services.formats.block.reader import FolderChips, read_block
 from services.formats.images.raster import write_raster
 from services.formats.images.scenes import read_scene
-from services.production.from_images import ProductionOptions
 from services.registration.on_points import register_scene
 from services.simulation.view import ViewPlan, simulate_block, simulate_view
 from services.simulation.world import make_world
@@ -90,7 +90,7 @@ def make_scenes(folder: Path, count: int) -> list[Path]:
         sources.append(folder / "images" / f"{view.geometry.plan.image_id}.tif")
         write_raster(sources[-1], view.pixels, view.geometry.delivered)
     identity = BlockIdentity("throughput", title="Simulated", license="CC0-1.0")
-    run_production(sources, folder / "block", identity, ProductionOptions(), sigma_m=4.0)
+    run_production(ProductionImages(tuple(sources), sigma_m=4.0), folder / "block", identity)
     lon, lat = (float(value) for value in world.centre_lon_lat)
     skew_px = np.array([[0.0, 0.0, SKEW_PX], [0.0, SKEW_PX, 0.0]])
     images = []

@@ -12,7 +12,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import simulated_images
 
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.image_production import ProductionImages, run_production
+from app.usecases.production import BlockIdentity
 from services.formats.block.reader import FolderChips, read_block
 from services.production.from_images import ProductionOptions
 from services.types import point_chips
@@ -25,7 +26,7 @@ def make_block(images: list[Path], folder: Path) -> None:
     identity = BlockIdentity("example", title="A block of the examples", license="CC0-1.0")
 
     # `sigma_m` states how wrong the models of the images may be: one standard deviation per coordinate.
-    production = run_production(images, folder, identity, options, sigma_m=3.0)
+    production = run_production(ProductionImages(tuple(images), sigma_m=3.0), folder, identity, options)
 
     accuracy = production.relative_accuracy
     print(f"{len(production.points)} points in {folder}")

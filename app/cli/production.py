@@ -5,85 +5,24 @@ from typing import Annotated
 
 import typer
 
+from app.cli.image_production import run
 from app.cli.image_selection import select
 from app.cli.output import AsJson, show_one
 from app.cli.production_points import points as make_known_points
 from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from app.cli.progress import shown_progress
-from app.usecases.production import (
-    BlockIdentity,
-    OrthoFiles,
-    run_ortho_production,
-    run_production,
-)
+from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
 from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
 app = typer.Typer(no_args_is_help=True)
 app.command()(select)
+app.command()(run)
 app.command(name="points")(make_known_points)
 
 _DEFAULT = ProductionOptions()
 _ORTHO_DEFAULT = OrthoPointOptions()
-
-
-@app.command()
-def run(
-    *,
-    images: Annotated[
-        list[Path], typer.Option("--images", help="Image with its model; repeat for every image.")
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
-    block_id: Annotated[
-        str | None, typer.Option("--id", help="Id of the block; by default the folder's name.")
-    ] = None,
-    version: Annotated[str, typer.Option(help="Version of the block.")] = "1",
-    title: Annotated[str, typer.Option(help="Title of the block.")] = "",
-    license_name: Annotated[
-        str, typer.Option("--license", help="Licence: SPDX identifier.")
-    ] = "proprietary",
-    gsd_m: Annotated[str, typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres.")] = (
-        f"{_DEFAULT.fine_gsd_m:g},{_DEFAULT.coarse_gsd_m:g}"
-    ),
-    points: Annotated[
-        int, typer.Option(help="Desired number of points; --spacing-m overrides it.", min=6)
-    ] = (_DEFAULT.points),
-    spacing_m: Annotated[
-        float | None, typer.Option(help="One point per square of this side, metres.", min=1.0)
-    ] = None,
-    min_views: Annotated[
-        int, typer.Option(help="Least number of images that see a point.", min=2)
-    ] = _DEFAULT.min_views,
-    sigma_m: Annotated[
-        float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Make control points with chips from two or more overlapping images."""
-    fine_m, coarse_m = sampling_pair(gsd_m)
-    options = ProductionOptions(
-        fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views
-    )
-    identity = BlockIdentity(block_id or output.name, version, title, license_name)
-    with shown_progress() as progress:
-        production = run_production(
-            images, output, identity, options, sigma_m=sigma_m, progress=progress
-        )
-    relative = production.relative_accuracy
-    show_one(
-        {
-            "block": output,
-            "points": len(production.points),
-            "views": int(production.points.views.start[-1]),
-            "tie_points": relative.tie_points,
-            "ray_residual_delivered_px": round(relative.before_px, 3),
-            "ray_residual_adjusted_px": round(relative.after_px, 3),
-            "ray_residual_points_px": round(relative.refined_px, 3),
-            **accuracy_row(production.points, as_json=as_json),
-        },
-        as_json=as_json,
-    )
 
 
 @app.command()

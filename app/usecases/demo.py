@@ -10,7 +10,8 @@ from app.config import Settings
 from app.db import engine
 from app.storage import open_storage
 from app.usecases.blocks import lifecycle
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.image_production import ProductionImages, run_production
+from app.usecases.production import BlockIdentity
 from app.usecases.registration.control_sources import points_of_store
 from app.usecases.registration.register import (
     ControlSources,
@@ -130,11 +131,10 @@ def run_demo(folder: Path, settings: Settings, options: DemoOptions, progress: P
     image = _write_image(truth.scene, folder / "images")
 
     production = run_production(
-        images,
+        ProductionImages(tuple(images), sigma_m=options.block_error_m),
         folder / "block",
         BlockIdentity("demo", title="Demonstration on a simulated world", license="CC0-1.0"),
         options.production,
-        sigma_m=options.block_error_m,
         progress=part_of(progress, 0.3, 0.4),
     )
     storage = open_storage(settings)

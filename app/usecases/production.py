@@ -1,4 +1,4 @@
-"""Make a block of points: read images or an ortho-image, call the science, write the block folder."""
+"""Make a block of points from ortho-images; what all blocks of points state of themselves."""
 
 import math
 from collections.abc import Sequence
@@ -18,15 +18,12 @@ from services.formats.block.writer import write_block
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.imagery.scene import Scene
-from services.production.from_images import Production, ProductionOptions, produce_points
 from services.production.from_ortho import (
     GroundHeights,
     OrthoPointOptions,
     OrthoPoints,
     produce_ortho_points,
 )
-from services.sensors.refined import refined_rpc
-from services.sensors.rpc import RpcModel
 from services.types import Array, ControlPoints, Progress, no_progress, part_of
 
 
@@ -71,46 +68,6 @@ class OrthoFiles:
     frame_sigma_up_m: float | None = None
     bands: str | None = None
     mask: Path | None = None
-
-
-def run_production(
-    images: Sequence[Path],
-    folder: Path,
-    identity: BlockIdentity,
-    options: ProductionOptions = ProductionOptions(),
-    *,
-    sigma_m: float | None = None,
-    progress: Progress = no_progress,
-) -> Production:
-    """Make a block of points from overlapping images and write its folder.
-
-    Args:
-        images: two or more; their models are found by the names of the files beside them.
-        folder: of the block; must not exist.
-        identity: of the block.
-        options: of the production.
-        sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
-        progress: receives the fraction done and a message.
-
-    Raises:
-        InputError: an image cannot be used, or the folder exists.
-        ComputationError: the images do not make a block.
-    """
-    refuse_existing(folder)
-    with ExitStack() as stack:
-        scenes = [read_scene(path, sigma_m=sigma_m) for path in images]
-        for scene in scenes:
-            stack.callback(scene.image.close)  # type: ignore[attr-defined]
-        production = produce_points(scenes, options, part_of(progress, 0.0, 0.9))
-        write_block(
-            folder,
-            _production_metadata(identity, scenes, production, options),
-            production.points,
-            production.chips,
-            _adjusted_models(scenes, production),
-            progress=part_of(progress, 0.9, 0.1),
-        )
-    return production
 
 
 def run_ortho_production(
@@ -178,51 +135,6 @@ def refuse_existing(folder: Path) -> None:
         raise InputError(f"{folder}: already exists; a block is written into a new folder")
 
 
-def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:
-    """The adjusted model of every image that an RPC expresses, by the image's name."""
-    models = {}
-    for scene, corrected in zip(scenes, production.adjustment.models, strict=True):
-        refined = refined_rpc(corrected, scene.image.shape).model
-        if refined is not None:
-            models[scene.acquisition.image_id] = refined
-    return models
-
-
-def _production_metadata(
-    identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
-) -> BlockMetadata:
-    relative, n_points = production.relative_accuracy, len(production.points)
-    return block_metadata(
-        identity,
-        scenes,
-        production.points,
-        description=f"{n_points} ground control points with chips, from {len(scenes)} images",
-        outline=production.outline,
-        specification=BlockSpecification(
-            gsds_m=(options.fine_gsd_m, options.coarse_gsd_m),
-            min_views=options.min_views,
-            points_per_km2=_points_per_km2(options.spacing_m),
-        ),
-        options=asdict(options),
-        accuracy=(
-            AccuracyFigure(
-                "relative",
-                "ray_residual_median_px",
-                relative.refined_px,
-                n_points,
-                "the rays of the block's own images",
-            ),
-            AccuracyFigure(
-                "absolute",
-                "frame_sigma_m",
-                relative.frame.sigma_m,
-                len(scenes),
-                "the stated accuracy of the images' models, not measured",
-            ),
-        ),
-    )
-
-
 def _ortho_metadata(
     identity: BlockIdentity, scenes: Sequence[Scene], production: OrthoPoints, options: OrthoPointOptions
 ) -> BlockMetadata:
@@ -237,7 +149,7 @@ def _ortho_metadata(
         specification=BlockSpecification(
             gsds_m=production.gsds_m,
             min_views=fewest_views(production.points),
-            points_per_km2=_points_per_km2(options.spacing_m),
+            points_per_km2=points_per_km2(options.spacing_m),
         ),
         options=asdict(options),
         accuracy=image_accuracy(production.points, production.local_sigma_m, len(scenes)),
@@ -312,7 +224,8 @@ def block_metadata(
     )
 
 
-def _points_per_km2(spacing_m: float | None) -> float | None:
+def points_per_km2(spacing_m: float | None) -> float | None:
+    """Density of one point for each square of a side in metres."""
     return None if spacing_m is None else (spacing_m / 1000.0) ** -2.0
 
 

@@ -20,7 +20,8 @@ from app.db.points import control_points
 from app.db.scenes import set_footprint
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.production import BlockIdentity, run_production
+from app.usecases.image_production import ProductionImages, run_production
+from app.usecases.production import BlockIdentity
 from app.usecases.registration.control_sources import points_of_store
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from services.formats.block.check import check_block
@@ -80,9 +81,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     )
     images = [as_file(view, folder) for view in views]
     options = ProductionOptions(fine_gsd_m=1.0, coarse_gsd_m=2.0, points=60)
-    run_production(
-        images, folder / "dateline", BlockIdentity("dateline"), options, sigma_m=BLOCK_SIGMA_M
-    )
+    delivered = ProductionImages(tuple(images), sigma_m=BLOCK_SIGMA_M)
+    run_production(delivered, folder / "dateline", BlockIdentity("dateline"), options)
     return Made(folder / "dateline", as_file(later_view(), folder))
 
 

@@ -1,0 +1,124 @@
+"""`amers production run`: make a block from overlapping images, given or chosen from a catalogue."""
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, show_one
+from app.cli.production_rows import accuracy_row, sampling_pair
+from app.cli.progress import shown_progress
+from app.errors import InputError
+from app.usecases.executors import ComputeOptions
+from app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from app.usecases.image_selection import CatalogueRequest, run_selection
+from app.usecases.production import BlockIdentity, refuse_existing
+from services.production.from_images import ProductionOptions
+from services.types import part_of
+
+_DEFAULT = ProductionOptions()
+_SHARE_OF_SELECTION = 0.05
+
+
+def run(
+    *,
+    images: Annotated[
+        list[Path] | None,
+        typer.Option("--images", help="Image with its model; repeat for every image."),
+    ] = None,
+    catalogue: Annotated[
+        str | None,
+        typer.Option(
+            help="STAC catalogue to choose images from; the selection stays in OUTPUT.selection."
+        ),
+    ] = None,
+    selection: Annotated[
+        Path | None, typer.Option(help="Folder that `amers production select` has written.")
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    block_id: Annotated[
+        str | None, typer.Option("--id", help="Id of the block; by default the folder's name.")
+    ] = None,
+    version: Annotated[str, typer.Option(help="Version of the block.")] = "1",
+    title: Annotated[str, typer.Option(help="Title of the block.")] = "",
+    license_name: Annotated[
+        str, typer.Option("--license", help="Licence: SPDX identifier.")
+    ] = "proprietary",
+    gsd_m: Annotated[str, typer.Option(help="Ground sampling of the chips: FINE,COARSE, metres.")] = (
+        f"{_DEFAULT.fine_gsd_m:g},{_DEFAULT.coarse_gsd_m:g}"
+    ),
+    points: Annotated[
+        int, typer.Option(help="Desired number of points; --spacing-m overrides it.", min=6)
+    ] = (_DEFAULT.points),
+    spacing_m: Annotated[
+        float | None, typer.Option(help="One point per square of this side, metres.", min=1.0)
+    ] = None,
+    min_views: Annotated[
+        int, typer.Option(help="Least number of images that see a point.", min=2)
+    ] = _DEFAULT.min_views,
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
+    ] = None,
+    area: Annotated[
+        Path | None, typer.Option(help="GeoJSON of the ground to see, for --catalogue.")
+    ] = None,
+    since: Annotated[
+        datetime | None,
+        typer.Option(help="Leave out images of --catalogue before this day.", formats=["%Y-%m-%d"]),
+    ] = None,
+    work: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of intermediate results, which is kept; by default OUTPUT.work, until the "
+            "block is complete. An interrupted production goes on from there."
+        ),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option(help="Processes on this machine.", min=1, max=1024)
+    ] = os.cpu_count() or 1,
+    cluster: Annotated[
+        str | None, typer.Option(help="Address of a Dask cluster's scheduler: tcp://HOST:8786.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make control points with chips from two or more overlapping images."""
+    sources = (images or None, catalogue, selection)
+    if sum(source is not None for source in sources) != 1:
+        raise InputError("one of --images, --catalogue and --selection is expected")
+    fine_m, coarse_m = sampling_pair(gsd_m)
+    options = ProductionOptions(
+        fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views
+    )
+    identity = BlockIdentity(block_id or output.name, version, title, license_name)
+    place = WorkPlace(work, ComputeOptions(jobs, cluster))
+    refuse_existing(output)
+    with shown_progress() as progress:
+        if catalogue is not None:
+            selection = output.with_name(f"{output.name}.selection")
+            first_day = None if since is None else since.replace(tzinfo=UTC)
+            request = CatalogueRequest(catalogue, area, first_day)
+            run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
+        production = run_production(
+            ProductionImages(tuple(images or ()), selection, sigma_m),
+            output,
+            identity,
+            options,
+            place=place,
+            progress=part_of(progress, _SHARE_OF_SELECTION, 1.0 - _SHARE_OF_SELECTION),
+        )
+    relative = production.relative_accuracy
+    show_one(
+        {
+            "block": output,
+            "points": len(production.points),
+            "views": int(production.points.views.start[-1]),
+            "tie_points": relative.tie_points,
+            "ray_residual_delivered_px": round(relative.before_px, 3),
+            "ray_residual_adjusted_px": round(relative.after_px, 3),
+            "ray_residual_points_px": round(relative.refined_px, 3),
+            **accuracy_row(production.points, as_json=as_json),
+        },
+        as_json=as_json,
+    )

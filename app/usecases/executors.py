@@ -1,0 +1,84 @@
+"""Where long work is computed: in processes of this machine, or on a Dask cluster."""
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from app.errors import InputError
+
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_LOST_WORKERS = 3
+"""How often a task is given to another worker after its own was lost."""
+_SECONDS_TO_CONNECT = 30
+
+
+@dataclass(frozen=True)
+class ComputeOptions:
+    """Where tasks are computed.
+
+    Attributes:
+        jobs: processes on this machine; ignored with a cluster.
+        cluster: address of the scheduler of a Dask cluster, such as tcp://host:8786.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+
+
+@contextmanager
+def open_executor(options: ComputeOptions) -> Iterator[tuple[Executor, int]]:
+    """An executor, and the number of tasks that keep it busy.
+
+    Raises:
+        InputError: the cluster cannot be reached or has no workers, or the library for it is missing.
+    """
+    if options.cluster is not None:
+        with _cluster(options.cluster) as opened:
+            yield opened
+        return
+    if options.jobs == 1:
+        with ThreadPoolExecutor(max_workers=1) as thread:
+            yield thread, 1
+        return
+    # Children that are forked from threads may lock up; linear algebra on one thread each.
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(options.jobs, mp_context=context, initializer=_begin_process) as pool:
+        try:
+            yield pool, options.jobs + 1
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _begin_process() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            "--cluster: the library of Dask is not installed; install amers[cluster]"
+        ) from None
+    try:
+        client: Any = Client(address, timeout=_SECONDS_TO_CONNECT)  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise InputError(f"--cluster: {address}: no scheduler of Dask answers: {error}") from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if threads == 0:
+            raise InputError(
+                f"--cluster: {address}: the cluster has no workers; start some with "
+                f"`dask worker {address}`"
+            )
+        client.run(_begin_process)
+        yield client.get_executor(pure=False, retries=_LOST_WORKERS), 2 * threads

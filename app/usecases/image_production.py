@@ -1,0 +1,193 @@
+"""Make a block of points from overlapping images: given as files, or chosen from a catalogue."""
+
+import hashlib
+import pickle
+import shutil
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from app.usecases.executors import ComputeOptions, open_executor
+from app.usecases.image_selection import ITEMS
+from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
+from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
+from services.formats.block.writer import write_block
+from services.formats.images.scenes import read_scene
+from services.formats.stac.catalogue import read_catalogue
+from services.formats.stac.scenes import image_path, read_item_scene
+from services.formats.work_folder import WorkFolder
+from services.imagery.scene import Scene
+from services.production.from_images import Production, ProductionOptions, produce_points
+from services.sensors.refined import refined_rpc
+from services.sensors.rpc import RpcModel
+from services.tasks import Work
+from services.types import Progress, no_progress, part_of
+
+
+@dataclass(frozen=True)
+class ProductionImages:
+    """The images of a production.
+
+    Attributes:
+        files: images with their models beside them or inside.
+        selection: folder that `run_selection` has written; its images are added.
+        sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
+    """
+
+    files: tuple[Path, ...] = ()
+    selection: Path | None = None
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True)
+class WorkPlace:
+    """Where the work is done.
+
+    Attributes:
+        folder: of the results of all tasks, so that an interrupted production goes on; by default beside
+            the block, until the block is complete.
+        compute: processes or a cluster.
+    """
+
+    folder: Path | None = None
+    compute: ComputeOptions = field(default_factory=ComputeOptions)
+
+
+def run_production(
+    images: ProductionImages,
+    folder: Path,
+    identity: BlockIdentity,
+    options: ProductionOptions = ProductionOptions(),
+    *,
+    place: WorkPlace = WorkPlace(),
+    progress: Progress = no_progress,
+) -> Production:
+    """Make a block of points from overlapping images and write its folder.
+
+    When the same production was interrupted, it goes on from where it was.
+
+    Args:
+        images: two or more.
+        folder: of the block; must not exist.
+        identity: of the block.
+        options: of the production.
+        place: of the work.
+        progress: receives the fraction done and a message.
+
+    Raises:
+        InputError: an image cannot be used, the folder exists, or the work folder is that of another
+            production.
+        ComputationError: the images do not make a block.
+    """
+    refuse_existing(folder)
+    with ExitStack() as stack:
+        scenes, files = _read(images, stack, part_of(progress, 0.0, 0.05))
+        work_folder = place.folder or folder.with_name(f"{folder.name}.work")
+        kept = WorkFolder(work_folder, _inputs(scenes, files, options))
+        executor, ahead = stack.enter_context(open_executor(place.compute))
+        work = Work(executor, kept, ahead)
+        production = produce_points(scenes, options, part_of(progress, 0.05, 0.85), work)
+        write_block(
+            folder,
+            _metadata(identity, scenes, production, options),
+            production.points,
+            production.chips,
+            _adjusted_models(scenes, production),
+            progress=part_of(progress, 0.9, 0.1),
+        )
+    if place.folder is None:
+        shutil.rmtree(work_folder)
+    return production
+
+
+def _read(
+    images: ProductionImages, stack: ExitStack, progress: Progress
+) -> tuple[list[Scene], list[Path]]:
+    """The scenes of all images, open until the stack closes, and their files."""
+    scenes: list[Scene] = []
+    files = list(images.files)
+
+    def add(scene: Scene) -> None:
+        stack.callback(scene.image.close)  # type: ignore[attr-defined]
+        scenes.append(scene)
+
+    for path in images.files:
+        add(read_scene(path, sigma_m=images.sigma_m))
+    if images.selection is not None:
+        source = images.selection / ITEMS
+        chosen = read_catalogue(str(source))
+        masks = chosen.images.mask.tolist()
+        for row, item in enumerate(chosen.items.read(range(len(masks)))):
+            progress(row / len(masks), f"reading {len(masks)} images")
+            add(read_item_scene(item, str(source), masks[row], sigma_m=images.sigma_m))
+            files.append(image_path(item, str(source)))
+    return scenes, files
+
+
+def _inputs(
+    scenes: Sequence[Scene], files: Sequence[Path], options: ProductionOptions
+) -> dict[str, Any]:
+    """What the results of all tasks depend on."""
+    return {
+        "version": version("amers"),
+        "images": [
+            {
+                "name": scene.acquisition.image_id,
+                "file": str(file.resolve()),
+                "bytes": file.stat().st_size,
+                "modified": file.stat().st_mtime_ns,
+                "model": hashlib.sha256(pickle.dumps(scene.model)).hexdigest(),
+                "sigma_m": scene.sigma_m,
+            }
+            for scene, file in zip(scenes, files, strict=True)
+        ],
+        "options": asdict(options),
+    }
+
+
+def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:
+    """The adjusted model of every image that an RPC expresses, by the image's name."""
+    models = {}
+    for scene, corrected in zip(scenes, production.adjustment.models, strict=True):
+        refined = refined_rpc(corrected, scene.image.shape).model
+        if refined is not None:
+            models[scene.acquisition.image_id] = refined
+    return models
+
+
+def _metadata(
+    identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
+) -> BlockMetadata:
+    relative, n_points = production.relative_accuracy, len(production.points)
+    return block_metadata(
+        identity,
+        scenes,
+        production.points,
+        description=f"{n_points} ground control points with chips, from {len(scenes)} images",
+        outline=production.outline,
+        specification=BlockSpecification(
+            gsds_m=(options.fine_gsd_m, options.coarse_gsd_m),
+            min_views=options.min_views,
+            points_per_km2=points_per_km2(options.spacing_m),
+        ),
+        options=asdict(options),
+        accuracy=(
+            AccuracyFigure(
+                "relative",
+                "ray_residual_median_px",
+                relative.refined_px,
+                n_points,
+                "the rays of the block's own images",
+            ),
+            AccuracyFigure(
+                "absolute",
+                "frame_sigma_m",
+                relative.frame.sigma_m,
+                len(scenes),
+                "the stated accuracy of the images' models, not measured",
+            ),
+        ),
+    )

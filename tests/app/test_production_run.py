@@ -1,0 +1,178 @@
+"""`amers production run` in one process, several, or on a cluster: the same block, also after kills."""
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import Client
+
+from app.errors import InputError
+from app.usecases.executors import ComputeOptions
+from app.usecases.image_production import ProductionImages, WorkPlace, run_production
+from app.usecases.production import BlockIdentity
+from services.formats.block.reader import read_block
+from services.formats.images.raster import write_raster
+from tests.service_process import free_port
+from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views
+
+pytestmark = pytest.mark.long
+
+SECONDS_TO_START = 60.0
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> ProductionImages:
+    folder = tmp_path_factory.mktemp("images")
+    for view in block_views():
+        path = folder / f"{view.geometry.acquisition.image_id}.tif"
+        write_raster(path, view.pixels, view.geometry.delivered)
+    return ProductionImages(tuple(sorted(folder.glob("*.tif"))), sigma_m=BLOCK_SIGMA_M)
+
+
+def content(block: Path) -> dict[str, str]:
+    """Hashes of all files of a block but the document, which states when it was made."""
+    return {
+        str(file.relative_to(block)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(block.rglob("*"))
+        if file.is_file() and file.name != "block.json"
+    }
+
+
+def make(images: ProductionImages, folder: Path, place: WorkPlace) -> dict[str, str]:
+    run_production(images, folder, BlockIdentity("made"), OPTIONS, place=place)
+    return content(folder)
+
+
+@pytest.fixture(scope="module")
+def alone(images: ProductionImages, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The block made in one process."""
+    return make(images, tmp_path_factory.mktemp("alone") / "block", WorkPlace())
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A scheduler of Dask and its workers, each a process."""
+
+    address: str
+    workers: list[subprocess.Popen[bytes]]
+
+
+@contextmanager
+def dask_cluster(count: int) -> Iterator[Cluster]:
+    """A scheduler and workers of one thread each on the loopback, ended at the end."""
+
+    def begin(*words: str) -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        return subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    address = f"tcp://127.0.0.1:{(port := free_port())}"
+    started = [begin("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")]
+    try:
+        for _ in range(count):
+            worker = ("--nthreads", "1", "--nworkers", "1", "--no-nanny", "--no-dashboard")
+            started.append(begin("dask_worker", address, "--host", "127.0.0.1", *worker))
+        with Client(address, timeout=SECONDS_TO_START) as client:
+            client.wait_for_workers(count, timeout=SECONDS_TO_START)
+        yield Cluster(address, started[1:])
+    finally:
+        for process in reversed(started):
+            process.kill()
+            process.wait()
+
+
+def test_several_processes_make_the_same_block_bit_for_bit(images, alone, tmp_path) -> None:
+    assert make(images, tmp_path / "block", WorkPlace(compute=ComputeOptions(jobs=2))) == alone
+
+
+def test_a_cluster_makes_the_same_block_bit_for_bit(images, alone, tmp_path) -> None:
+    with dask_cluster(2) as cluster:
+        place = WorkPlace(compute=ComputeOptions(cluster=cluster.address))
+        assert make(images, tmp_path / "block", place) == alone
+
+
+def test_a_worker_that_is_killed_in_the_middle_changes_nothing(images, alone, tmp_path) -> None:
+    work = tmp_path / "work"
+    with dask_cluster(2) as cluster:
+        killed = []
+
+        def kill_one(fraction: float, message: str) -> None:
+            if message.startswith("measures: 1 ") and not killed:
+                os.kill(cluster.workers[0].pid, signal.SIGKILL)
+                killed.append(message)
+
+        place = WorkPlace(work, ComputeOptions(cluster=cluster.address))
+        run_production(
+            images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place, progress=kill_one
+        )
+        assert killed
+    assert content(tmp_path / "block") == alone
+
+
+class StoppedHereError(Exception):
+    """Somebody stopped the production."""
+
+
+@pytest.mark.parametrize("stage", ["features", "matches", "measures", "points"])
+def test_an_interrupted_production_goes_on_from_where_it_was(
+    images, alone, tmp_path, monkeypatch, stage
+) -> None:
+    def stop(fraction: float, message: str) -> None:
+        if message.startswith(f"{stage}: 1 "):
+            raise StoppedHereError
+
+    folder = tmp_path / "block"
+    with pytest.raises(StoppedHereError):
+        run_production(images, folder, BlockIdentity("made"), OPTIONS, progress=stop)
+    assert not folder.exists()
+    work = tmp_path / "block.work"
+    kept = {file: file.stat().st_mtime_ns for file in work.rglob("*.npy")}
+    assert kept
+    place = WorkPlace(work)
+    assert make(images, folder, place) == alone
+    assert {file: file.stat().st_mtime_ns for file in kept} == kept, "computed again"
+
+
+def test_the_work_folder_is_gone_when_the_block_is_complete(images, tmp_path, alone) -> None:
+    assert make(images, tmp_path / "block", WorkPlace()) == alone
+    assert [file.name for file in tmp_path.iterdir()] == ["block"]
+
+
+def test_work_on_other_images_is_refused(images, tmp_path) -> None:
+    work = WorkPlace(tmp_path / "work")
+    fewer = ProductionImages(images.files[:2], sigma_m=BLOCK_SIGMA_M)
+
+    def stop(fraction: float, message: str) -> None:
+        if message.startswith("features: 1 "):
+            raise StoppedHereError
+
+    with pytest.raises(StoppedHereError):
+        run_production(images, tmp_path / "a", BlockIdentity("a"), OPTIONS, place=work, progress=stop)
+    with pytest.raises(InputError, match=r"other inputs.*--work"):
+        run_production(fewer, tmp_path / "b", BlockIdentity("b"), OPTIONS, place=work)
+
+
+def test_a_cluster_that_does_not_answer_is_named(images, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("app.usecases.executors._SECONDS_TO_CONNECT", 1)
+    place = WorkPlace(compute=ComputeOptions(cluster="tcp://127.0.0.1:9"))
+    with pytest.raises(InputError, match=r"--cluster: tcp://127\.0\.0\.1:9: no scheduler"):
+        run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place)
+
+
+def test_a_block_of_a_cluster_is_a_valid_block(images, alone, tmp_path) -> None:
+    make(images, tmp_path / "block", WorkPlace())
+    points = read_block(tmp_path / "block").points
+    assert len(points) > 20
+    assert np.isfinite(points.lon_lat_h).all()
