@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, show_one
-from app.cli.production_rows import accuracy_row, sampling_pair
+from app.cli.production_rows import accuracy_row, control_row, sampling_pair
 from app.cli.progress import shown_progress
 from app.errors import InputError
 from app.usecases.executors import ComputeOptions
@@ -61,6 +61,10 @@ def run(
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
     ] = None,
+    control: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of an older block that places the new one; repeat for several."),
+    ] = None,
     area: Annotated[
         Path | None, typer.Option(help="GeoJSON of the ground to see, for --catalogue.")
     ] = None,
@@ -101,7 +105,7 @@ def run(
             request = CatalogueRequest(catalogue, area, first_day)
             run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_production(
-            ProductionImages(tuple(images or ()), selection, sigma_m),
+            ProductionImages(tuple(images or ()), selection, sigma_m, tuple(control or ())),
             output,
             identity,
             options,
@@ -118,6 +122,7 @@ def run(
             "ray_residual_delivered_px": round(relative.before_px, 3),
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
+            **control_row(production.control, production.adjustment),
             **accuracy_row(production.points, as_json=as_json),
         },
         as_json=as_json,

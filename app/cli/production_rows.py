@@ -2,8 +2,12 @@
 
 import math
 
+import numpy as np
+
 from app.cli.output import Row
 from app.errors import InputError
+from services.adjustment.bundle import BlockAdjustment
+from services.adjustment.control_ground import ControlGround
 from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import produced_accuracy
 from services.types import Array, ControlPoints
@@ -16,6 +20,22 @@ def agreement_row(shift_m: Array, local_sigma_m: float) -> Row:
     return {
         "image_shifts_east_north_m": [[round(v, 2) for v in shift] for shift in shift_m.tolist()],
         "local_sigma_m": None if math.isnan(local_sigma_m) else round(local_sigma_m, 2),
+    }
+
+
+def control_row(control: ControlGround, adjustment: BlockAdjustment) -> Row:
+    """How control fits the block: points used, those thrown out by name, and the misfits."""
+    if len(control) == 0:
+        return {}
+    used = adjustment.control_active
+    rms_m = np.sqrt(np.nanmean(adjustment.control_misfit_m[used] ** 2, axis=0))
+    return {
+        "control_points": len(control),
+        "control_points_used": int(used.sum()),
+        "control_misfit_east_north_up_m": [round(value, 2) for value in rms_m.tolist()],
+        "control_points_left_out": [
+            name for name, is_used in zip(control.names, used, strict=True) if not is_used
+        ],
     }
 
 

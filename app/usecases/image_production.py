@@ -14,12 +14,15 @@ from app.usecases.executors import ComputeOptions, open_executor
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
+from services.formats.block.document_json import BLOCK_JSON
+from services.formats.block.reader import FolderChips, file_sha256, read_block
 from services.formats.block.writer import write_block
 from services.formats.images.scenes import read_scene
 from services.formats.stac.catalogue import read_catalogue
 from services.formats.stac.scenes import image_path, read_item_scene
 from services.formats.work_folder import WorkFolder
 from services.imagery.scene import Scene
+from services.production.control_points import ControlBlock
 from services.production.from_images import Production, ProductionOptions, produce_points
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel
@@ -35,11 +38,13 @@ class ProductionImages:
         files: images with their models beside them or inside.
         selection: folder that `run_selection` has written; its images are added.
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
+        control: folders of older blocks that place the new one on the Earth.
     """
 
     files: tuple[Path, ...] = ()
     selection: Path | None = None
     sigma_m: float | None = None
+    control: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -86,10 +91,13 @@ def run_production(
     with ExitStack() as stack:
         scenes, files = _read(images, stack, part_of(progress, 0.0, 0.05))
         work_folder = place.folder or folder.with_name(f"{folder.name}.work")
-        kept = WorkFolder(work_folder, _inputs(scenes, files, options))
+        control = [_control_block(folder, stack) for folder in images.control]
+        kept = WorkFolder(work_folder, _inputs(scenes, files, images.control, options))
         executor, ahead = stack.enter_context(open_executor(place.compute))
         work = Work(executor, kept, ahead)
-        production = produce_points(scenes, options, part_of(progress, 0.05, 0.85), work)
+        production = produce_points(
+            scenes, options, part_of(progress, 0.05, 0.85), control=control, work=work
+        )
         write_block(
             folder,
             _metadata(identity, scenes, production, options),
@@ -127,8 +135,17 @@ def _read(
     return scenes, files
 
 
+def _control_block(folder: Path, stack: ExitStack) -> ControlBlock:
+    contents = read_block(folder)
+    chips = stack.enter_context(FolderChips(folder))
+    return ControlBlock(contents.document.metadata.id, contents.points, chips)
+
+
 def _inputs(
-    scenes: Sequence[Scene], files: Sequence[Path], options: ProductionOptions
+    scenes: Sequence[Scene],
+    files: Sequence[Path],
+    control: Sequence[Path],
+    options: ProductionOptions,
 ) -> dict[str, Any]:
     """What the results of all tasks depend on."""
     return {
@@ -143,6 +160,10 @@ def _inputs(
                 "sigma_m": scene.sigma_m,
             }
             for scene, file in zip(scenes, files, strict=True)
+        ],
+        "control": [
+            {"folder": str(folder.resolve()), "sha256": file_sha256(folder / BLOCK_JSON)}
+            for folder in control
         ],
         "options": asdict(options),
     }
@@ -187,7 +208,17 @@ def _metadata(
                 "frame_sigma_m",
                 relative.frame.sigma_m,
                 len(scenes),
-                "the stated accuracy of the images' models, not measured",
+                _frame_source(production),
             ),
         ),
     )
+
+
+def _frame_source(production: Production) -> str:
+    """What places a block on the Earth."""
+    stated = "the stated accuracy of the images' models"
+    if len(production.control) == 0:
+        return f"{stated}, not measured"
+    blocks = sorted({name.rpartition(":")[0] for name in production.control.names})
+    used = int(production.adjustment.control_active.sum())
+    return f"{used} control points of {', '.join(blocks)}, and {stated}"

@@ -7,6 +7,7 @@ import numpy as np
 
 from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.intersection import intersect
 from services.adjustment.parameters import image_parameters
 from services.conventions import CHIP_SIZE
@@ -16,6 +17,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.matching.ground_features import FeatureOptions
 from services.matching.multi_image import RefinementOptions, chip_inside
 from services.matching.predict import rank_in_group
+from services.production.control_points import ControlBlock, find_control, joined
 from services.production.ground_parts import CutPoints, cut_points, measure_points
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
@@ -104,6 +106,7 @@ class Production:
         adjustment: of the images; the points refer to its models.
         relative_accuracy: how well the images agree.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
+        control: what was found of the older blocks; `adjustment` tells which of it agrees.
     """
 
     points: ControlPoints
@@ -111,24 +114,29 @@ class Production:
     adjustment: BlockAdjustment
     relative_accuracy: RelativeAccuracy
     outline: Array
+    control: ControlGround
 
 
 def produce_points(
     scenes: Sequence[Scene],
     options: ProductionOptions = ProductionOptions(),
     progress: Progress = no_progress,
+    *,
+    control: Sequence[ControlBlock] = (),
     work: Work | None = None,
 ) -> Production:
     """Control points with chips, produced from overlapping images alone.
 
     Tie points and one adjustment bring the images into agreement. Salient, well-distributed tie points
     are then measured again chip by chip, the images adjusted on these measures, and the points
-    intersected. The frame of the block is the mean of what the models of the images state.
+    intersected. The frame of the block is the mean of what the models of the images state, and of the
+    control if there is any.
 
     Args:
         scenes: two or more, with models as delivered.
         options: of the block.
         progress: receives the fraction done.
+        control: older blocks that place the new one on the Earth.
         work: computes the tasks and keeps their results; by default in this process, in memory.
 
     Raises:
@@ -154,14 +162,26 @@ def produce_points(
         options.fine_gsd_m,
         options.refinement,
         work=work,
-        progress=part_of(progress, 0.5, 0.3),
+        progress=part_of(progress, 0.5, 0.25),
     )
+    known = NO_CONTROL
+    if control:
+        of_control, known = find_control(
+            _with_models(scenes, tied),
+            tied.frames[0],
+            control,
+            first_point=len(candidates),
+            work=work,
+            progress=part_of(progress, 0.75, 0.05),
+        )
+        measures = joined(measures, of_control)
     progress(0.8, "adjusting the block on its chips")
-    adjustment = _adjust(scenes, passes, measures, options)
-    active = measures.take(adjustment.active)
+    adjustment = _adjust(scenes, passes, measures, options, known)
+    active = measures.take(adjustment.active & (measures.point < len(candidates)))
     adjusted = _with_models(scenes, adjustment)
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
-    saliency = saliency[: len(adjustment.lon_lat_h)]
+    # Points of the control and candidates that nothing measures are not selected.
+    saliency = np.append(saliency, np.zeros(len(known)))[: len(adjustment.lon_lat_h)]
     rows = _select_points(adjustment, saliency, shown, options)
     shown = shown.take(np.isin(shown.point, rows))
     shown = replace(shown, point=np.searchsorted(rows, shown.point))
@@ -182,7 +202,9 @@ def produce_points(
         frame=adjustment.frames[0],
     )
     progress(1.0, f"{len(points)} points")
-    return Production(points, cut.chips, adjustment, relative_accuracy, box_around(points.lon_lat_h))
+    return Production(
+        points, cut.chips, adjustment, relative_accuracy, box_around(points.lon_lat_h), known
+    )
 
 
 def _check_scenes(scenes: Sequence[Scene]) -> None:
@@ -196,6 +218,7 @@ def _adjust(
     passes: Sequence[BoolArray],
     observations: Observations,
     options: ProductionOptions,
+    control: ControlGround = NO_CONTROL,
 ) -> BlockAdjustment:
     """The block adjustment of scenes with their models as delivered."""
     images = [
@@ -208,7 +231,7 @@ def _adjust(
         )
         for scene in scenes
     ]
-    return adjust_block(images, observations, passes=passes, options=options.block)
+    return adjust_block(images, observations, control=control, passes=passes, options=options.block)
 
 
 def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:

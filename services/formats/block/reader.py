@@ -161,6 +161,10 @@ class FolderChips:
         start, size = layout.byte_range(row, count)
         return layout.decode(os.pread(descriptor, size, start), row, count)
 
+    def __reduce__(self) -> tuple[type["FolderChips"], tuple[Path]]:
+        """In another process the files are opened again."""
+        return FolderChips, (self._folder.resolve(),)
+
     def close(self) -> None:
         """Close all files."""
         while self._open:
