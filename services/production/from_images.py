@@ -9,6 +9,7 @@ from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.intersection import intersect
+from services.adjustment.observation_noise import found_noise
 from services.adjustment.parameters import image_parameters
 from services.conventions import CHIP_SIZE
 from services.errors import InputError, NotEnoughPoints
@@ -35,6 +36,9 @@ from services.types import (
     no_progress,
     part_of,
 )
+
+_ROUNDS_OF_NOISE = 2
+"""Adjustments with the noise that the residuals of the one before show."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,12 @@ def produce_points(
         measures = joined(measures, of_control)
     progress(0.8, "adjusting the block on its chips")
     adjustment = _adjust(scenes, passes, measures, options, known)
+    for _ in range(_ROUNDS_OF_NOISE):
+        used = measures.take(adjustment.active)
+        residual_px = adjustment.residual_px[adjustment.active]
+        noise = found_noise(used, adjustment.models, adjustment.lon_lat_h, residual_px)
+        measures = replace(measures, sigma_px=noise.applied(measures.sigma_px))
+        adjustment = _adjust(scenes, passes, measures, options, known)
     active = measures.take(adjustment.active & (measures.point < len(candidates)))
     adjusted = _with_models(scenes, adjustment)
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))

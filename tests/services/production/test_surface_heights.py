@@ -16,8 +16,8 @@ from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage, Window, render_chip
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
+from services.matching.ground_features import FeatureOptions
 from services.matching.surface_heights import surface_height
-from services.matching.tie_points import FeatureOptions, find_tie_points
 from services.production.from_images import Production, ProductionOptions, produce_points
 from services.simulation.view import SimulatedView, simulate_block
 from services.simulation.world import World
