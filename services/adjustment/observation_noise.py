@@ -90,7 +90,7 @@ def _squares(
     for image in np.unique(observations.image):
         rows = observations.image == image
         by_ground[rows] = models[image].project_derivative(lon_lat_h[observations.point[rows]])
-    points, first, count = np.unique(observations.point, return_index=True, return_counts=True)
+    _, first, count = np.unique(observations.point, return_index=True, return_counts=True)
     chosen = np.flatnonzero(count >= 2)
     chosen = chosen[:: max(1, len(chosen) // _POINTS)]
     squares = np.empty((len(chosen), 3))

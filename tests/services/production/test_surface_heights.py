@@ -19,8 +19,10 @@ from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.matching.ground_features import FeatureOptions
 from services.matching.surface_heights import surface_height
 from services.production.from_images import Production, ProductionOptions, produce_points
+from services.production.tie_points import find_tie_points
 from services.simulation.view import SimulatedView, simulate_block
 from services.simulation.world import World
+from services.tasks import Work
 from services.types import Array, Observations, no_progress
 from tests.services.simulated import (
     BLOCK_SIGMA_M,
@@ -212,7 +214,7 @@ def test_real_surfaces_agree_with_an_elevation_model_as_stated(triplet, real_dat
     assert points.surface is not None
     stated, sigma_m = points.surface.height_m, points.surface.sigma_m
     # Some thirty heights tell where the raster lies to a metre; thousands of ties, to a decimetre.
-    ties = find_tie_points(scenes, FeatureOptions(), no_progress)
+    ties = find_tie_points(scenes, [], FeatureOptions(), Work(), no_progress)
     tied = intersect(made.adjustment.models, ties, int(ties.point[-1]) + 1).lon_lat_h
     tied = tied[np.isfinite(tied[:, 0])]
     east, north, up = model.translation(tied, tied[:, 2])
