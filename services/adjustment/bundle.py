@@ -137,6 +137,8 @@ def adjust_block(
     relative_m2 = point_covariances(solved.equations, solved.points, accuracy, of_points)
     intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
     residual = problem.equations(state.values, state.lon_lat_h).residual
+    lon_lat_h = state.lon_lat_h.copy()
+    lon_lat_h[:, 0] -= 360.0 * np.round(lon_lat_h[:, 0] / 360.0)
     misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)
     n_images = len(images)
     return BlockAdjustment(
@@ -147,7 +149,7 @@ def adjust_block(
         values=state.values[:n_images],
         accuracy=accuracy,
         slope_factor=slope_factor,
-        lon_lat_h=np.where(intersected[:, None], state.lon_lat_h, np.nan),
+        lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
         group=gauge.group[:n_images],
         frames=earth_frames(accuracy, priors, images, passes),

@@ -10,10 +10,8 @@ from services.geodesy import move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import image_gsd_m, render_chip
 from services.matching.correlate import FOUND, CorrelationOptions, correlation_map, find_chip
-from services.matching.shadows import shadow_shift
 from services.sensors.base import SensorModel
 from services.types import (
-    Acquisition,
     Array,
     BoolArray,
     ChipArray,
@@ -89,8 +87,7 @@ def refine_on_chips(
         reference, chip = _reference_chip(scenes, seen_by, ground, gsd_m)
         saliency[row] = chip_saliency(chip)
         others = {i: scenes[i] for i in seen_by if i != reference}
-        template = _Template(chip, scenes[reference].acquisition, gsd_m)
-        measures = _measures(others, ground, template, options)
+        measures = _measures(others, ground, chip, gsd_m, options)
         if not measures:
             continue
         # The reference defines the detail: its position is as precise as the best of the others.
@@ -121,25 +118,18 @@ def _reference_chip(
     return i, chip
 
 
-@dataclass(frozen=True)
-class _Template:
-    """The chip that is searched, the image that it was cut from, and its ground sampling."""
-
-    chip: FloatImage
-    acquisition: Acquisition
-    gsd_m: float
-
-
 def _measures(
-    scenes: Mapping[int, Scene], ground: Array, template: _Template, options: RefinementOptions
+    scenes: Mapping[int, Scene],
+    ground: Array,
+    chip: FloatImage,
+    gsd_m: float,
+    options: RefinementOptions,
 ) -> dict[int, tuple[Array, float]]:
     """Image position (2,) and sigma, chip pixels, of a point (3,) in the images that show its chip."""
     found = {}
-    gsd_m = template.gsd_m
     for i, scene in scenes.items():
         patch = render_chip(scene.image, scene.model, ground, gsd_m, CHIP_SIZE + 2 * options.radius_px)
-        shadows = shadow_shift(template.acquisition, scene.acquisition, gsd_m)
-        peak = find_chip(patch, template.chip, options.correlation, shadows=shadows)
+        peak = find_chip(patch, chip, options.correlation)
         if peak.reason == FOUND:
             displacement_m = [[peak.row_col[1] * gsd_m, -peak.row_col[0] * gsd_m, 0.0]]
             position = scene.model.project(move_metres(ground[None, :], np.array(displacement_m)))[0]

@@ -185,6 +185,9 @@ def produce_points(
         used = measures.take(adjustment.active)
         residual_px = adjustment.residual_px[adjustment.active]
         noise = found_noise(used, adjustment.models, adjustment.lon_lat_h, residual_px)
+        if noise.own2_px2 == 0.0:
+            # What is in proportion to the stated sigmas is in the scale of the adjustment.
+            break
         measures = replace(measures, sigma_px=noise.applied(measures.sigma_px))
         adjustment = _adjust(scenes, passes, measures, options, known)
     active = measures.take(adjustment.active & (measures.point < len(candidates)))

@@ -23,6 +23,7 @@ a_centimetre = 0.01
 a_tenth_of_a_pixel = 0.1
 refined_limit_px = 0.3
 four_sigma = 4.0
+normalised_limit = 1.5
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_adjusted_models_agree_like_the_true_models(made: Production, true_point
     assert stated_px.max() < a_tenth_of_a_pixel / 2.0
     assert np.abs(true_points.residual_px).max() < a_tenth_of_a_pixel
     rms_px = np.sqrt((true_points.residual_px**2).mean())
-    assert rms_px < np.sqrt(2.0 / 3.0 * (stated_px**2).mean())
+    assert rms_px < normalised_limit * np.sqrt(2.0 / 3.0 * (stated_px**2).mean())
 
 
 def test_the_translation_is_within_the_stated_accuracy_of_the_models(
