@@ -247,7 +247,7 @@ def _look_at(block: _Block, rows: IntArray, found: TruePlaces) -> None:
         _under_one_sun(part, block.geometries[image], block.day) for image in np.unique(observed.image)
     ]
     gsd_m = float(block.points.views.gsd_m.min())
-    measured = refine_on_chips(scenes, start[usable], gsd_m)
+    measured = refine_on_chips(scenes, start[usable], gsd_m).observations
     heights_m = intersect([scene.model for scene in scenes], measured, len(usable)).lon_lat_h[:, 2]
     for number, height_m in zip(usable.tolist(), heights_m.tolist(), strict=True):
         if math.isnan(height_m):

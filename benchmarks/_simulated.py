@@ -37,7 +37,7 @@ def lay_points(
     start = np.column_stack([lon_lat, world.height_m(lon_lat)])
     for scene in references:
         start = start[chip_inside(scene.model, scene.image.shape, start, gsds_m[-1], 2)]
-    seen = refine_on_chips(references, start, gsds_m[0])
+    seen = refine_on_chips(references, start, gsds_m[0]).observations
     found = intersect(models, seen, len(start))
     saliency = np.array(
         [
