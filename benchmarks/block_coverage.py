@@ -11,16 +11,20 @@ Every layout is drawn many times with every limit and every share of blunders:
 
 A cell gives the share of points whose region holds their error relative to the median error of the
 block, the share whose region on the Earth does, the share of blocks whose frame does, east, north and
-up, and how many blocks were refused.
-Run: python -m benchmarks.block_coverage [--trials 40] [--layouts ring,pair]
+up, and how many blocks were refused. A scene that took no part in the block is registered on its points
+(`benchmarks._block_scenes`), and the shares of its corners and centre are given likewise.
+Run: python -m benchmarks.block_coverage [--trials 40] [--layouts ring,pair] [--jobs 2]
 """
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from itertools import product
+from multiprocessing import get_context
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -28,11 +32,13 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import chi2
 
+from benchmarks._block_scenes import scene_held
 from benchmarks._measuring import keep
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.parameters import ImageParameters, image_parameters
 from services.errors import ComputationError
 from services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree
+from services.sensors.correction import no_correction
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World, make_world
 from services.types import Array, Observations
@@ -67,6 +73,7 @@ class Coverage:
         relative, on_earth: share of points whose region holds their error.
         chance: standard deviation of `relative` by the draw of the blocks, whose points share errors.
         frame: (3,) share of blocks whose frame holds east, north, up.
+        scene_relative, scene_on_earth: share of the places of registered scenes whose region holds.
         sigma_up_m: median over the blocks of the stated sigma of heights relative to the frame.
         refused: blocks that the adjustment refused.
         reasons: first words of the refusals.
@@ -78,6 +85,8 @@ class Coverage:
     on_earth: float
     chance: float
     frame: tuple[float, float, float]
+    scene_relative: float
+    scene_on_earth: float
     sigma_up_m: float
     refused: int
     reasons: tuple[str, ...]
@@ -86,10 +95,11 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Layout:
-    """Images, and the rectangle of ground (west, east, south, north) they see, metres."""
+    """Images, the rectangle of ground (west, east, south, north) they see, metres, and a later scene."""
 
     views: tuple[ViewGeometry, ...]
     extent_m: tuple[float, float, float, float]
+    scene: ViewGeometry
 
 
 def main() -> None:
@@ -97,46 +107,62 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=40, help="blocks of every cell (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the random numbers (%(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (%(default)s)")
     parser.add_argument("--layouts", default=",".join(LAYOUTS), help="some of %(default)s")
     arguments = parser.parse_args()
     cases = [Case(*values) for values in product(arguments.layouts.split(","), DRIFTS_PX, BLUNDERS)]
-    outcomes = [measure(case, arguments.trials, arguments.seed) for case in track(cases, "cells")]
+    work = partial(measure, trials=arguments.trials, seed=arguments.seed)
+    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
+        outcomes = list(track(pool.map(work, cases), "cells", len(cases)))
     show(outcomes)
     keep("block_coverage", [asdict(outcome) for outcome in outcomes])
 
 
 def measure(case: Case, trials: int, seed: int) -> Coverage:
     """The coverage of one case over blocks that a seed draws."""
-    held: list[tuple[float, float, Array, float]] = []
+    held: list[Held] = []
     reasons: list[str] = []
     for trial in range(trials):
-        truth, images, observations = draw(case, np.random.default_rng([seed, trial]))
+        rng = np.random.default_rng([seed, trial])
+        truth, images, observations = draw(case, rng)
         try:
-            held.append(holds(adjust_block(images, observations), truth))
+            held.append(holds(adjust_block(images, observations), truth, case, rng))
         except ComputationError as error:
             reasons.append(str(error)[:60])
-    if not held:
-        nothing = (float("nan"),) * 3
-        return Coverage(
-            case, *nothing[:2], nothing, nothing[0], trials, tuple(sorted(set(reasons))), trials
-        )
-    relative, on_earth, frame, sigma_up_m = (np.array(part) for part in zip(*held, strict=True))
-    east, north, up = (float(share) for share in frame.mean(axis=0))
+    unknown = (float("nan"),) * len(Held._fields)
+    shares = Held(*np.mean(held, axis=0)) if held else Held(*unknown)
     return Coverage(
         case,
-        float(relative.mean()),
-        float(on_earth.mean()),
-        float(relative.std() / np.sqrt(len(relative))),
-        (east, north, up),
-        float(np.median(sigma_up_m)),
-        len(reasons),
-        tuple(sorted(set(reasons))),
-        trials,
+        relative=float(shares.relative),
+        on_earth=float(shares.on_earth),
+        chance=float(np.std([of.relative for of in held]) / np.sqrt(len(held)))
+        if held
+        else float("nan"),
+        frame=(float(shares.east), float(shares.north), float(shares.up)),
+        scene_relative=float(shares.scene_relative),
+        scene_on_earth=float(shares.scene_on_earth),
+        sigma_up_m=float(np.median([of.sigma_up_m for of in held])) if held else float("nan"),
+        refused=len(reasons),
+        reasons=tuple(sorted(set(reasons))),
+        trials=trials,
     )
 
 
-def holds(block: BlockAdjustment, truth: Array) -> tuple[float, float, Array, float]:
-    """Shares of points held, relative and on the Earth; is the frame (3,); median sigma of heights."""
+class Held(NamedTuple):
+    """What one block holds: shares of its points, its frame, a scene; median sigma of its heights."""
+
+    relative: float
+    on_earth: float
+    east: float
+    north: float
+    up: float
+    scene_relative: float
+    scene_on_earth: float
+    sigma_up_m: float
+
+
+def holds(block: BlockAdjustment, truth: Array, case: Case, rng: np.random.Generator) -> Held:
+    """What the regions of a block hold of the truth (p, 3) about its points, and of a scene on them."""
     found = np.flatnonzero(np.isfinite(block.lon_lat_h[:, 0]))
     east, north = metres_per_degree(float(truth[0, 1]), GROUND_M)
     error_m = (block.lon_lat_h[found] - truth[found]) * [east, north, 1.0]
@@ -147,7 +173,14 @@ def holds(block: BlockAdjustment, truth: Array) -> tuple[float, float, Array, fl
     on_earth = whitened_square(error_m, covariance + frame) <= limit
     of_frame = frame_error_m**2 <= chi2.ppf(CONFIDENCE, 1) * np.diagonal(frame)
     sigma_up_m = float(np.median(np.sqrt(covariance[:, 2, 2])))
-    return float(relative.mean()), float(on_earth.mean()), of_frame, sigma_up_m
+    scene = layout(case.layout).scene
+    slopes = rng.uniform(-case.drift_px, case.drift_px, (2, 2))
+    errors = np.column_stack([rng.normal(0.0, SHIFT_PX, 2), slopes])
+    correction = replace(no_correction(SHAPE), parameters=errors)
+    of_scene = scene_held(block, truth, frame_error_m, scene, correction)
+    return Held(
+        float(relative.mean()), float(on_earth.mean()), *map(float, of_frame), *of_scene, sigma_up_m
+    )
 
 
 def whitened_square(error: Array, covariance: Array) -> Array:
@@ -197,25 +230,31 @@ def draw(case: Case, rng: np.random.Generator) -> tuple[Array, list[ImageParamet
 def layout(name: str) -> Layout:
     """The images of a layout."""
     if name == "ring":
-        return Layout(_ring(0.0, 5), (-1700.0, 1700.0, -1700.0, 1700.0))
+        return Layout(_ring(0.0, 5), (-1700.0, 1700.0, -1700.0, 1700.0), _scene(0.0))
     if name == "pair":
         views = (view(0.0, 0.0, 15.0, 90.0), view(0.0, 0.0, 15.0, 270.0))
-        return Layout(views, (-1700.0, 1700.0, -1700.0, 1700.0))
+        return Layout(views, (-1700.0, 1700.0, -1700.0, 1700.0), _scene(0.0))
     if name == "star":
         turns = np.arange(6) * np.pi / 3.0
         around = tuple(
             view(1500.0 * np.sin(a), 1500.0 * np.cos(a), 18.0, float(np.degrees(a))) for a in turns
         )
-        return Layout((view(0.0, 0.0, 2.0, 0.0), *around), (-3000.0, 3000.0, -3000.0, 3000.0))
+        star = (view(0.0, 0.0, 2.0, 0.0), *around)
+        return Layout(star, (-3000.0, 3000.0, -3000.0, 3000.0), _scene(0.0))
     if name == "strip":
         sides = (45.0, 225.0, 135.0, 315.0)
-        views = tuple(view(1500.0 * k, 0.0, 12.0, sides[k % 4]) for k in range(16))
-        return Layout(views, (-1800.0, 24300.0, -1700.0, 1700.0))
-    return Layout(_ring(0.0, 3) + _ring(10_000.0, 3), (-1700.0, 11_700.0, -1700.0, 1700.0))
+        strip = tuple(view(1500.0 * k, 0.0, 12.0, sides[k % 4]) for k in range(16))
+        return Layout(strip, (-1800.0, 24300.0, -1700.0, 1700.0), _scene(11_000.0))
+    groups = _ring(0.0, 3) + _ring(10_000.0, 3)
+    return Layout(groups, (-1700.0, 11_700.0, -1700.0, 1700.0), _scene(0.0))
 
 
 def _ring(east_m: float, count: int) -> tuple[ViewGeometry, ...]:
     return tuple(view(east_m, 0.0, 15.0, 30.0 + 360.0 * k / count) for k in range(count))
+
+
+def _scene(east_m: float) -> ViewGeometry:
+    return view(east_m, 0.0, 8.0, 200.0)
 
 
 def view(east_m: float, north_m: float, incidence_deg: float, azimuth_deg: float) -> ViewGeometry:
@@ -246,7 +285,9 @@ def origin() -> Array:
 
 def show(outcomes: Sequence[Coverage]) -> None:
     """Print the table."""
-    table = Table(title="truth held by 90 % regions: relative / on the Earth / frame E, N, U; refused")
+    table = Table(
+        title="truth held by 90 % regions: relative / on the Earth / frame E, N, U / scene; refused"
+    )
     table.add_column("layout, drift")
     for blunders in BLUNDERS:
         table.add_column(f"{blunders:.0%} blunders")
@@ -263,7 +304,8 @@ def in_words(cell: Coverage) -> str:
     if cell.refused == cell.trials:
         return "refused"
     frame = ", ".join(f"{share:.2f}" for share in cell.frame)
-    return f"{cell.relative:.2f} / {cell.on_earth:.2f} / {frame}{refused}"
+    scene = f"{cell.scene_relative:.2f}, {cell.scene_on_earth:.2f}"
+    return f"{cell.relative:.2f} / {cell.on_earth:.2f} / {frame} / {scene}{refused}"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Data that pass between the services: frozen dataclasses of arrays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Protocol, Self
 
@@ -86,9 +86,13 @@ class Frame:
 
     Attributes:
         covariance_m2: (3, 3) of east, north, up; NaN where nobody stated it.
+        shared_m2: (3, 3) of what neighbouring points of the block are off by together, beyond its frame:
+            deformations, by the errors of its images. It is part of the covariance of every point; zero
+            where nobody stated it.
     """
 
     covariance_m2: Array
+    shared_m2: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
     def from_sigmas(cls, horizontal_m: float, up_m: float) -> Self:

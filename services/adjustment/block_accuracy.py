@@ -123,12 +123,13 @@ def _of_groups(covariance: Array) -> list[Array]:
     return [covariance[i : i + 3, i : i + 3] for i in range(0, len(covariance), 3)]
 
 
-def point_covariances(
+def carried_covariances(
     equations: Equations, points: Points, accuracy: BlockAccuracy, group: IntArray
 ) -> Array:
-    """Covariance (p, 3, 3) of the points relative to the frames of their groups (p,).
+    """What images add to the covariances of points, relative to their frames: (p, 3, 3).
 
-    Their own part is that of their rays. The other is what they take over from the images: with how far
+    The other part is that of a point's own rays; this one neighbours share. With `group` (p,) of the
+    points, and how far
     T a point goes when its group moves by a metre, nearly the unit matrix, the frame F adds
     (T - I) F (T - I)^T.
     """
@@ -137,7 +138,7 @@ def point_covariances(
     added, carried = shared_covariance(equations, points, accuracy.pairs, accuracy.relative, of_group)
     turned = carried - np.eye(3)
     frame_m2 = np.stack(_of_groups(accuracy.frame_m2))[group]
-    return np.asarray(points.inverse + added + turned @ frame_m2 @ turned.transpose(0, 2, 1))
+    return np.asarray(added + turned @ frame_m2 @ turned.transpose(0, 2, 1))
 
 
 def positive_part(matrix: Array) -> Array:

@@ -1,15 +1,15 @@
 """Bundle adjustment: the parameters of all images of a block, from tie points and control."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from services.adjustment.block_accuracy import (
     BlockAccuracy,
     block_accuracy,
+    carried_covariances,
     earth_frames,
-    point_covariances,
 )
 from services.adjustment.block_problem import BlockOptions, BlockProblem
 from services.adjustment.block_scale import check_scale, posterior_scale
@@ -102,7 +102,7 @@ def adjust_block(
         DisconnectedBlock: groups of images without common points, and without control of each.
         NoConvergence: the parameters still change after the last iteration.
     """
-    priors = block_priors(images, passes, [frame.covariance_m2 for frame in control.frames])
+    priors = block_priors(images, passes, _wholly_shared(control.frames))
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size)
     state, scale, active, control_active = robust_start(problem, priors)
@@ -134,8 +134,13 @@ def adjust_block(
     _check_control(control, used_control)
     of_points = np.full(n_points, -1)
     of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]
-    relative_m2 = point_covariances(solved.equations, solved.points, accuracy, of_points)
+    carried_m2 = carried_covariances(solved.equations, solved.points, accuracy, of_points)
     intersected = (of_points >= 0) & np.isfinite(solved.points.inverse[:, 0, 0])
+    relative_m2 = solved.points.inverse + carried_m2
+    frames = [
+        replace(frame, shared_m2=carried_m2[intersected & (of_points == group)].mean(axis=0))
+        for group, frame in enumerate(earth_frames(accuracy, priors, images, passes))
+    ]
     residual = problem.equations(state.values, state.lon_lat_h).residual
     lon_lat_h = state.lon_lat_h.copy()
     lon_lat_h[:, 0] -= 360.0 * np.round(lon_lat_h[:, 0] / 360.0)
@@ -152,7 +157,7 @@ def adjust_block(
         lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
         group=gauge.group[:n_images],
-        frames=earth_frames(accuracy, priors, images, passes),
+        frames=tuple(frames),
         residual_px=problem.image_rows(residual) * observations.sigma_px[:, None],
         active=used & intersected[observations.point],
         control_active=used_control,
@@ -160,6 +165,11 @@ def adjust_block(
         sigma_px=scale,
         iterations=state.iterations,
     )
+
+
+def _wholly_shared(frames: Sequence[Frame]) -> list[Array]:
+    """Covariances (3, 3) of frames with what the points of their blocks share beyond them."""
+    return [frame.covariance_m2 + frame.shared_m2 for frame in frames]
 
 
 def _determined(priors: BlockPriors, variance: Array) -> Array:

@@ -26,6 +26,13 @@ _THIN = 1e-3
 """Smallest width of the area of the points that determines drift and skew, half sizes of the image."""
 
 
+_DEFORMED = (((0, 3), 0.5), ((1, 4), 1.0), ((2, 5), 1.0))
+"""Parameters that follow a deformation of the points, and their variance over its mean variance.
+
+A linear deformation of a block as large as the scene has a drift and a skew of 1.5; in a larger block
+it is mostly a shift of 1. This lies between: 0.5 in the middle of the scene, 2.5 at its corners."""
+
+
 @dataclass(frozen=True)
 class AdjustmentOptions:
     """How a scene is adjusted.
@@ -67,6 +74,8 @@ class ControlObservations:
         usable: (n,) measures that may be used; all finite measures when None.
         common_covariance_px2: (2, 2) line, sample, of an error that all measures share; it adds to the
             covariance of the shift. None when there is no such error.
+        deformation_px2: (2, 2) line, sample, of what the blocks of the points are deformed by. None when
+            they are not.
         block: (n,) block that each point comes from; None when all come from one.
         frame_covariance_m2: (b, 3, 3) of the frames of the blocks, east, north, up, NaN where unknown;
             `block` counts its rows. None when all are unknown.
@@ -79,6 +88,7 @@ class ControlObservations:
     covariance_m2: Array
     usable: BoolArray | None = None
     common_covariance_px2: Array | None = None
+    deformation_px2: Array | None = None
     block: IntArray | None = None
     frame_covariance_m2: Array | None = None
     chip_side_px: float = 0.0
@@ -222,6 +232,9 @@ def adjust_scene(
     )
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
+    if observations.deformation_px2 is not None:
+        for pair, share in _DEFORMED:
+            covariance[np.ix_(pair, pair)] += share * observations.deformation_px2
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)

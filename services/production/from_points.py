@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -233,4 +233,5 @@ def _frame_with_image(frame: Frame, agreed: AgreedViews) -> Frame:
     if not agreed.tied.all():
         return frame
     image_m = agreed.scenes[0].sigma_m * agreed.disagreement
-    return Frame(frame.covariance_m2 + np.diag([image_m**2, image_m**2, 0.0]))
+    of_images = np.diag([image_m**2, image_m**2, 0.0])
+    return replace(frame, covariance_m2=frame.covariance_m2 + of_images)

@@ -15,7 +15,7 @@ def shared_frame(points: ControlPoints, active: BoolArray) -> Frame:
 
 
 def weighted_frame(frames: Sequence[Frame], weights: Array) -> Frame:
-    """The mean of the covariances of frames, by their weights (n,).
+    """The mean of the covariances of frames, and of what points share in them, by their weights (n,).
 
     Whatever the correlation between the errors of the frames, the covariance of their weighted mean
     cannot exceed this (the square is convex). It is unknown where a frame of positive weight is.
@@ -23,8 +23,11 @@ def weighted_frame(frames: Sequence[Frame], weights: Array) -> Frame:
     used = weights > 0.0
     if not used.any():
         return Frame(np.full((3, 3), np.nan))
-    covariances = np.array([frame.covariance_m2 for frame in frames])
-    return Frame(np.average(covariances[used], axis=0, weights=weights[used]))
+    covariance_m2, shared_m2 = (
+        np.average(np.array(matrices)[used], axis=0, weights=weights[used])
+        for matrices in zip(*((frame.covariance_m2, frame.shared_m2) for frame in frames), strict=True)
+    )
+    return Frame(covariance_m2, shared_m2)
 
 
 def frame_le90_m(frame: Frame) -> float:

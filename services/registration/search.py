@@ -25,6 +25,7 @@ from services.matching.consensus import (
     robust_affine_inliers,
 )
 from services.matching.control_points import PointMatches
+from services.quality.frames import shared_frame
 from services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
@@ -87,14 +88,18 @@ def adjust_search(
         like: an adjustment of these matches and others, whose prior and shared errors hold.
     """
     matches = search.matches
-    ground_to_px = scene.model.project_derivative(scene_centre(scene)[None, :])[0, :, :2]
+    usable = search.inliers if usable is None else usable
+    derivative = scene.model.project_derivative(scene_centre(scene)[None, :])[0]
+    ground_to_px = derivative[:, :2]
+    shared_m2 = shared_frame(search.points, usable).shared_m2
     observations = ControlObservations(
         lon_lat_h=search.points.lon_lat_h,
         line_sample=matches.line_sample,
         sigma_px=matches.sigma_px,
         covariance_m2=search.points.covariance_m2,
-        usable=search.inliers if usable is None else usable,
+        usable=usable,
         common_covariance_px2=ground_to_px @ matches.common_covariance_m2 @ ground_to_px.T,
+        deformation_px2=derivative @ shared_m2 @ derivative.T,
         block=search.points.block,
         frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
         chip_side_px=search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5),

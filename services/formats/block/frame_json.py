@@ -15,7 +15,10 @@ def format_frame(frame: Frame) -> FrameJson | None:
     if np.isnan(frame.covariance_m2).all():
         return None
     rows = frame.covariance_m2.tolist()
-    return {"covariance_m2": [[None if math.isnan(v) else v for v in row] for row in rows]}
+    stated: FrameJson = {"covariance_m2": [[None if math.isnan(v) else v for v in row] for row in rows]}
+    if frame.shared_m2.any():
+        stated["shared_m2"] = frame.shared_m2.tolist()
+    return stated
 
 
 def parse_frame(stated: object, sigma_m: float | None) -> Frame:
@@ -31,17 +34,32 @@ def parse_frame(stated: object, sigma_m: float | None) -> Frame:
     """
     if stated is None:
         return UNKNOWN_FRAME if sigma_m is None else Frame.from_sigmas(sigma_m, math.nan)
-    rows = stated.get("covariance_m2") if isinstance(stated, dict) else stated
-    try:
-        covariance = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
-        covariance = np.empty(0)
+    rows, shared = stated, None
+    if isinstance(stated, dict):
+        rows, shared = stated.get("covariance_m2"), stated.get("shared_m2")
+    covariance = _matrix(rows)
     if not _is_covariance(covariance):
         raise FormatError(
             f"block.json: amers:frame: {stated!r:.120} found, a 3 x 3 covariance_m2 in square metres "
             "expected, null in the row and column of a coordinate that is unknown"
         )
-    return Frame(covariance)
+    if shared is None:
+        return Frame(covariance)
+    shared_m2 = _matrix(shared)
+    if not _is_covariance(shared_m2) or np.isnan(shared_m2).any():
+        raise FormatError(
+            f"block.json: amers:frame: shared_m2: {shared!r:.120} found, a 3 x 3 covariance in square "
+            "metres expected; leave it out where it is not known"
+        )
+    return Frame(covariance, shared_m2)
+
+
+def _matrix(rows: object) -> Array:
+    """Rows as an array; an empty one where they are not numbers."""
+    try:
+        return np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
 
 def _is_covariance(matrix: Array) -> bool:

@@ -33,6 +33,9 @@ def test_regions_of_points_hold_the_truth_relative_and_on_the_earth(case: Case) 
     # Errors on the Earth are those of 20 frames: few.
     assert coverage.on_earth >= 0.75
     assert np.min(coverage.frame) >= 0.7
+    # Five places of 20 scenes; without what the points share: 0.3 in rings.
+    assert coverage.scene_relative >= 0.8
+    assert coverage.scene_on_earth >= 0.75
     assert coverage.refused <= 2
 
 

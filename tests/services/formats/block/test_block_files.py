@@ -221,6 +221,22 @@ def test_a_block_states_its_frame(tmp_path):
     assert_array_equal(frame.covariance_m2, covariance_m2)
 
 
+def test_a_block_states_what_its_points_share(tmp_path):
+    shared_m2 = np.array([[0.1, 0.02, 0.0], [0.02, 0.2, 0.05], [0.0, 0.05, 0.4]])
+    points, stated = control_points(3, np.random.default_rng(1)), Frame(np.eye(3), shared_m2)
+    write_block(tmp_path / "block", replace(metadata(), frame=stated), points, noise_chips(points), {})
+    (frame,) = check_block(tmp_path / "block").points.frames
+    assert_array_equal(frame.shared_m2, shared_m2)
+
+
+@pytest.mark.parametrize("shared_m2", [[[1.0]], "0.1 m", [[1, 0, 0], [0, None, 0], [0, 0, 1]], -1])
+def test_what_points_share_is_a_covariance_or_refused(block, shared_m2):
+    document = json.loads((block.folder / "block.json").read_text())
+    document["amers:frame"] = {"covariance_m2": np.eye(3).tolist(), "shared_m2": shared_m2}
+    with pytest.raises(FormatError, match="amers:frame: shared_m2"):
+        parse_block_json(json.dumps(document))
+
+
 def test_a_frame_is_unknown_where_nothing_or_null_is_stated(block):
     text = (block.folder / "block.json").read_text()
     document = json.loads(text)
