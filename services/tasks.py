@@ -1,5 +1,6 @@
 """Independent tasks: computed by any executor in any order, their results kept by name."""
 
+import time
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
@@ -11,6 +12,19 @@ from services.types import Progress, no_progress
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 """What a task returns: arrays by their names."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What tasks of one stage took.
+
+    Attributes:
+        tasks: number of those that were computed, not kept from before.
+        cpu_s: seconds of one core.
+    """
+
+    tasks: int = 0
+    cpu_s: float = 0.0
 
 
 def _own_thread() -> Executor:
@@ -26,11 +40,13 @@ class Work:
         kept: results by the name of the task. One that is there is not computed again, so that a
             mapping on a disk lets an interrupted work go on.
         ahead: tasks that are handed to the executor at once; their arguments are in memory.
+        effort: of the tasks computed so far, by the first part of their names.
     """
 
     executor: Executor = field(default_factory=_own_thread)
     kept: MutableMapping[str, Arrays] = field(default_factory=dict)
     ahead: int = 2
+    effort: dict[str, Effort] = field(default_factory=dict)
 
     def run(
         self,
@@ -48,12 +64,12 @@ class Work:
             tasks: names, and what returns the arguments when the task begins.
             progress: receives the fraction done.
         """
-        pending: dict[Future[Arrays], str] = {}
+        pending: dict[Future[tuple[Arrays, float]], str] = {}
         done = 0
         try:
             for name, arguments in tasks:
                 if name not in self.kept:
-                    pending[self.executor.submit(function, *arguments())] = name
+                    pending[self.executor.submit(_measured, function, arguments())] = name
                 else:
                     done += 1
                 if len(pending) >= self.ahead:
@@ -66,8 +82,18 @@ class Work:
             for future in pending:
                 future.cancel()
 
-    def _keep_ended(self, pending: dict[Future[Arrays], str]) -> int:
+    def _keep_ended(self, pending: dict[Future[tuple[Arrays, float]], str]) -> int:
         ended = wait(pending, return_when=FIRST_COMPLETED).done
         for future in ended:
-            self.kept[pending.pop(future)] = future.result()
+            name = pending.pop(future)
+            self.kept[name], cpu_s = future.result()
+            stage = name.partition("/")[0]
+            before = self.effort.get(stage, Effort())
+            self.effort[stage] = Effort(before.tasks + 1, before.cpu_s + cpu_s)
         return len(ended)
+
+
+def _measured(function: Callable[..., Arrays], arguments: tuple[Any, ...]) -> tuple[Arrays, float]:
+    """The result of a task, and the seconds of a core that it took."""
+    begun = time.thread_time()
+    return function(*arguments), time.thread_time() - begun

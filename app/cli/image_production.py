@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, show_one
-from app.cli.production_rows import accuracy_row, control_row, sampling_pair
+from app.cli.production_rows import accuracy_row, control_row, effort_row, sampling_pair
 from app.cli.progress import shown_progress
 from app.errors import InputError
 from app.usecases.executors import ComputeOptions
@@ -123,6 +123,7 @@ def run(
             "ray_residual_adjusted_px": round(relative.after_px, 3),
             "ray_residual_points_px": round(relative.refined_px, 3),
             **control_row(production.control, production.adjustment),
+            **effort_row(production.effort, as_json=as_json),
             **accuracy_row(production.points, as_json=as_json),
         },
         as_json=as_json,

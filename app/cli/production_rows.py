@@ -1,6 +1,8 @@
 """What the commands of `amers production` read and print alike."""
 
 import math
+from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from services.adjustment.bundle import BlockAdjustment
 from services.adjustment.control_ground import ControlGround
 from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import produced_accuracy
+from services.tasks import Effort
 from services.types import Array, ControlPoints
 
 
@@ -37,6 +40,13 @@ def control_row(control: ControlGround, adjustment: BlockAdjustment) -> Row:
             name for name, is_used in zip(control.names, used, strict=True) if not is_used
         ],
     }
+
+
+def effort_row(effort: Mapping[str, Effort], *, as_json: bool) -> Row:
+    """Seconds of a core that every stage took, and its number of tasks."""
+    if as_json:
+        return {"effort": {stage: asdict(one) for stage, one in effort.items()}}
+    return {"cpu_s": [f"{stage} {one.cpu_s:.0f} ({one.tasks})" for stage, one in effort.items()]}
 
 
 def accuracy_row(points: ControlPoints, *, as_json: bool) -> Row:

@@ -1,6 +1,7 @@
 """BLOCK OF IMAGES IN -> NEW POINTS OUT: tie, adjust, measure on chips, select, cut."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from services.production.ground_parts import CutPoints, cut_points, measure_poin
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
 from services.production.tie_points import find_tie_points
-from services.tasks import Work
+from services.tasks import Effort, Work
 from services.types import (
     Array,
     BoolArray,
@@ -111,6 +112,7 @@ class Production:
         relative_accuracy: how well the images agree.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
         control: what was found of the older blocks; `adjustment` tells which of it agrees.
+        effort: what every stage took; "adjustment" is all that is not done in tasks.
     """
 
     points: ControlPoints
@@ -119,6 +121,7 @@ class Production:
     relative_accuracy: RelativeAccuracy
     outline: Array
     control: ControlGround
+    effort: Mapping[str, Effort]
 
 
 def produce_points(
@@ -148,6 +151,7 @@ def produce_points(
         NotEnoughPoints: the images have too little in common.
     """
     _check_scenes(scenes)
+    begun = time.thread_time()
     work = work or Work()
     passes = image_passes([scene.acquisition for scene in scenes])
     ties = find_tie_points(scenes, passes, options.features, work, part_of(progress, 0.0, 0.5))
@@ -215,8 +219,15 @@ def produce_points(
         frame=adjustment.frames[0],
     )
     progress(1.0, f"{len(points)} points")
+    own = Effort(1, time.thread_time() - begun)
     return Production(
-        points, cut.chips, adjustment, relative_accuracy, box_around(points.lon_lat_h), known
+        points,
+        cut.chips,
+        adjustment,
+        relative_accuracy,
+        box_around(points.lon_lat_h),
+        known,
+        {**work.effort, "adjustment": own},
     )
 
 

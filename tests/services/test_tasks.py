@@ -1,6 +1,7 @@
 """Tasks: kept by name, computed once, independent of the order in which they end."""
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -39,6 +40,24 @@ def test_what_is_kept_is_not_computed_again() -> None:
     work.run(noted, named(3))
     assert computed == [0, 2]
     assert int(work.kept["doubled/1"]["value"][0]) == 99
+
+
+def busy(seconds: float) -> Arrays:
+    begun = time.thread_time()
+    while time.thread_time() - begun < seconds:
+        pass
+    return {}
+
+
+def test_the_effort_of_each_stage_is_that_of_its_computed_tasks() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        work = Work(executor, {"busy/0": {}})
+        work.run(busy, [(f"busy/{i}", partial(tuple, [0.1])) for i in range(3)])
+        work.run(doubled, named(4))
+    assert work.effort["busy"].tasks == 2
+    # Of one thread each: what others do at the same time does not count.
+    assert 0.2 <= work.effort["busy"].cpu_s < 0.4
+    assert work.effort["doubled"].tasks == 4
 
 
 def test_an_error_ends_the_work_and_keeps_what_had_ended() -> None:
