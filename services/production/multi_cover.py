@@ -26,6 +26,8 @@ _SHORTEST = 1e-3
 _MOMENTUM = 0.5
 _ABOVE = 1.05
 """Steps of the lower bound aim this much above the known cover, so that they never vanish."""
+_ROUNDING = 1e-12
+"""Error of the sums of a bound, as a share of its terms."""
 
 
 class _Incidence(NamedTuple):
@@ -178,9 +180,11 @@ def bound_of(problem: CoverProblem, price: Array) -> float:
 
     For prices u >= 0 of the cells, every cover x satisfies
     sum_i x_i >= sum_c need_c u_c + sum_i min(0, 1 - sum of u_c over the cells of image i).
+    What rounding may add to the difference is taken off.
     """
-    reduced = _reduced(problem.incidence, price)
-    return float(problem.need @ price + np.minimum(reduced, 0.0).sum())
+    asked = float(problem.need @ price)
+    taken_off = float(np.minimum(_reduced(problem.incidence, price), 0.0).sum())
+    return asked + taken_off - _ROUNDING * (asked - taken_off)
 
 
 def lower_bound(problem: CoverProblem, upper: int, iterations: int) -> LowerBound:
@@ -219,13 +223,14 @@ def _subgradient(images: _Incidence, upper: float, iterations: int) -> Array:
     direction = np.zeros(len(need))
     for _ in range(iterations):
         reduced = _reduced(images, price)
-        value = (need * price).sum()
+        asked, taken_off = (need * price).sum(), 0.0
         missing = need.astype(np.float64)
         for i in range(len(reduced)):
             if reduced[i] < 0.0:
-                value += reduced[i]
+                taken_off += reduced[i]
                 for c in images.cell[start[i] : start[i + 1]]:
                     missing[c] -= 1.0
+        value = asked + taken_off - _ROUNDING * (asked - taken_off)
         standstill = 0 if value > best * (1.0 + _PROGRESS) else standstill + 1
         if value > best:
             best = value
@@ -239,7 +244,7 @@ def _subgradient(images: _Incidence, upper: float, iterations: int) -> Array:
         missing[(price == 0.0) & (missing < 0.0)] = 0.0
         direction = missing + _MOMENTUM * direction
         norm = (direction * direction).sum()
-        if norm == 0.0 or step < _SHORTEST:
+        if norm == 0.0 or step < _SHORTEST or best >= upper:
             break
         price = np.maximum(0.0, price + step * (_ABOVE * upper - value) / norm * direction)
     return best_price

@@ -80,6 +80,16 @@ def test_any_prices_give_a_valid_bound(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_where_every_image_is_needed_the_bound_is_their_number(seed):
+    # Prices may then grow without end, and the bound is the difference of two large numbers.
+    matrix, problem = random_problem(seed, images=8)
+    every = replace(problem, need=matrix.sum(axis=0).astype(np.int16))
+    assert bound_of(every, np.full(len(every.need), 1e14)) <= 8.0
+    _, bound = solve(every)
+    assert 7.99 <= bound.images <= 8.0
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_no_image_of_a_cover_can_be_left_out(seed):
     matrix, problem = random_problem(seed, images=200)
     cover, _ = solve(problem)
