@@ -1,5 +1,6 @@
 """Data that pass between the services: frozen dataclasses of arrays."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Protocol, Self
@@ -348,3 +349,9 @@ class Observations:
         return Observations(
             self.point[rows], self.image[rows], self.line_sample[rows], self.sigma_px[rows]
         )
+
+
+def joined_observations(parts: Sequence[Observations]) -> Observations:
+    """All observations of one part or more, whose points are numbered one after the other."""
+    columns = [vars(part) for part in parts]
+    return Observations(**{name: np.concatenate([of[name] for of in columns]) for name in columns[0]})

@@ -7,13 +7,17 @@ from typing import Annotated
 
 import typer
 
+from app.cli import control_options
 from app.cli.output import AsJson, show_one
+from app.cli.point_statements import sigma_pair, stated_by_caller
 from app.cli.production_rows import accuracy_row, control_row, effort_row, sampling_pair
 from app.cli.progress import shown_progress
 from app.errors import InputError
+from app.usecases.control_files import ControlFiles
 from app.usecases.executors import ComputeOptions
 from app.usecases.image_production import ProductionImages, WorkPlace, run_production
 from app.usecases.image_selection import CatalogueRequest, run_selection
+from app.usecases.marked_files import PointStatements
 from app.usecases.production import BlockIdentity, refuse_existing
 from services.production.from_images import ProductionOptions
 from services.types import part_of
@@ -61,10 +65,15 @@ def run(
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
     ] = None,
-    control: Annotated[
-        list[Path] | None,
-        typer.Option(help="Folder of an older block that places the new one; repeat for several."),
-    ] = None,
+    control: control_options.Control = None,
+    control_sigma_m: control_options.SigmaM = None,
+    control_frame_sigma_m: control_options.FrameSigmaM = None,
+    control_mark_sigma_px: control_options.MarkSigmaPx = None,
+    control_vertical: control_options.Vertical = None,
+    control_geoid: control_options.Geoid = None,
+    control_crs: control_options.Crs = None,
+    control_columns: control_options.Columns = None,
+    control_sigma_axes: control_options.SigmaAxes = None,
     area: Annotated[
         Path | None, typer.Option(help="GeoJSON of the ground to see, for --catalogue.")
     ] = None,
@@ -97,6 +106,17 @@ def run(
     )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     place = WorkPlace(work, ComputeOptions(jobs, cluster))
+    control_files = ControlFiles(
+        tuple(control or ()),
+        PointStatements(
+            stated_by_caller(
+                control_geoid or control_vertical, control_crs, control_columns, control_sigma_axes
+            ),
+            sigma_pair(control_sigma_m, "--control-sigma-m"),
+            sigma_pair(control_frame_sigma_m, "--control-frame-sigma-m"),
+            control_mark_sigma_px,
+        ),
+    )
     refuse_existing(output)
     with shown_progress() as progress:
         if catalogue is not None:
@@ -105,7 +125,7 @@ def run(
             request = CatalogueRequest(catalogue, area, first_day)
             run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_production(
-            ProductionImages(tuple(images or ()), selection, sigma_m, tuple(control or ())),
+            ProductionImages(tuple(images or ()), selection, sigma_m, control_files),
             output,
             identity,
             options,

@@ -6,14 +6,12 @@ from typing import Annotated
 import typer
 
 from app.cli.output import AsJson, show_one
+from app.cli.point_statements import sigma_pair, stated_by_caller
 from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from app.cli.progress import shown_progress
-from app.errors import InputError
 from app.usecases.points_production import KnownPointFiles, run_points_production
 from app.usecases.production import BlockIdentity
 from app.usecases.terrain_file import TerrainFile
-from services.formats.gcp.csv_points import CsvLayout, parse_columns
-from services.formats.gcp.reader import StatedByCaller
 from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 from services.production.from_points import KnownPointOptions
 
@@ -106,15 +104,12 @@ def points(
     as_json: AsJson = False,
 ) -> None:
     """Make a block of the points of another base, with chips from images that show them."""
-    if sigma_axes not in (None, ECEF, LAT_LON_HEIGHT):
-        raise InputError(f"--sigma-axes: {sigma_axes[:40]!r} found, {ECEF} or {LAT_LON_HEIGHT} expected")
     fine_m, coarse_m = (None, None) if gsd_m is None else sampling_pair(gsd_m)
-    layout = CsvLayout({} if columns is None else parse_columns(columns), crs)
     files = KnownPointFiles(
         points=file,
         images=tuple(images),
-        stated=StatedByCaller(geoid or vertical, sigma_axes, layout),
-        point_sigma_m=None if point_sigma_m is None else _sigmas(point_sigma_m),
+        stated=stated_by_caller(geoid or vertical, crs, columns, sigma_axes),
+        point_sigma_m=sigma_pair(point_sigma_m, "--point-sigma-m"),
         terrain=None if dem is None else TerrainFile(dem, dem_vertical, dem_geoid),
         height_sigma_m=height_sigma_m,
         sigma_m=sigma_m,
@@ -143,16 +138,3 @@ def points(
         },
         as_json=as_json,
     )
-
-
-def _sigmas(text: str) -> tuple[float, float]:
-    """The horizontal and the vertical sigma of a text."""
-    try:
-        horizontal_m, up_m = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(
-            f"--point-sigma-m: {text!r} found, HORIZONTAL,UP such as 3,5 expected"
-        ) from None
-    if not (0.0 < horizontal_m < 1e6 and 0.0 < up_m < 1e6):
-        raise InputError(f"--point-sigma-m: {text!r} found, two positive lengths in metres expected")
-    return horizontal_m, up_m

@@ -10,19 +10,17 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from app.usecases.control_files import ControlFiles, control_inputs, read_control
 from app.usecases.executors import ComputeOptions, open_executor
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
-from services.formats.block.document_json import BLOCK_JSON
-from services.formats.block.reader import FolderChips, file_sha256, read_block
 from services.formats.block.writer import write_block
 from services.formats.images.scenes import read_scene
 from services.formats.stac.catalogue import read_catalogue
 from services.formats.stac.scenes import image_path, read_item_scene
 from services.formats.work_folder import WorkFolder
 from services.imagery.scene import Scene
-from services.production.control_points import ControlBlock
 from services.production.from_images import Production, ProductionOptions, produce_points
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel
@@ -38,13 +36,13 @@ class ProductionImages:
         files: images with their models beside them or inside.
         selection: folder that `run_selection` has written; its images are added.
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
-        control: folders of older blocks that place the new one on the Earth.
+        control: places the block on the Earth.
     """
 
     files: tuple[Path, ...] = ()
     selection: Path | None = None
     sigma_m: float | None = None
-    control: tuple[Path, ...] = ()
+    control: ControlFiles = field(default_factory=ControlFiles)
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ def run_production(
     with ExitStack() as stack:
         scenes, files = _read(images, stack, part_of(progress, 0.0, 0.05))
         work_folder = place.folder or folder.with_name(f"{folder.name}.work")
-        control = [_control_block(folder, stack) for folder in images.control]
+        control = read_control(images.control, scenes, files, stack)
         kept = WorkFolder(work_folder, _inputs(scenes, files, images.control, options))
         executor, ahead = stack.enter_context(open_executor(place.compute))
         work = Work(executor, kept, ahead)
@@ -135,16 +133,10 @@ def _read(
     return scenes, files
 
 
-def _control_block(folder: Path, stack: ExitStack) -> ControlBlock:
-    contents = read_block(folder)
-    chips = stack.enter_context(FolderChips(folder))
-    return ControlBlock(contents.document.metadata.id, contents.points, chips)
-
-
 def _inputs(
     scenes: Sequence[Scene],
     files: Sequence[Path],
-    control: Sequence[Path],
+    control: ControlFiles,
     options: ProductionOptions,
 ) -> dict[str, Any]:
     """What the results of all tasks depend on."""
@@ -161,10 +153,7 @@ def _inputs(
             }
             for scene, file in zip(scenes, files, strict=True)
         ],
-        "control": [
-            {"folder": str(folder.resolve()), "sha256": file_sha256(folder / BLOCK_JSON)}
-            for folder in control
-        ],
+        "control": control_inputs(control),
         "options": asdict(options),
     }
 
@@ -219,6 +208,6 @@ def _frame_source(production: Production) -> str:
     stated = "the stated accuracy of the images' models"
     if len(production.control) == 0:
         return f"{stated}, not measured"
-    blocks = sorted({name.rpartition(":")[0] for name in production.control.names})
+    sources = sorted({name.partition(":")[0] for name in production.control.names})
     used = int(production.adjustment.control_active.sum())
-    return f"{used} control points of {', '.join(blocks)}, and {stated}"
+    return f"{used} control points of {', '.join(sources)}, and {stated}"

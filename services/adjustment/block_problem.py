@@ -88,6 +88,26 @@ class BlockProblem:
         return np.split(order, ends[:-1])
 
     @cached_property
+    def single_rays(self) -> tuple[IntArray, IntArray]:
+        """Rows (s,) of the only ray of a known point, and rows of these points in the control.
+
+        Points that are not known in all three coordinates are left out.
+        """
+        rays = np.bincount(self.observations.point, minlength=self.n_points)
+        alone = (rays[self.control.point] == 1) & self.control.known.all(axis=1)
+        known = np.flatnonzero(alone)
+        return np.searchsorted(self.observations.point, self.control.point[known]), known
+
+    @cached_property
+    def by_hand(self) -> BoolArray:
+        """Observations (m,) that people made."""
+        return self.control.marks(self.observations.point)
+
+    def scales(self, scale: float) -> Array:
+        """Scale (m,) of the sigmas of the observations: 1 for those that people made."""
+        return np.where(self.by_hand, 1.0, scale)
+
+    @cached_property
     def pairs(self) -> Pairs:
         """The blocks of parameters that have a point in common."""
         return seen_pairs(self.point, self.block, self.n_blocks)

@@ -109,7 +109,7 @@ def adjust_block(
     _check_control(control, control_active)
     slope_factor = 1.0
     for _ in range(_ROUNDS):
-        weight = problem.weights(active / max(scale, _LEAST_SCALE) ** 2, control_active)
+        weight = problem.weights(active / problem.scales(max(scale, _LEAST_SCALE)) ** 2, control_active)
         equations = problem.equations(state.values, state.lon_lat_h, weight)
         gauge = checked_gauge(problem, equations, state.lon_lat_h)
         solved = least_squares(problem, priors, gauge, state, weight)
@@ -118,11 +118,11 @@ def adjust_block(
         used, previous = active, (scale, slope_factor)
         square = problem.squares(state.values, state.lon_lat_h)
         determined = _determined(priors, accuracy.variance())
-        computed = used & np.isfinite(square)
+        computed = used & np.isfinite(square) & ~problem.by_hand
         scale = posterior_scale(square[computed], observations.point[computed], float(determined.sum()))
         check_scale(scale)
         factor = _slope_factor(state.values.ravel(), priors, determined, slope_factor)
-        active = active_observations(problem, square, used, options.tolerance * scale, control_active)
+        active = active_observations(problem, square, used, scale, control_active)
         used_control, control_active = (
             control_active,
             agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
@@ -131,6 +131,8 @@ def adjust_block(
         if settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED):
             break
         priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
+    # Known ground that no image shows any more, as its rays have left, takes no part.
+    used_control = used_control & np.isin(control.point, observations.point[used])
     _check_control(control, used_control)
     of_points = np.full(n_points, -1)
     of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]

@@ -6,6 +6,7 @@ from scipy.stats import chi2
 
 from services.adjustment.block_accuracy import BlockAccuracy
 from services.adjustment.block_problem import BlockProblem
+from services.adjustment.block_solution import State
 from services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
 from services.adjustment.robust import CAUCHY_TUNING
 from services.types import Array, BoolArray, IntArray
@@ -45,6 +46,31 @@ def robust_control(
     scale = max(1.0, float(np.median(size)))
     near = square <= chi2.ppf(_AGREES, freedom) * _NEAR**2
     return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2, near
+
+
+def robust_single_rays(problem: BlockProblem, state: State, equations: Equations) -> Array:
+    """Weights (s,) of the only rays of known points (`BlockProblem.single_rays`) while the block moves.
+
+    Residuals are those at the known ground, in units of their own median: the images may be far off.
+
+    Args:
+        problem: the block.
+        state: parameters and points.
+        equations: at this state.
+    """
+    rows, known = problem.single_rays
+    if not len(rows):
+        return np.ones(0)
+    row = problem.place[rows]
+    misfit_m = problem.control_misfit_m(state.values, state.lon_lat_h)[known]
+    by_ground = equations.by_ground[row]
+    residual = equations.residual[row] - (by_ground @ misfit_m[:, :, None])[:, :, 0]
+    ground_m2 = problem.control.covariance_m2[known]
+    spread = np.eye(2) + by_ground @ ground_m2 @ by_ground.transpose(0, 2, 1)
+    square = (residual * np.linalg.solve(spread, residual[:, :, None])[:, :, 0]).sum(axis=1)
+    size = np.sqrt(square / 2.0)
+    scale = max(1.0, float(np.median(size)))
+    return np.asarray(1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2)
 
 
 def agreeing_control(

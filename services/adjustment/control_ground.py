@@ -1,5 +1,6 @@
 """Control of a block adjustment: points whose ground positions are known, with the frames they share."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ class ControlGround:
         source: (c,) int64, rows of `frames`.
         frames: of the sources.
         names: of the points, for messages and reports.
+        by_hand: (c,) points that people marked in the images: their observations keep the sigmas they
+            state, whatever the residuals of measures by correlation are; none of them by default.
     """
 
     point: IntArray
@@ -31,6 +34,7 @@ class ControlGround:
     source: IntArray
     frames: tuple[Frame, ...]
     names: tuple[str, ...]
+    by_hand: BoolArray | None = None
 
     def __len__(self) -> int:
         return len(self.point)
@@ -46,6 +50,15 @@ class ControlGround:
         return out
 
     @property
+    def is_by_hand(self) -> BoolArray:
+        """(c,) points that people marked in the images."""
+        return np.zeros(len(self), dtype=np.bool_) if self.by_hand is None else self.by_hand
+
+    def marks(self, point: IntArray) -> BoolArray:
+        """Which observations (m,) of given points people made."""
+        return np.asarray(np.isin(point, self.point[self.is_by_hand]))
+
+    @property
     def known(self) -> BoolArray:
         """(c, 3) coordinates that are known: east, north, up."""
         return np.isfinite(np.diagonal(self.covariance_m2, 0, 1, 2))
@@ -53,6 +66,22 @@ class ControlGround:
     def known_coordinates(self) -> IntArray:
         """Number (c,) of coordinates that are known."""
         return self.known.sum(axis=1).astype(np.int64)
+
+
+def joined_ground(parts: Sequence[ControlGround]) -> ControlGround:
+    """The known ground of several parts, whose points have their numbers already."""
+    if not parts:
+        return NO_CONTROL
+    start = np.cumsum([0] + [len(part.frames) for part in parts[:-1]])
+    return ControlGround(
+        point=np.concatenate([part.point for part in parts]),
+        lon_lat_h=np.concatenate([part.lon_lat_h for part in parts]),
+        covariance_m2=np.concatenate([part.covariance_m2 for part in parts]),
+        source=np.concatenate([part.source + by for part, by in zip(parts, start, strict=True)]),
+        frames=tuple(frame for part in parts for frame in part.frames),
+        names=tuple(name for part in parts for name in part.names),
+        by_hand=np.concatenate([part.is_by_hand for part in parts]),
+    )
 
 
 _EXACT_M = 1e-4

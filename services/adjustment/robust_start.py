@@ -5,7 +5,7 @@ import numpy as np
 from services.adjustment.block_problem import BlockProblem
 from services.adjustment.block_scale import check_scale, low_scale, magnitude, robust_scale
 from services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
-from services.adjustment.control_check import robust_control
+from services.adjustment.control_check import robust_control, robust_single_rays
 from services.adjustment.normal_equations import robust_points
 from services.adjustment.parameters import BlockPriors
 from services.errors import NotEnoughPoints
@@ -32,15 +32,18 @@ def robust_start(
     state = State(np.zeros((problem.n_blocks, problem.size)), problem.start())
     scale, change_px = _falling_scale(problem), np.inf
     falling = scale
+    alone = np.isin(np.arange(len(point)), problem.single_rays[0])
     while True:
         equations = problem.equations(state.values, state.lon_lat_h)
         step_m, weight = robust_points(equations, n, problem.n_points, max(scale, falling))
         _check_points(problem, step_m)
         equations, state = moved(equations, state, step_m)
         square = problem.image_rows((equations.residual**2).sum(axis=1))
-        square = np.where(np.isfinite(step_m[point, 0]), square, np.nan)
-        scale = low_scale(square, point)
+        square = np.where(np.isfinite(step_m[point, 0]) | alone, square, np.nan)
+        measured = np.where(problem.by_hand, np.nan, square)
+        scale = low_scale(measured, point)
         weight = problem.image_rows(weight * (equations.weight > 0)) / max(scale, falling) ** 2
+        weight[problem.single_rays[0]] = robust_single_rays(problem, state, equations)
         control_weight, near = robust_control(problem, equations, weight)
         if change_px <= _NEARLY_PX and falling <= scale:
             break
@@ -51,10 +54,10 @@ def robust_start(
         solved = step(problem, priors, gauge, state, equations)
         state, change_px = solved.state, solved.change_px
         falling *= 0.5
-    scale = robust_scale(square, point)
+    scale = robust_scale(measured, point)
     check_scale(scale)
-    tolerance = problem.options.tolerance * scale
-    active = active_observations(problem, square, square <= tolerance**2, tolerance, near)
+    small = square <= (problem.options.tolerance * problem.scales(scale)) ** 2
+    active = active_observations(problem, square, small, scale, near)
     return state, scale, active, near
 
 
@@ -74,12 +77,12 @@ def _check_points(problem: BlockProblem, step_m: Array) -> None:
 
 
 def active_observations(
-    problem: BlockProblem, square: Array, active: BoolArray, tolerance: float, control_active: BoolArray
+    problem: BlockProblem, square: Array, active: BoolArray, scale: float, control_active: BoolArray
 ) -> BoolArray:
-    """Observations (m,) within a tolerance, of points with two such rays, or one and known ground."""
+    """Observations (m,) within the tolerance, of points with two such rays, or one and known ground."""
     point = problem.observations.point
     size = magnitude(square, point, active)
-    within = np.nan_to_num(size, nan=np.inf) <= tolerance
+    within = np.nan_to_num(size, nan=np.inf) <= problem.options.tolerance * problem.scales(scale)
     rays = np.bincount(point[within], minlength=problem.n_points)
     rays[problem.control.point[control_active]] += 1
     return np.asarray(within & (rays[point] >= 2))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from services.adjustment.control_ground import ControlGround
+from services.adjustment.control_ground import ControlGround, joined_ground
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import NotEnoughPoints
 from services.imagery.scene import Scene
@@ -23,6 +23,7 @@ from services.types import (
     IntArray,
     Observations,
     Progress,
+    joined_observations,
 )
 
 _LARGEST_RADIUS_PX = 150
@@ -98,7 +99,7 @@ def find_control(
     if count < _MIN_FOUND:
         names = ", ".join(block.name for block in blocks)
         raise NotEnoughPoints(count, _MIN_FOUND, f"control points of {names} in two images or more")
-    return joined(*observations), _all_ground(ground)
+    return joined_observations(observations), joined_ground(ground)
 
 
 @dataclass(frozen=True)
@@ -167,24 +168,6 @@ def _known(block: ControlBlock, rows: IntArray, first: int) -> ControlGround:
         source=points.block[rows],
         frames=points.frames,
         names=tuple(f"{block.name}:{identity}" for identity in points.id[rows]),
-    )
-
-
-def joined(*parts: Observations) -> Observations:
-    """All observations of parts whose points are numbered one after the other."""
-    columns = [vars(part) for part in parts]
-    return Observations(**{name: np.concatenate([of[name] for of in columns]) for name in columns[0]})
-
-
-def _all_ground(parts: Sequence[ControlGround]) -> ControlGround:
-    start = np.cumsum([0] + [len(part.frames) for part in parts[:-1]])
-    return ControlGround(
-        point=np.concatenate([part.point for part in parts]),
-        lon_lat_h=np.concatenate([part.lon_lat_h for part in parts]),
-        covariance_m2=np.concatenate([part.covariance_m2 for part in parts]),
-        source=np.concatenate([part.source + by for part, by in zip(parts, start, strict=True)]),
-        frames=tuple(frame for part in parts for frame in part.frames),
-        names=tuple(name for part in parts for name in part.names),
     )
 
 

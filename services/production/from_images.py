@@ -19,7 +19,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.matching.ground_features import FeatureOptions
 from services.matching.multi_image import RefinementOptions, chip_inside
 from services.matching.predict import rank_in_group
-from services.production.control_points import ControlBlock, find_control, joined
+from services.production.control import Control, with_control
 from services.production.ground_parts import CutPoints, cut_points, measure_points
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
@@ -111,7 +111,7 @@ class Production:
         adjustment: of the images; the points refer to its models.
         relative_accuracy: how well the images agree.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
-        control: what was found of the older blocks; `adjustment` tells which of it agrees.
+        control: what was found of the known ground; `adjustment` tells which of it agrees.
         effort: what every stage took; "adjustment" is all that is not done in tasks.
     """
 
@@ -129,7 +129,7 @@ def produce_points(
     options: ProductionOptions = ProductionOptions(),
     progress: Progress = no_progress,
     *,
-    control: Sequence[ControlBlock] = (),
+    control: Control = Control(),
     work: Work | None = None,
 ) -> Production:
     """Control points with chips, produced from overlapping images alone.
@@ -143,7 +143,7 @@ def produce_points(
         scenes: two or more, with models as delivered.
         options: of the block.
         progress: receives the fraction done.
-        control: older blocks that place the new one on the Earth.
+        control: what places the block on the Earth.
         work: computes the tasks and keeps their results; by default in this process, in memory.
 
     Raises:
@@ -172,27 +172,27 @@ def produce_points(
         work=work,
         progress=part_of(progress, 0.5, 0.25),
     )
-    known = NO_CONTROL
-    if control:
-        of_control, known = find_control(
-            _with_models(scenes, tied),
-            tied.frames[0],
-            control,
-            first_point=len(candidates),
-            work=work,
-            progress=part_of(progress, 0.75, 0.05),
-        )
-        measures = joined(measures, of_control)
+    measures, known = with_control(
+        _with_models(scenes, tied),
+        tied.frames[0],
+        measures,
+        control,
+        first_point=len(candidates),
+        work=work,
+        progress=part_of(progress, 0.75, 0.05),
+    )
     progress(0.8, "adjusting the block on its chips")
     adjustment = _adjust(scenes, passes, measures, options, known)
     for _ in range(_ROUNDS_OF_NOISE):
-        used = measures.take(adjustment.active)
-        residual_px = adjustment.residual_px[adjustment.active]
+        by_hand = known.marks(measures.point)
+        correlated = adjustment.active & ~by_hand
+        used, residual_px = measures.take(correlated), adjustment.residual_px[correlated]
         noise = found_noise(used, adjustment.models, adjustment.lon_lat_h, residual_px)
         if noise.own2_px2 == 0.0:
             # What is in proportion to the stated sigmas is in the scale of the adjustment.
             break
-        measures = replace(measures, sigma_px=noise.applied(measures.sigma_px))
+        sigma_px = np.where(by_hand, measures.sigma_px, noise.applied(measures.sigma_px))
+        measures = replace(measures, sigma_px=sigma_px)
         adjustment = _adjust(scenes, passes, measures, options, known)
     active = measures.take(adjustment.active & (measures.point < len(candidates)))
     adjusted = _with_models(scenes, adjustment)

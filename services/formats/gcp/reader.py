@@ -67,13 +67,34 @@ def read_control_points(path: Path, heights: Heights | None = None) -> MarkedPoi
             needs is not installed.
     """
     points = _read(path, StatedByCaller(heights))
+    _refuse_unmarked(points, path)
+    return points.take(points.is_marked)
+
+
+def _refuse_unmarked(points: MarkedPoints, path: Path) -> None:
     if len(points) and not points.is_marked.any():
         raise FormatError(
             f"{path.name}: expected points with their positions in an image, found {len(points)} points "
             "without any; a CSV has them in the columns line and sample, after a first line with the "
             f"origin of its pixels such as '# pixel-origin=centre' ({', '.join(PIXEL_ORIGINS)})"
         )
-    return points.take(points.is_marked)
+
+
+def read_marked_ground(path: Path, stated: StatedByCaller = StatedByCaller()) -> MarkedPoints:
+    """The points of a file with their marks, without those that are switched off.
+
+    A point without any mark has one row.
+
+    Args:
+        path: of the file; its content decides on the format.
+        stated: what the file does not state.
+
+    Raises:
+        FormatError, InputError, VerticalDatumError: as for `read_ground_points`; or nothing is marked.
+    """
+    used = _used(_read(path, stated), path)
+    _refuse_unmarked(used, path)
+    return used
 
 
 def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) -> GroundPoints:
@@ -87,7 +108,13 @@ def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) ->
         FormatError, InputError, VerticalDatumError: as for `read_control_points`; or a point has two
             positions, or a sigma that is not positive.
     """
-    marks = _read(path, stated)
+    used = _used(_read(path, stated), path)
+    rows = np.sort(np.unique(used.id, return_index=True)[1])
+    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows])
+
+
+def _used(marks: MarkedPoints, path: Path) -> MarkedPoints:
+    """The points that are not switched off; refuses two positions of one, and sigmas of 0 or less."""
     used = marks.take(marks.active | marks.check)
     if len(used) == 0:
         raise FormatError(
@@ -107,8 +134,7 @@ def read_ground_points(path: Path, stated: StatedByCaller = StatedByCaller()) ->
             f"{path.name}, point {used.id[row]}: sigmas: expected positive metres east, north, up, "
             f"found {used.sigma_m[row].tolist()}"
         )
-    rows = np.sort(first)
-    return GroundPoints(used.id[rows], used.lon_lat_h[rows], used.sigma_m[rows])
+    return used
 
 
 def _read(path: Path, stated: StatedByCaller) -> MarkedPoints:

@@ -10,7 +10,7 @@ from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import ControlGround
 from services.errors import NoConsensus
 from services.geodesy import move_metres
-from services.types import UNKNOWN_FRAME, Array, Frame
+from services.types import UNKNOWN_FRAME, Array, Frame, Observations
 from tests.services.ties import difference_m
 
 point_sigma_m = 0.3
@@ -46,7 +46,8 @@ def test_the_frame_is_that_of_the_control_and_covers_the_truth() -> None:
         truth, images, observations = draw(CASE, rng)
         block = adjust_block(images, observations, control=known_ground(truth, rng, wrong=2))
         assert not block.control_active[:2].any()
-        assert block.control_active[2:].all()
+        seen = np.isin(np.arange(count), observations.point)
+        assert block.control_active[2:].tolist() == seen[2:].tolist()
         covariance = block.frames[0].covariance_m2
         # Images of 3 m help a little; 0.3 m of ten points add a little.
         assert (np.sqrt(np.diagonal(covariance)) < 1.15 * frame_sigma_m).all()
@@ -88,3 +89,42 @@ def test_control_that_mostly_disagrees_is_refused_by_name() -> None:
     scattered = move_metres(control.lon_lat_h, rng.uniform(-40.0, 40.0, (count, 3)))
     with pytest.raises(NoConsensus, match=r"of 12 control points disagree .*P\d"):
         adjust_block(images, observations, control=replace(control, lon_lat_h=scattered))
+
+
+def of_one_image(observations: Observations, known: int) -> Observations:
+    """The observations with the first rays alone of the first `known` points."""
+    first = np.unique(observations.point, return_index=True)[1]
+    is_first = np.isin(np.arange(len(observations)), first)
+    return observations.take(is_first | (observations.point >= known))
+
+
+def test_known_points_that_one_image_shows_place_the_block_as_well() -> None:
+    normalised = []
+    for trial in range(trials):
+        rng = np.random.default_rng([7, trial])
+        truth, images, observations = draw(CASE, rng)
+        control = known_ground(truth, rng, wrong=2)
+        free = adjust_block(images, of_one_image(observations, count))
+        block = adjust_block(images, of_one_image(observations, count), control=control)
+        assert not block.control_active[:2].any()
+        assert block.control_active[2:].sum() >= count - 3
+        covariance = block.frames[0].covariance_m2
+        assert block.frames[0].sigma_m < 0.75 * free.frames[0].sigma_m
+        error_m = np.nanmedian(difference_m(block.lon_lat_h, truth)[count:], axis=0)
+        normalised.append(error_m @ np.linalg.solve(covariance, error_m) / 3.0)
+    assert 0.4 < np.mean(normalised) < 1.8
+
+
+def test_images_far_off_are_placed_by_known_points_of_one_image_each() -> None:
+    rng = np.random.default_rng(8)
+    truth, images, observations = draw(CASE, rng)
+    far = [
+        replace(image, prior_px=np.where(image.prior_px > 1.0, 60.0, image.prior_px)) for image in images
+    ]
+    moved = replace(observations, line_sample=observations.line_sample + [45.0, -50.0])
+    block = adjust_block(far, of_one_image(moved, count), control=known_ground(truth, rng))
+    assert block.control_active.sum() >= count - 1
+    error_m = np.nanmedian(difference_m(block.lon_lat_h, truth)[count:], axis=0)
+    covariance = block.frames[0].covariance_m2
+    assert error_m @ np.linalg.solve(covariance, error_m) < 11.3
+    assert np.sqrt(np.diagonal(covariance)).max() < 1.5

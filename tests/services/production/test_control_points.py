@@ -10,6 +10,7 @@ from services.adjustment.intersection import intersect
 from services.errors import NotEnoughPoints
 from services.geodesy import east_north_up, move_metres
 from services.imagery.scene import Scene
+from services.production.control import Control
 from services.production.control_points import ControlBlock
 from services.production.from_images import Production, produce_points
 from services.simulation.view import SimulatedView, simulate_block
@@ -80,7 +81,7 @@ def moved(lon_lat_h: Array, by_m: Array) -> Array:
 
 @cache
 def placed() -> Production:
-    return produce_points(scenes(), OPTIONS, control=[older()])
+    return produce_points(scenes(), OPTIONS, control=Control((older(),)))
 
 
 def frame_error_m(made: Production) -> Array:
@@ -131,7 +132,7 @@ def test_blunders_of_the_control_are_thrown_out_by_name() -> None:
         lon_lat_h[wrong], np.array([[6.0, -3.0, 2.0], [0.0, 7.0, 0.0], [1.0, 0.0, 9.0]])
     )
     spoiled = replace(block, points=replace(block.points, lon_lat_h=lon_lat_h))
-    made = produce_points(scenes(), OPTIONS, control=[spoiled])
+    made = produce_points(scenes(), OPTIONS, control=Control((spoiled,)))
     left_out = {
         name
         for name, used in zip(made.control.names, made.adjustment.control_active, strict=True)
@@ -148,7 +149,7 @@ def test_control_of_another_place_is_refused_with_its_name() -> None:
     block = older()
     elsewhere = replace(block.points, lon_lat_h=block.points.lon_lat_h + [0.0, 0.5, 0.0])
     with pytest.raises(NotEnoughPoints, match="control points of older"):
-        produce_points(scenes(), OPTIONS, control=[replace(block, points=elsewhere)])
+        produce_points(scenes(), OPTIONS, control=Control((replace(block, points=elsewhere),)))
 
 
 def test_two_blocks_of_control_keep_their_own_frames() -> None:
@@ -160,7 +161,9 @@ def test_two_blocks_of_control_keep_their_own_frames() -> None:
         points: ControlPoints = replace(block.points.take(own), frames=(frame,))
         return ControlBlock(name, points, block.chips)
 
-    both = [part("a", rows[:half], FRAME), part("b", rows[half:], Frame.from_sigmas(20.0, 20.0))]
+    both = Control(
+        (part("a", rows[:half], FRAME), part("b", rows[half:], Frame.from_sigmas(20.0, 20.0)))
+    )
     made = produce_points(scenes(), OPTIONS, control=both)
     assert {name.partition(":")[0] for name in made.control.names} == {"a", "b"}
     assert set(made.control.source.tolist()) == {0, 1}

@@ -1,0 +1,177 @@
+"""Files of ground points marked in images, as control of a block."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from app.errors import InputError
+from services.formats.gcp.marked_points import MarkedPoints
+from services.formats.gcp.reader import StatedByCaller, read_marked_ground
+from services.imagery.scene import Scene
+from services.production.marked_control import MarkedGround
+from services.quality.check_points import MARKING_SIGMA_PX
+from services.types import Array, Frame, IntArray, Observations
+
+
+@dataclass(frozen=True)
+class PointStatements:
+    """What files of ground points do not state, of all of them.
+
+    Attributes:
+        stated: heights, reference system, columns.
+        sigma_m: horizontal and up, one standard deviation, of points whose file states none.
+        frame_sigma_m: horizontal and up, of the error on the Earth that all the points share.
+        mark_sigma_px: of marks whose file states none, a coordinate.
+    """
+
+    stated: StatedByCaller = field(default_factory=StatedByCaller)
+    sigma_m: tuple[float, float] | None = None
+    frame_sigma_m: tuple[float, float] | None = None
+    mark_sigma_px: float | None = None
+
+
+def read_marked(
+    paths: Sequence[Path], points: PointStatements, scenes: Sequence[Scene], images: Sequence[Path]
+) -> MarkedGround:
+    """The control points of files with their marks; those of one place are one point.
+
+    Args:
+        paths: of the files, one at least.
+        points: what they do not state.
+        scenes: of the block.
+        images: files of the scenes, by whose names marks refer to them.
+
+    Raises:
+        InputError: a file cannot be used, does not state what it must, or a point has no mark in the
+            images.
+    """
+    if points.frame_sigma_m is None:
+        raise InputError(
+            f"{paths[0].name}: nobody states how well the frame of these points is known on the Earth, "
+            "the error that all of them share: state it (--control-frame-sigma-m HORIZONTAL,UP), such "
+            "as 0.05,0.05 for points measured by GNSS in the ITRF"
+        )
+    names, files = [], []
+    image: list[IntArray] = []
+    for path in paths:
+        marks = _control_marks(read_marked_ground(path, points.stated), path)
+        image.append(_images_of(marks, path, scenes, images))
+        names += [f"{path.name}:{name}" for name in marks.id]
+        files.append(marks)
+    lon_lat_h, sigma_m, line_sample, sigma_px = (
+        np.concatenate([getattr(marks, column) for marks in files])
+        for column in ("lon_lat_h", "sigma_m", "line_sample", "sigma_px")
+    )
+    if points.sigma_m is not None:
+        horizontal_m, up_m = points.sigma_m
+        sigma_m = np.where(np.isnan(sigma_m), [horizontal_m, horizontal_m, up_m], sigma_m)
+    sigma_m[np.isnan(lon_lat_h[:, 2]), 2] = np.inf
+    _refuse_unknown_sigmas(sigma_m, names)
+    mark_sigma_px = points.mark_sigma_px or MARKING_SIGMA_PX
+    place = np.round(np.nan_to_num(lon_lat_h, nan=-1e6) / _SAME_PLACE).astype(np.int64)
+    _, first, point = np.unique(place, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(point, kind="stable")
+    observations = Observations(
+        point[order].astype(np.int64),
+        np.concatenate(image)[order],
+        line_sample[order],
+        np.nan_to_num(sigma_px[order], nan=mark_sigma_px),
+    )
+    _refuse_lone_rays(observations, lon_lat_h[first], [names[row] for row in first])
+    return MarkedGround(
+        names=tuple(names[row] for row in first),
+        lon_lat_h=lon_lat_h[first],
+        sigma_m=sigma_m[first],
+        frame=Frame.from_sigmas(*points.frame_sigma_m),
+        marks=observations,
+    )
+
+
+_SAME_PLACE = np.array([1e-8, 1e-8, 1e-3])
+"""Positions of one point in several files agree to this: degrees, degrees, metres."""
+
+
+def _control_marks(points: MarkedPoints, path: Path) -> MarkedPoints:
+    """The marks of control points; check points stay apart, and points without a mark are refused."""
+    control = points.take(~points.check)
+    if len(control) == 0:
+        raise InputError(f"{path.name}: all {len(points)} points are check points, no control is left")
+    unmarked = sorted(set(control.id.tolist()) - set(control.id[control.is_marked].tolist()))
+    if unmarked:
+        raise InputError(
+            f"{path.name}: {len(unmarked)} points have no position in any image: {_some(unmarked)}. "
+            "They cannot be found in the images: mark them, switch them off, or make a block of them "
+            "with chips (amers production points) and give that as --control"
+        )
+    return control.take(control.is_marked)
+
+
+def _images_of(
+    marks: MarkedPoints, path: Path, scenes: Sequence[Scene], images: Sequence[Path]
+) -> IntArray:
+    """The image (m,) of every mark, by its name, or that of the file where it names none.
+
+    Raises:
+        InputError: an image is not among those of the block, or a mark lies outside its image.
+    """
+    of_name: dict[str, set[int]] = {}
+    for row, (scene, image) in enumerate(zip(scenes, images, strict=True)):
+        for name in (scene.acquisition.image_id, image.name, image.stem):
+            of_name.setdefault(name.lower(), set()).add(row)
+    of_file = path.name.lower() if path.name.lower() in of_name else path.stem.lower()
+    names = np.where(marks.image == "", of_file, np.char.lower(marks.image))
+    unknown = sorted({name for name in names.tolist() if len(of_name.get(name, ())) != 1})
+    if unknown and (marks.image == "").any() and of_file in unknown:
+        raise InputError(
+            f"{path.name}: the marks name no image, and none of the images has the name of the file: "
+            f"call it like its image, such as {images[0].stem}{path.suffix}"
+        )
+    if unknown:
+        known = sorted(scene.acquisition.image_id for scene in scenes)
+        raise InputError(
+            f"{path.name}: marks in {_some(unknown)}, expected names of the images of the block: "
+            f"{_some(known)}; give these images, or leave their marks out"
+        )
+    number = np.array([min(of_name[name]) for name in names.tolist()], dtype=np.int64)
+    size = np.array([scene.image.shape for scene in scenes], dtype=np.float64)[number]
+    outside = (marks.line_sample < -0.5) | (marks.line_sample > size - 0.5)
+    for mark in np.flatnonzero(outside.any(axis=1)).tolist():
+        lines, samples = size[mark]
+        raise InputError(
+            f"{path.name}, point {marks.id[mark]}: line {marks.line_sample[mark, 0]:g}, sample "
+            f"{marks.line_sample[mark, 1]:g} found, outside {names[mark]} with {lines:g} lines of "
+            f"{samples:g} samples; correct the mark or the image it names"
+        )
+    return number
+
+
+def _refuse_unknown_sigmas(sigma_m: Array, names: Sequence[str]) -> None:
+    unknown = np.isnan(sigma_m)
+    for row in np.flatnonzero(unknown.any(axis=1)).tolist():
+        axes = [
+            axis
+            for axis, is_unknown in zip(("east", "north", "up"), unknown[row], strict=True)
+            if is_unknown
+        ]
+        raise InputError(
+            f"{int(unknown.any(axis=1).sum())} marks, such as that of {names[row]}, have no sigma "
+            f"{', '.join(axes)} of their ground: state it (--control-sigma-m HORIZONTAL,UP); for an ASP "
+            "file, state the axes of its sigmas (--control-sigma-axes) where you know them"
+        )
+
+
+def _refuse_lone_rays(marks: Observations, lon_lat_h: Array, names: Sequence[str]) -> None:
+    """Refuse points of one mark without a height: they tie nothing."""
+    count = np.bincount(marks.point, minlength=len(names))
+    lone = np.flatnonzero((count == 1) & np.isnan(lon_lat_h[:, 2])).tolist()
+    if lone:
+        raise InputError(
+            f"{len(lone)} control points have no height and are marked in one image alone: "
+            f"{_some([names[row] for row in lone])}. State their heights, or mark them in another image"
+        )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -1,0 +1,128 @@
+"""Files of marked points as control: matched to the images by name, or refused with the way out."""
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.errors import InputError
+from app.usecases.control_files import ControlFiles, read_control
+from app.usecases.marked_files import PointStatements, read_marked
+from services.errors import FormatError, VerticalDatumError
+from services.formats.gcp.reader import StatedByCaller
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.types import Acquisition
+from tests.services.simulated import ring_of_geometries
+
+IMAGES = [Path("one.tif"), Path("two.tif")]
+STATED = PointStatements(StatedByCaller("ellipsoid"), sigma_m=(0.5, 0.8), frame_sigma_m=(0.05, 0.1))
+CSV = """# pixel-origin=corner
+id,lon,lat,height_m,image,line,sample
+A,10.001,45.001,120.5,one.tif,10.5,20.5
+A,10.001,45.001,120.5,two,30,40
+B,10.002,45.002,121,two,50,60
+"""
+
+
+def scenes() -> list[Scene]:
+    pixels = np.zeros((100, 200), dtype=np.float32)
+    return [
+        Scene(ArrayImage(pixels), geometry.rpc, Acquisition(path.stem), 5.0)
+        for path, geometry in zip(IMAGES, ring_of_geometries(2), strict=True)
+    ]
+
+
+def written(folder: Path, text: str, name: str = "survey.csv") -> list[Path]:
+    path = folder / name
+    path.write_text(text)
+    return [path]
+
+
+def test_marks_of_a_point_are_collected_over_the_images(tmp_path: Path) -> None:
+    marked = read_marked(written(tmp_path, CSV), STATED, scenes(), IMAGES)
+    assert marked.names == ("survey.csv:A", "survey.csv:B")
+    assert marked.marks.point.tolist() == [0, 0, 1]
+    assert marked.marks.image.tolist() == [0, 1, 1]
+    # The corner of the first pixel is (0, 0) in the file, its centre inside.
+    assert marked.marks.line_sample.tolist() == [[10.0, 20.0], [29.5, 39.5], [49.5, 59.5]]
+    assert marked.marks.sigma_px.tolist() == [0.5] * 3
+    assert marked.sigma_m.tolist() == [[0.5, 0.5, 0.8]] * 2
+    assert np.sqrt(np.diagonal(marked.frame.covariance_m2)).tolist() == [0.05, 0.05, 0.1]
+
+
+def test_a_line_without_a_mark_adds_nothing_to_a_point_with_another_mark(tmp_path: Path) -> None:
+    marked = read_marked(written(tmp_path, CSV.replace("10.5,20.5", ",")), STATED, scenes(), IMAGES)
+    assert marked.names == ("survey.csv:A", "survey.csv:B")
+    assert marked.marks.image.tolist() == [1, 1]
+
+
+def test_sigmas_of_the_file_win_over_those_of_the_command(tmp_path: Path) -> None:
+    text = "\n".join(
+        line + end
+        for line, end in zip(
+            CSV.splitlines(),
+            ["", ",sigma_horizontal_m,sigma_px", ",0.2,0.1", ",0.2,0.1", ",,"],
+            strict=True,
+        )
+    )
+    marked = read_marked(written(tmp_path, text), STATED, scenes(), IMAGES)
+    assert marked.sigma_m.tolist() == [[0.2, 0.2, 0.8], [0.5, 0.5, 0.8]]
+    assert marked.marks.sigma_px.tolist() == [0.1, 0.1, 0.5]
+
+
+def test_a_file_that_names_no_image_is_of_the_image_of_its_name(tmp_path: Path) -> None:
+    text = "\n".join(",".join(line.split(",")[:4] + line.split(",")[5:]) for line in CSV.splitlines())
+    text = text.replace("\nA,10.001,45.001,120.5,30,40", "")
+    paths = written(tmp_path, text, "one.csv") + written(tmp_path, text, "two.tif.csv")
+    marked = read_marked(paths, STATED, scenes(), IMAGES)
+    assert marked.marks.point.tolist() == [0, 0, 1, 1]
+    assert sorted(marked.marks.image.tolist()) == [0, 0, 1, 1]
+    with pytest.raises(InputError, match=r"call it like its image, such as one\.csv"):
+        read_marked(written(tmp_path, text), STATED, scenes(), IMAGES)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("one.tif", "three.tif", r"marks in three\.tif, expected names .* one, two"),
+        ("50,60", ",", r"1 points have no position in any image: B\. .*amers production points"),
+        ("50,60", "50,201", r"point B: line 49\.5, sample 200\.5 found, outside two with 100 lines"),
+        ("B,10.002,45.002,121", "B,10.002,45.002,", r"no height .* survey\.csv:B"),
+    ],
+)
+def test_what_cannot_be_control_is_refused_by_name(tmp_path, old, new, message) -> None:
+    paths = written(tmp_path, CSV.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_marked(paths, STATED, scenes(), IMAGES)
+
+
+@pytest.mark.parametrize(
+    ("unstated", "error", "message"),
+    [
+        ({"frame_sigma_m": None}, InputError, r"--control-frame-sigma-m HORIZONTAL,UP"),
+        ({"sigma_m": None}, InputError, r"no sigma east, north, up .*--control-sigma-m HORIZONTAL,UP"),
+        ({"stated": StatedByCaller()}, VerticalDatumError, r"datum of its heights"),
+    ],
+)
+def test_accuracy_and_datum_are_never_invented(tmp_path, unstated, error, message) -> None:
+    with pytest.raises(error, match=message):
+        read_marked(written(tmp_path, CSV), replace(STATED, **unstated), scenes(), IMAGES)
+
+
+def test_marks_without_an_origin_of_pixels_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="pixel-origin"):
+        read_marked(
+            written(tmp_path, CSV.replace("# pixel-origin=corner\n", "")), STATED, scenes(), IMAGES
+        )
+
+
+def test_statements_without_a_file_of_points_and_missing_paths_are_refused(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        with pytest.raises(InputError, match="no --control is a file of points"):
+            read_control(ControlFiles((), STATED), scenes(), IMAGES, stack)
+        with pytest.raises(InputError, match="no such folder of a block or file of points"):
+            read_control(ControlFiles((tmp_path / "x",), STATED), scenes(), IMAGES, stack)
+        assert read_control(ControlFiles(), scenes(), IMAGES, stack).marked == ()

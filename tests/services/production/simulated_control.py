@@ -1,0 +1,53 @@
+"""Views with errors of some metres, and the true error on the Earth of the blocks made of them."""
+
+from functools import cache
+
+import numpy as np
+
+from services.adjustment.intersection import intersect
+from services.imagery.scene import Scene
+from services.production.from_images import Production
+from services.simulation.view import SimulatedView, simulate_block
+from services.types import Array, Observations
+from tests.services.simulated import GSD_M, SHAPE, world
+from tests.services.ties import difference_m
+
+SIGMA_M = 5.0
+CHI2_3 = 11.3
+"""Chi-squared of three coordinates that one draw of a hundred exceeds."""
+
+
+@cache
+def views(seed: int, error_m: float = SIGMA_M) -> tuple[SimulatedView, ...]:
+    rng = np.random.default_rng(seed)
+    return tuple(
+        simulate_block(
+            world(),
+            rng,
+            n_views=3,
+            shape=SHAPE,
+            gsd_m=GSD_M,
+            error_m=error_m,
+            largest_incidence_deg=20.0,
+        )
+    )
+
+
+def scenes(seed: int) -> list[Scene]:
+    return [view.as_scene(SIGMA_M) for view in views(seed)]
+
+
+def frame_error_m(made: Production, seen: tuple[SimulatedView, ...]) -> Array:
+    """Mean error (3,) on the Earth of the points: the true ground of what the images show there."""
+    n, count = len(made.points), len(made.adjustment.models)
+    seen_at = np.stack(
+        [model.project(made.points.lon_lat_h) for model in made.adjustment.models], axis=1
+    )
+    observations = Observations(
+        np.repeat(np.arange(n), count),
+        np.tile(np.arange(count), n),
+        seen_at.reshape(-1, 2),
+        np.full(n * count, 0.1),
+    )
+    truth = intersect([view.geometry.true_model for view in seen], observations, n)
+    return difference_m(made.points.lon_lat_h, truth.lon_lat_h).mean(axis=0)
