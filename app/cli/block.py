@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from app.cli.block_quality import quality, quality_row
+from app.cli.block_renewal import renew, renewal_row
 from app.cli.output import AsJson, Row, print_json, show, show_one
 from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
@@ -19,12 +20,14 @@ from app.usecases import storage_identity
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.export import ExportBlock, select_points, write_selected
 from app.usecases.blocks.lifecycle import Published
+from app.usecases.blocks.renewal import find_renewal
 from app.usecases.damage import open_chips
 from services.quality.accuracy_statement import accuracy_document
 from services.quality.block import quality_document
 
 app = typer.Typer(no_args_is_help=True)
 app.command()(quality)
+app.command()(renew)
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 
@@ -72,8 +75,12 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
     with transaction() as connection:
         block = lifecycle.find_block(connection, reference)
         stated = lifecycle.block_report(connection, block).stated
-    accuracy = accuracy_document(stated) if as_json else stated.words
-    show_one({**_record(block), **accuracy}, as_json=as_json)
+        renewed = find_renewal(connection, block)
+    if as_json:
+        print_json({**_record(block), **accuracy_document(stated), "renewal": renewed})
+        return
+    new = {} if renewed is None else renewal_row(renewed)
+    show_one({**_record(block), **stated.words, **new}, as_json=False)
 
 
 @app.command()

@@ -82,3 +82,9 @@ def find_by_job(connection: Connection, job_id: UUID) -> RegistrationRow | None:
     """The registration that a job made."""
     statement = select(*COLUMNS).where(registration.c.job_id == job_id)
     return first(RegistrationRow, connection.execute(statement))
+
+
+def find_counted(connection: Connection, scene_key: str) -> RegistrationRow | None:
+    """The registration that counts for a scene; None when none does."""
+    counts = (registration.c.scene_key == scene_key, registration.c.counted)
+    return first(RegistrationRow, connection.execute(select(*COLUMNS).where(*counts)))

@@ -29,6 +29,7 @@ from app.usecases import quotas
 from app.usecases.blocks.export import EXPORT_BLOCK
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.quality_job import ASSESS_BLOCK
+from app.usecases.blocks.renewal_job import RENEW_BLOCK
 from app.usecases.damage import report_damage
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work, WorkFailed
@@ -36,7 +37,14 @@ from app.usecases.registration.job import REGISTER_SCENE
 
 PROCESSES: dict[str, Process] = {
     process.id: process
-    for process in (REGISTER_SCENE, ORTHORECTIFY, INGEST_BLOCK, EXPORT_BLOCK, ASSESS_BLOCK)
+    for process in (
+        REGISTER_SCENE,
+        ORTHORECTIFY,
+        INGEST_BLOCK,
+        EXPORT_BLOCK,
+        ASSESS_BLOCK,
+        RENEW_BLOCK,
+    )
 }
 LONGEST_KEY = 200
 LARGEST_INPUTS_BYTES = 64 << 10

@@ -57,9 +57,9 @@ class VanishedPoints:
 def vanished_points(lon_lat_h: Array, searches: Searches) -> VanishedPoints:
     """The points that are no longer there, at most one in twenty of them wrongly.
 
-    A point that is still there is found in a scene with the probability `share * health`: the share of its
-    20 nearest neighbours that the scene found, and the point's own successes before against those of its
-    neighbours. The scenes since the point was last found are taken as one try for each quarter of a
+    A point that is still there is found in a scene with the probability `share * health`: the share of
+    its 20 nearest neighbours that the scene found, and the point's own successes before against those of
+    its neighbours. The scenes since the point was last found are taken as one try for each quarter of a
     year, the strongest, because scenes of one season miss a point for one reason. The product over these
     tries is the probability that a point is missed which is still there; Benjamini and Hochberg's
     procedure over all points that were searched decides how small it must be.

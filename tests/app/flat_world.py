@@ -38,6 +38,7 @@ class FlatWorld:
         rpc_text: its delivered model as a file beside it.
         tagged: the same scene with the model in its tags.
         true_model: of the scene.
+        ground: what its images show, but for their gain and noise.
     """
 
     block: Path
@@ -45,6 +46,7 @@ class FlatWorld:
     rpc_text: Path
     tagged: Path
     true_model: RpcModel
+    ground: FloatImage
 
 
 def make_flat_world(
@@ -56,7 +58,7 @@ def make_flat_world(
     """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
-    truth, ground = _model(size), _texture(size, rng)
+    truth, ground = _model(size), flat_texture(size, rng)
     seen = [_seen(ground, rng) for _ in range(VIEWS + 1)]
     _write_block(folder / "block", truth, seen[:VIEWS], points, rng, frame)
     delivered = replace(truth, image_offset=truth.image_offset - SHIFT_PX)
@@ -69,7 +71,7 @@ def make_flat_world(
                 file.rpcs = gdal_rpc(model)
     rpc_text = folder / "scene_RPC.TXT"
     rpc_text.write_text(format_rpc_text(delivered))
-    return FlatWorld(folder / "block", image, rpc_text, tagged, truth)
+    return FlatWorld(folder / "block", image, rpc_text, tagged, truth, ground)
 
 
 def _model(size: int) -> RpcModel:
@@ -94,7 +96,7 @@ def _model(size: int) -> RpcModel:
     )
 
 
-def _texture(size: int, rng: np.random.Generator) -> FloatImage:
+def flat_texture(size: int, rng: np.random.Generator) -> FloatImage:
     """Noise at all scales, like natural ground."""
     out = np.full((size, size), 1500.0, dtype=np.float32)
     for sigma in (1.0, 3.0, 9.0, 27.0):

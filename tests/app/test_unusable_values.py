@@ -52,6 +52,7 @@ def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any
         "ingest-block": {"path": "block"},
         "export-block": {"block": "flat"},
         "assess-block": {"block": "flat"},
+        "renew-block": {"block": "flat", "jobs": [scene]},
     }
 
 

@@ -20,7 +20,7 @@ export const showJob: ShowView = async (place, id) => {
   const back = h("a", { href: "#/scenes" }, "← Scenes");
   fill(panel, h("p", {}, back), heading, body);
   let job = await find(id, signal);
-  if (["ingest-block", "assess-block"].includes(job.processID)) {
+  if (["ingest-block", "assess-block", "renew-block"].includes(job.processID)) {
     back.href = "#/blocks";
     back.textContent = "← Blocks";
   }

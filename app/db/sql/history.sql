@@ -38,3 +38,17 @@ select point_id, view, 1, agreed::int, (select avg(agreed::int) from tried)
 from tried order by point_id, view
 on conflict (point_id, view) do update set attempts = h.attempts + 1,
     successes = h.successes + excluded.successes, expected = h.expected + excluded.expected
+
+-- name: searches
+-- The searches of points of a block in the counted registrations with the verdict "good", but for some:
+-- points that kept their places through versions of the block are told by them. A scene of unknown date
+-- counts as taken when it was registered.
+select m.registration_id, coalesce(
+        cast(r.report #>> '{scene,acquisition,acquired_at}' as timestamptz), r.created_at) as taken_at,
+    st_x(p.geom) as lon, st_y(p.geom) as lat, st_z(p.geom) as h, m.active
+from registration r join measure m on m.registration_id = r.id join point p on p.id = m.point_id
+    join block b on b.number = p.block_number
+where r.counted and r.verdict = 'good' and b.id = :block_id
+    and r.block_versions @> cast(:has_block as jsonb)
+    and r.id <> all(cast(:left_out as uuid[]))
+    and m.reason <> all(cast(:not_attributable as text[]))

@@ -86,7 +86,7 @@ def _run(work: Work) -> Commit:
         try:
             with suspecting_damage(work.database, work.storage, stored_keys(scene)):
                 registered = run_registration(
-                    _scene_files(inputs, image, scene.sigma_m),
+                    scene_files(inputs, image, scene.sigma_m),
                     _control_sources(work, inputs.method),
                     Path(folder),
                     options=inputs.options,
@@ -140,7 +140,7 @@ def _control_sources(work: Work, method: Method) -> ControlSources:
     )
 
 
-def _scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
+def scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
     """The files of a scene, which lie beside its image under the names of the inputs."""
 
     def beside(name: str | None) -> Path | None:

@@ -1,0 +1,91 @@
+"""`amers block renew`: a version of a block with views of new scenes, staged."""
+
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+from uuid import UUID
+
+import typer
+
+from app.cli.output import AsJson, Row, print_json, show_one
+from app.cli.progress import shown_progress
+from app.cli.transaction import transaction
+from app.config import read_settings
+from app.db.engine import opened
+from app.errors import InputError
+from app.storage import open_storage
+from app.usecases import storage_identity
+from app.usecases.blocks.renewal import read_base, renew_block, stage_renewal
+from app.usecases.blocks.renewing_scenes import registered_job, scene_of_image, scene_of_job
+from services.types import part_of
+
+
+def renew(
+    reference: Annotated[str, typer.Argument(help="Number of the published block, ID, or ID@VERSION.")],
+    *,
+    job: Annotated[
+        list[UUID] | None, typer.Option(help="Job that registered a scene on the block; repeat.")
+    ] = None,
+    image: Annotated[
+        list[Path] | None,
+        typer.Option(help="Image that `amers scene register` registered on this store; repeat."),
+    ] = None,
+    version: Annotated[
+        str, typer.Option(help="Version of the renewed block; by default the next whole number.")
+    ] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Stage a version of a block with views of scenes registered on it, without vanished points.
+
+    Nothing changes for readers before `amers block publish`.
+    """
+    if not job and not image:
+        raise InputError("no scene given: name registered ones with --job or --image")
+    settings = read_settings()
+    storage = open_storage(settings)
+    with transaction(settings):
+        storage_identity.announce(partial(transaction, settings), storage)
+    with (
+        opened(settings) as database,
+        TemporaryDirectory(prefix="amers-renewal-") as scratch,
+        shown_progress() as progress,
+    ):
+        folder = Path(scratch) / "block"
+        progress(0.0, "reading points")
+        with database.snapshot() as connection:
+            base = read_base(connection, reference, version)
+            rows = [registered_job(connection, base.block, one) for one in job or ()]
+            scenes = [scene_of_image(connection, base.block, one) for one in image or ()]
+        scenes += [scene_of_job(database, storage, settings, row, Path(scratch)) for row in rows]
+        document = renew_block(
+            database, storage, base, scenes, folder, progress=part_of(progress, 0.0, 0.9)
+        )
+        with database.transaction() as connection:
+            block = stage_renewal(connection, storage, base, folder, part_of(progress, 0.9, 0.1)).block
+    staged = {"number": block.number, "id": block.id, "version": block.version, "state": block.state}
+    if as_json:
+        print_json({**staged, "points": block.n_points, "renewal": document})
+        return
+    show_one({**staged, "points": block.n_points, **renewal_row(document)}, as_json=False)
+
+
+def renewal_row(document: dict[str, Any]) -> Row:
+    """What a renewed version of a block has of new and leaves out, by its names."""
+    scenes = "; ".join(
+        f"{one['image']}: {one['points_with_new_views']} points of {one['points_seen']} seen"
+        for one in document["scenes"]
+    )
+    withdrawals = [
+        f"point {one['point']}, missed by {one['scenes_that_missed_it']} scenes, "
+        f"last found {one['last_found'] or 'never'}, "
+        f"p = {one['probability_if_still_there']:g} if still there"
+        for one in document["proposed_withdrawals"]
+    ]
+    return {
+        "renews": document["renews"],
+        "scenes": scenes,
+        "new views": document["new_views"],
+        "new points": document["new_points"],
+        "proposed withdrawals": "; ".join([str(len(withdrawals)), *withdrawals]),
+    }
