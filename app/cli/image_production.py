@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from app.cli import control_options
 from app.cli.output import AsJson, show_one
@@ -20,10 +21,12 @@ from app.usecases.image_selection import CatalogueRequest, run_selection
 from app.usecases.marked_files import PointStatements
 from app.usecases.production import BlockIdentity, refuse_existing
 from services.production.from_images import ProductionOptions
+from services.reports.block_adjustment_pages import adjustment_table
 from services.types import part_of
 
 _DEFAULT = ProductionOptions()
 _SHARE_OF_SELECTION = 0.05
+_TABLE_WIDTH = 140
 
 
 def run(
@@ -133,9 +136,14 @@ def run(
             progress=part_of(progress, _SHARE_OF_SELECTION, 1.0 - _SHARE_OF_SELECTION),
         )
     relative = production.relative_accuracy
+    if not as_json:
+        Console(width=None if Console().is_terminal else _TABLE_WIDTH).print(
+            adjustment_table(production.image_fits)
+        )
     show_one(
         {
             "block": output,
+            "report": output.with_name(f"{output.name}.adjustment") / "report.html",
             "points": len(production.points),
             "views": int(production.points.views.start[-1]),
             "tie_points": relative.tie_points,

@@ -1,11 +1,13 @@
 """Make a block of points from overlapping images: given as files, or chosen from a catalogue."""
 
 import hashlib
+import json
 import pickle
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from app.usecases.control_files import ControlFiles, control_inputs, read_contro
 from app.usecases.executors import ComputeOptions, open_executor
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
+from app.usecases.registration.result_folder import replacing
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from services.formats.block.writer import write_block
 from services.formats.images.scenes import read_scene
@@ -22,6 +25,8 @@ from services.formats.stac.scenes import image_path, read_item_scene
 from services.formats.work_folder import WorkFolder
 from services.imagery.scene import Scene
 from services.production.from_images import Production, ProductionOptions, produce_points
+from services.reports.block_adjustment import adjustment_document, adjustment_report, points_csv
+from services.reports.block_adjustment_pages import format_adjustment_html
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc import RpcModel
 from services.tasks import Work
@@ -68,7 +73,7 @@ def run_production(
     place: WorkPlace = WorkPlace(),
     progress: Progress = no_progress,
 ) -> Production:
-    """Make a block of points from overlapping images and write its folder.
+    """Make a block of points from overlapping images; write its folder, and FOLDER.adjustment.
 
     When the same production was interrupted, it goes on from where it was.
 
@@ -104,9 +109,22 @@ def run_production(
             _adjusted_models(scenes, production),
             progress=part_of(progress, 0.9, 0.1),
         )
+    _write_report(folder.with_name(f"{folder.name}.adjustment"), identity.id, production)
     if place.folder is None:
         shutil.rmtree(work_folder)
     return production
+
+
+def _write_report(folder: Path, block: str, production: Production) -> None:
+    """The report on the adjustment, in a folder of its own: a block holds nothing else than a block."""
+    report = adjustment_report(
+        block, production, finished_at=datetime.now(UTC), software_version=version("amers")
+    )
+    with replacing(folder) as new:
+        document = json.dumps(adjustment_document(report), indent=2, allow_nan=False)
+        (new / "report.json").write_text(document + "\n", encoding="utf-8")
+        (new / "report.html").write_text(format_adjustment_html(report), encoding="utf-8")
+        (new / "points.csv").write_text(points_csv(report), encoding="utf-8")
 
 
 def _read(

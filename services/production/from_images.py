@@ -19,6 +19,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.matching.ground_features import FeatureOptions
 from services.matching.multi_image import RefinementOptions, chip_inside
 from services.matching.predict import rank_in_group
+from services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
 from services.production.control import Control, with_control
 from services.production.ground_parts import CutPoints, cut_points, measure_points
 from services.production.image_passes import image_passes
@@ -112,6 +113,8 @@ class Production:
         relative_accuracy: how well the images agree.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
         control: what was found of the known ground; `adjustment` tells which of it agrees.
+        image_fits: how every image fits.
+        point_fits: how the points fit, in their order.
         effort: what every stage took; "adjustment" is all that is not done in tasks.
     """
 
@@ -121,6 +124,8 @@ class Production:
     relative_accuracy: RelativeAccuracy
     outline: Array
     control: ControlGround
+    image_fits: tuple[ImageFit, ...]
+    point_fits: PointFits
     effort: Mapping[str, Effort]
 
 
@@ -227,6 +232,8 @@ def produce_points(
         relative_accuracy,
         box_around(points.lon_lat_h),
         known,
+        image_fits(scenes, measures, adjustment),
+        point_fits(rows, measures, adjustment),
         {**work.effort, "adjustment": own},
     )
 

@@ -1,6 +1,7 @@
 """`amers production run` in one process, several, or on a cluster: the same block, also after kills."""
 
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -147,7 +148,24 @@ def test_an_interrupted_production_goes_on_from_where_it_was(
 
 def test_the_work_folder_is_gone_when_the_block_is_complete(images, tmp_path, alone) -> None:
     assert make(images, tmp_path / "block", WorkPlace()) == alone
-    assert [file.name for file in tmp_path.iterdir()] == ["block"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["block", "block.adjustment"]
+
+
+def test_the_adjustment_is_reported_image_by_image_and_point_by_point(images, tmp_path) -> None:
+    made = run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS)
+    folder = tmp_path / "block.adjustment"
+    report = json.loads((folder / "report.json").read_text())
+    assert [image["name"] for image in report["images"]] == [file.stem for file in images.files]
+    assert {image["verdict"] for image in report["images"]} == {"fits"}
+    assert all(0.5 * image["measures"] < image["used"] for image in report["images"])
+    assert report["on_the_earth"]["words"].startswith("CE90")
+    lines = (folder / "points.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(made.points)
+    columns = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))
+    assert float(columns["lon"]) == pytest.approx(made.points.lon_lat_h[0, 0], abs=1e-7)
+    assert int(columns["used"]) >= OPTIONS.min_views
+    page = (folder / "report.html").read_text()
+    assert all(file.stem in page for file in images.files)
 
 
 def test_work_on_other_images_is_refused(images, tmp_path) -> None:
