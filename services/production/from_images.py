@@ -204,7 +204,7 @@ def produce_points(
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
     # Points of the control and candidates that nothing measures are not selected.
     saliency = np.append(saliency, np.zeros(len(known)))[: len(adjustment.lon_lat_h)]
-    rows = _select_points(adjustment, saliency, shown, options)
+    rows = _select_points(adjustment, saliency, shown, _dates(shown, passes, len(saliency)), options)
     shown = shown.take(np.isin(shown.point, rows))
     shown = replace(shown, point=np.searchsorted(rows, shown.point))
     cut = cut_points(
@@ -322,12 +322,16 @@ def _squares(lon_lat_h: Array, options: ProductionOptions) -> IntArray:
 
 
 def _select_points(
-    points: BlockAdjustment, saliency: Array, shown: Observations, options: ProductionOptions
+    points: BlockAdjustment,
+    saliency: Array,
+    shown: Observations,
+    dates: IntArray,
+    options: ProductionOptions,
 ) -> IntArray:
     """Row (n,), ascending, of the best point of every square of ground.
 
-    `saliency` is that of all points; `shown` are the measures in images that show the whole fine chip:
-    those that become views.
+    `saliency` and `dates` are those of all points; `shown` are the measures in images that show the
+    whole fine chip: those that become views.
     """
     sigma_m = np.sqrt(np.diagonal(points.point_covariance_m2, 0, 1, 2))
     views = np.bincount(shown.point, minlength=len(points.lon_lat_h))
@@ -339,7 +343,17 @@ def _select_points(
             len(rows), options.block.min_points, f"salient points out of {len(saliency)} candidates"
         )
     square = _squares(points.lon_lat_h[rows], options)
-    return rows[rank_in_group(square, views[rows] + saliency[rows]) == 0]
+    return rows[rank_in_group(square, dates[rows] + views[rows] + saliency[rows]) == 0]
+
+
+def _dates(shown: Observations, passes: Sequence[BoolArray], count: int) -> IntArray:
+    """Number (count,) of passes that show each point: what many dates show lasts longest."""
+    date = np.arange(1 + int(shown.image.max(initial=0)))
+    for members in passes:
+        own = np.flatnonzero(members)
+        date[own[own < len(date)]] = own[0]
+    seen = np.unique(np.column_stack([shown.point, date[shown.image]]), axis=0)
+    return np.bincount(seen[:, 0], minlength=count).astype(np.int64)
 
 
 def _control_points(

@@ -4,8 +4,11 @@ from collections.abc import Sequence
 from datetime import timedelta
 
 import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
-from services.types import Acquisition, BoolArray
+from services.types import Acquisition, Array, BoolArray
 
 _LONGEST_PASS = timedelta(minutes=20)
 """A satellite sees a place for less than this from horizon to horizon, and next after a whole orbit."""
@@ -17,18 +20,28 @@ def image_passes(acquisitions: Sequence[Acquisition]) -> list[BoolArray]:
     Images of an unknown platform or time may come from the pass of any other.
     """
     n = len(acquisitions)
-    group = np.arange(n)
-    for i, one in enumerate(acquisitions):
-        for j, other in enumerate(acquisitions[:i]):
-            if _may_be_one_pass(one, other):
-                group[group == group[i]] = group[j]
-    masks = [group == number for number in np.unique(group)]
-    return [mask for mask in masks if mask.sum() > 1]
+    sensor = np.array([one.sensor or "" for one in acquisitions], dtype=np.str_)
+    moments = [one.acquired_at for one in acquisitions]
+    time_s = np.array([np.nan if moment is None else moment.timestamp() for moment in moments])
+    first, second = np.array(_links(sensor, time_s), dtype=np.int64).reshape(-1, 2).T
+    links = sparse.coo_array((np.ones(len(first)), (first, second)), shape=(n, n))
+    _, group = connected_components(links, directed=False)
+    masks = [group == number for number in np.flatnonzero(np.bincount(group, minlength=1) > 1)]
+    return [np.asarray(mask) for mask in masks]
 
 
-def _may_be_one_pass(one: Acquisition, other: Acquisition) -> bool:
-    if one.sensor and other.sensor and one.sensor != other.sensor:
-        return False
-    if one.acquired_at is None or other.acquired_at is None:
-        return True
-    return abs(one.acquired_at - other.acquired_at) <= _LONGEST_PASS
+def _links(sensor: npt.NDArray[np.str_], time_s: Array) -> list[tuple[int, int]]:
+    """Pairs of images that may be of one pass: enough of them to join all that may."""
+    links = []
+    by_time = np.argsort(time_s, kind="stable")
+    by_time = by_time[np.isfinite(time_s[by_time])]
+    longest_s = _LONGEST_PASS.total_seconds()
+    for name in np.unique(sensor[sensor != ""]):
+        own = by_time[sensor[by_time] == name]
+        near = np.flatnonzero(np.diff(time_s[own]) <= longest_s)
+        links += list(zip(own[near].tolist(), own[near + 1].tolist(), strict=True))
+    for i in np.flatnonzero((sensor == "") | np.isnan(time_s)).tolist():
+        may_be = np.isnan(time_s) | np.isnan(time_s[i]) | (np.abs(time_s - time_s[i]) <= longest_s)
+        may_be &= (sensor == "") | (sensor[i] == "") | (sensor == sensor[i])
+        links += [(i, j) for j in np.flatnonzero(may_be).tolist()]
+    return links
