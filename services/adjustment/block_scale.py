@@ -1,7 +1,7 @@
 """Size of residuals relative to their stated sigmas, where a third of the observations may be wrong."""
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri
 
 from services.errors import NoConsensus
 from services.types import Array, BoolArray, IntArray
@@ -94,8 +94,8 @@ def posterior_scale(square: Array, point: IntArray, parameters: float) -> float:
     of_point, freedom = np.bincount(point, square)[rays >= 2], 2.0 * rays[rays >= 2] - 3.0
     if not len(freedom):
         return 1.0
-    most = chi2.ppf(_COUNTED, freedom)
-    expected = freedom * chi2.cdf(most, freedom + 2.0) + most * (1.0 - _COUNTED)
+    most = chdtri(freedom, 1.0 - _COUNTED)
+    expected = freedom * chdtr(freedom + 2.0, most) + most * (1.0 - _COUNTED)
     scale2 = of_point.sum() / freedom.sum()
     for _ in range(100):
         last, scale2 = scale2, np.minimum(of_point, most * scale2).sum() / expected.sum()

@@ -2,7 +2,7 @@
 
 import numpy as np
 from numba import njit
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from services.adjustment.block_accuracy import BlockAccuracy
 from services.adjustment.block_problem import BlockProblem
@@ -44,7 +44,7 @@ def robust_control(
     freedom = problem.control.known_coordinates()
     size = np.sqrt(square / freedom)
     scale = max(1.0, float(np.median(size)))
-    near = square <= chi2.ppf(_AGREES, freedom) * _NEAR**2
+    near = square <= chdtri(freedom, 1.0 - _AGREES) * _NEAR**2
     return 1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2, near
 
 
@@ -100,7 +100,7 @@ def agreeing_control(
     halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
     residual = problem.control_rows(equations.residual).reshape(-1, 4)
     freedom = problem.control.known_coordinates()
-    limit = chi2.ppf(_AGREES, freedom)
+    limit = chdtri(freedom, 1.0 - _AGREES)
     ratio = np.full(len(active), np.inf)
     for i in range(len(active)):
         fitted = halves[i] @ predicted[i] @ halves[i].T

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from scipy.stats import median_abs_deviation
 
+from services.adjustment.robust import MAD_TO_STD
 from services.matching.shadows import shadow_vector
 from services.types import Acquisition, Array, IntArray, Views
 
@@ -102,7 +102,7 @@ def _image_variance_px2(views: Views, row: IntArray, offset: Array, weight: Arra
         if seen.sum() >= MIN_VIEWS_OF_IMAGE:
             contrast[i] = ((np.eye(len(used_images))[i] - share[point[seen]].mean(axis=0)) ** 2).sum()
             median = np.median(offset[seen], axis=0)
-            scatter_px = median_abs_deviation(offset[seen], axis=0, scale="normal")
+            scatter_px = MAD_TO_STD * np.median(np.abs(offset[seen] - median), axis=0)
             by_chance_px2 = _MEDIAN_VARIANCE * scatter_px**2 / seen.sum()
             square_px2[i] = (median**2 - by_chance_px2).mean()
     seen_px2, freedom = 0.0, 0.0
