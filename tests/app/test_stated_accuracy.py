@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from html import unescape
 from pathlib import Path
@@ -17,6 +15,7 @@ from app.storage import Storage
 from services.types import UNKNOWN_FRAME, Frame
 from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
 from tests.app.worker_processes import ended, running_worker
+from tests.command_line import amers_here
 
 pytestmark = pytest.mark.long
 
@@ -58,11 +57,8 @@ def amers(settings: Settings) -> Callable[..., str]:
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
 
-    def run(*arguments: object, fails: bool = False) -> str:
-        command = [sys.executable, "-m", "app.cli.main", *map(str, arguments)]
-        done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=240, check=False
-        )
+    def run(*words: object, fails: bool = False) -> str:
+        done = amers_here(words, environment)
         assert (done.returncode != 0) == fails, done.stderr
         return done.stdout + (done.stderr if fails else "")
 

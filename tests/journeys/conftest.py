@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ from uuid import uuid4
 
 import pytest
 
+from tests.command_line import amers_here
 from tests.service_process import Service, until
 
 Amers = Callable[..., Any]
@@ -36,14 +35,7 @@ def amers(service: Service) -> Amers:
     """Runs a command on the service's installation; returns its JSON output."""
 
     def run(*words: str | Path) -> Any:
-        done = subprocess.run(
-            [sys.executable, "-m", "app.cli.main", *map(str, words), "--json"],
-            env=service.environment,
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=False,
-        )
+        done = amers_here((*words, "--json"), service.environment)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)
 

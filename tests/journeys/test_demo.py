@@ -1,11 +1,12 @@
 """The demonstration on the simulated world, as a new user runs it."""
 
 import json
-import subprocess
-import sys
+import os
 from pathlib import Path
 
 import pytest
+
+from tests.command_line import Done, amers_here, amers_process
 
 pytestmark = pytest.mark.long
 
@@ -13,19 +14,14 @@ half_a_pixel = 0.5
 injected_m = 50.0
 
 
-def amers(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "app.cli.main", *map(str, words)],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+def amers(*words: str | Path) -> Done:
+    return amers_here(words, os.environ)
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    result = amers("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
+    words = ("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
+    result = amers_process(words, os.environ)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
