@@ -10,16 +10,24 @@ PAGE := app/web/built/index.html
 WORKERS := $(shell expr $$(nproc) \* 3 / 2)
 LONG := continent faults image_selection load stress throughput block_adjustment
 
-.PHONY: demo test test-fast test-security test-endurance check docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
+.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
 
-test: check postgis page chromium
+# Style, types and contracts are checked on one core while another compiles what all tests use.
+test: $(READY)
+	$(MAKE) --jobs 2 check kernels
+	$(MAKE) postgis page chromium
+	$(MAKE) --jobs 2 test-files test-operations
+
+test-files: $(READY)
 	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
 		--ignore tests/app/test_openapi.py
-	# All its operations have one name, of which files handed out as a whole run only the first.
-	$(BIN)/python -m pytest -n auto --dist load tests/app/test_openapi.py
+
+# All operations have one name, of which files handed out as a whole run only the first.
+test-operations: $(READY)
+	$(BIN)/python -m pytest -q -n0 tests/app/test_openapi.py
 
 # Under two minutes on two cores: no database, no journeys, nothing long. It reports what it leaves out.
 test-fast: $(READY)
@@ -29,7 +37,7 @@ test-fast: $(READY)
 test-security: postgis
 	$(BIN)/python -m pytest -m security --attacks full -n auto --dist loadfile --no-loadscope-reorder
 
-# Repeated kills, cuts and floods, bombs, further real views.
+# Repeated kills, cuts and floods, bombs, further cases and real views.
 test-endurance: postgis
 	$(BIN)/python -m pytest -m endurance -n auto --dist load
 
@@ -41,6 +49,9 @@ check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+kernels: $(READY)
+	$(BIN)/python -m tests.kernels
 
 serve: postgis page
 	$(BIN)/amers serve

@@ -1,5 +1,6 @@
 """What every test may ask for, and which tests a fast run leaves out."""
 
+import fcntl
 import os
 from collections import Counter
 from collections.abc import Iterator
@@ -114,8 +115,20 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def small_continent(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A small `benchmarks._continent.Continent`: a simulated archive as files, and its truth."""
-    # Not with the others: NumPy is first imported after this file.
-    from benchmarks.continent import make
+    """A small `benchmarks._continent.Continent`: a simulated archive as files, and its truth.
 
-    return make(tmp_path_factory.mktemp("continent"), "small", seed=1)
+    The first process of tests that asks makes it, others wait and open it: nobody changes its files.
+    """
+    # Not with the others: NumPy is first imported after this file.
+    from benchmarks.continent import make, open_continent
+
+    temporary = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        temporary = temporary.parent
+    folder, complete = temporary / "continent", temporary / "continent_complete"
+    with (temporary / "continent_lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not complete.exists():
+            make(folder, "small", seed=1)
+            complete.touch()
+    return open_continent(folder)

@@ -21,6 +21,7 @@ from app.usecases.image_production import ProductionImages, WorkPlace, run_produ
 from app.usecases.production import BlockIdentity
 from services.formats.block.reader import read_block
 from services.formats.images.raster import write_raster
+from services.production.from_images import Production
 from tests.service_process import free_port
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views
 
@@ -53,9 +54,21 @@ def make(images: ProductionImages, folder: Path, place: WorkPlace) -> dict[str, 
 
 
 @pytest.fixture(scope="module")
-def alone(images: ProductionImages, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the block made in one process, once there is a `production`."""
+    return tmp_path_factory.mktemp("alone") / "block"
+
+
+@pytest.fixture(scope="module")
+def production(images: ProductionImages, block: Path) -> Production:
     """The block made in one process."""
-    return make(images, tmp_path_factory.mktemp("alone") / "block", WorkPlace())
+    return run_production(images, block, BlockIdentity("made"), OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def alone(block: Path, production: Production) -> dict[str, str]:
+    """The content of the block made in one process."""
+    return content(block)
 
 
 @dataclass(frozen=True)
@@ -98,6 +111,7 @@ def test_several_processes_make_the_same_block_bit_for_bit(images, alone, tmp_pa
     assert make(images, tmp_path / "block", WorkPlace(compute=ComputeOptions(jobs=2))) == alone
 
 
+@pytest.mark.endurance
 def test_a_cluster_makes_the_same_block_bit_for_bit(images, alone, tmp_path) -> None:
     with dask_cluster(2) as cluster:
         place = WorkPlace(compute=ComputeOptions(cluster=cluster.address))
@@ -126,7 +140,15 @@ class StoppedHereError(Exception):
     """Somebody stopped the production."""
 
 
-@pytest.mark.parametrize("stage", ["features", "matches", "measures", "points"])
+@pytest.mark.parametrize(
+    "stage",
+    [
+        pytest.param("features", marks=pytest.mark.endurance),
+        "matches",
+        pytest.param("measures", marks=pytest.mark.endurance),
+        "points",
+    ],
+)
 def test_an_interrupted_production_goes_on_from_where_it_was(
     images, alone, tmp_path, monkeypatch, stage
 ) -> None:
@@ -146,23 +168,21 @@ def test_an_interrupted_production_goes_on_from_where_it_was(
     assert {file: file.stat().st_mtime_ns for file in kept} == kept, "computed again"
 
 
-def test_the_work_folder_is_gone_when_the_block_is_complete(images, tmp_path, alone) -> None:
-    assert make(images, tmp_path / "block", WorkPlace()) == alone
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["block", "block.adjustment"]
+def test_the_work_folder_is_gone_when_the_block_is_complete(block, production) -> None:
+    assert sorted(file.name for file in block.parent.iterdir()) == ["block", "block.adjustment"]
 
 
-def test_the_adjustment_is_reported_image_by_image_and_point_by_point(images, tmp_path) -> None:
-    made = run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS)
-    folder = tmp_path / "block.adjustment"
+def test_the_adjustment_is_reported_image_by_image_and_point_by_point(images, block, production) -> None:
+    folder = block.parent / "block.adjustment"
     report = json.loads((folder / "report.json").read_text())
     assert [image["name"] for image in report["images"]] == [file.stem for file in images.files]
     assert {image["verdict"] for image in report["images"]} == {"fits"}
     assert all(0.5 * image["measures"] < image["used"] for image in report["images"])
     assert report["on_the_earth"]["words"].startswith("CE90")
     lines = (folder / "points.csv").read_text().splitlines()
-    assert len(lines) == 1 + len(made.points)
+    assert len(lines) == 1 + len(production.points)
     columns = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))
-    assert float(columns["lon"]) == pytest.approx(made.points.lon_lat_h[0, 0], abs=1e-7)
+    assert float(columns["lon"]) == pytest.approx(production.points.lon_lat_h[0, 0], abs=1e-7)
     assert int(columns["used"]) >= OPTIONS.min_views
     page = (folder / "report.html").read_text()
     assert all(file.stem in page for file in images.files)
@@ -189,8 +209,7 @@ def test_a_cluster_that_does_not_answer_is_named(images, tmp_path, monkeypatch) 
         run_production(images, tmp_path / "block", BlockIdentity("made"), OPTIONS, place=place)
 
 
-def test_a_block_of_a_cluster_is_a_valid_block(images, alone, tmp_path) -> None:
-    make(images, tmp_path / "block", WorkPlace())
-    points = read_block(tmp_path / "block").points
+def test_what_is_made_is_a_valid_block(block, production) -> None:
+    points = read_block(block).points
     assert len(points) > 20
     assert np.isfinite(points.lon_lat_h).all()

@@ -30,8 +30,8 @@ IMAGE = b"II*\0" + bytes(400_000)
 SMALL_WINDOW = 4096
 
 
-@pytest.fixture
-def service(open_folder):
+@contextmanager
+def running(open_folder: Path) -> Iterator[Service]:
     service = Service(open_folder / uuid4().hex[:8])
     try:
         assert until(service.is_ready), service.log.read_text()
@@ -43,6 +43,20 @@ def service(open_folder):
             pass
 
 
+@pytest.fixture
+def service(open_folder: Path) -> Iterator[Service]:
+    """A running service of this test alone, which may end it."""
+    with running(open_folder) as service:
+        yield service
+
+
+@pytest.fixture(scope="module")
+def lasting(open_folder: Path) -> Iterator[Service]:
+    """A running service that tests harm and leave running."""
+    with running(open_folder) as service:
+        yield service
+
+
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_service_stops_its_worker_and_its_database(service, ending):
     workers = service.workers()
@@ -52,23 +66,23 @@ def test_a_stopped_service_stops_its_worker_and_its_database(service, ending):
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
 
 
-def test_a_killed_worker_is_replaced(service):
-    (worker,) = service.workers()
+def test_a_killed_worker_is_replaced(lasting):
+    (worker,) = lasting.workers()
     os.kill(worker, signal.SIGKILL)
-    assert until(lambda: service.workers() not in ([], [worker]))
-    assert service.is_ready()
+    assert until(lambda: lasting.workers() not in ([], [worker]))
+    assert lasting.is_ready()
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_killed_api_is_replaced_while_its_callers_wait_and_its_worker_lives(service, ending):
-    workers, (api,) = service.workers(), service.apis()
+def test_a_killed_api_is_replaced_while_its_callers_wait_and_its_worker_lives(lasting, ending):
+    workers, (api,) = lasting.workers(), lasting.apis()
     os.kill(api, ending)
     assert until(lambda: not Path(f"/proc/{api}").exists())
     # A connection is not refused: it waits until the next process of the API accepts it.
-    assert httpx.get(f"{service.url}/readyz", timeout=60).status_code == 200
-    assert service.apis() not in ([], [api])
-    assert service.workers() == workers
-    assert f"the API ended with exit code {-ending} and is restarted" in service.log.read_text()
+    assert httpx.get(f"{lasting.url}/readyz", timeout=60).status_code == 200
+    assert lasting.apis() not in ([], [api])
+    assert lasting.workers() == workers
+    assert f"the API ended with exit code {-ending} and is restarted" in lasting.log.read_text()
 
 
 def test_a_used_port_ends_the_service_with_the_reason(tmp_path):
@@ -85,9 +99,9 @@ def test_a_used_port_ends_the_service_with_the_reason(tmp_path):
     assert f"amers: cannot listen on 127.0.0.1, port {port}: Address already in use" in run.stderr
 
 
-def test_a_killed_database_is_restarted(service):
-    os.kill(int((service.cluster.data / "postmaster.pid").read_text().splitlines()[0]), signal.SIGKILL)
-    assert until(service.is_ready)
+def test_a_killed_database_is_restarted(lasting):
+    os.kill(int((lasting.cluster.data / "postmaster.pid").read_text().splitlines()[0]), signal.SIGKILL)
+    assert until(lasting.is_ready)
 
 
 def test_a_service_that_is_killed_leaves_neither_api_nor_worker_behind(service):

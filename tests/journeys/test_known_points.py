@@ -1,11 +1,14 @@
 """Points of a base without chips, on real images: chips from two views, a third registered on them."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+
+from tests.command_line import amers_here
 
 pytestmark = pytest.mark.real_data
 
@@ -14,8 +17,15 @@ BIAS_PX = 1.2
 """Between the first and the third view as delivered, from tie points."""
 
 
+def amers(*words: object) -> dict:
+    """What a command that needs no service prints."""
+    done = amers_here((*words, "--json"), os.environ)
+    assert done.returncode == 0, done.stderr
+    return dict(json.loads(done.stdout))
+
+
 def test_a_lattice_with_heights_of_a_surface_model_gets_chips_that_register_another_view(
-    real_data: Path, amers, tmp_path: Path
+    real_data: Path, tmp_path: Path
 ) -> None:
     folder = real_data / "phr_calanques_triplet"
     dsm = folder / "expected_output" / "dsm.tif"

@@ -1,6 +1,7 @@
 """A simulated continent as files: readable as an archive, with the errors that its truth states."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -183,8 +184,10 @@ def agreement(continent: Continent, one: str, other: str) -> float:
     return float(np.median(scores))
 
 
-def test_what_is_there_is_kept_and_what_is_missing_is_made_again(small_continent: Continent) -> None:
-    folder = small_continent.folder
+def test_what_is_there_is_kept_and_what_is_missing_is_made_again(
+    small_continent: Continent, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(small_continent.folder, tmp_path / "continent")
     paths = sorted((folder / "archive" / "images").glob("*.tif"))
     missing, kept = paths[0], paths[1]
     pixels, time = missing.read_bytes(), kept.stat().st_mtime_ns

@@ -31,7 +31,14 @@ def largest_error_px(registration: Registration, case: tuple[float, float, int])
     return float(np.linalg.norm(registration.model.project(ground) - shown, axis=1).max())
 
 
-@pytest.mark.parametrize(("gsds_m", "error_km"), [((2.0, 20.0), 4.9), ((2.0,), 1.0), ((2.0,), 4.9)])
+@pytest.mark.parametrize(
+    ("gsds_m", "error_km"),
+    [
+        ((2.0, 20.0), 4.9),
+        pytest.param((2.0,), 1.0, marks=pytest.mark.endurance),
+        ((2.0,), 4.9),
+    ],
+)
 def test_a_scene_kilometres_off_is_found(gsds_m: tuple[float, ...], error_km: float) -> None:
     east, north = (1000.0 * error_km * DIRECTION).tolist()
     points, chips = wide_points(10_000.0, 500.0, gsds_m)

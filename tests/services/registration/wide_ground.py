@@ -29,6 +29,7 @@ STEP_M = 2.0
 PERIODS_PX = (997, 1103, 1217, 1321)
 """Of four textures that repeat; their sum does so nowhere within 10 km."""
 _NODE_PX = 16
+_CHIP_NODE_PX = 25
 
 
 @cache
@@ -51,10 +52,21 @@ def _textures(seed: int, mean_px: int) -> tuple[FloatImage, ...]:
 def brightness(east: Array, north: Array, seed: int = 0, mean_px: int = 1) -> FloatImage:
     """Grey values of the ground at positions in the frame of `CENTRE`, metres; means of squares."""
     total = np.zeros(east.shape, dtype=np.float32)
+    column, row = east / STEP_M, north / STEP_M
     for period, texture in zip(PERIODS_PX, _textures(seed, mean_px), strict=True):
-        x, y = ((axis / STEP_M % period).astype(np.float32) for axis in (east, north))
+        # As `% period`, in a quarter of the time.
+        x, y = ((axis - period * np.floor(axis / period)).astype(np.float32) for axis in (column, row))
         total += cv2.remap(texture, x, y, cv2.INTER_LINEAR)
     return np.asarray(1000.0 + 120.0 * total, dtype=np.float32)
+
+
+def _between_nodes(enu: Array, shape: tuple[int, int], step_px: int) -> tuple[Array, Array]:
+    """East and north of all pixels, bilinear between nodes (n, m, 2) every `step_px` pixels."""
+    rows, columns = (
+        np.maximum(0.0, 1.0 - np.abs(np.arange(size)[:, None] / step_px - np.arange(count)))
+        for size, count in zip(shape, enu.shape[:2], strict=True)
+    )
+    return rows @ enu[..., 0] @ columns.T, rows @ enu[..., 1] @ columns.T
 
 
 @dataclass(frozen=True)
@@ -73,16 +85,12 @@ class WideImage:
 
     def read(self, window: Window) -> FloatImage:
         """Pixels of a window; NaN beyond the image."""
-        counts = [-(-size // _NODE_PX) + 1 for size in (window.lines, window.samples)]
-        axes = [np.arange(count) * float(_NODE_PX) for count in counts]
+        shape = (window.lines, window.samples)
+        axes = [np.arange(-(-size // _NODE_PX) + 1) * float(_NODE_PX) for size in shape]
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1) + (window.line, window.sample)
         ground = self.model.locate(nodes.reshape(-1, 2), np.zeros(nodes.size // 2))
         enu = east_north_up(ground, CENTRE)[:, :2].reshape(nodes.shape)
-        weights = [
-            np.maximum(0.0, 1.0 - np.abs(np.arange(size)[:, None] - axis) / _NODE_PX)
-            for size, axis in zip((window.lines, window.samples), axes, strict=True)
-        ]
-        east, north = (weights[0] @ enu[..., k] @ weights[1].T for k in range(2))
+        east, north = _between_nodes(enu, shape, _NODE_PX)
         pixels = brightness(east, north, self.seed)
         pixels += (
             np.random.default_rng(10_000 + window.line)
@@ -138,11 +146,13 @@ class WideChips:
         return np.stack([self._chip(point, gsd_m) for gsd_m in self.gsds_m])
 
     def _chip(self, point: Array, gsd_m: float) -> ChipArray:
-        ground = chip_ground(point, gsd_m, CHIP_SIZE)
-        enu = east_north_up(ground, CENTRE)[:, :2].reshape(CHIP_SIZE, CHIP_SIZE, 2)
+        nodes = CHIP_SIZE // _CHIP_NODE_PX + 1
+        ground = chip_ground(point, gsd_m * _CHIP_NODE_PX, nodes)
+        enu = east_north_up(ground, CENTRE)[:, :2].reshape(nodes, nodes, 2)
+        east, north = _between_nodes(enu, (CHIP_SIZE, CHIP_SIZE), _CHIP_NODE_PX)
         # An odd number of pixels is averaged, so that the mean stays on the pixel.
         mean_px = int(gsd_m / STEP_M) | 1
-        pixels = brightness(enu[..., 0], enu[..., 1], mean_px=mean_px)
+        pixels = brightness(east, north, mean_px=mean_px)
         return np.clip(pixels, 1.0, 65535.0).astype(np.uint16)
 
 

@@ -1,0 +1,18 @@
+"""Compile the functions that tests spend most time to compile, once, before processes of tests start.
+
+Run: python -m tests.kernels
+"""
+
+from app.worker.warm_up import warm_up
+from services.registration.on_points import register_scene
+from tests.services.simulated import BLOCK_SIGMA_M, block, spoiled_view
+
+
+def compile_kernels() -> None:
+    """Simulate views, make a block of them, and register a scene on it."""
+    warm_up()
+    register_scene(spoiled_view().as_scene(10.0 * BLOCK_SIGMA_M), *block())
+
+
+if __name__ == "__main__":
+    compile_kernels()
