@@ -16,6 +16,7 @@ from app.cli.progress import shown_progress
 from app.errors import InputError
 from app.usecases.control_files import ControlFiles
 from app.usecases.executors import ComputeOptions
+from app.usecases.ground_classes import GroundFiles
 from app.usecases.image_production import ProductionImages, WorkPlace, run_production
 from app.usecases.image_selection import CatalogueRequest, run_selection
 from app.usecases.marked_files import PointStatements
@@ -77,6 +78,18 @@ def run(
     control_crs: control_options.Crs = None,
     control_columns: control_options.Columns = None,
     control_sigma_axes: control_options.SigmaAxes = None,
+    exclude: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Ground without points: GeoJSON polygons, or an image on a map; repeat for several."
+        ),
+    ] = None,
+    land_cover: Annotated[
+        Path | None,
+        typer.Option(
+            help="Image of land cover classes: the typology of the points; water, snow and ice get none."
+        ),
+    ] = None,
     area: Annotated[
         Path | None, typer.Option(help="GeoJSON of the ground to see, for --catalogue.")
     ] = None,
@@ -128,7 +141,13 @@ def run(
             request = CatalogueRequest(catalogue, area, first_day)
             run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_production(
-            ProductionImages(tuple(images or ()), selection, sigma_m, control_files),
+            ProductionImages(
+                tuple(images or ()),
+                selection,
+                sigma_m,
+                control_files,
+                GroundFiles(tuple(exclude or ()), land_cover),
+            ),
             output,
             identity,
             options,

@@ -14,6 +14,7 @@ from typing import Any
 
 from app.usecases.control_files import ControlFiles, control_inputs, read_control
 from app.usecases.executors import ComputeOptions, open_executor
+from app.usecases.ground_classes import GroundFiles, read_ground
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from app.usecases.registration.result_folder import replacing
@@ -42,12 +43,14 @@ class ProductionImages:
         selection: folder that `run_selection` has written; its images are added.
         sigma_m: accuracy of the images' models, metres; by default that of the producer or the sensor.
         control: places the block on the Earth.
+        ground: where no points are wanted, and what points stand on.
     """
 
     files: tuple[Path, ...] = ()
     selection: Path | None = None
     sigma_m: float | None = None
     control: ControlFiles = field(default_factory=ControlFiles)
+    ground: GroundFiles = field(default_factory=GroundFiles)
 
 
 @dataclass(frozen=True)
@@ -95,11 +98,17 @@ def run_production(
         scenes, files = _read(images, stack, part_of(progress, 0.0, 0.05))
         work_folder = place.folder or folder.with_name(f"{folder.name}.work")
         control = read_control(images.control, scenes, files, stack)
-        kept = WorkFolder(work_folder, _inputs(scenes, files, images.control, options))
+        ground = read_ground(images.ground)
+        kept = WorkFolder(work_folder, _inputs(scenes, files, images, options))
         executor, ahead = stack.enter_context(open_executor(place.compute))
         work = Work(executor, kept, ahead)
         production = produce_points(
-            scenes, options, part_of(progress, 0.05, 0.85), control=control, work=work
+            scenes,
+            options,
+            part_of(progress, 0.05, 0.85),
+            control=control,
+            excluded=ground.excluded,
+            work=work,
         )
         write_block(
             folder,
@@ -107,6 +116,7 @@ def run_production(
             production.points,
             production.chips,
             _adjusted_models(scenes, production),
+            typology=ground.typology(production.points),
             progress=part_of(progress, 0.9, 0.1),
         )
     _write_report(folder.with_name(f"{folder.name}.adjustment"), identity.id, production)
@@ -154,7 +164,7 @@ def _read(
 def _inputs(
     scenes: Sequence[Scene],
     files: Sequence[Path],
-    control: ControlFiles,
+    given: ProductionImages,
     options: ProductionOptions,
 ) -> dict[str, Any]:
     """What the results of all tasks depend on."""
@@ -171,7 +181,8 @@ def _inputs(
             }
             for scene, file in zip(scenes, files, strict=True)
         ],
-        "control": control_inputs(control),
+        "control": control_inputs(given.control),
+        "ground": given.ground.inputs(),
         "options": asdict(options),
     }
 

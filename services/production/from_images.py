@@ -25,6 +25,7 @@ from services.production.ground_parts import CutPoints, cut_points, measure_poin
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
 from services.production.tie_points import find_tie_points
+from services.quality.density import GroundMask
 from services.tasks import Effort, Work
 from services.types import (
     Array,
@@ -135,6 +136,7 @@ def produce_points(
     progress: Progress = no_progress,
     *,
     control: Control = Control(),
+    excluded: GroundMask | None = None,
     work: Work | None = None,
 ) -> Production:
     """Control points with chips, produced from overlapping images alone.
@@ -149,6 +151,7 @@ def produce_points(
         options: of the block.
         progress: receives the fraction done.
         control: what places the block on the Earth.
+        excluded: ground that gets no points.
         work: computes the tasks and keeps their results; by default in this process, in memory.
 
     Raises:
@@ -168,7 +171,7 @@ def produce_points(
     tied = _adjust(scenes, passes, ties, options)
     before = intersect([scene.model for scene in scenes], ties, int(ties.point[-1]) + 1)
 
-    candidates = _candidates(_with_models(scenes, tied), tied, ties, options)
+    candidates = _candidates(_with_models(scenes, tied), tied, ties, options, excluded)
     measures, saliency = measure_points(
         _with_models(scenes, tied),
         candidates,
@@ -202,8 +205,11 @@ def produce_points(
     active = measures.take(adjustment.active & (measures.point < len(candidates)))
     adjusted = _with_models(scenes, adjustment)
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
-    # Points of the control and candidates that nothing measures are not selected.
+    # Points of the control, candidates that nothing measures, and those that have moved onto excluded
+    # ground are not selected.
     saliency = np.append(saliency, np.zeros(len(known)))[: len(adjustment.lon_lat_h)]
+    if excluded is not None:
+        saliency[excluded(adjustment.lon_lat_h[:, :2])] = 0.0
     rows = _select_points(adjustment, saliency, shown, _dates(shown, passes, len(saliency)), options)
     shown = shown.take(np.isin(shown.point, rows))
     shown = replace(shown, point=np.searchsorted(rows, shown.point))
@@ -275,7 +281,11 @@ def _median_px(residual: Array) -> float:
 
 
 def _candidates(
-    scenes: Sequence[Scene], block: BlockAdjustment, ties: Observations, options: ProductionOptions
+    scenes: Sequence[Scene],
+    block: BlockAdjustment,
+    ties: Observations,
+    options: ProductionOptions,
+    excluded: GroundMask | None,
 ) -> Array:
     """Ground positions (n, 3) of the tie points to try, the best of every square, square by square."""
     active = ties.take(block.active)
@@ -286,6 +296,8 @@ def _candidates(
     sigma_m = np.sqrt(np.diagonal(block.point_covariance_m2, 0, 1, 2))
     usable = np.isfinite(block.lon_lat_h[:, 0]) & (rays >= 2) & _precise(sigma_m, options)
     rows = np.flatnonzero(usable)
+    if excluded is not None:
+        rows = rows[~excluded(block.lon_lat_h[rows, :2])]
     n_whole = np.zeros(len(rows), dtype=np.int64)
     for scene in scenes:
         n_whole += chip_inside(scene.model, scene.image.shape, block.lon_lat_h[rows], options.fine_gsd_m)

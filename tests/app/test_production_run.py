@@ -8,22 +8,25 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from distributed import Client
+from rasterio.transform import from_origin
 
 from app.errors import InputError
 from app.usecases.executors import ComputeOptions
+from app.usecases.ground_classes import GroundFiles
 from app.usecases.image_production import ProductionImages, WorkPlace, run_production
 from app.usecases.production import BlockIdentity
 from services.formats.block.reader import read_block
 from services.formats.images.raster import write_raster
 from services.production.from_images import Production
 from tests.service_process import free_port
-from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views
+from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views, world
 
 pytestmark = pytest.mark.long
 
@@ -186,6 +189,33 @@ def test_the_adjustment_is_reported_image_by_image_and_point_by_point(images, bl
     assert int(columns["used"]) >= OPTIONS.min_views
     page = (folder / "report.html").read_text()
     assert all(file.stem in page for file in images.files)
+
+
+def test_points_stand_on_the_land_cover_and_not_on_water_or_excluded_ground(images, tmp_path) -> None:
+    """West of the middle lies water; of the rest, trees and buildings, the north is excluded."""
+    lon, lat = world().centre_lon_lat
+    cover = np.full((100, 100), 10, dtype=np.uint8)
+    cover[:, :50], cover[:, 75:] = 80, 50
+    grid = from_origin(lon - 0.01, lat + 0.01, 0.0002, 0.0002)
+    form = {"driver": "GTiff", "width": 100, "height": 100, "count": 1, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "cover.tif", "w", **form, crs="EPSG:4326", transform=grid) as file:
+        file.write(cover, 1)
+    north = [[lon - 1, lat], [lon + 1, lat], [lon + 1, lat + 1], [lon - 1, lat + 1], [lon - 1, lat]]
+    polygon = {"type": "Polygon", "coordinates": [north]}
+    (tmp_path / "north.geojson").write_text(json.dumps(polygon))
+    ground = GroundFiles((tmp_path / "north.geojson",), tmp_path / "cover.tif")
+    made = run_production(
+        replace(images, ground=ground), tmp_path / "block", BlockIdentity("made"), OPTIONS
+    )
+    places = made.points.lon_lat_h[:, :2]
+    a_metre = 1e-5
+    assert len(places) >= 6
+    assert (places[:, 0] > lon - a_metre).all()
+    assert (places[:, 1] < lat + a_metre).all()
+    contents = read_block(tmp_path / "block")
+    on_trees = contents.points.lon_lat_h[:, 0] < lon + 0.005
+    expected = np.where(on_trees, "trees", "buildings")
+    assert contents.typology.tolist() == expected.tolist()
 
 
 def test_work_on_other_images_is_refused(images, tmp_path) -> None:
