@@ -86,6 +86,5 @@ def renewal_row(document: dict[str, Any]) -> Row:
         "renews": document["renews"],
         "scenes": scenes,
         "new views": document["new_views"],
-        "new points": document["new_points"],
         "proposed withdrawals": "; ".join([str(len(withdrawals)), *withdrawals]),
     }

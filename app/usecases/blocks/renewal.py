@@ -240,7 +240,6 @@ def _document(
         ],
         "new_views": int(len(renewed.points.views.gsd_m) - _views_of(points, renewed.points)),
         "points_with_new_views": len(np.unique(np.concatenate(renewed.gained))),
-        "new_points": 0,
         "suspended_points_left_out": base.suspended.tolist(),
         "proposed_withdrawals": [
             {

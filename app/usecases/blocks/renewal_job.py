@@ -81,7 +81,6 @@ def _run(work: Work) -> Commit:
             "points": block.n_points,
             "renews": document["renews"],
             "new_views": document["new_views"],
-            "new_points": document["new_points"],
             "proposed_withdrawals": len(document["proposed_withdrawals"]),
             "files": keys,
         }
@@ -96,7 +95,7 @@ RENEW_BLOCK = Process(
     "that later scenes no longer find.",
     scope=Scope.ADMIN,
     inputs=RenewBlock,
-    outputs={DOCUMENT: "What is renewed: scenes, new views and points, proposed withdrawals."},
+    outputs={DOCUMENT: "What is renewed: scenes, new views, proposed withdrawals."},
     check=_check,
     run=_run,
     values={
@@ -107,7 +106,6 @@ RENEW_BLOCK = Process(
         "points": {"type": "integer", "title": "Points of the version"},
         "renews": {"type": "string", "title": "Version that it renews"},
         "new_views": {"type": "integer", "title": "Views added"},
-        "new_points": {"type": "integer", "title": "Points added"},
         "proposed_withdrawals": {"type": "integer", "title": "Points left out as vanished"},
     },
 )
