@@ -47,6 +47,36 @@ Crs = Annotated[
 Columns = Annotated[
     str | None, typer.Option(help="Columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…")
 ]
+Ortho = Annotated[
+    list[Path] | None,
+    typer.Option(help="Ortho-image that places the block east and north; repeat for several."),
+]
+OrthoSigmaM = Annotated[
+    float | None,
+    typer.Option(
+        help="Accuracy of --control-ortho on the Earth, one sigma a coordinate, metres; by default that "
+        "of the product.",
+        min=0.001,
+    ),
+]
+Dem = Annotated[
+    Path | None, typer.Option(help="GeoTIFF with heights of the ground that places the block in height.")
+]
+DemVertical = Annotated[
+    str | None,
+    typer.Option(help="Vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…"),
+]
+DemGeoid = Annotated[
+    Path | None, typer.Option(help="Grid file of the geoid of --control-dem, GTX or GeoTIFF.")
+]
+DemSigmaM = Annotated[
+    float | None,
+    typer.Option(help="Sigma of single heights of --control-dem, metres.", min=0.001),
+]
+DemFrameSigmaM = Annotated[
+    str | None,
+    typer.Option(help="Error that all of --control-dem has: HORIZONTAL,UP, one sigma, metres."),
+]
 SigmaAxes = Annotated[
     str | None,
     typer.Option(help=f"Axes of the sigmas of an ASP file: {ECEF} or {LAT_LON_HEIGHT}."),

@@ -1,5 +1,6 @@
-"""Files that place a new block on the Earth: older blocks, and ground points marked in its images."""
+"""Files that place a new block on the Earth: blocks, marked points, ortho-images, elevation models."""
 
+import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -8,11 +9,35 @@ from typing import Any
 
 from app.errors import InputError
 from app.usecases.marked_files import PointStatements, read_marked
+from app.usecases.registration.reference_source import COMMON_SIGMA_PX, LOCAL_SIGMA_PX
+from app.usecases.terrain_file import TerrainFile, read_terrain
+from services.errors import VerticalDatumError
 from services.formats.block.document_json import BLOCK_JSON
 from services.formats.block.reader import FolderChips, file_sha256, read_block
+from services.formats.images.scenes import product_sigma_m, read_scene
 from services.imagery.scene import Scene
+from services.matching.reference_image import Reference
 from services.production.control import Control
 from services.production.control_points import ControlBlock
+from services.production.height_control import ControlHeights
+from services.production.ortho_control import ControlOrtho
+from services.sensors.ortho import OrthoModel
+from services.types import Frame
+
+
+@dataclass(frozen=True)
+class HeightFile:
+    """An elevation model that gives a block its heights.
+
+    Attributes:
+        terrain: the file, with its vertical datum.
+        sigma_m: of its heights, one standard deviation, independent from place to place.
+        frame_sigma_m: horizontal and up, of the error that the whole model has.
+    """
+
+    terrain: TerrainFile
+    sigma_m: float | None = None
+    frame_sigma_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -22,10 +47,17 @@ class ControlFiles:
     Attributes:
         paths: folders of older blocks, and files of ground points marked in the images.
         points: what the files of points do not state.
+        orthos: ortho-images, which tell positions.
+        ortho_sigma_m: accuracy of them on the Earth, one standard deviation a coordinate; by default
+            that of their product.
+        heights: an elevation model, which tells heights.
     """
 
     paths: tuple[Path, ...] = ()
     points: PointStatements = field(default_factory=PointStatements)
+    orthos: tuple[Path, ...] = ()
+    ortho_sigma_m: float | None = None
+    heights: HeightFile | None = None
 
 
 def read_control(
@@ -53,7 +85,12 @@ def read_control(
         )
     marked = (read_marked(of_points, files.points, scenes, images),) if of_points else ()
     blocks = tuple(_block(path, stack) for path in files.paths if path.is_dir())
-    return Control(blocks=blocks, marked=marked)
+    return Control(
+        blocks=blocks,
+        marked=marked,
+        orthos=tuple(_ortho(path, files.ortho_sigma_m, stack) for path in files.orthos),
+        heights=() if files.heights is None else (_heights(files.heights),),
+    )
 
 
 def control_inputs(files: ControlFiles) -> dict[str, Any]:
@@ -67,6 +104,9 @@ def control_inputs(files: ControlFiles) -> dict[str, Any]:
             for path in files.paths
         ],
         "points": asdict(files.points),
+        "orthos": [{"path": str(path.resolve()), "sha256": file_sha256(path)} for path in files.orthos],
+        "ortho_sigma_m": files.ortho_sigma_m,
+        "heights": None if files.heights is None else asdict(files.heights),
     }
 
 
@@ -74,3 +114,45 @@ def _block(folder: Path, stack: ExitStack) -> ControlBlock:
     contents = read_block(folder)
     chips = stack.enter_context(FolderChips(folder))
     return ControlBlock(contents.document.metadata.id, contents.points, chips)
+
+
+def _ortho(path: Path, sigma_m: float | None, stack: ExitStack) -> ControlOrtho:
+    scene = read_scene(path, sigma_m=math.nan)
+    stack.callback(scene.image.close)  # type: ignore[attr-defined]
+    if not isinstance(scene.model, OrthoModel):
+        raise InputError(
+            f"{path}: expected an ortho-image on a map (--control-ortho), found an image with a sensor "
+            "model; give it with --images"
+        )
+    stated_m = sigma_m or product_sigma_m(scene.acquisition.sensor)
+    if stated_m is None:
+        raise InputError(
+            f"{path}: nobody states how accurate this ortho-image is on the Earth: state it "
+            "(--control-ortho-sigma-m), one standard deviation a coordinate in metres"
+        )
+    gsd_m = scene.model.grid.gsd_m
+    reference = Reference(
+        image=scene.image,
+        model=scene.model,
+        terrain=None,
+        sigma_m=LOCAL_SIGMA_PX * gsd_m,
+        height_sigma_m=math.nan,
+        common_sigma_m=COMMON_SIGMA_PX * gsd_m,
+        frame=Frame.from_sigmas(stated_m, math.nan),
+    )
+    return ControlOrtho(path.name, reference)
+
+
+def _heights(heights: HeightFile) -> ControlHeights:
+    name = heights.terrain.dem.name
+    if heights.sigma_m is None or heights.frame_sigma_m is None:
+        raise InputError(
+            f"{name}: nobody states how accurate these heights are: state what they are off one by one "
+            "(--control-dem-sigma-m) and what the whole model is off in position and height "
+            "(--control-dem-frame-sigma-m HORIZONTAL,UP), one standard deviation in metres"
+        )
+    try:
+        terrain = read_terrain(heights.terrain)
+    except VerticalDatumError as error:
+        raise InputError(f"{error} (--control-dem-vertical, --control-dem-geoid)") from None
+    return ControlHeights(name, terrain, heights.sigma_m, Frame.from_sigmas(*heights.frame_sigma_m))

@@ -102,7 +102,7 @@ def adjust_block(
         DisconnectedBlock: groups of images without common points, and without control of each.
         NoConvergence: the parameters still change after the last iteration.
     """
-    priors = block_priors(images, passes, _wholly_shared(control.frames))
+    priors = block_priors(images, passes, control.frame_covariances())
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size)
     state, scale, active, control_active = robust_start(problem, priors)
@@ -167,11 +167,6 @@ def adjust_block(
         sigma_px=scale,
         iterations=state.iterations,
     )
-
-
-def _wholly_shared(frames: Sequence[Frame]) -> list[Array]:
-    """Covariances (3, 3) of frames with what the points of their blocks share beyond them."""
-    return [frame.covariance_m2 + frame.shared_m2 for frame in frames]
 
 
 def _determined(priors: BlockPriors, variance: Array) -> Array:

@@ -95,8 +95,9 @@ def agreeing_control(
     if not len(problem.control):
         return active
     covariance = accuracy.covariance()
-    point = problem.control.point
-    predicted = _predicted_covariance(equations, points, problem.pairs, covariance, point)
+    frame = len(problem.images) + problem.control.source
+    place = np.column_stack([problem.control.point, frame])
+    predicted = _predicted_covariance(equations, points, problem.pairs, covariance, place)
     halves = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
     residual = problem.control_rows(equations.residual).reshape(-1, 4)
     freedom = problem.control.known_coordinates()
@@ -124,13 +125,20 @@ def agreeing_control(
 
 @njit(cache=True)
 def _predicted_covariance(
-    equations: Equations, points: Points, pairs: Pairs, covariance: Array, point: IntArray
+    equations: Equations,
+    points: Points,
+    pairs: Pairs,
+    covariance: Array,
+    place: IntArray,
 ) -> Array:
-    """Covariance (c, 3, 3) of the computed ground of control points with the errors of their frames."""
+    """Covariance (c, 3, 3) of the computed ground of control points with the errors of their frames.
+
+    `place` (c, 2) are the points, and the blocks of parameters of their frames.
+    """
     k = equations.by_parameters.shape[2]
-    out = np.empty((len(point), 3, 3))
-    for c in range(len(point)):
-        p = point[c]
+    out = np.empty((len(place), 3, 3))
+    for c in range(len(place)):
+        p = place[c, 0]
         first = np.searchsorted(equations.point, p)
         last = np.searchsorted(equations.point, p, side="right")
         by_block = np.zeros((last - first + 1, 3, k))
@@ -141,8 +149,7 @@ def _predicted_covariance(
             if w > 0.0:
                 cross = equations.by_ground[i].T @ equations.by_parameters[i]
                 by_block[i - first] = -w * (points.inverse[p] @ cross)
-        # The rows of known ground are the last ones of their point.
-        block[last - first] = equations.block[last - 1]
+        block[last - first] = place[c, 1]
         for a in range(3):
             by_block[last - first, a, a] = 1.0
         total = points.inverse[p].copy()

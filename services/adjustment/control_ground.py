@@ -17,7 +17,8 @@ class ControlGround:
     gives the block its shape, not its place.
 
     Attributes:
-        point: (c,) int64, rows of the points of the observations; each at most once.
+        point: (c,) int64, rows of the points of the observations; a point may be known from several
+            sources.
         lon_lat_h: (c, 3).
         covariance_m2: (c, 3, 3) of east, north, up, relative to the frame; infinite on the diagonal
             where a coordinate is not known (planimetry only, height only).
@@ -62,6 +63,18 @@ class ControlGround:
     def known(self) -> BoolArray:
         """(c, 3) coordinates that are known: east, north, up."""
         return np.isfinite(np.diagonal(self.covariance_m2, 0, 1, 2))
+
+    def frame_covariances(self) -> list[Array]:
+        """Covariances (3, 3) of the frames, with what the points of a block share beyond its frame.
+
+        NaN where unknown, 1 for coordinates that no point has.
+        """
+        out = []
+        for number, frame in enumerate(self.frames):
+            absent = ~self.known[self.source == number].any(axis=0)
+            apart = absent[:, None] | absent[None, :]
+            out.append(np.where(apart, np.eye(3), frame.covariance_m2 + frame.shared_m2))
+        return out
 
     def known_coordinates(self) -> IntArray:
         """Number (c,) of coordinates that are known."""

@@ -76,15 +76,14 @@ def refine_on_chips(
         gsd_m: ground sampling of the chips, metres.
         options: thresholds.
     """
-    whole = np.stack([chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for scene in scenes])
-    by_incidence = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
     point, image, line_sample, sigma = [], [], [], []
     saliency = np.zeros(len(lon_lat_h))
-    for row, ground in enumerate(lon_lat_h):
-        seen_by = [int(i) for i in by_incidence if whole[i, row]]
+    for row, (ground, seen_by) in enumerate(
+        zip(lon_lat_h, seen_whole(scenes, lon_lat_h, gsd_m), strict=True)
+    ):
         if len(seen_by) < 2:
             continue
-        reference, chip = _reference_chip(scenes, seen_by, ground, gsd_m)
+        reference, chip = reference_chip(scenes, seen_by, ground, gsd_m)
         saliency[row] = chip_saliency(chip)
         others = {i: scenes[i] for i in seen_by if i != reference}
         measures = _measures(others, ground, chip, gsd_m, options)
@@ -107,7 +106,14 @@ def refine_on_chips(
     return ChipMeasures(observations, saliency)
 
 
-def _reference_chip(
+def seen_whole(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> list[list[int]]:
+    """The images that show the whole chip of every point (n, 3), those closest to the vertical first."""
+    whole = np.stack([chip_inside(scene.model, scene.image.shape, lon_lat_h, gsd_m) for scene in scenes])
+    by_incidence = np.argsort([np.nan_to_num(s.acquisition.incidence_deg, nan=90.0) for s in scenes])
+    return [[int(i) for i in by_incidence if whole[i, row]] for row in range(len(lon_lat_h))]
+
+
+def reference_chip(
     scenes: Sequence[Scene], seen_by: Sequence[int], ground: Array, gsd_m: float
 ) -> tuple[int, FloatImage]:
     """The first image that shows a point (3,) without clouds or gaps, or else the last; its chip."""

@@ -1,14 +1,19 @@
 """What places a block on the Earth, from all kinds of control."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from services.adjustment.control_ground import ControlGround, joined_ground
+from services.adjustment.intersection import intersect
 from services.imagery.scene import Scene
 from services.production.control_points import ControlBlock, find_control
+from services.production.height_control import ControlHeights, known_heights, surfaces_above
 from services.production.marked_control import MarkedGround, known_marks
+from services.production.ortho_control import ControlOrtho, known_on_ortho
 from services.tasks import Work
-from services.types import Frame, Observations, Progress, joined_observations
+from services.types import Array, Frame, Observations, Progress, joined_observations, part_of
 
 
 @dataclass(frozen=True)
@@ -18,46 +23,100 @@ class Control:
     Attributes:
         blocks: older blocks, whose points are searched by their chips.
         marked: ground points that people marked in the images.
+        orthos: ortho-images, which tell the positions of the points of the block.
+        heights: elevation models, which tell their heights.
     """
 
     blocks: tuple[ControlBlock, ...] = ()
     marked: tuple[MarkedGround, ...] = ()
+    orthos: tuple[ControlOrtho, ...] = ()
+    heights: tuple[ControlHeights, ...] = ()
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Points of a block, measured in its images before they are adjusted.
+
+    Attributes:
+        lon_lat_h: (n, 3) in the frame of the images; those near each other follow each other.
+        frame: of the images on the Earth.
+        gsd_m: ground sampling of the chips, metres.
+        measures: of the points; `point` is the row of `lon_lat_h`.
+    """
+
+    lon_lat_h: Array
+    frame: Frame
+    gsd_m: float
+    measures: Observations
+
+    def measured(self, scenes: Sequence[Scene]) -> Array:
+        """Positions (n, 3) where the rays of the measures intersect; NaN for points without any."""
+        count = len(self.lon_lat_h)
+        return intersect([scene.model for scene in scenes], self.measures, count).lon_lat_h
 
 
 def with_control(
     scenes: Sequence[Scene],
-    frame: Frame,
-    measures: Observations,
+    points: MeasuredPoints,
     control: Control,
     *,
-    first_point: int,
     work: Work,
     progress: Progress,
 ) -> tuple[Observations, ControlGround]:
     """The measures of a block with those of its control, and the known ground.
 
+    Ortho-images and elevation models tell where the points of the block lie; blocks and marks bring
+    points of their own, which are numbered behind those.
+
     Args:
         scenes: with models that agree.
-        frame: of the scenes on the Earth.
-        measures: of the points of the block.
+        points: of the block.
         control: may be empty.
-        first_point: number of the first point of the control.
         work: computes the tasks and keeps their results.
         progress: receives the fraction done.
 
     Raises:
-        NotEnoughPoints: too few points of older blocks are found.
+        NotEnoughPoints: too few points of a source are found.
     """
-    observations, ground = [measures], []
+    observations, ground = [points.measures], []
+    at = points.measured(scenes)
+    rows = np.flatnonzero(np.isfinite(at).all(axis=1))
+    share = 1.0 / (1 + len(control.orthos) + bool(control.heights))
+    for number, ortho in enumerate(control.orthos):
+        known = known_on_ortho(
+            scenes,
+            points.frame,
+            points.lon_lat_h[rows],
+            ortho,
+            gsd_m=points.gsd_m,
+            name=f"ortho/{number:02d}",
+            work=work,
+            progress=part_of(progress, number * share, share),
+        )
+        ground.append(replace(known, point=rows[known.point]))
+    if control.heights:
+        above = surfaces_above(
+            scenes, at[rows], points.gsd_m, work, part_of(progress, 1.0 - share, share)
+        )
+    for heights in control.heights:
+        known = known_heights(at[rows], above, points.frame.sigma_m, heights)
+        ground.append(replace(known, point=rows[known.point]))
+    first = len(points.lon_lat_h)
     if control.blocks:
         found, known = find_control(
-            scenes, frame, control.blocks, first_point=first_point, work=work, progress=progress
+            scenes,
+            points.frame,
+            control.blocks,
+            first_point=first,
+            work=work,
+            progress=progress,
         )
         observations.append(found)
         ground.append(known)
+        first += len(known)
     for marked in control.marked:
-        first = first_point + sum(map(len, ground))
         marks, known = known_marks(marked, first)
         observations.append(marks)
         ground.append(known)
+        first += len(known)
     return joined_observations(observations), joined_ground(ground)

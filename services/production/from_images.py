@@ -20,7 +20,7 @@ from services.matching.ground_features import FeatureOptions
 from services.matching.multi_image import RefinementOptions, chip_inside
 from services.matching.predict import rank_in_group
 from services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
-from services.production.control import Control, with_control
+from services.production.control import Control, MeasuredPoints, with_control
 from services.production.ground_parts import CutPoints, cut_points, measure_points
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
@@ -182,10 +182,8 @@ def produce_points(
     )
     measures, known = with_control(
         _with_models(scenes, tied),
-        tied.frames[0],
-        measures,
+        MeasuredPoints(candidates, tied.frames[0], options.fine_gsd_m, measures),
         control,
-        first_point=len(candidates),
         work=work,
         progress=part_of(progress, 0.75, 0.05),
     )

@@ -37,10 +37,7 @@ def measure_points(
     progress: Progress,
 ) -> tuple[Observations, Array]:
     """Points (n, 3) measured on chips, part by part, and their saliency (n,); see `refine_on_chips`."""
-    footprints = np.array([shapely.Polygon(scene_footprint(scene)) for scene in scenes])
-    tree = shapely.STRtree(footprints)
-    parts = [slice(first, first + _POINTS) for first in range(0, len(lon_lat_h), _POINTS)]
-    images = [_images_near(tree, lon_lat_h[part]) for part in parts]
+    parts, images = image_parts(scenes, lon_lat_h)
 
     def arguments(number: int) -> tuple[Any, ...]:
         return [scenes[i] for i in images[number]], lon_lat_h[parts[number]], gsd_m, options
@@ -55,6 +52,13 @@ def measure_points(
         np.concatenate([one["sigma_px"] for one in found]),
     )
     return observations, np.concatenate([one["saliency"] for one in found])
+
+
+def image_parts(scenes: Sequence[Scene], lon_lat_h: Array) -> tuple[list[slice], list[IntArray]]:
+    """The parts of points (n, 3) near each other, and rows of the images that may show each part."""
+    tree = shapely.STRtree(np.array([shapely.Polygon(scene_footprint(scene)) for scene in scenes]))
+    parts = [slice(first, first + _POINTS) for first in range(0, len(lon_lat_h), _POINTS)]
+    return parts, [_images_near(tree, lon_lat_h[part]) for part in parts]
 
 
 def _images_near(tree: shapely.STRtree, lon_lat_h: Array) -> IntArray:

@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from app.errors import InputError
-from app.usecases.control_files import ControlFiles, read_control
+from app.usecases.control_files import ControlFiles, HeightFile, read_control
 from app.usecases.marked_files import PointStatements, read_marked
+from app.usecases.terrain_file import TerrainFile
 from services.errors import FormatError, VerticalDatumError
 from services.formats.gcp.reader import StatedByCaller
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
+from services.production.control import Control
 from services.types import Acquisition
 from tests.services.simulated import ring_of_geometries
 
@@ -126,3 +129,53 @@ def test_statements_without_a_file_of_points_and_missing_paths_are_refused(tmp_p
         with pytest.raises(InputError, match="no such folder of a block or file of points"):
             read_control(ControlFiles((tmp_path / "x",), STATED), scenes(), IMAGES, stack)
         assert read_control(ControlFiles(), scenes(), IMAGES, stack).marked == ()
+
+
+def map_file(folder: Path, name: str) -> Path:
+    path = folder / name
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        width=20,
+        height=20,
+        count=1,
+        dtype="float32",
+        crs="EPSG:32633",
+        transform=rasterio.Affine(10.0, 0.0, 500000.0, 0.0, -10.0, 5000000.0),
+    ) as raster:
+        raster.write(np.ones((1, 20, 20), dtype=np.float32))
+    return path
+
+
+def control_of(files: ControlFiles) -> Control:
+    with ExitStack() as stack:
+        return read_control(files, scenes(), IMAGES, stack)
+
+
+def test_the_accuracy_of_an_ortho_image_is_that_of_its_product_or_stated(tmp_path: Path) -> None:
+    unknown, product = (
+        map_file(tmp_path, "map.tif"),
+        map_file(tmp_path, "T33UUU_20190405T101031_B04.tif"),
+    )
+    with pytest.raises(InputError, match=r"map\.tif: nobody states .*--control-ortho-sigma-m"):
+        control_of(ControlFiles(orthos=(unknown,)))
+    assert control_of(ControlFiles(orthos=(product,))).orthos[0].reference.frame.sigma_m > 5.0
+    stated = control_of(ControlFiles(orthos=(unknown,), ortho_sigma_m=2.0)).orthos[0]
+    assert stated.reference.frame.sigma_m == 2.0
+    assert np.isnan(stated.reference.frame.sigma_up_m)
+
+
+@pytest.mark.parametrize(
+    ("stated", "error", "message"),
+    [
+        ({"sigma_m": None}, InputError, r"dem\.tif: nobody states .*--control-dem-sigma-m"),
+        ({"frame_sigma_m": None}, InputError, r"--control-dem-frame-sigma-m HORIZONTAL,UP"),
+        ({"vertical": None}, InputError, r"vertical datum.*--control-dem-vertical"),
+    ],
+)
+def test_heights_of_unknown_accuracy_or_datum_are_refused(tmp_path, stated, error, message) -> None:
+    values = {"sigma_m": 1.0, "frame_sigma_m": (5.0, 2.0), "vertical": "ellipsoid", **stated}
+    terrain = TerrainFile(map_file(tmp_path, "dem.tif"), values.pop("vertical"))
+    with pytest.raises(error, match=message):
+        control_of(ControlFiles(heights=HeightFile(terrain, **values)))

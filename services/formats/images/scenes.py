@@ -194,10 +194,18 @@ def _ortho_acquisition(image: RasterImage) -> Acquisition:
     return Acquisition(name, sensor, time, incidence_deg=0.0, azimuth_deg=0.0)
 
 
-def _ortho_sigma_m(path: Path, sensor: str) -> float:
+def product_sigma_m(sensor: str) -> float | None:
+    """Horizontal accuracy of a delivered ortho-image, one standard deviation; None when unknown."""
     for start, ce90_m in ORTHO_CE90_M:
         if sensor.startswith(start):
             return ce90_m * CE90_TO_SIGMA
+    return None
+
+
+def _ortho_sigma_m(path: Path, sensor: str) -> float:
+    sigma_m = product_sigma_m(sensor)
+    if sigma_m is not None:
+        return sigma_m
     raise FormatError(
         f"{path}: the sensor of this ortho-image is unknown: give the horizontal accuracy of its map "
         "grid as sigma_m, one standard deviation in metres"
