@@ -31,11 +31,13 @@ def control_row(control: ControlGround, adjustment: BlockAdjustment) -> Row:
     if len(control) == 0:
         return {}
     used = adjustment.control_active
-    rms_m = np.sqrt(np.nanmean(adjustment.control_misfit_m[used] ** 2, axis=0))
+    misfit_m = [axis[np.isfinite(axis)] for axis in adjustment.control_misfit_m[used].T]
     return {
         "control_points": len(control),
         "control_points_used": int(used.sum()),
-        "control_misfit_east_north_up_m": [round(value, 2) for value in rms_m.tolist()],
+        "control_misfit_east_north_up_m": [
+            round(float(np.sqrt(np.mean(axis**2))), 2) if len(axis) else None for axis in misfit_m
+        ],
         "control_points_left_out": [
             name for name, is_used in zip(control.names, used, strict=True) if not is_used
         ],

@@ -110,8 +110,8 @@ def known_heights(
             len(rows),
             _MIN_FOUND,
             f"points on smooth ground of the elevation model {heights.name}: {len(lon_lat_h)} tried, "
-            f"{int(np.isfinite(rough_m).sum())} where it has heights, {int(smooth.sum())} of them not steep "
-            f"nor rougher than {_ROUGHEST:g} times its sigma of {heights.sigma_m:g} m "
+            f"{int(np.isfinite(rough_m).sum())} where it has heights, {int(smooth.sum())} of them not "
+            f"steep nor rougher than {_ROUGHEST:g} times its sigma of {heights.sigma_m:g} m "
             "(--control-dem-sigma-m); at others the images show no smooth surface",
         )
     mean = slope[rows].mean(axis=0)

@@ -35,7 +35,7 @@ def reference():
 
 
 def ortho(seed: int, damaged: bool = False) -> ControlOrtho:
-    """A vertical ortho-image whose map is off as it declares; of a damaged one a corner is 8 m off."""
+    """A vertical ortho-image whose map is off as it declares; of a damaged one a quarter is 4 m off."""
     east_m, north_m = np.random.default_rng([seed, 7]).normal(0.0, ORTHO_SIGMA_M, 2)
     exact = reference()
     off = replace(exact.model.grid, origin_xy=exact.model.grid.origin_xy + [east_m, north_m])
@@ -43,7 +43,7 @@ def ortho(seed: int, damaged: bool = False) -> ControlOrtho:
     if damaged:
         pixels = image.pixels.copy()
         half = len(pixels) // 2
-        pixels[:half, :half] = np.roll(pixels[:half, :half], 8, axis=1)
+        pixels[:half, :half] = np.roll(pixels[:half, :half], 4, axis=1)
         image = ArrayImage(pixels)
     frame = Frame.from_sigmas(ORTHO_SIGMA_M, np.nan)
     moved = replace(exact, image=image, model=OrthoModel(off), sigma_m=0.3, frame=frame)
