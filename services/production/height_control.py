@@ -23,6 +23,8 @@ _PER_SIDE = 7
 """Heights along each side of the square around a point."""
 _FRAME_SIGMAS = 2.0
 """Half of the square around a point, in standard deviations of its place."""
+_FILLED = 0.5
+"""Smallest share of the square where the model has heights."""
 _STEEPEST = 0.4
 """Largest slope of the ground at a point."""
 _ROUGHEST = 2.0
@@ -141,6 +143,13 @@ def _planes(lon_lat_h: Array, terrain: Terrain, off_m: float) -> tuple[Array, Ar
     step = np.column_stack([np.tile(offset, (len(lon_lat_h), 1)), np.zeros(len(around))])
     ground_m = terrain.height_m(move_metres(around, step)[:, :2]).reshape(len(lon_lat_h), -1)
     columns = np.column_stack([np.ones(len(offset)), offset])
-    plane = ground_m @ np.linalg.pinv(columns).T
-    square = ((ground_m - plane @ columns.T) ** 2).sum(axis=1)
-    return plane[:, 0], plane[:, 1:], np.sqrt(square / (len(offset) - columns.shape[1]))
+    known = np.isfinite(ground_m)
+    filled = known.mean(axis=1) >= _FILLED
+    ground_m, known = np.nan_to_num(ground_m), known & filled[:, None]
+    normal = np.einsum("nk,ki,kj->nij", known, columns, columns)
+    normal[~filled] = np.eye(3)
+    plane = np.linalg.solve(normal, ((ground_m * known) @ columns)[:, :, None])[:, :, 0]
+    plane[~filled] = np.nan
+    square = (known * (ground_m - plane @ columns.T) ** 2).sum(axis=1)
+    freedom = np.maximum(known.sum(axis=1) - columns.shape[1], 1)
+    return plane[:, 0], plane[:, 1:], np.sqrt(square / freedom)

@@ -1,5 +1,6 @@
 """Real pairs whose heights are biased by metres take those of an elevation model as control."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from tests.services.production.test_surface_heights import ElevationModel, read_
 pytestmark = [pytest.mark.long, pytest.mark.real_data]
 
 OPTIONS = ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0)
+PLEIADES_SIGMA_M = 4.0
 DSM_SIGMA_M = 1.0
 DSM_FRAME_M = (2.0, 0.3)
 
@@ -44,7 +46,7 @@ def height_bias_m(made: Production, scenes: list[Scene], dsm: Path) -> float:
 def test_the_heights_of_a_pair_become_those_of_the_model(real_data: Path, pair) -> None:
     folder = real_data / "phr_calanques_triplet"
     dsm = folder / "expected_output" / "dsm.tif"
-    scenes = read_triplet(folder, pair)
+    scenes = [replace(scene, sigma_m=PLEIADES_SIGMA_M) for scene in read_triplet(folder, pair)]
     heights = ControlHeights(
         "dsm.tif", read_dem(dsm, "ellipsoid"), DSM_SIGMA_M, Frame.from_sigmas(*DSM_FRAME_M)
     )
