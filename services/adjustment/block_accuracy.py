@@ -138,7 +138,8 @@ def carried_covariances(
     added, carried = shared_covariance(equations, points, accuracy.pairs, accuracy.relative, of_group)
     turned = carried - np.eye(3)
     frame_m2 = np.stack(_of_groups(accuracy.frame_m2))[group]
-    return np.asarray(added + turned @ frame_m2 @ turned.transpose(0, 2, 1))
+    carried_m2 = added + turned @ frame_m2 @ turned.transpose(0, 2, 1)
+    return np.asarray((carried_m2 + carried_m2.transpose(0, 2, 1)) / 2.0)
 
 
 def positive_part(matrix: Array) -> Array:

@@ -26,8 +26,8 @@ _THIN = 1e-3
 """Smallest width of the area of the points that determines drift and skew, half sizes of the image."""
 
 
-_DEFORMED = (((0, 3), 0.5), ((1, 4), 1.0), ((2, 5), 1.0))
-"""Parameters that follow a deformation of the points, and their variance over its mean variance.
+_DEFORMED = 0.5, 1.0, 1.0
+"""Variances of shift, drift and skew that follow a deformation of the points, over its mean variance.
 
 A linear deformation of a block as large as the scene has a drift and a skew of 1.5; in a larger block
 it is mostly a shift of 1. This lies between: 0.5 in the middle of the scene, 2.5 at its corners."""
@@ -232,10 +232,9 @@ def adjust_scene(
     )
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
-    if observations.deformation_px2 is not None:
-        for pair, share in _DEFORMED:
-            covariance[np.ix_(pair, pair)] += share * observations.deformation_px2
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
+    if observations.deformation_px2 is not None:
+        covariance += np.kron(observations.deformation_px2, _deformed_parameters(correction))
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
@@ -335,6 +334,18 @@ def _sigma0(
     chi2 = float((fit.residual(parameters)[active] ** 2 / fit.variance[active]).sum())
     freedom = fit.freedom(active, free, slope_px, covariance)
     return float(np.sqrt(chi2 / freedom / kept_variance)) if freedom > 0 else 1.0
+
+
+def _deformed_parameters(correction: ImageCorrection) -> Array:
+    """Covariance (3, 3) of the parameters of one coordinate by a deformation of unit variance.
+
+    Shift, drift and skew are those of the middle of the image: a model that is far off has it far from
+    the origin of its parameters.
+    """
+    centre = correction.centre
+    t = (correction.invert(centre[None, :])[0] - centre) / correction.half_size
+    moves = np.array([[1.0, 0.0, 0.0], [-t[0], 1.0, 0.0], [-t[1], 0.0, 1.0]])
+    return np.asarray(moves.T @ np.diag(_DEFORMED) @ moves)
 
 
 def _covariance(

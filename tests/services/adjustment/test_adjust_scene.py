@@ -489,3 +489,25 @@ def test_chips_that_overlap_do_not_count_twice() -> None:
     assert variance(ten_times, 100.0) > 0.9 * NOISE_PX**2 / 12.0
     assert variance(ten_times, 0.0) < 0.5 * variance(ten_times, 100.0)
     assert variance(points, 100.0) < 2.0 * NOISE_PX**2 / 12.0
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 12_000.0])
+def test_a_deformation_of_the_points_is_in_the_accuracy_however_far_off_the_model_is(
+    shift_px: float,
+) -> None:
+    parameters = np.array([[shift_px, 0.5, 0.0], [-shift_px, 0.0, 0.5]])
+    points = seen(parameters, np.random.default_rng(9))
+    plain = ControlObservations(
+        points.lon_lat_h, points.line_sample, points.sigma_px, points.covariance_m2
+    )
+    deformation_px2 = np.array([[0.4, 0.1], [0.1, 0.2]])
+    deformed = replace(plain, deformation_px2=deformation_px2)
+    without, with_it = (
+        adjust_scene(FlatModel(), SHAPE, one, AdjustmentOptions()) for one in (plain, deformed)
+    )
+    line, sample = np.array(SHAPE) - 1.0
+    places = np.array([[line / 2, sample / 2], [0.0, 0.0], [line, 0.0], [line, sample]])
+    added = with_it.covariance_at(places) - without.covariance_at(places)
+    assert added[0] == pytest.approx(0.5 * deformation_px2, abs=0.01)
+    for corner in added[1:]:
+        assert corner == pytest.approx(2.5 * deformation_px2, abs=0.05)
