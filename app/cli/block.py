@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.block_frame import frame
 from app.cli.block_quality import quality, quality_row
 from app.cli.block_renewal import renew, renewal_row
 from app.cli.output import AsJson, Row, print_json, show, show_one
@@ -28,6 +29,7 @@ from services.quality.block import quality_document
 app = typer.Typer(no_args_is_help=True)
 app.command()(quality)
 app.command()(renew)
+app.command()(frame)
 
 Reference = Annotated[str, typer.Argument(help="Number of the block, its ID, or ID@VERSION.")]
 

@@ -1,10 +1,16 @@
-"""The options that state the control of a new block."""
+"""The options that state the control of a block."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypedDict, Unpack
 
 import typer
 
+from app.cli.point_statements import sigma_pair, stated_by_caller
+from app.errors import InputError
+from app.usecases.control_files import ControlFiles, HeightFile
+from app.usecases.marked_files import PointStatements
+from app.usecases.terrain_file import TerrainFile
 from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 from services.quality.check_points import MARKING_SIGMA_PX
 
@@ -81,3 +87,69 @@ SigmaAxes = Annotated[
     str | None,
     typer.Option(help=f"Axes of the sigmas of an ASP file: {ECEF} or {LAT_LON_HEIGHT}."),
 ]
+
+
+class GivenControl(TypedDict):
+    """The values of the options, by the names of the types above."""
+
+    control: list[Path] | None
+    sigma_m: str | None
+    frame_sigma_m: str | None
+    mark_sigma_px: float | None
+    vertical: str | None
+    geoid: Path | None
+    crs: str | None
+    columns: str | None
+    sigma_axes: str | None
+    ortho: list[Path] | None
+    ortho_sigma_m: float | None
+    dem: Path | None
+    dem_vertical: str | None
+    dem_geoid: Path | None
+    dem_sigma_m: float | None
+    dem_frame_sigma_m: str | None
+
+
+def control_files(**given: Unpack[GivenControl]) -> ControlFiles:
+    """The control that the options of a command state.
+
+    Raises:
+        InputError: a value is wrong, or states something of a file that is not given.
+    """
+    dem = given["dem"]
+    of_dem = {
+        "--control-dem-vertical": given["dem_vertical"],
+        "--control-dem-geoid": given["dem_geoid"],
+        "--control-dem-sigma-m": given["dem_sigma_m"],
+        "--control-dem-frame-sigma-m": given["dem_frame_sigma_m"],
+    }
+    _refuse_alone(of_dem, "--control-dem", dem)
+    _refuse_alone({"--control-ortho-sigma-m": given["ortho_sigma_m"]}, "--control-ortho", given["ortho"])
+    heights = None
+    if dem is not None:
+        terrain = TerrainFile(dem, given["dem_vertical"], given["dem_geoid"])
+        frame_sigma_m = sigma_pair(given["dem_frame_sigma_m"], "--control-dem-frame-sigma-m")
+        heights = HeightFile(terrain, given["dem_sigma_m"], frame_sigma_m)
+    stated = stated_by_caller(
+        given["geoid"] or given["vertical"], given["crs"], given["columns"], given["sigma_axes"]
+    )
+    points = PointStatements(
+        stated,
+        sigma_pair(given["sigma_m"], "--control-sigma-m"),
+        sigma_pair(given["frame_sigma_m"], "--control-frame-sigma-m"),
+        given["mark_sigma_px"],
+    )
+    return ControlFiles(
+        tuple(given["control"] or ()),
+        points,
+        orthos=tuple(given["ortho"] or ()),
+        ortho_sigma_m=given["ortho_sigma_m"],
+        heights=heights,
+    )
+
+
+def _refuse_alone(options: Mapping[str, object], of_option: str, given: object) -> None:
+    """Refuse options that state something of a file which is not given."""
+    alone = [name for name, value in options.items() if value is not None]
+    if alone and not given:
+        raise InputError(f"{', '.join(alone)}: of {of_option}, which is missing; add it")

@@ -10,18 +10,14 @@ from rich.console import Console
 
 from app.cli import control_options
 from app.cli.output import AsJson, show_one
-from app.cli.point_statements import sigma_pair, stated_by_caller
 from app.cli.production_rows import accuracy_row, control_row, effort_row, sampling_pair
 from app.cli.progress import shown_progress
 from app.errors import InputError
-from app.usecases.control_files import ControlFiles, HeightFile
 from app.usecases.executors import ComputeOptions
 from app.usecases.ground_classes import GroundFiles
 from app.usecases.image_production import ProductionImages, WorkPlace, run_production
 from app.usecases.image_selection import CatalogueRequest, run_selection
-from app.usecases.marked_files import PointStatements
 from app.usecases.production import BlockIdentity, refuse_existing
-from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.reports.block_adjustment_pages import adjustment_table
 from services.types import part_of
@@ -130,37 +126,24 @@ def run(
     )
     identity = BlockIdentity(block_id or output.name, version, title, license_name)
     place = WorkPlace(work, ComputeOptions(jobs, cluster))
-    control_files = ControlFiles(
-        tuple(control or ()),
-        PointStatements(
-            stated_by_caller(
-                control_geoid or control_vertical, control_crs, control_columns, control_sigma_axes
-            ),
-            sigma_pair(control_sigma_m, "--control-sigma-m"),
-            sigma_pair(control_frame_sigma_m, "--control-frame-sigma-m"),
-            control_mark_sigma_px,
-        ),
-        orthos=tuple(control_ortho or ()),
+    control_files = control_options.control_files(
+        control=control,
+        sigma_m=control_sigma_m,
+        frame_sigma_m=control_frame_sigma_m,
+        mark_sigma_px=control_mark_sigma_px,
+        vertical=control_vertical,
+        geoid=control_geoid,
+        crs=control_crs,
+        columns=control_columns,
+        sigma_axes=control_sigma_axes,
+        ortho=control_ortho,
         ortho_sigma_m=control_ortho_sigma_m,
-        heights=None
-        if control_dem is None
-        else HeightFile(
-            TerrainFile(control_dem, control_dem_vertical, control_dem_geoid),
-            control_dem_sigma_m,
-            sigma_pair(control_dem_frame_sigma_m, "--control-dem-frame-sigma-m"),
-        ),
+        dem=control_dem,
+        dem_vertical=control_dem_vertical,
+        dem_geoid=control_dem_geoid,
+        dem_sigma_m=control_dem_sigma_m,
+        dem_frame_sigma_m=control_dem_frame_sigma_m,
     )
-    _refuse_alone(
-        {
-            "--control-dem-vertical": control_dem_vertical,
-            "--control-dem-geoid": control_dem_geoid,
-            "--control-dem-sigma-m": control_dem_sigma_m,
-            "--control-dem-frame-sigma-m": control_dem_frame_sigma_m,
-        },
-        "--control-dem",
-        control_dem,
-    )
-    _refuse_alone({"--control-ortho-sigma-m": control_ortho_sigma_m}, "--control-ortho", control_ortho)
     refuse_existing(output)
     with shown_progress() as progress:
         if catalogue is not None:
@@ -203,10 +186,3 @@ def run(
         },
         as_json=as_json,
     )
-
-
-def _refuse_alone(options: dict[str, object], of_option: str, given: object) -> None:
-    """Refuse options that state something of a file which is not given."""
-    alone = [name for name, value in options.items() if value is not None]
-    if alone and not given:
-        raise InputError(f"{', '.join(alone)}: of {of_option}, which is missing; add it")
