@@ -8,8 +8,9 @@ unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
-# Tests of services wait for them: half as many processes again as there are cores.
-WORKERS := $(shell expr $$(nproc) \* 3 / 2)
+# Tests of services wait for them: half as many processes again as there are cores, which nproc does not
+# tell where OMP_NUM_THREADS is set.
+WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
 LONG := continent faults image_selection load stress throughput block_adjustment
 
 .PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
