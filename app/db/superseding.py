@@ -28,6 +28,15 @@ PUBLICATION_LOCK = 0x504F494E54
 MARGIN_DEG = 0.01
 """Around outlines: points of two blocks whose outlines do not quite touch may still be one place."""
 
+INDEX_SCANS = "select set_config('enable_indexscan', %(allowed)s, true)"
+"""Turned off, indexes are read by bitmap scans.
+
+Of a first page that is the whole index, an index scan of GiST that starts again for each row keeps which
+entries are dead, and after a split of that page marks others in their place: the index no longer finds
+living points (seen with PostgreSQL 15). The statement that supersedes points splits pages while it
+scans. A bitmap scan marks nothing.
+"""
+
 
 @dataclass(frozen=True)
 class Ranked:
@@ -123,8 +132,10 @@ def _supersede(connection: Connection, number: int, winners: list[int], **restri
     }
     statement = _supersede_statement()
     with driver(connection).cursor() as cursor:
+        cursor.execute(INDEX_SCANS, {"allowed": "off"})
         # Not prepared: the best plan depends on the restrictions.
         cursor.execute(statement.sql, parameters, prepare=False)
+        cursor.execute(INDEX_SCANS, {"allowed": "on"})
 
 
 @cache

@@ -65,6 +65,15 @@ def served(connection) -> dict[str, int]:
     return {row["name"]: row["n"] for row in rows}
 
 
+def found_by_place(connection) -> int:
+    """How many points the index of places finds."""
+    run_sql(connection, "set local enable_seqscan = off")
+    everywhere = "st_makeenvelope(5, 43, 6, 44, 4979)"
+    return run_sql(connection, f"select count(*) as n from point where geom && {everywhere}").fetchone()[
+        "n"
+    ]
+
+
 def test_of_two_blocks_over_one_place_the_one_with_the_better_frame_is_served(
     connection, ingest, places
 ):
@@ -164,6 +173,24 @@ def test_only_a_block_that_was_published_is_restored(connection, ingest, places)
     ingest("a", places)
     with pytest.raises(Conflict, match="never published"):
         lifecycle.restore_block(connection, "a")
+
+
+def test_points_stay_in_the_index_that_outgrows_its_first_page(connection, ingest, places):
+    for version in ("1", "2", "3"):
+        ingest("a", places, version=version)
+    for priority, name in enumerate(("b", "c"), start=1):
+        ingest(name, places, priority=priority)
+    connection.commit()
+    for reference in ("a@1", "a@3", "b", "c", "a@2", "a@1", "a@3", "a@2"):
+        state = lifecycle.find_block(connection, reference).state
+        (lifecycle.restore_block if state == "withdrawn" else lifecycle.publish_block)(
+            connection, reference
+        )
+        connection.commit()
+        assert found_by_place(connection) == 5 * len(places), reference
+    assert served(connection) == {"c@1": 30}
+    pages = run_sql(connection, "select pg_relation_size('point_geom') / 8192 as n").fetchone()
+    assert pages["n"] > 1
 
 
 def test_administrators_who_publish_at_once_leave_one_version_and_one_point_a_place(

@@ -5,9 +5,9 @@
 -- of the first block in the order of `winners` that has a point within `metres`, the nearest one.
 -- Two restrictions can be null, and the planner then drops them: `part`, where the losers lie, and
 -- `lost_first` and `lost_end`, the ids of points that superseded them until now.
--- Distances are on a sphere: 0.5 % of ten metres do not matter.
-update point set superseded_by = decided.winner
-from (
+-- Distances are on a sphere: 0.5 % of ten metres do not matter. Materialised: otherwise each winner is
+-- looked for twice, for the comparison and for its value.
+with decided as materialized (
     select l.id, (
         select w.id
         from point w, lateral (select st_distancesphere(w.geom, l.geom) as metres) apart
@@ -21,8 +21,9 @@ from (
         and (cast(:part as geometry) is null or l.geom && st_setsrid(cast(:part as geometry), 4979))
         and (cast(:lost_first as bigint) is null
             or l.superseded_by >= :lost_first and l.superseded_by < :lost_end)
-) decided
-where point.id = decided.id and point.superseded_by is distinct from decided.winner
+)
+update point set superseded_by = decided.winner
+from decided where point.id = decided.id and point.superseded_by is distinct from decided.winner
 
 -- name: release
 -- Let no point of a block be superseded.
