@@ -13,12 +13,13 @@ from services.geodesy import (
     ecef_from_lon_lat_h,
     lon_lat_h_from_ecef,
 )
+from services.sensors.light_path import EARTH_ROTATION_RAD_S
+from services.sensors.piecewise import PiecewisePolynomial, lagrange
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.rpc import VALIDITY
 from services.types import Array
 
 EARTH_GM_M3_S2 = 3.986004418e14
-EARTH_ROTATION_RAD_S = 7.292115e-5
 INCLINATION_DEG = 98.2
 """Inclination of a sun-synchronous orbit at 700 km."""
 
@@ -90,14 +91,19 @@ def pushbroom_over(
     across_per_px = gsd_m * float(np.linalg.norm(across - (across @ sight) * sight)) / distance
     return PushbroomModel(
         image_shape=shape,
-        first_line_s=-(shape[0] - 1.0) / 2.0 * line_period_s,
-        line_period_s=line_period_s,
-        orbit_s=times,
-        position=position,
-        attitude_s=times,
-        ecef_from_body=quaternions * flips[:, None],
-        look=np.array([[0.0, 0.0], [0.0, -across_per_px * shape[1] / 2.0]]),
+        line_time=_centred(shape[0], [line_period_s]),
+        orbit=lagrange(times, position),
+        attitude=lagrange(times, quaternions * flips[:, None]),
+        look=_centred(shape[1], [0.0, -across_per_px]),
         height_range_m=height_range_m,
+    )
+
+
+def _centred(size: int, per_px: list[float]) -> PiecewisePolynomial:
+    """Linear functions of a line or sample that are zero at the image centre."""
+    slope = np.array(per_px) * size / 2.0
+    return PiecewisePolynomial(
+        np.array([-0.5, size - 0.5]), np.stack([slope, np.zeros_like(slope)], axis=-1)[None]
     )
 
 
