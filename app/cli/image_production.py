@@ -18,6 +18,7 @@ from app.usecases.ground_classes import GroundFiles
 from app.usecases.image_production import ProductionImages, WorkPlace, run_production
 from app.usecases.image_selection import CatalogueRequest, run_selection
 from app.usecases.production import BlockIdentity, refuse_existing
+from services.formats.addresses import file_place
 from services.production.from_images import ProductionOptions
 from services.reports.block_adjustment_pages import adjustment_table
 from services.types import part_of
@@ -30,13 +31,17 @@ _TABLE_WIDTH = 140
 def run(
     *,
     images: Annotated[
-        list[Path] | None,
-        typer.Option("--images", help="Image with its model; repeat for every image."),
+        list[str] | None,
+        typer.Option(
+            "--images",
+            help="Image with its model: a path, s3://BUCKET/KEY or https://…; repeat for every image.",
+        ),
     ] = None,
     catalogue: Annotated[
         str | None,
         typer.Option(
-            help="STAC catalogue to choose images from; the selection stays in OUTPUT.selection."
+            help="STAC catalogue to choose images from, a path or an address; the selection stays in "
+            "OUTPUT.selection."
         ),
     ] = None,
     selection: Annotated[
@@ -153,7 +158,7 @@ def run(
             run_selection(request, selection, progress=part_of(progress, 0.0, _SHARE_OF_SELECTION))
         production = run_production(
             ProductionImages(
-                tuple(images or ()),
+                tuple(map(file_place, images or ())),
                 selection,
                 sigma_m,
                 control_files,

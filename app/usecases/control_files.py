@@ -12,6 +12,7 @@ from app.usecases.marked_files import PointStatements, read_marked
 from app.usecases.registration.reference_source import COMMON_SIGMA_PX, LOCAL_SIGMA_PX
 from app.usecases.terrain_file import TerrainFile, read_terrain
 from services.errors import VerticalDatumError
+from services.formats.addresses import FilePlace
 from services.formats.block.document_json import BLOCK_JSON
 from services.formats.block.reader import FolderChips, file_sha256, read_block
 from services.formats.images.scenes import product_sigma_m, read_scene
@@ -61,7 +62,7 @@ class ControlFiles:
 
 
 def read_control(
-    files: ControlFiles, scenes: Sequence[Scene], images: Sequence[Path], stack: ExitStack
+    files: ControlFiles, scenes: Sequence[Scene], images: Sequence[FilePlace], stack: ExitStack
 ) -> Control:
     """The control of a production; chips stay open until the stack closes.
 

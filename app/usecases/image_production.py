@@ -18,11 +18,13 @@ from app.usecases.ground_classes import GroundFiles, read_ground
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from app.usecases.registration.result_folder import replacing
+from services.errors import FormatError
+from services.formats.addresses import Address, FilePlace
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from services.formats.block.writer import write_block
 from services.formats.images.scenes import read_scene
 from services.formats.stac.catalogue import read_catalogue
-from services.formats.stac.scenes import image_path, read_item_scene
+from services.formats.stac.scenes import image_place, read_item_scene
 from services.formats.work_folder import WorkFolder
 from services.imagery.scene import Scene
 from services.production.from_images import Production, ProductionOptions, produce_points
@@ -46,7 +48,7 @@ class ProductionImages:
         ground: where no points are wanted, and what points stand on.
     """
 
-    files: tuple[Path, ...] = ()
+    files: tuple[FilePlace, ...] = ()
     selection: Path | None = None
     sigma_m: float | None = None
     control: ControlFiles = field(default_factory=ControlFiles)
@@ -139,7 +141,7 @@ def _write_report(folder: Path, block: str, production: Production) -> None:
 
 def _read(
     images: ProductionImages, stack: ExitStack, progress: Progress
-) -> tuple[list[Scene], list[Path]]:
+) -> tuple[list[Scene], list[FilePlace]]:
     """The scenes of all images, open until the stack closes, and their files."""
     scenes: list[Scene] = []
     files = list(images.files)
@@ -152,18 +154,22 @@ def _read(
         add(read_scene(path, sigma_m=images.sigma_m))
     if images.selection is not None:
         source = images.selection / ITEMS
-        chosen = read_catalogue(str(source))
+        chosen = read_catalogue(str(source), elsewhere=True)
+        if chosen.bad:
+            raise FormatError(
+                f"{source}: {chosen.bad} chosen items cannot be used; the first: {chosen.problems[0]}"
+            )
         masks = chosen.images.mask.tolist()
         for row, item in enumerate(chosen.items.read(range(len(masks)))):
             progress(row / len(masks), f"reading {len(masks)} images")
             add(read_item_scene(item, str(source), masks[row], sigma_m=images.sigma_m))
-            files.append(image_path(item, str(source)))
+            files.append(image_place(item, str(source)))
     return scenes, files
 
 
 def _inputs(
     scenes: Sequence[Scene],
-    files: Sequence[Path],
+    files: Sequence[FilePlace],
     given: ProductionImages,
     options: ProductionOptions,
 ) -> dict[str, Any]:
@@ -173,9 +179,7 @@ def _inputs(
         "images": [
             {
                 "name": scene.acquisition.image_id,
-                "file": str(file.resolve()),
-                "bytes": file.stat().st_size,
-                "modified": file.stat().st_mtime_ns,
+                **_file_facts(file),
                 "model": hashlib.sha256(pickle.dumps(scene.model)).hexdigest(),
                 "sigma_m": scene.sigma_m,
             }
@@ -185,6 +189,15 @@ def _inputs(
         "ground": given.ground.inputs(),
         "options": asdict(options),
     }
+
+
+def _file_facts(file: FilePlace) -> dict[str, Any]:
+    """Which file it is, and what changes with its content."""
+    if isinstance(file, Address):
+        opened = file.open()
+        return {"file": str(file), "bytes": opened.size, "version": opened.version}
+    stat = file.stat()
+    return {"file": str(file.resolve()), "bytes": stat.st_size, "modified": stat.st_mtime_ns}
 
 
 def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[str, RpcModel]:

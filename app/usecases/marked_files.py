@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from app.errors import InputError
+from services.formats.addresses import FilePlace
 from services.formats.gcp.marked_points import MarkedPoints
 from services.formats.gcp.reader import StatedByCaller, read_marked_ground
 from services.imagery.scene import Scene
@@ -33,7 +34,7 @@ class PointStatements:
 
 
 def read_marked(
-    paths: Sequence[Path], points: PointStatements, scenes: Sequence[Scene], images: Sequence[Path]
+    paths: Sequence[Path], points: PointStatements, scenes: Sequence[Scene], images: Sequence[FilePlace]
 ) -> MarkedGround:
     """The control points of files with their marks; those of one place are one point.
 
@@ -109,7 +110,7 @@ def _control_marks(points: MarkedPoints, path: Path) -> MarkedPoints:
 
 
 def _images_of(
-    marks: MarkedPoints, path: Path, scenes: Sequence[Scene], images: Sequence[Path]
+    marks: MarkedPoints, path: Path, scenes: Sequence[Scene], images: Sequence[FilePlace]
 ) -> IntArray:
     """The image (m,) of every mark, by its name, or that of the file where it names none.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from services.errors import FormatError
+from services.formats.addresses import Address, FilePlace
 
 NUMBER_PATTERN = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 """Pattern of a decimal number; "nan" and "inf" do not match."""
@@ -13,24 +14,28 @@ NUMBER_PATTERN = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _MAX_TEXT_BYTES = 20_000_000
 
 
-def read_text(path: Path) -> str:
+def read_text(path: FilePlace) -> str:
     """The content of a small text file in UTF-8, with or without a byte order mark, or else in Latin-1.
 
     Raises:
         FormatError: the file cannot be read, or is larger than 20 MB.
     """
+    data = path.read_bytes(_MAX_TEXT_BYTES) if isinstance(path, Address) else _content(path)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def _content(path: Path) -> bytes:
     try:
         if not path.is_file() or path.stat().st_size > _MAX_TEXT_BYTES:
             raise FormatError(
                 f"{path}: expected an existing text file of at most {_MAX_TEXT_BYTES} bytes"
             )
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
 
 
 def parse_number(text: str, key: str, source: str) -> float:

@@ -21,7 +21,7 @@ import rasterio
 from rasterio.windows import Window
 from app.errors import is_no_memory
 from app.worker.warm_server import limit_memory
-from services.formats.images.raster import as_format_error
+from services.formats.images.datasets import as_format_error
 from pathlib import Path
 
 with rasterio.open(sys.argv[1]) as image:

@@ -8,6 +8,7 @@ import numpy as np
 from pyproj import CRS
 
 from services.errors import CoverageError, FormatError, VerticalDatumError
+from services.formats.addresses import FilePlace
 from services.formats.elevation.geoid import geoid_of_crs, geoid_of_grid, vertical_crs
 from services.formats.images.raster import RasterImage, map_grid_of, open_raster
 from services.imagery.source import ImageSource, Window
@@ -171,7 +172,7 @@ def _name(vertical: CRS | None) -> str:
     return "the ellipsoid" if vertical is None else vertical.name
 
 
-def _unit_m(vertical: CRS | None, path: Path) -> float:
+def _unit_m(vertical: CRS | None, path: FilePlace) -> float:
     """Metres per unit of a vertical reference system."""
     if vertical is None:
         return 1.0

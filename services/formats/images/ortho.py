@@ -13,10 +13,9 @@ from rasterio.transform import Affine
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
+from services.formats.images.datasets import GDAL_OPTIONS, as_format_error
 from services.formats.images.raster import (
     GDAL_FIRST_PIXEL,
-    GDAL_OPTIONS,
-    as_format_error,
     map_grid_of,
     open_raster,
 )

@@ -1,10 +1,7 @@
-"""Untrusted image files: few drivers, local files only, no sidecars, bounded sizes."""
+"""Untrusted image files: few drivers, no sidecars, bounded sizes; at a path nothing but a local file."""
 
-import os
 import shutil
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +12,13 @@ import rasterio
 import rasterio.rpc
 from pyproj.exceptions import ProjError
 from rasterio.enums import MaskFlags
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.windows import Window as RasterWindow
 
 from services.errors import FormatError
+from services.formats.addresses import Address, FilePlace, file_bytes
 from services.formats.images.bands import BandMix, PixelCodes, default_mix, one_band
+from services.formats.images.datasets import GDAL_CACHE, GDAL_OPTIONS, as_format_error, open_dataset
 from services.imagery.source import Window
 from services.map_grid import MapGrid
 from services.sensors.rpc import RpcModel
@@ -28,17 +27,6 @@ from services.types import FloatImage
 # An image that is not rectified has a sensor model instead of a map grid.
 warnings.simplefilter("ignore", NotGeoreferencedWarning)
 
-DRIVER_OF_SIGNATURE = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
-    b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
-    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
-    b"NITF": "NITF",
-    b"NSIF": "NITF",
-}
-"""The GDAL driver of a file, by its first bytes; no other driver is used."""
 GDAL_FIRST_PIXEL = 0.5
 """Line and sample of the centre of the first pixel in GDAL."""
 MAX_PIXELS = 40_000_000_000
@@ -46,29 +34,19 @@ MAX_PIXELS = 40_000_000_000
 MAX_EXPANSION = 5_000
 """Largest ratio of pixel bytes to file bytes: Deflate reaches 1,032 on a constant image."""
 
-# Outside of such an environment GDAL's cache grows to a twentieth of the machine's memory.
-_CACHE = {"GDAL_CACHEMAX": 64_000_000}
-GDAL_OPTIONS = _CACHE | {
-    "GDAL_PAM_ENABLED": "NO",
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-    "GDAL_NUM_THREADS": 1,
-    "OPJ_NUM_THREADS": 1,
-    "GTIFF_REPORT_COMPD_CS": "YES",
-}
-
 
 @dataclass(frozen=True)
 class RasterImage:
     """One band of an image file, or a mix of several: an `ImageSource` for one thread at a time.
 
     Attributes:
-        path: of the file.
+        path: of the file, or its address.
         dataset: the dataset that `open_raster` opened.
         mix: the bands and their weights.
         codes: what the product says about its pixels, beside what the file says.
     """
 
-    path: Path
+    path: FilePlace
     dataset: rasterio.DatasetReader
     mix: BandMix
     codes: PixelCodes = field(default_factory=PixelCodes)
@@ -109,7 +87,8 @@ class RasterImage:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process the file is opened again."""
-        return _opened_again, (self.path.resolve(), self.mix, self.codes)
+        path = self.path if isinstance(self.path, Address) else self.path.resolve()
+        return _opened_again, (path, self.mix, self.codes)
 
     def _fill(self, out: FloatImage, window: RasterWindow) -> None:
         if len(self.mix.bands) == 1:
@@ -124,7 +103,7 @@ class RasterImage:
     def _fill_band(self, out: FloatImage, band: int, window: RasterWindow) -> None:
         flags = self.dataset.mask_flag_enums[band - 1]
         nodata = self.dataset.nodatavals[band - 1]
-        with as_format_error(self.path, "readable pixels"), rasterio.Env(**_CACHE):
+        with as_format_error(self.path, "readable pixels"), rasterio.Env(**GDAL_CACHE):
             pixels = self.dataset.read(band, window=window)
             out[:] = pixels
             for saturated in self.saturated_values(band):
@@ -153,26 +132,22 @@ class RasterImage:
         return (largest,) if stated in (None, largest) else (largest, stated)
 
 
-def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
+def open_raster(path: FilePlace, bands: int | BandMix | None = 1) -> RasterImage:
     """Open one band, or a mix of several, of a GeoTIFF (or COG), JPEG 2000 or NITF file.
 
-    Only the file itself is opened: no sidecar, no URL, no archive, no file that refers to others. The
-    last pixel is read, so that a truncated file is refused here and not during the processing.
+    Only the file itself is opened: no sidecar, no path that is a URL, no archive, no file that refers to
+    others. A file at an `Address`, as operators and their catalogues give, is read by parts. The last
+    pixel is read, so that a truncated file is refused here and not during the processing.
 
     Args:
-        path: of a regular file.
+        path: of a regular file, or an address.
         bands: number of a band, counted from 1, or a mix; None for the `default_mix`.
 
     Raises:
         FormatError: the file cannot be used; the message states the reason and what was expected.
     """
-    resolved = path.resolve()
-    if "://" in str(path) or str(path).startswith("/vsi") or not resolved.is_file():
-        raise FormatError(f"{path}: expected the name of an existing image file")
-    driver = _driver(path)
     with rasterio.Env(**GDAL_OPTIONS):
-        with as_format_error(path, f"a readable {driver} image"):
-            dataset = rasterio.open(resolved, driver=driver)
+        dataset = open_dataset(path)
         if bands is None:
             bands = default_mix(tuple(colour.name for colour in dataset.colorinterp))
         image = RasterImage(path, dataset, bands if isinstance(bands, BandMix) else one_band(bands))
@@ -185,7 +160,7 @@ def open_raster(path: Path, bands: int | BandMix | None = 1) -> RasterImage:
     return image
 
 
-def _opened_again(path: Path, mix: BandMix, codes: PixelCodes) -> RasterImage:
+def _opened_again(path: FilePlace, mix: BandMix, codes: PixelCodes) -> RasterImage:
     return replace(open_raster(path, mix), codes=codes)
 
 
@@ -302,19 +277,6 @@ def gdal_rpc(model: RpcModel) -> rasterio.rpc.RPC:
     )
 
 
-def _driver(path: Path) -> str:
-    """The GDAL driver for a file, by its first bytes."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(12)
-    except OSError as error:
-        raise FormatError(f"{path}: cannot be opened: {error.strerror}") from error
-    for signature, driver in DRIVER_OF_SIGNATURE.items():
-        if start.startswith(signature):
-            return driver
-    raise FormatError(f"{path}: expected a GeoTIFF, JPEG 2000 or NITF image, found another kind of file")
-
-
 def _check_declaration(image: RasterImage) -> None:
     """Refuse impossible sizes and bands before memory is allocated for them."""
     dataset, path = image.dataset, image.path
@@ -324,19 +286,10 @@ def _check_declaration(image: RasterImage) -> None:
         dtype = np.dtype(dataset.dtypes[band - 1])
         if dtype.kind not in "uif":
             raise FormatError(f"{path}: expected integer or floating-point pixels, found {dtype.name}")
-    pixels, size = dataset.width * dataset.height, os.path.getsize(path)
+    pixels, size = dataset.width * dataset.height, file_bytes(path)
     if pixels > MAX_PIXELS or pixels * dtype.itemsize > MAX_EXPANSION * size:
         raise FormatError(
             f"{path}: declares {dataset.height} lines of {dataset.width} samples in {size} bytes; "
             f"at most {MAX_PIXELS} pixels, and {MAX_EXPANSION} bytes of pixels for each byte of file, "
             "are accepted"
         )
-
-
-@contextmanager
-def as_format_error(path: Path, expected: str) -> Iterator[None]:
-    """Convert errors of the driver into a FormatError that names the file."""
-    try:
-        yield
-    except RasterioError as error:
-        raise FormatError(f"{path}: truncated or damaged, {expected} expected: {error}") from error

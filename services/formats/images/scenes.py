@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from services.errors import FormatError
+from services.formats.addresses import FilePlace
 from services.formats.images.bands import BandMix, PixelCodes
 from services.formats.images.masks import apply_mask
 from services.formats.images.raster import RasterImage, map_grid_of, open_raster
@@ -69,7 +70,7 @@ UNKNOWN_SIGMA_M = 50.0
 
 
 def read_scene(
-    path: Path,
+    path: FilePlace,
     model_path: Path | None = None,
     *,
     sigma_m: float | None = None,
@@ -82,7 +83,7 @@ def read_scene(
     An image with a map grid and without an RPC is an ortho-image.
 
     Args:
-        path: GeoTIFF, JPEG 2000 or NITF.
+        path: GeoTIFF, JPEG 2000 or NITF; or its address, beside which its model lies.
         model_path, crop_origin: as for `read_rpc`.
         sigma_m: horizontal accuracy of the model, one standard deviation of each coordinate; by default
             the figure of the producer, else that of the sensor, else 50 m. Required for an ortho-image
@@ -128,7 +129,8 @@ def model_files(path: Path, model_path: Path | None = None) -> list[Path]:
         image.close()
     product = delivered.path.with_name(_product_name(delivered.path))
     candidates = dict.fromkeys([delivered.path, product])
-    return [file for file in candidates if file.is_file() and file.resolve() != path.resolve()]
+    beside = [file for file in candidates if isinstance(file, Path) and file.is_file()]
+    return [file for file in beside if file.resolve() != path.resolve()]
 
 
 def prior_sigma_m(model: RpcModel, sensor: str) -> float:
@@ -202,7 +204,7 @@ def product_sigma_m(sensor: str) -> float | None:
     return None
 
 
-def _ortho_sigma_m(path: Path, sensor: str) -> float:
+def _ortho_sigma_m(path: FilePlace, sensor: str) -> float:
     sigma_m = product_sigma_m(sensor)
     if sigma_m is not None:
         return sigma_m
@@ -212,12 +214,12 @@ def _ortho_sigma_m(path: Path, sensor: str) -> float:
     )
 
 
-def _product_name(path: Path) -> str:
+def _product_name(path: FilePlace) -> str:
     """File name of the DIMAP document of the product, from that of its RPC."""
     return re.sub("^RPC_", "DIM_", path.name, flags=re.IGNORECASE)
 
 
-def _dimap_acquisition(path: Path, image_id: str) -> Acquisition:
+def _dimap_acquisition(path: FilePlace, image_id: str) -> Acquisition:
     """The acquisition in the DIMAP document of the product, where it exists, else in that of the RPC."""
     product = path.with_name(_product_name(path))
     source = product if product.is_file() else path

@@ -1,6 +1,7 @@
 """The RPC of an image: finding it, converting it to the pixels of the image, writing a refined one."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -8,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from services.errors import FormatError
+from services.formats.addresses import Address, FilePlace
 from services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
 from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
 from services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
@@ -25,7 +27,7 @@ from services.sensors.rpc import RpcModel, check_rpc
 
 Convention = Literal["tags", "text", "rpb", "dimap", "geom"]
 
-_Found = tuple[RpcModel, Path, Convention, str]
+_Found = tuple[RpcModel, FilePlace, Convention, str]
 """A model, its file and format, and what was mended in it."""
 
 _CROP_EVIDENCE = 2.0
@@ -46,20 +48,20 @@ class DeliveredModel:
     """
 
     model: RpcModel
-    path: Path
+    path: FilePlace
     convention: Convention
     crop_origin: tuple[float, float]
     note: str
 
 
 def read_rpc(
-    path: Path, model_path: Path | None = None, crop_origin: tuple[float, float] | None = None
+    path: FilePlace, model_path: Path | None = None, crop_origin: tuple[float, float] | None = None
 ) -> DeliveredModel:
     """The RPC of an image, in the pixels of that image.
 
     The RPC is, in this order: the file `model_path`; the RPC tags of a GeoTIFF or the RPC00B of a NITF;
     `STEM_RPC.TXT`, `STEM.RPB` or `STEM_RPC.XML` beside the image, for `IMG_NAME_R1C1` the `RPC_NAME.XML`
-    of its DIMAP, or `STEM.geom` (in upper or lower case).
+    of its DIMAP, or `STEM.geom` (in upper or lower case; spelt like that at an address).
 
     A crop often stores its position in the full scene as a geotransform of unit pixels without a
     reference system. Its RPC may then be for the full scene or for the crop. The range of the RPC,
@@ -113,7 +115,8 @@ def write_model(
     written = []
     for name, text in texts.items():
         target = folder / name
-        if delivered is not None and target.resolve() == delivered.path.resolve():
+        given = None if delivered is None else delivered.path
+        if isinstance(given, Path) and target.resolve() == given.resolve():
             raise FormatError(
                 f"{target}: the delivered model would be overwritten; give another output folder"
             )
@@ -187,7 +190,7 @@ def _find_model(image: RasterImage) -> _Found:
     )
 
 
-def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
+def _files_beside(image: RasterImage) -> tuple[list[str], Sequence[FilePlace]]:
     """The names that the RPC of an image may have, and the files beside the image with such a name."""
     stem = image.path.stem
     names = [f"{stem}_RPC.TXT", f"{stem}.RPB", f"{stem}_RPC.XML"]
@@ -195,11 +198,13 @@ def _files_beside(image: RasterImage) -> tuple[list[str], list[Path]]:
     if airbus is not None:
         names.append(f"RPC_{airbus[1]}.XML")
     names.append(f"{stem}.geom")
+    if isinstance(image.path, Address):
+        return names, [file for file in map(image.path.with_name, names) if file.is_file()]
     beside = {file.name.upper(): file for file in image.path.resolve().parent.iterdir()}
     return names, [beside[name.upper()] for name in names if name.upper() in beside]
 
 
-def _read_model_file(path: Path) -> _Found:
+def _read_model_file(path: FilePlace) -> _Found:
     """The RPC of a model file, whose content, not its name, decides on the format."""
     text = read_text(path)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
@@ -276,7 +281,7 @@ def _choose_origin(
     )
 
 
-def _check_coverage(model: RpcModel, image: RasterImage, path: Path) -> None:
+def _check_coverage(model: RpcModel, image: RasterImage, path: FilePlace) -> None:
     """Refuse a model that cannot locate the corners of the image."""
     lines, samples = image.shape
     corners = np.array([[0, 0], [0, samples - 1], [lines - 1, samples - 1], [lines - 1, 0]], float)

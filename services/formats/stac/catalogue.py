@@ -77,14 +77,18 @@ def read_catalogue(
     box: tuple[float, float, float, float] | None = None,
     since: datetime | None = None,
     progress: Progress = no_progress,
+    *,
+    elsewhere: bool = False,
 ) -> StacCatalogue:
     """The images of a STAC catalogue; items that cannot be used are left out and counted.
 
     Args:
-        source: path of a folder or a file, or address of an API or a catalogue on a server.
+        source: path of a folder or a file, or address of an API or of a catalogue on a server or in a
+            bucket.
         box: west, south, east, north, which a search API is asked for; required with such an API.
         since: items before are left out.
         progress: receives 0 and a message with the number of items.
+        elsewhere: whether masks may be on other servers, as those of our own selections.
 
     Raises:
         FormatError: the source is no catalogue, or none of its items can be used.
@@ -94,7 +98,7 @@ def read_catalogue(
         query["datetime"] = f"{since:%Y-%m-%dT%H:%M:%SZ}/.."
     reader = _Reader(since)
     with ExitStack() as stack:
-        documents = stack.enter_context(Documents(source))
+        documents = stack.enter_context(Documents(source, elsewhere=elsewhere))
         for count, found in enumerate(walk(documents, query)):
             reader.take(documents, found.source, found.base, found.item)
             if count % _REPORTED_EVERY == 0:

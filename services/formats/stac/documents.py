@@ -1,4 +1,4 @@
-"""JSON documents of a catalogue, from files or one server, within limits of size, time and number.
+"""JSON documents of a catalogue, from files, one server or one bucket, within limits of size and time.
 
 A catalogue in files stays in files, and one on a server stays on that server: links that lead elsewhere
 are not followed.
@@ -12,6 +12,7 @@ from typing import Any, Self
 from urllib.parse import unquote, urljoin, urlsplit
 
 from services.errors import FormatError
+from services.formats.addresses import SCHEMES, Address
 from services.formats.text_files import load_json
 
 LARGEST_DOCUMENT_BYTES = 512_000_000
@@ -21,8 +22,8 @@ _MOST_REDIRECTS = 5
 
 
 def is_address(source: str) -> bool:
-    """Whether a source is the address of a server, not a path."""
-    return urlsplit(source).scheme in ("http", "https")
+    """Whether a source is the address of a server or a bucket, not a path."""
+    return source.partition("://")[0].lower() in SCHEMES
 
 
 class Documents:
@@ -32,10 +33,17 @@ class Documents:
         source: path or address of the catalogue.
     """
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, *, elsewhere: bool = False) -> None:
+        """Read documents of one catalogue.
+
+        Args:
+            source: path or address of it.
+            elsewhere: whether its links may lead to other servers: those of our own selections do.
+        """
         self.source = source
+        self._elsewhere = elsewhere
         self._client: Any = None
-        if is_address(source):
+        if is_address(source) and not _in_bucket(source):
             import httpx  # imported here because only catalogues on servers need it
 
             self._client = httpx.Client(timeout=TIMEOUT_S, transport=httpx.HTTPTransport(retries=2))
@@ -59,9 +67,11 @@ class Documents:
             FormatError: it leads away from the files or the server of the catalogue.
         """
         if is_address(base):
-            absolute = urljoin(base, address)
-            if self._client is not None and _origin(absolute) == _origin(self.source):
+            absolute = absolute_address(address, base)
+            if _origin(absolute) == _origin(self.source):
                 return absolute
+        elif self._elsewhere and is_address(address):
+            return address
         elif not is_address(address) and urlsplit(address).scheme in ("", "file"):
             path = unquote(urlsplit(address).path if address.startswith("file:") else address)
             return _beside(base, path)
@@ -79,6 +89,11 @@ class Documents:
         Raises:
             FormatError: it cannot be read, or is no JSON, or exceeds the limits.
         """
+        if is_address(address) and (self._client is None or _in_bucket(address)):
+            place = Address(address)
+            return load_json(
+                place.read_bytes(LARGEST_REPLY_BYTES).decode("utf-8", "replace"), str(place)
+            )
         if self._client is None:
             return load_json(_file_text(Path(address)), address)
         return load_json(self._reply(address, body).decode("utf-8", "replace"), address)
@@ -109,7 +124,14 @@ def absolute_address(address: str, base: str) -> str:
     """The absolute form of an address in a document, wherever it leads."""
     if urlsplit(address).scheme:
         return address
+    if _in_bucket(base):
+        bucket, _, key = base.removeprefix("s3://").partition("/")
+        return f"s3://{bucket}" + _beside(f"/{key}", unquote(address))
     return urljoin(base, address) if is_address(base) else _beside(base, unquote(address))
+
+
+def _in_bucket(address: str) -> bool:
+    return address.startswith("s3://")
 
 
 def _beside(base: str, path: str) -> str:

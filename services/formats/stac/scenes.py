@@ -8,6 +8,7 @@ from urllib.parse import unquote, urlsplit
 import shapely
 
 from services.errors import FormatError
+from services.formats.addresses import Address, FilePlace, file_place
 from services.formats.images.scenes import read_scene
 from services.formats.stac.items import Json, parse_item
 from services.imagery.hidden import without_hidden_ground
@@ -35,8 +36,11 @@ def read_item_scene(
     """
     stated = parse_item(item, source)
     name = stated.key[1]
-    path = image_path(item, f"{source}: item {name!r:.80}")
-    scene = without_hidden_ground(read_scene(path, sigma_m=sigma_m), hidden)
+    path = image_place(item, f"{source}: item {name!r:.80}")
+    try:
+        scene = without_hidden_ground(read_scene(path, sigma_m=sigma_m), hidden)
+    except FormatError as error:
+        raise FormatError(f"image {name:.80}: {error}") from None
     acquisition = replace(
         scene.acquisition,
         image_id=name,
@@ -48,11 +52,11 @@ def read_item_scene(
     return replace(scene, acquisition=acquisition)
 
 
-def image_path(item: Json, source: str) -> Path:
+def image_place(item: Json, source: str) -> FilePlace:
     """The image file of an item: the asset with the role data, or the only image.
 
     Raises:
-        FormatError: there is none, there are several, or it is on another machine.
+        FormatError: there is none, there are several, or its address cannot be read.
     """
     assets = item.get("assets")
     images = {
@@ -69,12 +73,19 @@ def image_path(item: Json, source: str) -> Path:
             'it the role "data"'
         )
     address = str(next(iter(chosen.values()))["href"])
+    try:
+        place = file_place(address)
+    except FormatError as error:
+        raise FormatError(f"{source}: {error}") from None
+    if isinstance(place, Address) or "://" not in address:
+        return place
     parts = urlsplit(address)
-    if parts.scheme not in ("", "file") or parts.netloc:
+    if parts.scheme != "file" or parts.netloc:
         raise FormatError(
-            f"{source}: {address:.200}: a file on this machine or in a shared folder expected"
+            f"{source}: {address:.200}: a file on this machine, in a shared folder, in a bucket (s3://) "
+            "or on a server (https://) expected"
         )
-    return Path(unquote(parts.path) if parts.scheme else address)
+    return Path(unquote(parts.path))
 
 
 def _is_image(asset: Json) -> bool:
