@@ -29,8 +29,9 @@ from obstore.store import HTTPStore, S3Store
 from services.errors import FormatError
 
 SCHEMES = ("s3", "https", "http")
-BLOCK_BYTES = 1 << 18
-KEPT_BLOCKS = 256
+BLOCK_BYTES = 1 << 20
+"""What a request takes at least: one of a bucket lasts about as long as the transfer of a megabyte."""
+KEPT_BLOCKS = 64
 """Blocks that a process keeps: 64 MiB."""
 _RETRY: Any = {"max_retries": 3, "retry_timeout": timedelta(seconds=20)}
 _STORES = 256
@@ -223,7 +224,7 @@ def file_bytes(place: FilePlace) -> int:
 
 
 class RangeFile(io.RawIOBase):
-    """A file at an address, read by blocks of 256 KiB that all readers of a process share.
+    """A file at an address, read by blocks that all readers of a process share.
 
     Attributes:
         address: of the file.
