@@ -63,6 +63,70 @@ def from_function(breaks: Array, function: Callable[[Array], Array], degree: int
     )
 
 
+def polynomial(centre: float, half_width: float, coefficients: Array) -> PiecewisePolynomial:
+    """One polynomial of `(x - centre) / half_width`.
+
+    Args:
+        centre: where the variable is zero.
+        half_width: where it is one, after the centre.
+        coefficients: (values, degree + 1), constant first.
+    """
+    return PiecewisePolynomial(
+        np.array([centre - half_width, centre + half_width]),
+        np.ascontiguousarray(coefficients[None, :, ::-1], dtype=np.float64),
+    )
+
+
+def linear(x: Array, values: Array) -> PiecewisePolynomial:
+    """The straight lines between samples; the first and the last line go on.
+
+    Args:
+        x: (m,) positions of the samples, increasing, at least two.
+        values: (m, values).
+    """
+    middle, half = (values[1:] + values[:-1]) / 2.0, (values[1:] - values[:-1]) / 2.0
+    return PiecewisePolynomial(
+        np.ascontiguousarray(x, dtype=np.float64), np.stack([half, middle], axis=-1)
+    )
+
+
+def extended(
+    function: PiecewisePolynomial, range_: tuple[float, float], degree: int
+) -> PiecewisePolynomial:
+    """The same function, which goes on by its Taylor polynomial at the first and at the last break.
+
+    A polynomial of degree seven must not be used beyond its samples.
+
+    Args:
+        function: to be used beyond its breaks.
+        range_: where the result is used; nothing changes where the breaks cover it.
+        degree: of the Taylor polynomials.
+    """
+    breaks, coefficients = function.breaks, function.coefficients
+    order = coefficients.shape[2] - 1
+    ends = ((0, range_[0] - breaks[0], -1.0), (-1, range_[1] - breaks[-1], 1.0))
+    for piece, beyond, side in ends:
+        if beyond * side <= 0.0:
+            continue
+        half, new_half = (np.diff(breaks)[piece] / 2.0, abs(beyond) / 2.0)
+        new = np.zeros_like(coefficients[:1])
+        for k, row in enumerate(coefficients[piece]):
+            at_end = np.poly1d(row)(np.poly1d([1.0, side]))
+            kept = np.zeros(order + 1)
+            kept[: len(at_end.coeffs)] = at_end.coeffs[::-1]
+            kept[degree + 1 :] = 0.0
+            kept *= (new_half / half) ** np.arange(order + 1)
+            moved = np.poly1d(kept[::-1])(np.poly1d([1.0, side])).coeffs
+            new[0, k, order + 1 - len(moved) :] = moved
+        if side < 0.0:
+            breaks = np.concatenate([[range_[0]], breaks])
+            coefficients = np.concatenate([new, coefficients])
+        else:
+            breaks = np.concatenate([breaks, [range_[1]]])
+            coefficients = np.concatenate([coefficients, new])
+    return PiecewisePolynomial(breaks, coefficients)
+
+
 def lagrange(x: Array, values: Array) -> PiecewisePolynomial:
     """The interpolation by polynomials of degree seven over the eight samples around each interval.
 

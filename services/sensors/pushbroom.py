@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from services.errors import FormatError
 from services.sensors import pushbroom_kernels as kernels
 from services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
@@ -16,6 +17,14 @@ from services.sensors.piecewise import PiecewisePolynomial
 from services.sensors.rpc import VALIDITY
 from services.types import Array
 
+TERRAIN_M = (-500.0, 9000.0)
+"""Heights of all ground on the Earth, above the ellipsoid: physical models hold everywhere."""
+
+MAX_SIZE = 10_000_000
+"""Largest number of lines or samples of an image."""
+
+_CHECK_NODES = 5
+_CHECK_TOLERANCE_PX = 1e-4
 _GUESS_NODES = (9, 5, 3)
 """Lines, samples and heights of the grid on which the first guess of a line is fitted."""
 
@@ -118,6 +127,35 @@ class PushbroomModel:
             line_slope=1.0,
         )
         return _with_guess(packed, self.height_range_m)
+
+
+def check_pushbroom(model: PushbroomModel, source: str) -> PushbroomModel:
+    """The model itself, after a check that it is usable.
+
+    It must locate a grid of image positions at the lowest and the highest height, and project them back.
+
+    Args:
+        model: as read.
+        source: name of its file, for messages.
+
+    Raises:
+        FormatError: the model is not usable; the message has the number of positions that fail.
+    """
+    axis = np.linspace(0.0, 1.0, _CHECK_NODES)
+    lines, samples, heights = (nodes.ravel() for nodes in np.meshgrid(axis, axis, model.height_range_m))
+    image = np.column_stack([lines, samples]) * (np.array(model.image_shape) - 1.0)
+    with np.errstate(all="ignore"):
+        ground = model.locate(image, heights)
+        misfit_px = np.abs(model.project(ground) - image).max(axis=1)
+    located = np.isfinite(ground).all(axis=1)
+    failed = ~(misfit_px < _CHECK_TOLERANCE_PX)
+    if failed.any():
+        raise FormatError(
+            f"{source}: the sensor model is not usable: of {len(image)} positions over the image, "
+            f"{int((~located).sum())} do not meet the ground and "
+            f"{int((failed & located).sum())} are not projected back within {_CHECK_TOLERANCE_PX:g} px"
+        )
+    return model
 
 
 def _with_guess(packed: kernels.Packed, height_range_m: tuple[float, float]) -> kernels.Packed:

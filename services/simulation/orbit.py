@@ -13,8 +13,9 @@ from services.geodesy import (
     ecef_from_lon_lat_h,
     lon_lat_h_from_ecef,
 )
+from services.sensors.attitude import interpolated_attitude
 from services.sensors.light_path import EARTH_ROTATION_RAD_S
-from services.sensors.piecewise import PiecewisePolynomial, lagrange
+from services.sensors.piecewise import lagrange, polynomial
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.rpc import VALIDITY
 from services.types import Array
@@ -82,28 +83,16 @@ def pushbroom_over(
         phase = rng.uniform(0.0, 2.0 * np.pi, 3) if rng else np.zeros(3)
         angles = np.sin(2.0 * np.pi * JITTER_HZ * times[:, None] + phase)
         attitude = attitude * Rotation.from_rotvec(jitter_px * gsd_m / distance * angles)
-    quaternions = attitude.as_quat()
-    flips = np.cumprod(
-        np.concatenate([[1.0], np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))])
-    )
     across = np.cross(heading, ground_axes[:, 2])
     sight = (target - satellite) / distance
     across_per_px = gsd_m * float(np.linalg.norm(across - (across @ sight) * sight)) / distance
     return PushbroomModel(
         image_shape=shape,
-        line_time=_centred(shape[0], [line_period_s]),
+        line_time=polynomial((shape[0] - 1.0) / 2.0, 1.0, np.array([[0.0, line_period_s]])),
         orbit=lagrange(times, position),
-        attitude=lagrange(times, quaternions * flips[:, None]),
-        look=_centred(shape[1], [0.0, -across_per_px]),
+        attitude=interpolated_attitude(times, attitude.as_quat()),
+        look=polynomial((shape[1] - 1.0) / 2.0, 1.0, np.array([[0.0, 0.0], [0.0, -across_per_px]])),
         height_range_m=height_range_m,
-    )
-
-
-def _centred(size: int, per_px: list[float]) -> PiecewisePolynomial:
-    """Linear functions of a line or sample that are zero at the image centre."""
-    slope = np.array(per_px) * size / 2.0
-    return PiecewisePolynomial(
-        np.array([-0.5, size - 0.5]), np.stack([slope, np.zeros_like(slope)], axis=-1)[None]
     )
 
 

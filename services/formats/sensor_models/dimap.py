@@ -16,6 +16,7 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.images.bands import PixelCodes
 from services.formats.sensor_models.rpc_text import rpc_from_numbers
+from services.formats.sensor_models.xml_values import parse_xml, single
 from services.formats.text_files import parse_number
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_to_ground
@@ -45,20 +46,20 @@ def parse_dimap_rpc(text: str, source: str = "DIMAP") -> RpcModel:
     Raises:
         FormatError: it is not such a document, or a number is missing or given twice.
     """
-    root = _parse_xml(text, source)
+    root = parse_xml(text, source)
     values, domain, first = _layout(root, source)
-    model = _single(root, values, source)
-    validity = _single(root, "RFM_Validity", source)
+    model = single(root, values, source)
+    validity = single(root, "RFM_Validity", source)
 
     def number(key: str) -> float:
         if key.startswith("ERR_"):
             return math.nan
         parent = model if "COEFF" in key else validity
-        return parse_number(_single(parent, key, source).text or "", key, source)
+        return parse_number(single(parent, key, source).text or "", key, source)
 
     if domain is not None:
         first_texts = [
-            _single(_single(root, domain, source), name, source).text or ""
+            single(single(root, domain, source), name, source).text or ""
             for name in ("FIRST_ROW", "FIRST_COL")
         ]
         first_row, first_col = (parse_number(text, domain, source) for text in first_texts)
@@ -86,7 +87,7 @@ def format_dimap_rpc(text: str, model: RpcModel, source: str = "DIMAP") -> str:
         FormatError: the document is not a DIMAP RPC, or does not read back as the model.
     """
     own = parse_dimap_rpc(text, source)
-    root = _parse_xml(text, source)
+    root = parse_xml(text, source)
     values = _layout(root, source)[0]
     first = _file_offset(root, source) - own.image_offset
     folded = _image_frame(own, model)
@@ -128,7 +129,7 @@ def parse_dimap_acquisition(text: str, image_id: str, source: str = "DIMAP") -> 
     Raises:
         FormatError: it is not a DIMAP document.
     """
-    root = _parse_xml(text, source)
+    root = parse_xml(text, source)
     if root.tag != "Dimap_Document":
         raise FormatError(f"{source}: expected a DIMAP document, found <{root.tag[:60]}>")
     mission = root.findtext(".//Strip_Source/MISSION", "").strip()
@@ -158,7 +159,7 @@ def parse_dimap_pixel_codes(text: str, source: str = "DIMAP") -> PixelCodes:
     """
     values = {
         special.findtext("SPECIAL_VALUE_TEXT", "").strip(): special.findtext("SPECIAL_VALUE_COUNT", "")
-        for special in _parse_xml(text, source).iter("Special_Value")
+        for special in parse_xml(text, source).iter("Special_Value")
     }
 
     def code(name: str) -> int | None:
@@ -181,16 +182,6 @@ def parse_imaging_time(date: str, time: str) -> datetime | None:
         return None
 
 
-def _parse_xml(text: str, source: str) -> ElementTree.Element:
-    """The root of an XML document without a document type, hence without entities of its own."""
-    if "<!DOCTYPE" in text:
-        raise FormatError(f"{source}: <!DOCTYPE found, a document without a document type expected")
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise FormatError(f"{source}: expected a well-formed XML document: {error}") from None
-
-
 def _layout(root: ElementTree.Element, source: str) -> tuple[str, str | None, tuple[float, float]]:
     """Element of the model, element of the domain with the first pixel if any, default first pixel."""
     declared = root.find("Metadata_Identification/METADATA_FORMAT")
@@ -205,18 +196,11 @@ def _layout(root: ElementTree.Element, source: str) -> tuple[str, str | None, tu
     )
 
 
-def _single(parent: ElementTree.Element, name: str, source: str) -> ElementTree.Element:
-    elements = parent.findall(f".//{name}")
-    if len(elements) != 1:
-        raise FormatError(f"{source}: expected one {name} in <{parent.tag}>, found {len(elements)}")
-    return elements[0]
-
-
 def _file_offset(root: ElementTree.Element, source: str) -> Array:
     """The image offset (2,) as the document has it, with its own first pixel."""
     return np.array(
         [
-            parse_number(_single(root, key, source).text or "", key, source)
+            parse_number(single(root, key, source).text or "", key, source)
             for key in ("LINE_OFF", "SAMP_OFF")
         ]
     )

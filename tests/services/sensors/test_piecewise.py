@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
 
-from services.sensors.piecewise import from_function, lagrange
+from services.sensors.piecewise import extended, from_function, lagrange, linear, polynomial
 
 rounding = 1e-9
 
@@ -43,3 +43,23 @@ def test_every_position_finds_its_piece_where_the_breaks_are_uneven() -> None:
     identity = from_function(breaks, lambda t: t[:, None], 1)
     t = np.concatenate([breaks, [-1.0, 60.0], np.random.default_rng(1).uniform(0.0, 50.0, 300)])
     np.testing.assert_allclose(identity(t)[:, 0], t, atol=rounding)
+
+
+def test_a_polynomial_of_samples_goes_on_by_its_value_and_rate_beyond_them() -> None:
+    x = np.linspace(2.0, 4.0, 12)
+    wave = lagrange(x, np.stack([np.sin(x), np.cos(x)], -1))
+    longer = extended(wave, (0.0, 9.0), 1)
+    np.testing.assert_allclose(longer(x), wave(x), atol=rounding)
+    for end, beyond in ((2.0, -0.7), (4.0, 3.1)):
+        line = wave(np.array([end])) + beyond * wave.derivative(np.array([end]))
+        np.testing.assert_allclose(longer(np.array([end + beyond])), line, atol=rounding)
+    assert extended(wave, (2.5, 3.5), 1).breaks is wave.breaks
+
+
+def test_straight_lines_between_samples_and_one_polynomial_have_their_values() -> None:
+    table = linear(np.array([1.0, 2.0, 5.0]), np.array([[0.0], [4.0], [1.0]]))
+    np.testing.assert_allclose(
+        table(np.array([0.0, 1.5, 4.0, 6.0]))[:, 0], [-4.0, 2.0, 2.0, 0.0], atol=rounding
+    )
+    parabola = polynomial(10.0, 2.0, np.array([[1.0, 0.5, 3.0]]))
+    np.testing.assert_allclose(parabola(np.array([10.0, 12.0, 8.0]))[:, 0], [1.0, 4.5, 3.5])

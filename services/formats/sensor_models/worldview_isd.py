@@ -1,0 +1,110 @@
+"""WorldView ISD: the physical model of basic (1B) products of WorldView satellites."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from services.errors import FormatError
+from services.formats.sensor_models.xml_values import (
+    check_increasing,
+    midnight_before,
+    number,
+    numbers,
+    parse_xml,
+    seconds,
+    single,
+    whole_number,
+)
+from services.sensors.attitude import interpolated_attitude
+from services.sensors.light_path import LightPath
+from services.sensors.piecewise import extended, lagrange, linear, polynomial
+from services.sensors.pushbroom import MAX_SIZE, TERRAIN_M, PushbroomModel, check_pushbroom
+from services.types import Array
+
+_LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=True)
+_MARGIN_S = 60.0
+
+
+def parse_worldview_isd(
+    text: str, source: str = "ISD", light_path: LightPath = _LIGHT_PATH
+) -> PushbroomModel:
+    """The physical model of the XML of a basic WorldView product.
+
+    The attitude is that of the camera at the time of a line, without aberration, light time and
+    refraction: the RPC of the product contains these effects.
+
+    Args:
+        text: contents of the file.
+        source: its name, for messages.
+        light_path: the effects that the model applies.
+
+    Raises:
+        FormatError: it is not such a document, or a value is missing, impossible or not supported.
+    """
+    root = parse_xml(text, source)
+    if root.tag != "isd":
+        raise FormatError(f"{source}: expected <isd>, found <{root.tag[:60]}>")
+    image = single(root, "IMD/IMAGE", source)
+    start = single(image, "TLCTIME", source)
+    midnight = midnight_before(start, source)
+    shape = (
+        whole_number(root, "IMD/NUMROWS", source, (1, MAX_SIZE)),
+        whole_number(root, "IMD/NUMCOLUMNS", source, (1, MAX_SIZE)),
+    )
+    lines = np.array([numbers(entry, source, 2) for entry in image.iter("TLCLIST")])
+    check_increasing(lines[:, 0] if len(lines) else np.empty(0), "lines of TLCLIST", 2, source)
+
+    def table(part: str, entry: str, first: int, last: int) -> tuple[Array, Array]:
+        """Times and columns of the table of a part of the document, evenly spaced in time."""
+        parent = single(root, part, source)
+        rows = [numbers(row, source) for row in parent.iter(entry)]
+        count = whole_number(parent, "NUMPOINTS", source, (8, 1_000_000))
+        if len(rows) != count or any(len(row) < last for row in rows):
+            raise FormatError(
+                f"{source}: {part}: {len(rows)} {entry} found, "
+                f"{count} of at least {last} numbers expected"
+            )
+        first_s = seconds(single(parent, "STARTTIME", source), midnight, source)
+        step_s = number(parent, "TIMEINTERVAL", source, (1e-6, 1e3))
+        values = np.array([row[first:last] for row in rows], dtype=np.float64)
+        return first_s + step_s * np.arange(count, dtype=np.float64), values
+
+    orbit_s, position = table("EPH", "EPHEMLIST", 1, 4)
+    attitude_s, quaternions = table("ATT", "ATTLIST", 1, 5)
+    if not (np.linalg.norm(quaternions, axis=1) > 0.5).all():
+        raise FormatError(f"{source}: ATTLIST: a quaternion is not of unit length")
+    geometry = single(root, "GEO", source)
+    attitude = interpolated_attitude(attitude_s, quaternions)
+    centre = [number(geometry, f"PERSPECTIVE_CENTER/{key}", source) for key in ("CX", "CY", "CZ")]
+    position = position + Rotation.from_quat(attitude(orbit_s)).apply(centre)
+    camera = [number(geometry, f"CAMERA_ATTITUDE/QCS{k}", source, (-1.0, 1.0)) for k in (1, 2, 3, 4)]
+    quaternions = (Rotation.from_quat(quaternions) * Rotation.from_quat(camera)).as_quat()
+    tlc_s = seconds(start, midnight, source)
+    used = (tlc_s - _MARGIN_S, tlc_s + _MARGIN_S)
+    model = PushbroomModel(
+        image_shape=shape,
+        line_time=linear(lines[:, 0], tlc_s + lines[:, 1:]),
+        orbit=extended(lagrange(orbit_s, position), used, 2),
+        attitude=extended(interpolated_attitude(attitude_s, quaternions), used, 1),
+        look=polynomial(0.0, 1.0, _look(geometry, source)),
+        height_range_m=TERRAIN_M,
+        light_path=light_path,
+    )
+    return check_pushbroom(model, source)
+
+
+def _look(geometry: ElementTree.Element, source: str) -> Array:
+    """Tangents along and across (2, 2), constant and change per sample, of the row of detectors."""
+    order = number(geometry, "OPTICAL_DISTORTION/POLYORDER", source)
+    if order >= 0:
+        raise FormatError(
+            f"{source}: OPTICAL_DISTORTION/POLYORDER: {order:g} found, only -1 (none) is supported"
+        )
+    focal_mm = number(geometry, "PRINCIPAL_DISTANCE/PD", source, (1.0, 1e6))
+    detectors = single(geometry, "DETECTOR_MOUNTING//DETECTOR_ARRAY", source)
+    x_mm = number(detectors, "DETORIGINX", source)
+    y_mm = number(detectors, "DETORIGINY", source)
+    pitch_mm = number(detectors, "DETPITCH", source, (1e-6, 10.0))
+    angle = np.radians(number(detectors, "DETROTANGLE", source, (-360.0, 360.0)))
+    return np.array([[x_mm, pitch_mm * np.sin(angle)], [y_mm, -pitch_mm * np.cos(angle)]]) / focal_mm

@@ -1,0 +1,91 @@
+"""Readers of physical models find the satellite that wrote the metadata, or say what is wrong."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from services.errors import FormatError
+from services.formats.sensor_models.phr_dimap import parse_phr_dimap
+from services.formats.sensor_models.worldview_isd import parse_worldview_isd
+from services.sensors.light_path import GEOMETRIC, LightPath
+from services.sensors.pushbroom import PushbroomModel
+from tests.services.formats.sensor_models import simulated_metadata as simulated
+
+ALL = LightPath(velocity_aberration=True, light_time=True, refraction=True)
+Reader = Callable[[str, str], PushbroomModel]
+Writer = Callable[[PushbroomModel], str]
+PRODUCTS: dict[str, tuple[Writer, Reader, LightPath]] = {
+    "ISD": (simulated.worldview_isd, parse_worldview_isd, ALL),
+    "PHRDIMAP": (simulated.phr_dimap, parse_phr_dimap, GEOMETRIC),
+}
+a_thousandth_of_a_pixel = 1e-3
+"""Times in the metadata have seven decimals: 0.05 microseconds are 0.0005 lines."""
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_the_model_of_a_simulated_satellite_is_read_from_its_metadata(product: str) -> None:
+    write, read, light_path = PRODUCTS[product]
+    true = simulated.truth(light_path)
+    found = read(write(true), product)
+    rng = np.random.default_rng(2)
+    image = rng.uniform(-0.1, 1.1, (500, 2)) * simulated.SHAPE
+    height = rng.uniform(0.0, 4000.0, 500)
+    seen = found.project(true.locate(image, height))
+    np.testing.assert_allclose(seen, image, atol=a_thousandth_of_a_pixel)
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_truncated_and_garbled_metadata_are_refused_or_read(product: str) -> None:
+    write, read, light_path = PRODUCTS[product]
+    text = write(simulated.truth(light_path))
+    rng = np.random.default_rng(6)
+    messages = []
+    for _ in range(60):
+        start = int(rng.integers(len(text)))
+        end = start + int(rng.integers(1, 40))
+        for damaged in (text[:start], text[:start] + text[end:], text[:start] + "7<" + text[start:]):
+            try:
+                read(damaged, "damaged.xml")
+            except FormatError as error:
+                messages.append(str(error))
+    assert len(messages) > 100
+    assert all(message.startswith("damaged.xml: ") for message in messages)
+    assert not [message for message in messages if re.search(r"\b(nan|inf)\b", message)]
+
+
+@pytest.mark.parametrize(
+    ("product", "pattern", "new", "message"),
+    [
+        ("ISD", "<isd>", "<isd><isd>", "well-formed"),
+        ("ISD", "<?xml version", "<!DOCTYPE a><?xml version", "DOCTYPE"),
+        ("ISD", "<PD>13246.0</PD>", "", "expected one PRINCIPAL_DISTANCE/PD"),
+        ("ISD", "<PD>13246.0</PD>", "<PD>nan</PD>", "PD: expected a number, found 'nan'"),
+        ("ISD", "<PD>13246.0</PD>", "<PD>1e999</PD>", "PD: 1e999 found, 1 to 1e"),
+        ("ISD", "<PD>13246.0</PD>", "<PD>-3</PD>", "-3 found, 1 to 1e"),
+        ("ISD", "<POLYORDER>-1", "<POLYORDER>3", "only -1"),
+        ("ISD", "<NUMPOINTS>101", "<NUMPOINTS>100", "101 EPHEMLIST found, 100 "),
+        ("ISD", "<NUMPOINTS>101", "<NUMPOINTS>1e9", "NUMPOINTS: 1e9 found, 8 to"),
+        ("ISD", "<NUMROWS>4000", "<NUMROWS>4000.5", "4000.5 found, a whole number"),
+        ("ISD", "<TLCLIST>0.0 0.0", "<TLCLIST>9e9 0.0", "lines of TLCLIST"),
+        ("ISD", "<TLCTIME>2021", "<TLCTIME>noon 2021", "a time like"),
+        ("ISD", "<TLCTIME>2021", "<TLCTIME>1950", "is not usable"),
+        ("PHRDIMAP", "<SCALE>", "<SCALE>-", "SCALE: -"),
+        ("PHRDIMAP", "<START>2021-06", "<START>2021-13", "a time like"),
+        ("PHRDIMAP", "<Q2>", "<Q1>", "well-formed"),
+        ("PHRDIMAP", "<COEFFICIENTS>0.0<", "<COEFFICIENTS><", "0 numbers found"),
+        ("PHRDIMAP", "<COEFFICIENTS>0.0<", "<COEFFICIENTS>1e300<", "is not usable"),
+        ("PHRDIMAP", "unit='m'>", "unit='m'>1 ", "4 numbers found, 3 expected"),
+        ("PHRDIMAP", "PHR_Dimap_Document>", "Dimap_Document>", "expected <PHR_Dimap_Document>"),
+    ],
+)
+def test_the_message_names_file_field_value_and_expectation(
+    product: str, pattern: str, new: str, message: str
+) -> None:
+    write, read, light_path = PRODUCTS[product]
+    text = write(simulated.truth(light_path))
+    assert pattern in text
+    with pytest.raises(FormatError, match=re.escape(message)) as refusal:
+        read(text.replace(pattern, new), "product.xml")
+    assert str(refusal.value).startswith("product.xml: ")
