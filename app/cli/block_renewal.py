@@ -86,5 +86,6 @@ def renewal_row(document: dict[str, Any]) -> Row:
         "renews": document["renews"],
         "scenes": scenes,
         "new views": document["new_views"],
+        "new points": f"{document['new_points']}: {document['new_points_note']}",
         "proposed withdrawals": "; ".join([str(len(withdrawals)), *withdrawals]),
     }

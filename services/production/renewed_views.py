@@ -1,4 +1,7 @@
-"""POINTS AND REGISTERED SCENES IN -> THE SAME POINTS WITH NEW VIEWS: positions stay, chips are added."""
+"""POINTS AND REGISTERED SCENES IN -> THE SAME POINTS WITH NEW VIEWS: positions stay, chips are added.
+
+New points of the same scenes join them at the end.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -6,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from services.imagery.scene import Scene, scene_gsd_m
+from services.production.new_points import NewPoints
 from services.production.point_views import chips_of, shows_nearly_whole_chip, views_at_levels
 from services.types import (
     Array,
@@ -14,6 +18,7 @@ from services.types import (
     ControlPoints,
     IntArray,
     Observations,
+    SurfaceHeights,
     Views,
     point_chips,
 )
@@ -84,6 +89,63 @@ def with_new_views(
     of_view = np.repeat(np.arange(len(points)), np.diff(new.start))
     gained = tuple(np.unique(of_view[new.image == image]) for image in range(len(scenes)))
     return RenewedViews(replace(points, views=views), all_chips, gained)
+
+
+def with_new_points(renewed: RenewedViews, new: NewPoints) -> RenewedViews:
+    """Points with new views followed by new points of the same block and scenes."""
+    first, second = renewed.points, new.points
+    n = len(first)
+    images = first.views.images
+    second_views = replace(
+        second.views, image=second.views.image + len(images) - len(second.views.images), images=images
+    )
+    points = ControlPoints(
+        id=np.arange(n + len(second), dtype=np.int64),
+        views=_one_after_the_other(first.views, second_views),
+        frames=first.frames,
+        chip_files=(),
+        surface=_all_surfaces(first, second),
+        **{
+            name: np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in (
+                "lon_lat_h",
+                "covariance_m2",
+                "block",
+                "saliency",
+                "health",
+                "chip_file",
+                "chip_row",
+            )
+        },
+    )
+
+    def chips(row: int) -> ChipArray:
+        return renewed.chips(row) if row < n else new.chips(row - n)
+
+    return RenewedViews(points, chips, renewed.gained)
+
+
+def _one_after_the_other(first: Views, second: Views) -> Views:
+    """The views of points followed by those of others, of the same images."""
+    columns = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("gsd_m", "image", "incidence_deg", "azimuth_deg", "health")
+    }
+    start = np.concatenate([first.start, first.start[-1] + second.start[1:]])
+    return Views(start=start, images=first.images, **columns)
+
+
+def _all_surfaces(first: ControlPoints, second: ControlPoints) -> SurfaceHeights | None:
+    """The surface at all points; unknown where one part states none."""
+    if first.surface is None and second.surface is None:
+        return None
+    parts = [
+        one.surface or SurfaceHeights(np.full(len(one), np.nan), np.full(len(one), np.nan))
+        for one in (first, second)
+    ]
+    return SurfaceHeights(
+        np.concatenate([one.height_m for one in parts]), np.concatenate([one.sigma_m for one in parts])
+    )
 
 
 def _shown(scenes: Sequence[SeeingScene], lon_lat_h: Array, gsd_m: float) -> Observations:

@@ -1,7 +1,8 @@
-"""Renew a block: new views of its points from scenes registered on it, as a version to publish.
+"""Renew a block: new views and points from scenes registered on it, as a version to publish.
 
 Positions, covariances and frame stay those of the block. Points that later scenes no longer find are
-left out and named. Nothing changes for readers before an administrator publishes the version.
+left out and named; where points are short, two scenes or more give new ones. Nothing changes for
+readers before an administrator publishes the version.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from app.db import blocks, renewal
 from app.db.blocks import Block
 from app.db.engine import Connection, Database
 from app.db.points import points_of_block
-from app.errors import Conflict, InputError
+from app.errors import ComputationError, Conflict, InputError
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
 from app.usecases.blocks.lifecycle import Ingested
@@ -27,12 +28,21 @@ from app.usecases.damage import open_chips
 from services.formats.block.document import BlockMetadata, Provenance
 from services.formats.block.document_json import parse_block_json
 from services.formats.block.writer import write_block
-from services.production.renewed_views import RenewedViews, SeeingScene, with_new_views
+from services.production.control_points import ControlBlock
+from services.production.new_points import NewPoints, points_where_short, short_ground, shown_twice
+from services.production.renewed_views import (
+    RenewedViews,
+    SeeingScene,
+    with_new_points,
+    with_new_views,
+)
 from services.quality.vanished import Searches, VanishedPoints, vanished_points
 from services.types import ChipSource, ControlPoints, IntArray, Progress, no_progress, part_of
 
 RENEWAL = "renewal"
 """Member of the options in the provenance of a renewed block."""
+USUAL_POINTS_PER_KM2 = 0.5
+"""Density of a block that specifies none: one point for two square kilometres."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +141,8 @@ def renew_block(
     chips = open_chips(database, storage)
     with ExitStack() as stack:
         stack.callback(chips.close)
-        seen = register_on_block(base.points, chips, scenes, stack, part_of(progress, 0.0, 0.7))
-        progress(0.7, "looking for vanished points")
+        seen = register_on_block(base.points, chips, scenes, stack, part_of(progress, 0.0, 0.5))
+        progress(0.5, "looking for vanished points")
         with database.reading() as connection:
             stored = renewal.find_searches(
                 connection, base.block.id, [one.registration for one in scenes]
@@ -146,15 +156,21 @@ def renew_block(
                 f"block {base.block.id}: all {len(base.points)} points have vanished; withdraw the block"
             )
         renewed = _with_views(base, chips, kept, seen)
+        new, note = _new_points(base, chips, kept, seen, part_of(progress, 0.5, 0.3))
         document = _document(base, seen, renewed, vanished)
+        document |= {"new_points": len(new.points) if new else 0, "new_points_note": note}
+        typology = [base.typology[row] for row in kept]
+        if new is not None:
+            renewed = with_new_points(renewed, new)
+            typology += [None] * len(new.points)
         write_block(
             folder,
             _metadata(base, seen, document),
             renewed.points,
             renewed.chips,
             {},
-            typology=[base.typology[row] for row in kept],
-            progress=part_of(progress, 0.7, 0.3),
+            typology=typology,
+            progress=part_of(progress, 0.8, 0.2),
         )
     return document
 
@@ -218,6 +234,30 @@ def _with_views(
                 f"{sampling} m or it shows none of them whole; leave it out"
             )
     return renewed
+
+
+def _new_points(
+    base: Base,
+    chips: ChipSource,
+    kept: IntArray,
+    seen: Sequence[SceneOnBlock],
+    progress: Progress,
+) -> tuple[NewPoints | None, str]:
+    """New points where the kept ones are fewer than specified; and how many places, or why none."""
+    specification, points = base.metadata.specification, base.points.take(kept)
+    per_km2 = specification.points_per_km2 or USUAL_POINTS_PER_KM2
+    ground = short_ground(points, base.metadata.extent, per_km2)
+    scenes = [one.scene for one in seen]
+    n_short = shown_twice(ground, scenes)
+    squares = f"of the squares of {ground.spacing_m:,.0f} m without a point"
+    if n_short == 0:
+        return None, f"none {squares} is shown by two scenes"
+    block = ControlBlock(base.block.id, points, chips)
+    try:
+        new = points_where_short(scenes, block, ground, specification.min_views, progress)
+    except ComputationError as error:
+        return None, f"{n_short} {squares} are shown by two scenes, which give no point: {error}"
+    return new, f"{n_short} {squares} are shown by two scenes"
 
 
 def _document(
