@@ -105,6 +105,7 @@ class SceneAdjustment:
         slope_px: a priori standard deviation of drift and skew at the edge of the image, as used.
         covariance: (6, 6) of `correction.parameters.ravel()`, px^2; zero for parameters that a given
             order leaves out. It is relative to the frame that the blocks of the points scatter about.
+        deformation: (6, 6) part of it by what the points share, as they are deformed.
         local_sigma_px: (2,) standard deviation, line and sample, of what parts of the image are off by
             and no correction follows: seams between detectors, terrain.
         shared: what the residuals tell of errors that the points share.
@@ -121,6 +122,7 @@ class SceneAdjustment:
     validation_px: tuple[tuple[Order, float], ...]
     slope_px: float
     covariance: Array
+    deformation: Array
     local_sigma_px: Array
     shared: SharedErrors
     apart_px: float
@@ -233,8 +235,9 @@ def adjust_scene(
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
+    deformation = np.zeros((6, 6))
     if observations.deformation_px2 is not None:
-        covariance += np.kron(observations.deformation_px2, _deformed_parameters(correction))
+        deformation[:] = np.kron(observations.deformation_px2, _deformed_parameters(correction))
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
@@ -243,7 +246,8 @@ def adjust_scene(
         order=order,
         validation_px=validation,
         slope_px=slope_px,
-        covariance=covariance,
+        covariance=covariance + deformation,
+        deformation=deformation,
         local_sigma_px=np.sqrt(local_px2),
         shared=shared,
         apart_px=apart_px,

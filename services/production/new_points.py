@@ -5,16 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy.sparse.csgraph import connected_components
 
-from services.adjustment.frame_fit import misfits_m
+from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
 from services.geodesy import east_north_up, longitudes_near, move_metres
-from services.imagery.scene import Scene, scene_footprint
+from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from services.matching.predict import rank_in_group
-from services.production.control import Control
-from services.production.control_points import ControlBlock
 from services.production.from_images import Production, ProductionOptions, produce_points
-from services.production.placed_block import FoundControl, find_in_block
 from services.production.point_views import chips_of, point_views
 from services.sensors.base import SensorModel
 from services.types import (
@@ -30,8 +28,6 @@ from services.types import (
 
 _COARSE = 4.0
 """Ground sampling of the coarse chips over the fine one, where a block has one sampling only."""
-_MEDIAN_SQUARE = 0.4549
-"""Median of the square of a normal error over its variance."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +97,49 @@ def shown_twice(ground: ShortGround, scenes: Sequence[Scene]) -> int:
     return int((count >= 2).sum())
 
 
+def overlapping_scenes(scenes: Sequence[Scene]) -> list[list[Scene]]:
+    """Groups of two scenes or more that overlap, directly or through others."""
+    footprints = [scene_footprint(scene) for scene in scenes]
+    near = float(footprints[0][:, 0].mean())
+    outlines = [
+        shapely.Polygon(np.column_stack([longitudes_near(outline[:, 0], near), outline[:, 1]]))
+        for outline in footprints
+    ]
+    meet = np.array([[one.intersects(other) for other in outlines] for one in outlines])
+    count, group = connected_components(meet, directed=False)
+    groups = [
+        [scenes[row] for row in np.flatnonzero(group == number).tolist()] for number in range(count)
+    ]
+    return [members for members in groups if len(members) >= 2]
+
+
+def registered_scene(scene: Scene, model: SensorModel, adjustment: SceneAdjustment) -> Scene:
+    """A scene with its registered model, and the accuracy of that relative to the points.
+
+    What the points share, as they are deformed, is no error of the scene: it follows them.
+
+    Args:
+        scene: as delivered.
+        model: registered.
+        adjustment: of the model.
+    """
+    centre = (np.array(scene.image.shape, dtype=np.float64) - 1.0) / 2.0
+    own = replace(
+        adjustment,
+        covariance=adjustment.covariance - adjustment.deformation,
+        local_sigma_px=np.zeros(2),
+    )
+    sigma_px = np.sqrt(np.trace(own.covariance_at(centre[None, :])[0]) / 2.0)
+    return replace(scene, model=model, sigma_m=float(sigma_px) * scene_gsd_m(scene))
+
+
 @dataclass(frozen=True)
 class NewPoints:
     """New points in the frame of a block.
 
     Attributes:
-        points: `views.images` are the scenes.
+        points: `views.images` are the scenes; the frame is that of the block, with what the new points
+            share.
         models: of the scenes, which the chips are cut with.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
     """
@@ -118,22 +151,20 @@ class NewPoints:
 
 def points_where_short(
     scenes: Sequence[Scene],
-    block: ControlBlock,
+    block: ControlPoints,
     ground: ShortGround,
     min_views: int,
     progress: Progress = no_progress,
 ) -> NewPoints:
-    """New points in the squares without one, produced from scenes with the block as control.
+    """New points in the squares without one, produced from scenes that are registered on a block.
 
-    The scenes are adjusted together on the points of the block, whose frame is taken as exact, but for
-    what its points share. What the adjustment then states as its frame is how well the scenes are
-    placed in that of the block: a part of the covariance of every new point, which is one in the frame
-    of the block.
+    Registered models are in the frame of the block, each with an error of its own. What production
+    states as the frame of its points is then how well these scenes together are placed in that frame: a
+    part of the covariance of every new point, which the new points share.
 
     Args:
-        scenes: with registered models, and the accuracy of the models as delivered: registered ones know
-            of the block what the control says once more.
-        block: the points that are kept, and their chips.
+        scenes: that overlap; see `registered_scene`.
+        block: the points that are kept.
         ground: where points are short.
         min_views: smallest number of scenes that show a new point; two at least.
         progress: receives the fraction done.
@@ -141,30 +172,21 @@ def points_where_short(
     Raises:
         ComputationError: the scenes have too little in common, or no new point lies where it is short.
     """
-    gsds_m = np.unique(block.points.views.gsd_m).tolist()
+    gsds_m = np.unique(block.views.gsd_m).tolist()
     options = ProductionOptions(
         fine_gsd_m=gsds_m[0],
         coarse_gsd_m=gsds_m[-1] if len(gsds_m) > 1 else _COARSE * gsds_m[0],
         spacing_m=ground.spacing_m,
         min_views=max(min_views, 2),
     )
-    exact = replace(
-        block.points,
-        frames=tuple(replace(frame, covariance_m2=np.zeros((3, 3))) for frame in block.points.frames),
-    )
-    control = Control(blocks=(replace(block, points=exact),))
-    made = produce_points(scenes, options, progress, control=control)
+    made = produce_points(scenes, options, progress)
     rows = _chosen(made.points, ground)
     if len(rows) == 0:
         raise ComputationError(
             f"{len(made.points)} points were produced, none of them in a square of "
             f"{ground.spacing_m:g} m without a point"
         )
-    adjusted = [
-        replace(scene, model=model) for scene, model in zip(scenes, made.adjustment.models, strict=True)
-    ]
-    scale = _found_scale(find_in_block(adjusted, made.points, control))
-    return _in_frame(made, rows, adjusted, scale, block.points)
+    return _in_frame(made, rows, scenes, block)
 
 
 def _chosen(points: ControlPoints, ground: ShortGround) -> IntArray:
@@ -175,46 +197,31 @@ def _chosen(points: ControlPoints, ground: ShortGround) -> IntArray:
     return rows[rank_in_group(group, points.saliency[rows]) == 0]
 
 
-def _found_scale(found: FoundControl) -> Array:
-    """By how much (3,) errors east, north, up exceed what is declared, by the points of the block.
-
-    They are found again in the scenes, where the rays of the scenes alone tell their places. What these
-    scatter about their median beyond the covariances of both is what two matches of one detail differ
-    by: in height, where relief and shadows shift it, more than the correlation states.
-    """
-    misfit_m = misfits_m(found.known, found.lon_lat_h)
-    declared = np.diagonal(found.known.covariance_m2 + found.covariance_m2, 0, 1, 2)
-    square = (misfit_m - np.median(misfit_m, axis=0)) ** 2 / declared
-    horizontal, up = np.median(square[:, :2]), np.median(square[:, 2])
-    scale2 = np.array([horizontal, horizontal, up]) / _MEDIAN_SQUARE
-    return np.sqrt(np.maximum(scale2, 1.0))
-
-
 def _in_frame(
-    made: Production, rows: IntArray, scenes: Sequence[Scene], scale: Array, block: ControlPoints
+    made: Production, rows: IntArray, scenes: Sequence[Scene], block: ControlPoints
 ) -> NewPoints:
     """Some of the points produced, in the frame of the block, with chips of its samplings.
 
     Args:
         made: the production.
         rows: (k,) of its points.
-        scenes: with adjusted models.
-        scale: (3,) of the standard deviations.
+        scenes: that it was made from.
         block: points of the block, which have its frame and its samplings.
     """
+    models = made.adjustment.models
+    adjusted = [replace(scene, model=model) for scene, model in zip(scenes, models, strict=True)]
     points = made.points.take(rows)
     of_view = np.repeat(np.arange(len(points)), np.diff(points.views.start))
     seen = np.unique(np.column_stack([of_view, points.views.image]), axis=0)
     nowhere = np.full((len(seen), 2), np.nan)
     observations = Observations(seen[:, 0], seen[:, 1], nowhere, nowhere[:, 0])
-    views = point_views(scenes, observations, points.lon_lat_h, np.unique(block.views.gsd_m).tolist())
-    placed_m2 = points.frames[0].covariance_m2
+    views = point_views(adjusted, observations, points.lon_lat_h, np.unique(block.views.gsd_m).tolist())
+    of_block, of_scenes = block.frames[0], made.points.frames[0]
+    placed_m2 = of_scenes.covariance_m2 + of_block.shared_m2
     in_block = replace(
         points,
-        covariance_m2=points.covariance_m2 * np.outer(scale, scale) + placed_m2,
-        frames=block.frames,
+        covariance_m2=points.covariance_m2 + placed_m2,
+        frames=(replace(of_block, shared_m2=placed_m2 + of_scenes.shared_m2),),
         views=views,
     )
-    return NewPoints(
-        in_block, tuple(made.adjustment.models), chips_of(scenes, in_block.lon_lat_h, views)
-    )
+    return NewPoints(in_block, tuple(models), chips_of(adjusted, in_block.lon_lat_h, views))

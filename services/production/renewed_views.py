@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from services.adjustment.block_accuracy import positive_part
 from services.imagery.scene import Scene, scene_gsd_m
 from services.production.new_points import NewPoints
 from services.production.point_views import chips_of, shows_nearly_whole_chip, views_at_levels
@@ -92,17 +93,23 @@ def with_new_views(
 
 
 def with_new_points(renewed: RenewedViews, new: NewPoints) -> RenewedViews:
-    """Points with new views followed by new points of the same block and scenes."""
+    """Points with new views followed by new points of the same block and scenes.
+
+    The frame states what the new points share where that is more than the others do: scenes may see the
+    new ones alone.
+    """
     first, second = renewed.points, new.points
     n = len(first)
     images = first.views.images
-    second_views = replace(
-        second.views, image=second.views.image + len(images) - len(second.views.images), images=images
-    )
+    row_of = {image.image_id: row for row, image in enumerate(images)}
+    rows = np.array([row_of[image.image_id] for image in second.views.images])
+    second_views = replace(second.views, image=rows[second.views.image], images=images)
+    frame, shared_m2 = first.frames[0], second.frames[0].shared_m2
+    covering_m2 = frame.shared_m2 + positive_part(shared_m2 - frame.shared_m2)
     points = ControlPoints(
         id=np.arange(n + len(second), dtype=np.int64),
         views=_one_after_the_other(first.views, second_views),
-        frames=first.frames,
+        frames=(replace(frame, shared_m2=covering_m2),),
         chip_files=(),
         surface=_all_surfaces(first, second),
         **{

@@ -1,38 +1,38 @@
 """A renewal fills a hole of a block from scenes that were registered on it; the other points stay."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from fastapi.testclient import TestClient
+from typer.testing import CliRunner
 
-from app.db import engine
+from app.cli.main import app as amers
+from app.config import Settings
+from app.db import blocks, engine
 from app.db.engine import Database
 from app.db.points import points_of_block
 from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from app.usecases.blocks.renewal import find_renewal, read_base, renew_block, stage_renewal
-from app.usecases.blocks.renewing_scenes import scene_of_image
-from app.usecases.registration.control_sources import points_of_store
-from app.usecases.registration.register import (
-    ControlSources,
-    SceneFiles,
-    image_key,
-    record_registration,
-    run_registration,
-)
+from services.formats.block.document_json import parse_block_json
 from services.formats.block.writer import write_block
 from services.formats.images.raster import write_raster
 from services.geodesy import east_north_up
-from services.registration.options import RegistrationOptions
-from services.types import point_chips
+from services.types import Array, ControlPoints, point_chips
+from tests.app.ledger import job_runner
 from tests.factories import metadata
 from tests.services.block_with_hole import HOLE_M, PER_KM2, SIGMA_M, older, simulated
 
 pytestmark = pytest.mark.long
 
+VIEWS = 2
 
-def publish_block_with_hole(dsn: str, storage: Storage, folder: Path) -> None:
+
+def publish_block_with_hole(dsn: str, storage: Storage, folder: Path) -> Array:
+    """Publish the block; returns its outline."""
     _, block, outline = older()
     stated = metadata("holed", "1", gsds_m=tuple(np.unique(block.points.views.gsd_m).tolist()))
     specification = replace(stated.specification, points_per_km2=PER_KM2)
@@ -46,44 +46,71 @@ def publish_block_with_hole(dsn: str, storage: Storage, folder: Path) -> None:
     with engine.connect(dsn) as connection:
         ingested = lifecycle.ingest_block(connection, storage, folder).block
         lifecycle.publish_block(connection, str(ingested.number))
+    return outline
+
+
+def of_version(database: Database, version: str) -> tuple[ControlPoints, Array]:
+    """The points of a version of the block, and what they share by its document."""
+    with database.reading() as connection:
+        number = next(
+            one.number for one in blocks.find_blocks(connection, "holed") if one.version == version
+        )
+        document = parse_block_json(blocks.find_document(connection, number))
+        return points_of_block(connection, number).points, document.metadata.frame.shared_m2
 
 
 def test_a_renewal_fills_the_hole_of_a_block(
-    dsn: str, database: Database, storage: Storage, tmp_path: Path
+    dsn: str,
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    database: Database,
+    settings: Settings,
+    storage: Storage,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    publish_block_with_hole(dsn, storage, tmp_path / "holed")
-    images = []
-    for number, view in enumerate(simulated(seed=21, error_m=SIGMA_M)):
-        images.append(tmp_path / f"later_{number}.tif")
-        write_raster(images[-1], view.pixels, view.geometry.delivered)
-        made = run_registration(
-            SceneFiles(images[-1], sigma_m=SIGMA_M),
-            ControlSources(points_of_store(database, storage)),
-            tmp_path / f"out_{number}",
-            options=RegistrationOptions(max_points=0),
-        )
-        assert made.report.verdict == "good"
-        with database.transaction() as connection:
-            record_registration(connection, made, image_key(images[-1]))
-
-    with database.snapshot() as snapshot:
-        base = read_base(snapshot, "holed")
-        scenes = [scene_of_image(snapshot, base.block, image) for image in images]
-    document = renew_block(database, storage, base, scenes, tmp_path / "renewed")
-    with database.transaction() as connection:
-        staged = stage_renewal(connection, storage, base, tmp_path / "renewed").block
-        assert find_renewal(connection, staged) == document
-        old = points_of_block(connection, base.block.number).points
-        new = points_of_block(connection, staged.number).points
-    assert document["proposed_withdrawals"] == []
-    assert document["new_points"] == len(new) - len(old) >= 6
+    outline = publish_block_with_hole(dsn, storage, tmp_path / "holed")
+    admin = bearer("admin")
+    run = job_runner(client, database, settings, admin)
+    jobs = []
+    for number, view in enumerate(simulated(21, SIGMA_M)[:VIEWS]):
+        image = tmp_path / f"later_{number}.tif"
+        write_raster(image, view.pixels, view.geometry.delivered)
+        address = f"/scenes?name={image.name}&sigma_m={SIGMA_M}"
+        scene = client.post(address, content=image.read_bytes(), headers=admin).json()["id"]
+        registered = run("register-scene", scene=scene, options={"max_points": 0})
+        assert registered["status"] == "successful", registered
+        jobs.append(registered["jobID"])
+    renewed = run("renew-block", block="holed", jobs=jobs)
+    assert renewed["status"] == "successful", renewed
+    results = client.get(f"/jobs/{renewed['jobID']}/results", headers=admin).json()
+    document: dict[str, Any] = client.get(results["renewal.json"]["href"], headers=admin).json()
     assert "shown by two scenes" in document["new_points_note"]
+    assert document["proposed_withdrawals"] == []
 
-    kept = {place.tobytes() for place in old.lon_lat_h}
-    is_new = np.array([place.tobytes() not in kept for place in new.lon_lat_h])
+    (old, nothing), (new, shared_m2) = of_version(database, "1"), of_version(database, "2")
+    assert document["new_points"] == len(new) - len(old) >= 6
+    kept = {place.tobytes(): row for row, place in enumerate(old.lon_lat_h)}
+    old_row = np.array([kept.get(place.tobytes(), -1) for place in new.lon_lat_h])
+    is_new = old_row < 0
     assert is_new.sum() == document["new_points"]
-    enu = east_north_up(new.lon_lat_h[is_new], np.array([*base.metadata.extent.mean(axis=0), 0.0]))
+    assert (new.covariance_m2[~is_new] == old.covariance_m2[old_row[~is_new]]).all()
+    enu = east_north_up(new.lon_lat_h[is_new], np.array([*outline.mean(axis=0), 0.0]))
     assert (np.abs(enu[:, :2]) < HOLE_M).all(axis=1).sum() >= 6
     of_view = np.repeat(np.arange(len(new)), np.diff(new.views.start))
     names = np.array([image.image_id for image in new.views.images])[new.views.image]
-    assert set(names[is_new[of_view]].tolist()) == {image.stem for image in images}
+    assert set(names[is_new[of_view]].tolist()) == {f"later_{number}" for number in range(VIEWS)}
+    # What the new points share is stated, and a part of what each of them declares.
+    assert not nothing.any()
+    assert np.linalg.eigvalsh(shared_m2).min() > 0.0
+    own_m2 = new.covariance_m2[is_new] - shared_m2
+    assert np.median(np.linalg.eigvalsh(own_m2)[:, 0]) > 0.0
+
+    monkeypatch.setenv("AMERS_DATABASE_URL", dsn)
+    monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
+    words = ["block", "renew", "holed", "--job", jobs[0], "--job", jobs[1], "--version", "by-command"]
+    printed = CliRunner().invoke(amers, words)
+    assert printed.exit_code == 0, printed.output
+    again, _ = of_version(database, "by-command")
+    np.testing.assert_array_equal(again.lon_lat_h, new.lon_lat_h)
+    np.testing.assert_array_equal(again.covariance_m2, new.covariance_m2)

@@ -28,8 +28,13 @@ from app.usecases.damage import open_chips
 from services.formats.block.document import BlockMetadata, Provenance
 from services.formats.block.document_json import parse_block_json
 from services.formats.block.writer import write_block
-from services.production.control_points import ControlBlock
-from services.production.new_points import NewPoints, points_where_short, short_ground, shown_twice
+from services.production.new_points import (
+    NewPoints,
+    overlapping_scenes,
+    points_where_short,
+    short_ground,
+    shown_twice,
+)
 from services.production.renewed_views import (
     RenewedViews,
     SeeingScene,
@@ -156,16 +161,15 @@ def renew_block(
                 f"block {base.block.id}: all {len(base.points)} points have vanished; withdraw the block"
             )
         renewed = _with_views(base, chips, kept, seen)
-        new, note = _new_points(base, chips, kept, seen, part_of(progress, 0.5, 0.3))
+        new, note = _new_points(base, kept, seen, part_of(progress, 0.5, 0.3))
         document = _document(base, seen, renewed, vanished)
-        document |= {"new_points": len(new.points) if new else 0, "new_points_note": note}
-        typology = [base.typology[row] for row in kept]
-        if new is not None:
-            renewed = with_new_points(renewed, new)
-            typology += [None] * len(new.points)
+        document |= {"new_points": sum(len(one.points) for one in new), "new_points_note": note}
+        for one in new:
+            renewed = with_new_points(renewed, one)
+        typology = [base.typology[row] for row in kept] + [None] * document["new_points"]
         write_block(
             folder,
-            _metadata(base, seen, document),
+            replace(_metadata(base, seen, document), frame=renewed.points.frames[0]),
             renewed.points,
             renewed.chips,
             {},
@@ -237,12 +241,8 @@ def _with_views(
 
 
 def _new_points(
-    base: Base,
-    chips: ChipSource,
-    kept: IntArray,
-    seen: Sequence[SceneOnBlock],
-    progress: Progress,
-) -> tuple[NewPoints | None, str]:
+    base: Base, kept: IntArray, seen: Sequence[SceneOnBlock], progress: Progress
+) -> tuple[list[NewPoints], str]:
     """New points where the kept ones are fewer than specified; and how many places, or why none."""
     specification, points = base.metadata.specification, base.points.take(kept)
     per_km2 = specification.points_per_km2 or USUAL_POINTS_PER_KM2
@@ -251,13 +251,17 @@ def _new_points(
     n_short = shown_twice(ground, scenes)
     squares = f"of the squares of {ground.spacing_m:,.0f} m without a point"
     if n_short == 0:
-        return None, f"none {squares} is shown by two scenes"
-    block = ControlBlock(base.block.id, points, chips)
-    try:
-        new = points_where_short(scenes, block, ground, specification.min_views, progress)
-    except ComputationError as error:
-        return None, f"{n_short} {squares} are shown by two scenes, which give no point: {error}"
-    return new, f"{n_short} {squares} are shown by two scenes"
+        return [], f"none {squares} is shown by two scenes"
+    new, problems = [], []
+    groups = overlapping_scenes(scenes)
+    for number, group in enumerate(groups):
+        part = part_of(progress, number / len(groups), 1.0 / len(groups))
+        try:
+            new.append(points_where_short(group, points, ground, specification.min_views, part))
+        except ComputationError as error:
+            names = ", ".join(scene.acquisition.image_id for scene in group)
+            problems.append(f"; {names} give no point: {error}")
+    return new, f"{n_short} {squares} are shown by two scenes{''.join(problems)}"
 
 
 def _document(

@@ -27,6 +27,7 @@ from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
+from services.production.new_points import registered_scene
 from services.quality.qualification import QualificationOptions
 from services.registration.on_points import register_scene
 from services.registration.options import RegistrationOptions
@@ -58,7 +59,7 @@ class SceneOnBlock:
 
     Attributes:
         name, registration: as in `GoodScene`.
-        scene: with its registered model; open as long as the caller's stack.
+        scene: with its registered model and the accuracy of that; open as long as the caller's stack.
         taken_at: when it was taken, or registered where that is unknown.
         searched: (k,) int64 rows of the points that it shows and tried.
         found: (k,) whether the point was active at the end.
@@ -228,7 +229,9 @@ def _registered(
     return SceneOnBlock(
         name=one.name,
         registration=one.registration,
-        scene=replace(scene, image=CachedImage(scene.image), model=made.model),
+        scene=registered_scene(
+            replace(scene, image=CachedImage(scene.image)), made.model, made.adjustment
+        ),
         taken_at=scene.acquisition.acquired_at or one.registered_at,
         searched=np.searchsorted(points.id, made.measures.point_id[tried]),
         found=made.measures.active[tried],
