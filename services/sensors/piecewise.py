@@ -90,6 +90,27 @@ def linear(x: Array, values: Array) -> PiecewisePolynomial:
     )
 
 
+def hermite(x: Array, values: Array, rates: Array) -> PiecewisePolynomial:
+    """The cubic polynomials that have the values and the rates of samples at both ends of each interval.
+
+    Args:
+        x: (m,) positions of the samples, increasing, at least two.
+        values: (m, values).
+        rates: (m, values) derivatives.
+    """
+    half = np.diff(x)[:, None] / 2.0
+    low, high, low_rate, high_rate = values[:-1], values[1:], half * rates[:-1], half * rates[1:]
+    coefficients = [
+        (low - high + low_rate + high_rate) / 4.0,
+        (high_rate - low_rate) / 4.0,
+        (3.0 * (high - low) - low_rate - high_rate) / 4.0,
+        (2.0 * (low + high) + low_rate - high_rate) / 4.0,
+    ]
+    return PiecewisePolynomial(
+        np.ascontiguousarray(x, dtype=np.float64), np.stack(coefficients, axis=-1)
+    )
+
+
 def extended(
     function: PiecewisePolynomial, range_: tuple[float, float], degree: int
 ) -> PiecewisePolynomial:

@@ -123,18 +123,19 @@ def midnight_before(element: ElementTree.Element, source: str) -> datetime:
     return datetime.fromisoformat((element.text or "").strip()[:10])
 
 
-def check_increasing(times: Array, name: str, needed: int, source: str) -> Array:
-    """The times (n,) themselves.
+def check_increasing(values: Array, name: str, needed: int, source: str) -> Array:
+    """The values (n,) themselves.
 
     Raises:
-        FormatError: they are fewer than needed, or one is not after the one before.
+        FormatError: they are fewer than needed, or one is not larger than the one before.
     """
-    if len(times) < needed:
-        raise FormatError(f"{source}: {name}: {len(times)} found, at least {needed} expected")
-    late = np.flatnonzero(np.diff(times) <= 0.0)
+    if len(values) < needed:
+        raise FormatError(f"{source}: {name}: {len(values)} found, at least {needed} expected")
+    steps = np.diff(values)
+    late = np.flatnonzero(steps <= 0.0)
     if len(late):
         raise FormatError(
-            f"{source}: {name}: the time of entry {late[0] + 2} is "
-            f"{np.diff(times)[late[0]]:g} s after the one before, a later time expected"
+            f"{source}: {name}: entry {late[0] + 2} is {steps[late[0]]:g} after the one before, "
+            "increasing entries expected"
         )
-    return times
+    return values

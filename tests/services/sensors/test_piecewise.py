@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BarycentricInterpolator
 
-from services.sensors.piecewise import extended, from_function, lagrange, linear, polynomial
+from services.sensors.piecewise import extended, from_function, hermite, lagrange, linear, polynomial
 
 rounding = 1e-9
 
@@ -63,3 +63,11 @@ def test_straight_lines_between_samples_and_one_polynomial_have_their_values() -
     )
     parabola = polynomial(10.0, 2.0, np.array([[1.0, 0.5, 3.0]]))
     np.testing.assert_allclose(parabola(np.array([10.0, 12.0, 8.0]))[:, 0], [1.0, 4.5, 3.5])
+
+
+def test_hermite_reproduces_a_cubic_from_its_values_and_rates() -> None:
+    cubic = np.poly1d([0.3, -1.0, 2.0, 5.0])
+    x = np.array([0.0, 1.0, 4.0, 4.5])
+    t = np.linspace(-0.5, 5.0, 30)
+    found = hermite(x, cubic(x)[:, None], cubic.deriv()(x)[:, None])
+    np.testing.assert_allclose(found(t)[:, 0], cubic(t), atol=rounding)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from services.sensors.light_path import GEOMETRIC, LightPath
 from services.sensors.pushbroom import PushbroomModel
@@ -106,4 +107,133 @@ def phr_dimap(model: PushbroomModel) -> str:
 <PsiY_Model><DEGREE>0</DEGREE><COEFFICIENTS>0.0</COEFFICIENTS></PsiY_Model>
 </Viewing_Directions></Sensor_Viewing_Model></Sensor_Model_Characteristics></Geometric_Data>
 </PHR_Dimap_Document>
+"""
+
+
+def dimap_v2(model: PushbroomModel) -> str:
+    """A DIMAP document of version 2 with quaternions at 32 Hz that end with the image."""
+    start_s, end_s = line_time_s(model, 0.0), line_time_s(model, SHAPE[0] - 1.0)
+    times = np.round(np.linspace(start_s - 1e-3, end_s + 1e-3, 16), 7)
+    quaternions = "".join(
+        f"<Quaternion><Q0>{row(q[3])}</Q0><Q1>{row(q[0])}</Q1><Q2>{row(q[1])}</Q2><Q3>{row(q[2])}</Q3>"
+        f"<TIME>{utc(t)}</TIME></Quaternion>\n"
+        for t, q in zip(times, model.attitude(times), strict=True)
+    )
+    points_s = np.array([-0.7, -0.1, 0.5])
+    points = "".join(
+        f"<Point><LOCATION_XYZ>{row(p)}</LOCATION_XYZ><VELOCITY_XYZ>{row(v)}</VELOCITY_XYZ>"
+        f"<TIME>{utc(t)}</TIME></Point>\n"
+        for t, p, v in zip(points_s, *_orbit(model, points_s), strict=True)
+    )
+    across = [model.look(np.zeros(1))[0, 1], model.look.derivative(np.zeros(1))[0, 1]]
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.12">DIMAP</METADATA_FORMAT>
+</Metadata_Identification>
+<Raster_Dimensions><NROWS>{SHAPE[0]}</NROWS><NCOLS>{SHAPE[1]}</NCOLS></Raster_Dimensions>
+<Geometric_Data><Refined_Model><Time><Time_Range><START>{utc(start_s)}</START></Time_Range><Time_Stamp>
+<LINE_PERIOD unit="microsecond">{1e6 * (end_s - start_s) / (SHAPE[0] - 1.0)!r}</LINE_PERIOD>
+</Time_Stamp></Time><Ephemeris><Point_List>{points}</Point_List></Ephemeris>
+<Attitudes><Quaternion_List>{quaternions}</Quaternion_List></Attitudes>
+<Geometric_Calibration><Instrument_Calibration><Band_Calibration_List><Band_Calibration>
+<Swath_Range><FIRST_COL>1</FIRST_COL></Swath_Range><Polynomial_Look_Angles>
+<XLOS_0>{row(-across[0])}</XLOS_0><XLOS_1>{row(-across[1])}</XLOS_1><YLOS_0>0.0</YLOS_0>
+</Polynomial_Look_Angles></Band_Calibration></Band_Calibration_List>
+<Instrument_Biases><YAW>0.0</YAW><PITCH>0.0</PITCH><ROLL>0.0</ROLL></Instrument_Biases>
+</Instrument_Calibration></Geometric_Calibration></Refined_Model></Geometric_Data></Dimap_Document>
+"""
+
+
+def spot5_dimap(model: PushbroomModel) -> str:
+    """A DIMAP document of version 1 with corrected angles and a table of all detectors."""
+    times = np.round(np.arange(-0.8, 0.8, 0.02), 7)
+    corrected = _entries("Angles", times, _spot_angles(model, times))
+    attitudes = (
+        "<Corrected_Attitudes><STAR_TRACKER_USED>Y</STAR_TRACKER_USED>"
+        f"<Corrected_Attitude>{corrected}</Corrected_Attitude></Corrected_Attitudes>"
+    )
+    return _dimap_v1(model, attitudes, np.arange(SHAPE[1]))
+
+
+def spot4_dimap(model: PushbroomModel) -> str:
+    """A DIMAP document of version 1 with one angle, measured rates and the two ends of the detectors.
+
+    One rate is marked as out of range, and wrong.
+    """
+    times = np.round(np.arange(-0.5, 0.5, 0.02), 7)
+    step_s = 0.01
+    rates = (_spot_angles(model, times + step_s) - _spot_angles(model, times - step_s)) / (2.0 * step_s)
+    known_s = np.array([-0.41])
+    known = _entries("Angles", known_s, _spot_angles(model, known_s))
+    speeds = _entries("Angular_Speeds", times, rates)
+    wrong = _entries("Angular_Speeds", np.array([0.005]), np.ones((1, 3))).replace(">N<", ">Y<")
+    attitudes = (
+        f"<Raw_Attitudes><Aocs_Attitude><Angles_List>{known}</Angles_List><Angular_Speeds_List>{speeds}{wrong}</Angular_Speeds_List></Aocs_Attitude>"
+        "</Raw_Attitudes>"
+    )
+    return _dimap_v1(model, attitudes, np.array([0, SHAPE[1] - 1]))
+
+
+def _orbit(model: PushbroomModel, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return model.orbit(times), model.orbit.derivative(times)
+
+
+def _entries(tag: str, times: np.ndarray, values: np.ndarray) -> str:
+    """Angles or rates about three axes with their times."""
+    return "".join(
+        f"<{tag}><TIME>{utc(t)}</TIME><YAW>{row(y)}</YAW><PITCH>{row(p)}</PITCH><ROLL>{row(r)}</ROLL>"
+        f"<OUT_OF_RANGE>N</OUT_OF_RANGE></{tag}>\n"
+        for t, (y, p, r) in zip(times, values, strict=True)
+    )
+
+
+def _spot_angles(model: PushbroomModel, times: np.ndarray) -> np.ndarray:
+    """Yaw, pitch, roll (n, 3) of a model by the matrices of the SPOT handbook, in its navigation frame.
+
+    There x points to the right, y forwards and z up; the rotation is pitch times roll times yaw.
+    """
+    position, velocity = model.orbit(times), model.orbit.derivative(times)
+    up = position / np.linalg.norm(position, axis=1, keepdims=True)
+    right = np.cross(velocity, up)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    orbital = np.stack([right, np.cross(up, right), up], axis=-1)
+    body = Rotation.from_quat(model.attitude(times)).as_matrix()
+    navigation = np.stack([body[:, :, 1], body[:, :, 0], -body[:, :, 2]], axis=-1)
+    m = np.einsum("nji,njk->nik", orbital, navigation)
+    roll = -np.arcsin(m[:, 0, 2])
+    pitch = np.arctan2(m[:, 1, 2], m[:, 2, 2])
+    yaw = np.arctan2(-m[:, 0, 1], m[:, 0, 0])
+    return np.stack([yaw, pitch, roll], axis=-1)
+
+
+def _dimap_v1(model: PushbroomModel, attitudes: str, samples: np.ndarray) -> str:
+    """A DIMAP document of version 1 with the look angles of some samples."""
+    psi_y = -np.arctan(model.look(samples.astype(float))[:, 1])
+    detectors = "".join(
+        f"<Look_Angles><DETECTOR_ID>{sample + 1}</DETECTOR_ID><PSI_X>0.0</PSI_X>"
+        f"<PSI_Y>{row(psi)}</PSI_Y></Look_Angles>\n"
+        for sample, psi in zip(samples, psi_y, strict=True)
+    )
+
+    def axes(name: str, vector: np.ndarray) -> str:
+        x, y, z = vector
+        return f"<{name}><X>{row(x)}</X><Y>{row(y)}</Y><Z>{row(z)}</Z></{name}>"
+
+    points_s = np.round(np.linspace(-0.75, 0.75, 9), 7)
+    points = "".join(
+        f"<Point><TIME>{utc(t)}</TIME>{axes('Location', p)}{axes('Velocity', v)}</Point>\n"
+        for t, p, v in zip(points_s, *_orbit(model, points_s), strict=True)
+    )
+    centre = SHAPE[0] // 2
+    period_s = line_time_s(model, 1.0) - line_time_s(model, 0.0)
+    return f"""<?xml version="1.0" encoding="ISO-8859-1"?>
+<Dimap_Document><Metadata_Id><METADATA_FORMAT version="1.1">DIMAP</METADATA_FORMAT></Metadata_Id>
+<Raster_Dimensions><NROWS>{SHAPE[0]}</NROWS><NCOLS>{SHAPE[1]}</NCOLS></Raster_Dimensions>
+<Data_Processing><PROCESSING_LEVEL>1A</PROCESSING_LEVEL></Data_Processing>
+<Data_Strip><Ephemeris><Points>{points}</Points></Ephemeris>
+<Satellite_Attitudes>{attitudes}</Satellite_Attitudes>
+<Sensor_Configuration><Time_Stamp><LINE_PERIOD>{period_s!r}</LINE_PERIOD>
+<SCENE_CENTER_TIME>{utc(line_time_s(model, centre - 1.0))}</SCENE_CENTER_TIME>
+<SCENE_CENTER_LINE>{centre}</SCENE_CENTER_LINE></Time_Stamp>
+<Instrument_Look_Angles_List><Instrument_Look_Angles><Look_Angles_List>{detectors}</Look_Angles_List>
+</Instrument_Look_Angles></Instrument_Look_Angles_List></Sensor_Configuration></Data_Strip></Dimap_Document>
 """

@@ -1,0 +1,38 @@
+"""Attitudes from quaternions of any sign, and from rates integrated from known angles."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from services.sensors.attitude import integrated_rates, interpolated_attitude
+
+rounding = 1e-12
+
+
+def test_quaternions_of_any_sign_and_length_are_one_smooth_rotation() -> None:
+    times = np.linspace(0.0, 2.0, 15)
+
+    def turned(t: np.ndarray) -> Rotation:
+        return Rotation.from_rotvec(np.outer(t, [0.01, 3.0, -0.02]))
+
+    quaternions = turned(times).as_quat() * np.resize([1.0, -2.0, -0.5], 15)[:, None]
+    t = np.linspace(0.0, 2.0, 50)
+    found = Rotation.from_quat(interpolated_attitude(times, quaternions)(t))
+    assert (found * turned(t).inv()).magnitude().max() < 1e-5
+
+
+@pytest.mark.parametrize("known_s", [-0.5, 0.0, 0.7, 3.0, 4.0])
+def test_rates_are_integrated_exactly_from_angles_known_at_any_time(known_s: float) -> None:
+    times = np.array([0.0, 0.5, 1.5, 3.0])
+    rates = np.array([[1.0], [2.0], [-1.0], [4.0]])
+    known = np.array([10.0])
+    angles = integrated_rates(times, rates, (known_s, known))
+    edge = {-0.5: 1.0 * 0.5, 4.0: -4.0 * 1.0}.get(known_s, 0.0)
+    inside = np.clip(known_s, 0.0, 3.0)
+    assert angles(np.array([inside]))[0, 0] == pytest.approx(10.0 + edge, abs=rounding)
+    t = np.linspace(0.0, 3.0, 3001)
+    rate = np.interp(t, times, rates[:, 0])
+    np.testing.assert_allclose(angles.derivative(t[1:-1])[:, 0], rate[1:-1], atol=0.02)
+    trapezoid = np.sum((rate[1:] + rate[:-1]) / 2.0 * np.diff(t))
+    change = angles(np.array([3.0])) - angles(np.array([0.0]))
+    assert change[0, 0] == pytest.approx(trapezoid, abs=1e-9)
