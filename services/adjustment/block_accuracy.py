@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.adjustment.block_gauge import Gauge
+from services.adjustment.known_images import Tie
 from services.adjustment.normal_equations import Equations, Pairs, Points, shared_covariance
 from services.adjustment.parameters import (
     PASS_SHARE,
@@ -79,10 +80,22 @@ def block_accuracy(system: ReducedSystem, pairs: Pairs, gauge: Gauge, of_images:
     weight = system.times(move)
     frame_m2 = np.asarray(np.linalg.inv(move.T @ weight), dtype=np.float64)
     # M + (a - 1) M D F D^T M has the inverse R + D F D^T / a: taking off a small F loses nothing.
-    stiffer = max(1.0, float(np.trace(frame_m2)) / len(frame_m2) / _LITTLE_M**2)
-    root = np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(frame_m2)
+    stiffer, root = _stiffened(weight, frame_m2)
     relative = system.inverse(pairs, root) - _of_pairs(pairs, move, frame_m2 / stiffer)
     return BlockAccuracy(frame_m2, move, pairs, relative)
+
+
+def joint_relative(system: ReducedSystem, accuracy: BlockAccuracy) -> Array:
+    """Covariance (K, K) of all parameters for exact frames: `BlockAccuracy.relative` of all pairs."""
+    stiffer, root = _stiffened(system.times(accuracy.move), accuracy.frame_m2)
+    added = accuracy.move @ (accuracy.frame_m2 / stiffer) @ accuracy.move.T
+    return np.asarray(system.dense_inverse(root) - added)
+
+
+def _stiffened(weight: Array, frame_m2: Array) -> tuple[float, Array]:
+    """The factor a, and columns whose squares add (a - 1) M D F D^T M, of M D and F."""
+    stiffer = max(1.0, float(np.trace(frame_m2)) / len(frame_m2) / _LITTLE_M**2)
+    return stiffer, np.sqrt(stiffer - 1.0) * weight @ np.linalg.cholesky(frame_m2)
 
 
 _LITTLE_M = 0.1
@@ -94,6 +107,7 @@ def earth_frames(
     priors: BlockPriors,
     images: Sequence[ImageParameters],
     passes: Sequence[BoolArray],
+    tie: Tie | None = None,
 ) -> tuple[Frame, ...]:
     """The frames of the groups of a block on the Earth.
 
@@ -101,20 +115,37 @@ def earth_frames(
     weaken the position and strengthen the height. With the covariance F0 for images that share nothing
     and F1 for images that share all, the frame is F0 + (F1 - F0)+, which covers both.
 
+    The frame of a neighbour may share errors in turn with those images of a pass that it has not: with
+    what it adds, X, and what these add, Y, their sum has at most the covariance (1 + a) X + (1 + 1/a) Y.
+
     Args:
         accuracy: of the block.
         priors: of the parameters.
         images: with their own priors.
         passes: masks (n,) of images that may share errors.
+        tie: images in common with an adjusted block.
     """
+    common = np.zeros(len(images), dtype=np.bool_) if tie is None else tie.members(len(images))
     gain = accuracy.frame_m2 @ (priors.locating @ accuracy.move).T
     doubted = accuracy.frame_m2.copy()
-    for members in passes:
+    beside = np.zeros_like(doubted)
+    for both in passes:
+        members = both & ~common
+        if not members.any():
+            continue
         rows = shift_rows(images, members, priors.size)
         weighted = gain[:, rows]
         none, half, full = (sharing_covariance(images, members, s) for s in (0.0, PASS_SHARE, 1.0))
         doubted += weighted @ (none - half) @ weighted.T
         doubted += positive_part(weighted @ (full - none) @ weighted.T)
+        if (both & common).any():
+            beside += weighted @ full @ weighted.T
+    if tie is not None and beside.any():
+        own = tie.parameter_rows(priors.size)
+        weighted = gain[:, own]
+        carried = weighted @ np.linalg.solve(priors.locating[np.ix_(own, own)].toarray(), weighted.T)
+        share = np.sqrt(np.trace(beside) / np.trace(carried))
+        doubted += share * carried + beside / share
     return tuple(Frame((own + own.T) / 2.0) for own in _of_groups(doubted))
 
 

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from services.adjustment.control_ground import ControlGround
+from services.adjustment.known_images import Tie
 from services.adjustment.normal_equations import Equations, Pairs, seen_pairs
 from services.adjustment.parameters import ImageParameters
 from services.geodesy import metres_per_degree_at, wrapped_degrees
@@ -42,6 +43,7 @@ class BlockProblem:
         options: thresholds.
         n_points: number of points.
         size: number of parameters in a block.
+        tie: images in common with an adjusted block.
     """
 
     images: Sequence[ImageParameters]
@@ -50,11 +52,18 @@ class BlockProblem:
     options: BlockOptions
     n_points: int
     size: int
+    tie: Tie | None = None
 
     @property
     def n_blocks(self) -> int:
         """Images, and behind them the frames of the control."""
         return len(self.images) + len(self.control.frames)
+
+    @cached_property
+    def common(self) -> BoolArray:
+        """Blocks of parameters (n,) that are those of images in common with an adjusted block."""
+        none = np.zeros(self.n_blocks, dtype=np.bool_)
+        return none if self.tie is None else self.tie.members(self.n_blocks)
 
     @cached_property
     def _order(self) -> IntArray:
@@ -111,6 +120,14 @@ class BlockProblem:
     def pairs(self) -> Pairs:
         """The blocks of parameters that have a point in common."""
         return seen_pairs(self.point, self.block, self.n_blocks)
+
+    def start_values(self) -> Array:
+        """Parameters (n, k) to begin with: 0, or those of the adjusted block."""
+        values = np.zeros((self.n_blocks, self.size))
+        if self.tie is not None:
+            known = self.tie.known.values
+            values[self.tie.rows, : known.shape[1]] = known
+        return values
 
     def start(self) -> Array:
         """Points (p, 3) on the first ray of each, at the middle height of its model, or where known."""

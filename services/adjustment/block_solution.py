@@ -55,6 +55,12 @@ def step(
     """One Gauss-Newton step with the points eliminated."""
     points = eliminated(equations, problem.n_points)
     values, right = reduced(equations, points, problem.pairs)
+    if problem.tie is not None:
+        # The neighbour has used what common images observe of points that they see together.
+        among = equations._replace(weight=equations.weight * problem.common[equations.block])
+        told = reduced(among, eliminated(among, problem.n_points), problem.pairs)
+        values, right = values - told[0], right - told[1]
+        priors = problem.tie.priors(priors, gauge.move)
     system = reduced_system(values, problem.pairs, priors, gauge)
     right_side = system.right_side(right.ravel(), state.values.ravel())
     change = system.solve(right_side).reshape(state.values.shape)
@@ -93,7 +99,7 @@ def checked_gauge(
     n = len(problem.images)
     group = connected_groups(equations, n, problem.n_blocks)
     known = [np.isfinite(frame.covariance_m2).any() for frame in problem.control.frames]
-    held = set(group[n:][np.array(known, dtype=np.bool_)])
+    held = set(group[n:][np.array(known, dtype=np.bool_)]) | set(group[problem.common])
     number = int(group.max(initial=-1)) + 1
     if refuse and number > 1 and len(held) < number:
         names = [

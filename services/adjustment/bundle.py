@@ -10,13 +10,16 @@ from services.adjustment.block_accuracy import (
     block_accuracy,
     carried_covariances,
     earth_frames,
+    joint_relative,
 )
 from services.adjustment.block_problem import BlockOptions, BlockProblem
 from services.adjustment.block_scale import check_scale, posterior_scale
 from services.adjustment.block_solution import checked_gauge, least_squares
 from services.adjustment.control_check import agreeing_control
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
+from services.adjustment.known_images import KnownImages, known_images, tie
 from services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
+from services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
 from services.adjustment.robust_start import active_observations, robust_start
 from services.errors import NoConsensus
 from services.sensors.correction import CorrectedModel
@@ -36,6 +39,7 @@ class BlockAdjustment:
         point_covariance_m2: (p, 3, 3) east, north, up, relative to the frame of the point's group: with
             the errors that points take over from images.
         group: (n,) group of images that points tie together; -1 for images without an observation.
+        known: what a later block may be tied to: the images of the first group; None beyond 333 images.
         frames: of the groups, on the Earth. The error of a point on the Earth is that of its frame plus
             its own; the two are independent.
         residual_px: (m, 2) observed minus computed.
@@ -53,6 +57,7 @@ class BlockAdjustment:
     lon_lat_h: Array
     point_covariance_m2: Array
     group: IntArray
+    known: KnownImages | None
     frames: tuple[Frame, ...]
     residual_px: Array
     active: BoolArray
@@ -77,6 +82,7 @@ def adjust_block(
     observations: Observations,
     *,
     control: ControlGround = NO_CONTROL,
+    neighbour: KnownImages | None = None,
     passes: Sequence[BoolArray] = (),
     options: BlockOptions = BlockOptions(),
 ) -> BlockAdjustment:
@@ -91,20 +97,26 @@ def adjust_block(
         images: with what may move.
         observations: m image positions of points, by point.
         control: known ground positions of some of the points.
+        neighbour: images of an adjusted block, some of which are images of this one: what it tells of
+            their parameters is observed, and what they observe of their common points is not used again.
         passes: masks (n,) of images that may share errors, as those of one pass do; nobody states how
             much, and the frames cover every share.
         options: thresholds.
 
     Raises:
+        InputError: the neighbour has no image of the block, or one with another model.
         NotEnoughPoints: too few points can be intersected.
         NoConsensus: the residuals are too large for the sigmas of the observations, or most control
             points disagree.
         DisconnectedBlock: groups of images without common points, and without control of each.
         NoConvergence: the parameters still change after the last iteration.
     """
-    priors = block_priors(images, passes, control.frame_covariances())
+    tied = None if neighbour is None else tie(images, neighbour)
+    common = np.zeros(len(images), dtype=np.bool_) if tied is None else tied.members(len(images))
+    apart = [members & ~common for members in passes if (members & ~common).any()]
+    priors = block_priors(images, apart, control.frame_covariances())
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
-    problem = BlockProblem(images, observations, control, options, n_points, priors.size)
+    problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     state, scale, active, control_active = robust_start(problem, priors)
     _check_control(control, control_active)
     slope_factor = 1.0
@@ -117,11 +129,11 @@ def adjust_block(
         accuracy = block_accuracy(solved.system, problem.pairs, gauge, len(images) * priors.size)
         used, previous = active, (scale, slope_factor)
         square = problem.squares(state.values, state.lon_lat_h)
-        determined = _determined(priors, accuracy.variance())
+        determined = _determined(solved.system.priors, accuracy.variance())
         computed = used & np.isfinite(square) & ~problem.by_hand
         scale = posterior_scale(square[computed], observations.point[computed], float(determined.sum()))
         check_scale(scale)
-        factor = _slope_factor(state.values.ravel(), priors, determined, slope_factor)
+        factor = _slope_factor(state.values.ravel(), solved.system.priors, determined, slope_factor)
         active = active_observations(problem, square, used, scale, control_active)
         used_control, control_active = (
             control_active,
@@ -141,7 +153,7 @@ def adjust_block(
     relative_m2 = solved.points.inverse + carried_m2
     frames = [
         replace(frame, shared_m2=carried_m2[intersected & (of_points == group)].mean(axis=0))
-        for group, frame in enumerate(earth_frames(accuracy, priors, images, passes))
+        for group, frame in enumerate(earth_frames(accuracy, solved.system.priors, images, passes, tied))
     ]
     residual = problem.equations(state.values, state.lon_lat_h).residual
     lon_lat_h = state.lon_lat_h.copy()
@@ -159,6 +171,7 @@ def adjust_block(
         lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),
         point_covariance_m2=np.where(intersected[:, None, None], relative_m2, np.nan),
         group=gauge.group[:n_images],
+        known=_known(images, state.values, gauge.group, frames, of=(solved.system, accuracy)),
         frames=tuple(frames),
         residual_px=problem.image_rows(residual) * observations.sigma_px[:, None],
         active=used & intersected[observations.point],
@@ -167,6 +180,26 @@ def adjust_block(
         sigma_px=scale,
         iterations=state.iterations,
     )
+
+
+def _known(
+    images: Sequence[ImageParameters],
+    values: Array,
+    group: IntArray,
+    frames: Sequence[Frame],
+    *,
+    of: tuple[ReducedSystem, BlockAccuracy],
+) -> KnownImages | None:
+    """The images of the first group with the covariance of all their parameters."""
+    n, size = len(images), values.shape[1]
+    rows = np.flatnonzero(group[:n] == 0)
+    k = {len(images[row].sigma) for row in rows.tolist()}
+    if values.size > DENSE_ROWS or len(k) != 1:
+        return None
+    inside = (rows[:, None] * size + np.arange(own := k.pop())).ravel()
+    relative = joint_relative(*of)[np.ix_(inside, inside)]
+    members = [images[row] for row in rows.tolist()]
+    return known_images(members, values[rows, :own], relative, frames[0])
 
 
 def _determined(priors: BlockPriors, variance: Array) -> Array:

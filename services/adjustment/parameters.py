@@ -117,11 +117,13 @@ class BlockPriors:
         size: parameters of the image that has most; those that others lack have no derivative.
         locating: (K, K) sparse, inverse covariance of the parameters that tell where images lie.
         shape: (K,) inverse variances of the others: drifts and skews.
+        mean: (K,) what is expected: 0, or what a neighbouring block tells.
     """
 
     size: int
     locating: sparse.csc_matrix
     shape: Array
+    mean: Array
 
     def with_slopes(self, factor: float) -> "BlockPriors":
         """The same where standard deviations of drifts and skews are multiplied by a factor."""
@@ -160,7 +162,7 @@ def block_priors(
         locating[np.ix_(rows, rows)] = frame_weight(covariance)
         rest = np.arange(rows[-1] + 1, (len(images) + i + 1) * size)
         locating[rest, rest] = 1.0
-    return BlockPriors(size, locating.tocsc(), shape)
+    return BlockPriors(size, locating.tocsc(), shape, np.zeros(n * size))
 
 
 def frame_weight(covariance_m2: Array) -> Array:

@@ -55,9 +55,10 @@ class ReducedSystem:
 
     def right_side(self, observed: Array, at: Array) -> Array:
         """Right side (K,) at parameters (K,), of that of the observations (K,)."""
-        basis, moves, shape = self.gauge.basis, self.gauge.moves, self.priors.shape * at
+        basis, moves, off = self.gauge.basis, self.gauge.moves, at - self.priors.mean
+        shape = self.priors.shape * off
         observed = observed - basis @ (basis.T @ observed)
-        return np.asarray(observed - shape + moves @ (moves.T @ shape) - self.priors.locating @ at)
+        return np.asarray(observed - shape + moves @ (moves.T @ shape) - self.priors.locating @ off)
 
     def dense(self) -> Array:
         """The matrix (K, K)."""
@@ -92,7 +93,7 @@ class ReducedSystem:
         """Blocks (s, k, k) of the inverse of the matrix and the squares of columns (K, c) together."""
         k, first = self.priors.size, np.repeat(np.arange(len(pairs.start) - 1), np.diff(pairs.start))
         if len(root) <= DENSE_ROWS:
-            inverse = _dense_inverse(self.dense() + root @ root.T).reshape(len(root) // k, k, -1, k)
+            inverse = self.dense_inverse(root).reshape(len(root) // k, k, -1, k)
             return np.asarray(inverse[first, :, pairs.other])
         left, other = (np.hstack(part) for part in zip(self._removed, (-root, root), strict=True))
         solved, other_solved = self._factor.solve(left), self._factor.solve(other)
@@ -103,6 +104,10 @@ class ReducedSystem:
             other_solved.reshape(-1, k, left.shape[1]),
         )
         return np.asarray(blocks + one[first] @ two[pairs.other].transpose(0, 2, 1))
+
+    def dense_inverse(self, root: Array) -> Array:
+        """The whole inverse (K, K) of the matrix and the squares of columns (K, c) together."""
+        return _dense_inverse(self.dense() + root @ root.T)
 
 
 def _dense_inverse(matrix: Array) -> Array:

@@ -29,7 +29,7 @@ def robust_start(
         NoConvergence: the parameters still change after the last iteration.
     """
     point, n = problem.observations.point, len(problem.images)
-    state = State(np.zeros((problem.n_blocks, problem.size)), problem.start())
+    state = State(problem.start_values(), problem.start())
     scale, change_px = _falling_scale(problem), np.inf
     falling = scale
     alone = np.isin(np.arange(len(point)), problem.single_rays[0])
