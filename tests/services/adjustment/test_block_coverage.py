@@ -12,7 +12,7 @@ from services.errors import DisconnectedBlock
 TRIALS = 20
 lowest, highest = 0.85, 0.97
 by_chance = 1.65
-"""Standard deviations of the draw below which an honest cell falls in one of twenty repetitions."""
+"""Standard deviations of the draw by which an honest cell misses in one of twenty repetitions."""
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ by_chance = 1.65
 def test_regions_of_points_hold_the_truth_relative_and_on_the_earth(case: Case) -> None:
     coverage = measure(case, TRIALS, seed=1)
     assert lowest <= coverage.relative + by_chance * coverage.chance
-    assert coverage.relative <= highest
+    assert coverage.relative - by_chance * coverage.chance <= highest
     # Errors on the Earth are those of 20 frames: few.
     assert coverage.on_earth >= 0.75
     assert np.min(coverage.frame) >= 0.7
