@@ -8,21 +8,26 @@ unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 READY := .venv/ready
 PAGE := app/web/built/index.html
-# Tests of services wait for them: half as many processes again as there are cores, which nproc does not
-# tell where OMP_NUM_THREADS is set.
-WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
+# Tests of services wait for them: twice as many processes as there are cores, which nproc does not tell
+# where OMP_NUM_THREADS is set.
+WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 2)
 LONG := continent faults image_selection load stress throughput block_adjustment
 
-.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
+.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 
 demo: postgis
 	$(BIN)/amers demo
 
-# Style, types and contracts are checked on one core while another compiles what all tests use.
+# Style, types and contracts are checked while another core compiles what all tests use and others download.
 test: $(READY)
-	$(MAKE) --jobs 2 check kernels
-	$(MAKE) postgis page chromium
+	$(MAKE) --jobs 3 check kernels programs
 	$(MAKE) --jobs 2 test-files test-operations
+
+# One after the other: Debian's packages are installed by one process at a time.
+programs: $(READY)
+	$(MAKE) postgis
+	$(MAKE) page
+	$(MAKE) chromium
 
 test-files: $(READY)
 	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \

@@ -46,8 +46,10 @@ def left_over_px(result: Registration) -> Array:
 
 @pytest.mark.parametrize(
     ("max_search_px", "name"),
-    [(400, "coarse"), (100, "far")],
-    ids=["around each point", "in the whole scene"],
+    [
+        pytest.param(400, "coarse", id="around each point", marks=pytest.mark.endurance),
+        pytest.param(100, "far", id="in the whole scene"),
+    ],
 )
 def test_a_scene_wrong_by_half_its_size_is_found(max_search_px: int, name: str) -> None:
     result = registered(CoarseOptions(max_search_px=max_search_px))
