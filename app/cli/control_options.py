@@ -53,6 +53,13 @@ Crs = Annotated[
 Columns = Annotated[
     str | None, typer.Option(help="Columns of a CSV of other names: lon=COLUMN,lat=COLUMN,…")
 ]
+Neighbour = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder BLOCK.adjustment of a block that was made from some of the same images: both "
+        "agree along their seam."
+    ),
+]
 Ortho = Annotated[
     list[Path] | None,
     typer.Option(help="Ortho-image that places the block east and north; repeat for several."),

@@ -1,6 +1,7 @@
 """`amers production run`: make a block from overlapping images, given or chosen from a catalogue."""
 
 import os
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -80,6 +81,7 @@ def run(
     control_crs: control_options.Crs = None,
     control_columns: control_options.Columns = None,
     control_sigma_axes: control_options.SigmaAxes = None,
+    neighbour: control_options.Neighbour = None,
     control_ortho: control_options.Ortho = None,
     control_ortho_sigma_m: control_options.OrthoSigmaM = None,
     control_dem: control_options.Dem = None,
@@ -149,6 +151,7 @@ def run(
         dem_sigma_m=control_dem_sigma_m,
         dem_frame_sigma_m=control_dem_frame_sigma_m,
     )
+    control_files = replace(control_files, neighbour=neighbour)
     refuse_existing(output)
     with shown_progress() as progress:
         if catalogue is not None:

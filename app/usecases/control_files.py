@@ -11,8 +11,10 @@ from app.errors import InputError
 from app.usecases.marked_files import PointStatements, read_marked
 from app.usecases.registration.reference_source import COMMON_SIGMA_PX, LOCAL_SIGMA_PX
 from app.usecases.terrain_file import TerrainFile, read_terrain
+from services.adjustment.known_images import KnownImages
 from services.errors import VerticalDatumError
 from services.formats.addresses import FilePlace
+from services.formats.adjusted_images import read_adjusted_images
 from services.formats.block.document_json import BLOCK_JSON
 from services.formats.block.reader import FolderChips, file_sha256, read_block
 from services.formats.images.scenes import product_sigma_m, read_scene
@@ -24,6 +26,9 @@ from services.production.height_control import ControlHeights
 from services.production.ortho_control import ControlOrtho
 from services.sensors.ortho import OrthoModel
 from services.types import Frame
+
+IMAGES_NPZ = "images.npz"
+"""The adjusted images of a block in its folder BLOCK.adjustment."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class ControlFiles:
         ortho_sigma_m: accuracy of them on the Earth, one standard deviation a coordinate; by default
             that of their product.
         heights: an elevation model, which tells heights.
+        neighbour: folder BLOCK.adjustment of a block that was made from some of the same images.
     """
 
     paths: tuple[Path, ...] = ()
@@ -59,6 +65,7 @@ class ControlFiles:
     orthos: tuple[Path, ...] = ()
     ortho_sigma_m: float | None = None
     heights: HeightFile | None = None
+    neighbour: Path | None = None
 
 
 def read_control(
@@ -91,6 +98,7 @@ def read_control(
         marked=marked,
         orthos=tuple(_ortho(path, files.ortho_sigma_m, stack) for path in files.orthos),
         heights=() if files.heights is None else (_heights(files.heights),),
+        neighbour=None if files.neighbour is None else _neighbour(files.neighbour, blocks),
     )
 
 
@@ -108,7 +116,18 @@ def control_inputs(files: ControlFiles) -> dict[str, Any]:
         "orthos": [{"path": str(path.resolve()), "sha256": file_sha256(path)} for path in files.orthos],
         "ortho_sigma_m": files.ortho_sigma_m,
         "heights": None if files.heights is None else asdict(files.heights),
+        "neighbour": None if files.neighbour is None else file_sha256(files.neighbour / IMAGES_NPZ),
     }
+
+
+def _neighbour(folder: Path, blocks: Sequence[ControlBlock]) -> KnownImages:
+    block, known = read_adjusted_images(folder / IMAGES_NPZ)
+    if block in (one.name for one in blocks):
+        raise InputError(
+            f"{block}: given as control and as neighbour, which tell the same twice; give it as "
+            "neighbour alone (--neighbour): its images tell all that its points do"
+        )
+    return known
 
 
 def _block(folder: Path, stack: ExitStack) -> ControlBlock:

@@ -12,14 +12,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from app.usecases.control_files import ControlFiles, control_inputs, read_control
+from app.usecases.control_files import IMAGES_NPZ, ControlFiles, control_inputs, read_control
 from app.usecases.executors import ComputeOptions, open_executor
 from app.usecases.ground_classes import GroundFiles, read_ground
 from app.usecases.image_selection import ITEMS
 from app.usecases.production import BlockIdentity, block_metadata, points_per_km2, refuse_existing
 from app.usecases.registration.result_folder import replacing
+from services.adjustment.known_images import KnownImages
 from services.errors import FormatError
 from services.formats.addresses import Address, FilePlace
+from services.formats.adjusted_images import write_adjusted_images
 from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from services.formats.block.writer import write_block
 from services.formats.images.scenes import read_scene
@@ -114,7 +116,7 @@ def run_production(
         )
         write_block(
             folder,
-            _metadata(identity, scenes, production, options),
+            _metadata(identity, scenes, production, options, control.neighbour),
             production.points,
             production.chips,
             _adjusted_models(scenes, production),
@@ -136,6 +138,8 @@ def _write_report(folder: Path, block: str, production: Production) -> None:
         document = json.dumps(adjustment_document(report), indent=2, allow_nan=False)
         (new / "report.json").write_text(document + "\n", encoding="utf-8")
         (new / "report.html").write_text(format_adjustment_html(report), encoding="utf-8")
+        if production.adjustment.known is not None:
+            write_adjusted_images(new / IMAGES_NPZ, block, production.adjustment.known)
         (new / "points.csv").write_text(points_csv(report), encoding="utf-8")
 
 
@@ -211,7 +215,11 @@ def _adjusted_models(scenes: Sequence[Scene], production: Production) -> dict[st
 
 
 def _metadata(
-    identity: BlockIdentity, scenes: Sequence[Scene], production: Production, options: ProductionOptions
+    identity: BlockIdentity,
+    scenes: Sequence[Scene],
+    production: Production,
+    options: ProductionOptions,
+    neighbour: KnownImages | None,
 ) -> BlockMetadata:
     relative, n_points = production.relative_accuracy, len(production.points)
     return block_metadata(
@@ -239,17 +247,20 @@ def _metadata(
                 "frame_sigma_m",
                 relative.frame.sigma_m,
                 len(scenes),
-                _frame_source(production),
+                _frame_source(production, neighbour),
             ),
         ),
     )
 
 
-def _frame_source(production: Production) -> str:
+def _frame_source(production: Production, neighbour: KnownImages | None) -> str:
     """What places a block on the Earth."""
     stated = "the stated accuracy of the images' models"
+    if neighbour is not None:
+        names = {image.name for image in production.image_fits}
+        stated = f"{len(names & set(neighbour.names))} images of a neighbouring block, and {stated}"
     if len(production.control) == 0:
-        return f"{stated}, not measured"
+        return stated if neighbour is not None else f"{stated}, not measured"
     sources = sorted({name.partition(":")[0] for name in production.control.names})
     used = int(production.adjustment.control_active.sum())
     return f"{used} control points of {', '.join(sources)}, and {stated}"

@@ -144,7 +144,8 @@ def earth_frames(
         own = tie.parameter_rows(priors.size)
         weighted = gain[:, own]
         carried = weighted @ np.linalg.solve(priors.locating[np.ix_(own, own)].toarray(), weighted.T)
-        share = np.sqrt(np.trace(beside) / np.trace(carried))
+        together = np.linalg.inv(doubted)
+        share = np.sqrt(np.trace(together @ beside) / np.trace(together @ carried))
         doubted += share * carried + beside / share
     return tuple(Frame((own + own.T) / 2.0) for own in _of_groups(doubted))
 

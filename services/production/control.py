@@ -7,6 +7,7 @@ import numpy as np
 
 from services.adjustment.control_ground import ControlGround, joined_ground
 from services.adjustment.intersection import intersect
+from services.adjustment.known_images import KnownImages
 from services.imagery.scene import Scene
 from services.production.control_points import ControlBlock, find_control
 from services.production.height_control import ControlHeights, known_heights, surfaces_above
@@ -25,12 +26,14 @@ class Control:
         marked: ground points that people marked in the images.
         orthos: ortho-images, which tell the positions of the points of the block.
         heights: elevation models, which tell their heights.
+        neighbour: images of an adjusted block, some of which are images of this one.
     """
 
     blocks: tuple[ControlBlock, ...] = ()
     marked: tuple[MarkedGround, ...] = ()
     orthos: tuple[ControlOrtho, ...] = ()
     heights: tuple[ControlHeights, ...] = ()
+    neighbour: KnownImages | None = None
 
 
 @dataclass(frozen=True)

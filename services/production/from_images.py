@@ -10,6 +10,7 @@ from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.intersection import intersect
+from services.adjustment.known_images import KnownImages
 from services.adjustment.observation_noise import found_noise
 from services.adjustment.parameters import image_parameters
 from services.conventions import CHIP_SIZE
@@ -168,7 +169,7 @@ def produce_points(
             0, options.block.min_points, "tie points: the images have nothing in common"
         )
     progress(0.5, "adjusting the block")
-    tied = _adjust(scenes, passes, ties, options)
+    tied = _adjust(scenes, passes, ties, options, neighbour=control.neighbour)
     before = intersect([scene.model for scene in scenes], ties, int(ties.point[-1]) + 1)
 
     candidates = _candidates(_with_models(scenes, tied), tied, ties, options, excluded)
@@ -188,7 +189,7 @@ def produce_points(
         progress=part_of(progress, 0.75, 0.05),
     )
     progress(0.8, "adjusting the block on its chips")
-    adjustment = _adjust(scenes, passes, measures, options, known)
+    adjustment = _adjust(scenes, passes, measures, options, known, neighbour=control.neighbour)
     for _ in range(_ROUNDS_OF_NOISE):
         by_hand = known.marks(measures.point)
         correlated = adjustment.active & ~by_hand
@@ -199,7 +200,7 @@ def produce_points(
             break
         sigma_px = np.where(by_hand, measures.sigma_px, noise.applied(measures.sigma_px))
         measures = replace(measures, sigma_px=sigma_px)
-        adjustment = _adjust(scenes, passes, measures, options, known)
+        adjustment = _adjust(scenes, passes, measures, options, known, neighbour=control.neighbour)
     active = measures.take(adjustment.active & (measures.point < len(candidates)))
     adjusted = _with_models(scenes, adjustment)
     shown = active.take(shows_chip(adjusted, active, adjustment.lon_lat_h, options.fine_gsd_m))
@@ -254,6 +255,8 @@ def _adjust(
     observations: Observations,
     options: ProductionOptions,
     control: ControlGround = NO_CONTROL,
+    *,
+    neighbour: KnownImages | None,
 ) -> BlockAdjustment:
     """The block adjustment of scenes with their models as delivered."""
     images = [
@@ -266,7 +269,14 @@ def _adjust(
         )
         for scene in scenes
     ]
-    return adjust_block(images, observations, control=control, passes=passes, options=options.block)
+    return adjust_block(
+        images,
+        observations,
+        control=control,
+        neighbour=neighbour,
+        passes=passes,
+        options=options.block,
+    )
 
 
 def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:
