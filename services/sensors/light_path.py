@@ -39,18 +39,18 @@ GEOMETRIC = LightPath()
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def refraction_lift_m(height_m: float, cos_zenith: float) -> float:
-    """Height by which refraction raises the ground, in metres: where the straight ray passes above it.
+def zenith_path_excess_m(height_m: float) -> float:
+    """Refraction lifts the ground by this, in metres, over the squared cosine of the zenith angle.
 
-    The ray is displaced by `Z tan(z) / cos(z)^2` towards the point below the satellite, with `Z` the
-    excess path at the zenith, which falls with the pressure. A straight ray at the zenith angle `z` has
-    that displacement at the height `Z / cos(z)^2` above the ground.
+    It is the excess path of light from the zenith, which falls with the pressure. Refraction displaces a
+    ray by `Z tan(z) / cos(z)^2` towards the point below the satellite; a straight ray at the zenith
+    angle `z` has that displacement at the height `Z / cos(z)^2` above the ground.
 
     Source: the integral of Snell's law over flat layers; Noerdlinger (1999), "Atmospheric refraction
     effects in Earth remote sensing".
     """
     relative_pressure = max(1.0 - _LAPSE_PER_M * height_m, 0.0) ** _PRESSURE_EXPONENT
-    return ZENITH_PATH_EXCESS_M * relative_pressure / (cos_zenith * cos_zenith)
+    return ZENITH_PATH_EXCESS_M * relative_pressure
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")

@@ -114,16 +114,20 @@ def hermite(x: Array, values: Array, rates: Array) -> PiecewisePolynomial:
 def extended(
     function: PiecewisePolynomial, range_: tuple[float, float], degree: int
 ) -> PiecewisePolynomial:
-    """The same function, which goes on by its Taylor polynomial at the first and at the last break.
+    """The same function over a range, beyond its breaks by its Taylor polynomials there.
 
-    A polynomial of degree seven must not be used beyond its samples.
+    A polynomial of degree seven must not be used beyond its samples. Pieces outside the range are
+    dropped: the fewer there are, the faster the rest is found.
 
     Args:
-        function: to be used beyond its breaks.
-        range_: where the result is used; nothing changes where the breaks cover it.
+        function: to be used over the range.
+        range_: where the result is used.
         degree: of the Taylor polynomials.
     """
-    breaks, coefficients = function.breaks, function.coefficients
+    last = len(function.coefficients) - 1
+    low, high = np.clip(np.searchsorted(function.breaks, range_, side="right") - 1, 0, last)
+    breaks = function.breaks[low : high + 2]
+    coefficients = function.coefficients[low : high + 1]
     order = coefficients.shape[2] - 1
     ends = ((0, range_[0] - breaks[0], -1.0), (-1, range_[1] - breaks[-1], 1.0))
     for piece, beyond, side in ends:

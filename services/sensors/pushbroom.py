@@ -14,7 +14,7 @@ from services.sensors.light_path import (
     LightPath,
 )
 from services.sensors.piecewise import PiecewisePolynomial
-from services.sensors.rpc import VALIDITY
+from services.sensors.rpc import VALIDITY, cubic_terms
 from services.types import Array
 
 TERRAIN_M = (-500.0, 9000.0)
@@ -25,7 +25,7 @@ MAX_SIZE = 10_000_000
 
 _CHECK_NODES = 5
 _CHECK_TOLERANCE_PX = 1e-4
-_GUESS_NODES = (9, 5, 3)
+_GUESS_NODES = (13, 7, 4)
 """Lines, samples and heights of the grid on which the first guess of a line is fitted."""
 
 
@@ -123,10 +123,16 @@ class PushbroomModel:
             refraction=1.0 if path.refraction else 0.0,
             ground_radius=0.0,
             guess_frame=np.zeros((2, 3)),
-            guess=np.zeros(10),
+            guess=np.zeros(20),
             line_slope=1.0,
         )
         return _with_guess(packed, self.height_range_m)
+
+
+def used_times(line_time: PiecewisePolynomial, lines: int) -> tuple[float, float]:
+    """The first and the last time at which the model of an image of some lines is used, seconds."""
+    first, last = sorted(line_time(np.array([-0.5 * lines - 1.0, 1.5 * lines]))[:, 0].tolist())
+    return first, last
 
 
 def check_pushbroom(model: PushbroomModel, source: str) -> PushbroomModel:
@@ -159,7 +165,7 @@ def check_pushbroom(model: PushbroomModel, source: str) -> PushbroomModel:
 
 
 def _with_guess(packed: kernels.Packed, height_range_m: tuple[float, float]) -> kernels.Packed:
-    """The model with the radius of its ground and a quadratic polynomial from ECEF to the line."""
+    """The model with the radius of its ground and a cubic polynomial from ECEF to the line."""
     centre = np.array([[(packed.lines - 1.0) / 2.0, (packed.samples - 1.0) / 2.0]])
     low, high = height_range_m
     below = kernels.locate_ecef(packed, centre, np.array([(low + high) / 2.0]))[0]
@@ -172,11 +178,10 @@ def _with_guess(packed: kernels.Packed, height_range_m: tuple[float, float]) -> 
     image = centre + np.column_stack([u, v]) * reach
     ecef = kernels.locate_ecef(packed, image, (low + high) / 2.0 + h * (high - low) / 2.0)
     valid = np.isfinite(ecef[:, 0])
-    if valid.sum() < 20:
-        return packed._replace(guess=np.concatenate([centre[0, :1], np.zeros(9)]))
+    if valid.sum() < 40:
+        return packed._replace(guess=np.concatenate([centre[0, :1], np.zeros(19)]))
     ecef, image = ecef[valid], image[valid]
     frame = np.stack([ecef.mean(axis=0), 1.0 / np.maximum(ecef.std(axis=0), 1.0)])
-    x, y, z = ((ecef - frame[0]) * frame[1]).T
-    terms = np.stack([np.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=-1)
-    guess = np.linalg.lstsq(terms, image[:, 0], rcond=1e-10)[0]
+    terms = cubic_terms((ecef - frame[0]) * frame[1])
+    guess: Array = np.linalg.lstsq(terms, image[:, 0], rcond=1e-10)[0].astype(np.float64)
     return packed._replace(guess_frame=frame, guess=guess)

@@ -10,22 +10,24 @@ from services.geodesy import WGS84_A, WGS84_B, WGS84_E2
 from services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
     height_and_vertical,
-    refraction_lift_m,
+    zenith_path_excess_m,
 )
 from services.sensors.piecewise import horner, horner_with_slope, piece_at
-from services.sensors.rpc import VALIDITY
+from services.sensors.rpc import VALIDITY, cubic
 from services.types import Array
 
-_PROJECT_TOLERANCE_PX = 1e-6
-"""The last secant step; its own error is a thousand times smaller."""
+_PROJECT_TOLERANCE_PX = 1e-3
+"""The last secant step; its own error is a thousand times smaller, or more."""
+_MOVED_PX = 1e-5
+"""A shorter step gives no slope, for rounding."""
 _PROJECT_ITERATIONS = 30
 _LOOK_TOLERANCE_PX = 1e-6
 _LOOK_ITERATIONS = 10
 _LOCATE_TOLERANCE_M = 1e-6
 """The last Newton step; its own error is a million times smaller."""
 _LOCATE_ITERATIONS = 20
-_EXACT_AFTER = 2
-"""Rounds in which the small effects of light are computed from a direction that contains them."""
+_LIGHT_ROUNDS = 2
+"""Rounds in which the effects of light are computed from a direction that contains them."""
 
 
 class Packed(NamedTuple):
@@ -40,8 +42,8 @@ class Packed(NamedTuple):
         refraction: 1, or 0 without refraction.
         ground_radius: distance of the ground at the image centre from the centre of the Earth, metres.
         guess_frame: (2, 3) centre in metres and inverse scale of ECEF positions.
-        guess: (10,) quadratic polynomial from there to the line.
-        line_slope: change of the misfit of `_row_misfit` per line, at the image centre.
+        guess: (20,) cubic polynomial from there to the line, in the order of `rpc.cubic_terms`.
+        line_slope: change per line of the tangent along the track of the ground at the image centre.
     """
 
     lines: float
@@ -67,17 +69,19 @@ class Packed(NamedTuple):
 def _pose(m: Packed, line: float, pose: Array) -> None:
     """Write the pose (5, 3) at a line: position, velocity in ECEF, and the rotation ecef_from_body.
 
-    The velocity is right only where aberration needs it.
+    The velocity is written only where aberration needs it.
     """
     piece, u = piece_at(m.line_breaks, line)
     time = horner(m.line_times, piece, 0, u)
     piece, u = piece_at(m.orbit_breaks, time)
-    for k in range(3):
-        pose[0, k], pose[1, k] = horner_with_slope(m.orbit, piece, k, u)
     if m.per_light_speed > 0.0:
         per_s = 2.0 / (m.orbit_breaks[piece + 1] - m.orbit_breaks[piece])
         for k in range(3):
-            pose[1, k] *= per_s
+            pose[0, k], slope = horner_with_slope(m.orbit, piece, k, u)
+            pose[1, k] = slope * per_s
+    else:
+        for k in range(3):
+            pose[0, k] = horner(m.orbit, piece, k, u)
     piece, u = piece_at(m.attitude_breaks, time)
     x = horner(m.attitude, piece, 0, u)
     y = horner(m.attitude, piece, 1, u)
@@ -162,13 +166,14 @@ def _meet_height(m: Packed, o: Array, d: Array, height: float, ground: Array) ->
     if not (root >= 0.0 and height > -WGS84_B / 2.0):
         return np.nan
     distance = (-along - math.sqrt(root)) / square
+    excess_m = zenith_path_excess_m(height) if m.refraction > 0.0 else 0.0
     for _ in range(_LOCATE_ITERATIONS):
         x, y, z = o[0] + distance * d[0], o[1] + distance * d[1], o[2] + distance * d[2]
         h, ux, uy, uz, tan_lat = height_and_vertical(x, y, z)
         descent = -(d[0] * ux + d[1] * uy + d[2] * uz)
         if not descent > 0.0:
             return np.nan
-        lift = refraction_lift_m(height, descent) if m.refraction > 0.0 else 0.0
+        lift = excess_m / (descent * descent)
         step = (h - height - lift) / descent
         distance += step
         if abs(step) < _LOCATE_TOLERANCE_M:
@@ -198,7 +203,7 @@ def line_of_sight(m: Packed, image: Array, height: float) -> tuple[Array, Array]
                 continue
             _, ux, uy, uz, _ = height_and_vertical(ground[0], ground[1], ground[2])
             descent = -(direction[i, 0] * ux + direction[i, 1] * uy + direction[i, 2] * uz)
-            lift = refraction_lift_m(height, descent)
+            lift = zenith_path_excess_m(height) / (descent * descent)
             origin[i, 0] -= lift * ux
             origin[i, 1] -= lift * uy
             origin[i, 2] -= lift * uz
@@ -234,15 +239,15 @@ def locate(m: Packed, image: Array, height: Array) -> Array:
     return out
 
 
-@njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _ground_point(lon_lat_h: Array, ground: Array) -> None:
-    """Write ECEF position, upward unit vector and height (7,) of a ground point (3,)."""
+@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def _ground_point(m: Packed, lon_lat_h: Array, ground: Array) -> None:
+    """Write ECEF position, upward unit vector and excess path of refraction (7,) of a ground point."""
     lon, lat = math.radians(lon_lat_h[0]), math.radians(lon_lat_h[1])
     sin_lat, cos_lat, h = math.sin(lat), math.cos(lat), lon_lat_h[2]
     ground[3] = cos_lat * math.cos(lon)
     ground[4] = cos_lat * math.sin(lon)
     ground[5] = sin_lat
-    ground[6] = h
+    ground[6] = zenith_path_excess_m(h) if m.refraction > 0.0 else 0.0
     n = WGS84_A / math.sqrt(1.0 - WGS84_E2 * sin_lat * sin_lat)
     ground[0] = (n + h) * ground[3]
     ground[1] = (n + h) * ground[4]
@@ -250,29 +255,53 @@ def _ground_point(lon_lat_h: Array, ground: Array) -> None:
 
 
 @njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _towards(m: Packed, pose: Array, ground: Array, direction: Array) -> None:
-    """Write the apparent direction (3,), not of unit length, of a ground point from a pose.
+def _light_shift(m: Packed, pose: Array, ground: Array, shift: Array) -> None:
+    """Write the vector (3,) in metres from a ground point to where it appears from a pose.
 
-    `ground` (7,) has its ECEF position, the upward unit vector there and its height.
+    `ground` is that of `_ground_point`. The shift varies so slowly along the orbit that `project`
+    computes it in its first steps only.
     """
-    dx, dy, dz = ground[0] - pose[0, 0], ground[1] - pose[0, 1], ground[2] - pose[0, 2]
+    ox, oy, oz = ground[0] - pose[0, 0], ground[1] - pose[0, 1], ground[2] - pose[0, 2]
+    dx, dy, dz = ox, oy, oz
     if m.refraction > 0.0:
         lift = 0.0
-        for _ in range(_EXACT_AFTER):
-            x, y, z = dx + lift * ground[3], dy + lift * ground[4], dz + lift * ground[5]
-            descent = -(x * ground[3] + y * ground[4] + z * ground[5]) / math.sqrt(x * x + y * y + z * z)
-            lift = refraction_lift_m(ground[6], descent)
-        dx, dy, dz = dx + lift * ground[3], dy + lift * ground[4], dz + lift * ground[5]
+        for _ in range(_LIGHT_ROUNDS):
+            dx, dy, dz = ox + lift * ground[3], oy + lift * ground[4], oz + lift * ground[5]
+            descent = -(dx * ground[3] + dy * ground[4] + dz * ground[5])
+            lift = ground[6] * (dx * dx + dy * dy + dz * dz) / (descent * descent)
+        dx, dy, dz = ox + lift * ground[3], oy + lift * ground[4], oz + lift * ground[5]
     if m.per_light_speed > 0.0 or m.turn_per_m > 0.0:
-        norm = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-        ux, uy, uz = dx * norm, dy * norm, dz * norm
+        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+        ux, uy, uz = dx / distance, dy / distance, dz / distance
         dx, dy, dz = ux, uy, uz
-        for _ in range(_EXACT_AFTER):
+        for _ in range(_LIGHT_ROUNDS):
             ax, ay, az = _aberration(m, pose, (dx, dy, dz))
             along = ux * ax + uy * ay + uz * az
             scale = along + math.sqrt(1.0 - (ax * ax + ay * ay + az * az) + along * along)
             dx, dy, dz = scale * ux - ax, scale * uy - ay, scale * uz - az
-    direction[0], direction[1], direction[2] = dx, dy, dz
+        dx, dy, dz = distance * dx, distance * dy, distance * dz
+    shift[0], shift[1], shift[2] = dx - ox, dy - oy, dz - oz
+
+
+@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def _in_body(pose: Array, direction: Array) -> tuple[float, float, float]:
+    """A direction (3,) in ECEF in the body frame of a pose."""
+    x, y, z = direction[0], direction[1], direction[2]
+    return (
+        pose[2, 0] * x + pose[3, 0] * y + pose[4, 0] * z,
+        pose[2, 1] * x + pose[3, 1] * y + pose[4, 1] * z,
+        pose[2, 2] * x + pose[3, 2] * y + pose[4, 2] * z,
+    )
+
+
+@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def _guess(m: Packed, ground: Array) -> float:
+    """The line of a ground point by the cubic polynomial of the model."""
+    f, g = m.guess_frame, m.guess
+    x = (ground[0] - f[0, 0]) * f[1, 0]
+    y = (ground[1] - f[0, 1]) * f[1, 1]
+    z = (ground[2] - f[0, 2]) * f[1, 2]
+    return cubic(g, 0, x, y, z)
 
 
 @njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
@@ -294,104 +323,120 @@ def _detector(m: Packed, across: float, start: float) -> tuple[float, float]:
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def line_slope(m: Packed, line: float, ground: Array) -> float:
-    """Change per line of the tangent along the track of a ground point (3,) in ECEF."""
+    """Change per line of the tangent along the track of a ground point (3,) in ECEF, without light."""
     pose, direction = np.empty((5, 3)), np.empty(3)
-    with_vertical = np.empty(7)
-    with_vertical[:3] = ground
-    with_vertical[6], with_vertical[3], with_vertical[4], with_vertical[5], _ = height_and_vertical(
-        ground[0], ground[1], ground[2]
-    )
     slope = 0.0
     for sign in (-1.0, 1.0):
         _pose(m, line + 0.5 * sign, pose)
-        _towards(m, pose, with_vertical, direction)
-        body = pose[2:].T @ direction
-        slope += sign * body[0] / body[2]
+        direction[:] = ground - pose[0]
+        along, _, depth = _in_body(pose, direction)
+        slope += sign * along / depth
     return slope
+
+
+@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def _tangents(
+    m: Packed, line: float, renew_shift: bool, ground: Array, work: Array
+) -> tuple[float, float]:
+    """Tangents along and across of a ground point from the pose at a line; NaN where it is behind.
+
+    `work` (7, 3) has the pose, the direction to the point and the shift by light, which is computed
+    again when `renew_shift` says so.
+    """
+    pose, direction, shift = work[:5], work[5], work[6]
+    _pose(m, line, pose)
+    if renew_shift:
+        _light_shift(m, pose, ground, shift)
+    for k in range(3):
+        direction[k] = ground[k] - pose[0, k] + shift[k]
+    along, across, depth = _in_body(pose, direction)
+    if not depth > 0.0:
+        return np.nan, np.nan
+    return along / depth, across / depth
+
+
+@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+def _project_one(m: Packed, ground: Array, work: Array) -> tuple[float, float]:
+    """Line and sample of a ground point, NaN where the secant steps leave the model."""
+    middle, reach = (m.lines - 1.0) / 2.0, VALIDITY * m.lines / 2.0
+    line = min(max(_guess(m, ground), middle - reach), middle + reach)
+    sample = (m.samples - 1.0) / 2.0
+    last, last_sample, last_misfit, slope = line, sample, 0.0, m.line_slope
+    for iteration in range(_PROJECT_ITERATIONS):
+        along, across = _tangents(m, line, iteration < _LIGHT_ROUNDS, ground, work)
+        sample, own_along = _detector(m, across, sample)
+        misfit = along - own_along
+        moved = line - last
+        if abs(moved) > _MOVED_PX:
+            slope = (misfit - last_misfit) / moved
+        step = -misfit / slope
+        if not np.isfinite(step):
+            break
+        if iteration > 0 and abs(step) < _PROJECT_TOLERANCE_PX:
+            if abs(moved) > _MOVED_PX:
+                sample += step * (sample - last_sample) / moved
+            return line + step, sample
+        last, last_sample, last_misfit = line, sample, misfit
+        line = min(max(line + step, middle - reach), middle + reach)
+    return np.nan, np.nan
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def project(m: Packed, lon_lat_h: Array) -> Array:
     """Line and sample (n, 2) of ground points (n, 3)."""
     out = np.full((len(lon_lat_h), 2), np.nan)
-    pose, direction = np.empty((5, 3)), np.empty(3)
-    ground = np.empty(7)
-    lowest = (m.lines - 1.0) / 2.0 - VALIDITY * m.lines / 2.0
-    highest = (m.lines - 1.0) / 2.0 + VALIDITY * m.lines / 2.0
-    g = m.guess
-    middle = (m.samples - 1.0) / 2.0
+    ground, work = np.empty(7), np.zeros((7, 3))
     for i in range(len(lon_lat_h)):
-        _ground_point(lon_lat_h[i], ground)
-        x = (ground[0] - m.guess_frame[0, 0]) * m.guess_frame[1, 0]
-        y = (ground[1] - m.guess_frame[0, 1]) * m.guess_frame[1, 1]
-        z = (ground[2] - m.guess_frame[0, 2]) * m.guess_frame[1, 2]
-        line = (
-            g[0]
-            + x * (g[1] + x * g[4] + y * g[5] + z * g[6])
-            + y * (g[2] + y * g[7] + z * g[8])
-            + z * (g[3] + z * g[9])
-        )
-        if not np.isfinite(line):
-            continue
-        line = min(max(line, lowest), highest)
-        sample = middle
-        last, last_misfit, slope = line, 0.0, m.line_slope
-        for iteration in range(_PROJECT_ITERATIONS):
-            _pose(m, line, pose)
-            _towards(m, pose, ground, direction)
-            bx = pose[2, 0] * direction[0] + pose[3, 0] * direction[1] + pose[4, 0] * direction[2]
-            by = pose[2, 1] * direction[0] + pose[3, 1] * direction[1] + pose[4, 1] * direction[2]
-            bz = pose[2, 2] * direction[0] + pose[3, 2] * direction[1] + pose[4, 2] * direction[2]
-            if not bz > 0.0:
-                break
-            sample, along = _detector(m, by / bz, sample)
-            misfit = bx / bz - along
-            if iteration > 0:
-                slope = (misfit - last_misfit) / (line - last)
-            step = -misfit / slope
-            if not np.isfinite(step):
-                break
-            last, last_misfit = line, misfit
-            line = min(max(line + step, lowest), highest)
-            if abs(step) < _PROJECT_TOLERANCE_PX:
-                if _inside(sample, m.samples):
-                    out[i, 0] = line
-                    out[i, 1] = sample
-                break
+        if np.isfinite(lon_lat_h[i]).all():
+            _ground_point(m, lon_lat_h[i], ground)
+            line, sample = _project_one(m, ground, work)
+            if _inside(line, m.lines) and _inside(sample, m.samples):
+                out[i, 0] = line
+                out[i, 1] = sample
     return out
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def project_derivative(m: Packed, lon_lat_h: Array, image: Array) -> Array:
-    """Derivative (n, 2, 3) of `project` by metres east, north, up, at its results (n, 2)."""
+    """Derivative (n, 2, 3) of `project` by metres east, north, up, at its results (n, 2).
+
+    The tangents along and across of a ground point equal those of its detector: their derivatives by the
+    ground, by the line (a difference over one line) and by the sample give that of the position.
+    """
     out = np.full((len(lon_lat_h), 2, 3), np.nan)
-    pose, direction = np.empty((5, 3)), np.empty(3)
-    ground = np.empty(7)
-    by_ground = np.empty((2, 3))
-    by_image = np.empty((2, 2))
-    enu = np.empty((3, 3))
+    ground, work, axis = np.empty(7), np.zeros((7, 3)), np.empty(3)
+    pose, direction = work[:5], work[5]
     for i in range(len(lon_lat_h)):
         if np.isnan(image[i, 0]):
             continue
-        _ground_point(lon_lat_h[i], ground)
-        lon = math.radians(lon_lat_h[i, 0])
-        enu[:, 0] = np.array([-math.sin(lon), math.cos(lon), 0.0])
-        enu[:, 2] = ground[3:6]
-        enu[:, 1] = np.cross(enu[:, 2], enu[:, 0])
-        by_image[:] = 0.0
+        _ground_point(m, lon_lat_h[i], ground)
+        along_line, across_line = 0.0, 0.0
         for sign in (-1.0, 1.0):
-            _pose(m, image[i, 0] + 0.5 * sign, pose)
-            _towards(m, pose, ground, direction)
-            body = pose[2:].T @ direction
-            by_image[0, 0] += sign * body[0] / body[2]
-            by_image[1, 0] += sign * body[1] / body[2]
+            along, across = _tangents(m, image[i, 0] + 0.5 * sign, True, ground, work)
+            along_line += sign * along
+            across_line += sign * across
         piece, u = piece_at(m.look_breaks, image[i, 1])
         per_px = 2.0 / (m.look_breaks[piece + 1] - m.look_breaks[piece])
-        for k in range(2):
-            by_image[k, 1] = -horner_with_slope(m.look, piece, k, u)[1] * per_px
+        along_sample = -horner_with_slope(m.look, piece, 0, u)[1] * per_px
+        across_sample = -horner_with_slope(m.look, piece, 1, u)[1] * per_px
+        inverse = -1.0 / (along_line * across_sample - along_sample * across_line)
         _pose(m, image[i, 0], pose)
-        body = pose[2:].T @ (ground[:3] - pose[0])
-        for k in range(2):
-            by_ground[k] = (pose[2:, k] - pose[2:, 2] * body[k] / body[2]) / body[2]
-        out[i] = -np.linalg.solve(by_image, by_ground @ enu)
+        for k in range(3):
+            direction[k] = ground[k] - pose[0, k]
+        along, across, depth = _in_body(pose, direction)
+        horizontal = math.sqrt(ground[3] * ground[3] + ground[4] * ground[4])
+        east_x, east_y = -ground[4] / horizontal, ground[3] / horizontal
+        for k in range(3):
+            if k == 0:
+                axis[0], axis[1], axis[2] = east_x, east_y, 0.0
+            elif k == 1:
+                axis[0], axis[1] = -ground[5] * east_y, ground[5] * east_x
+                axis[2] = horizontal
+            else:
+                axis[0], axis[1], axis[2] = ground[3], ground[4], ground[5]
+            x, y, z = _in_body(pose, axis)
+            by_along = (x - z * along / depth) / depth
+            by_across = (y - z * across / depth) / depth
+            out[i, 0, k] = inverse * (by_along * across_sample - by_across * along_sample)
+            out[i, 1, k] = inverse * (by_across * along_line - by_along * across_line)
     return out

@@ -203,7 +203,7 @@ def cubic_terms(normalised: Array) -> Array:
 
 
 @njit(inline="always", error_model="numpy")
-def _cubic(c: Array, o: int, x: float, y: float, z: float) -> float:
+def cubic(c: Array, o: int, x: float, y: float, z: float) -> float:
     """One polynomial in nested form: x lon, y lat, z height, coefficients from `c[o]` on."""
     return (
         c[o]
@@ -282,9 +282,9 @@ def _project(packed: Array, ground: Array) -> Array:
             y[i] = (ground[first + i, 1] - c[85]) * per_lat
             z[i] = (ground[first + i, 2] - c[86]) * per_h
         for i in range(size):
-            line[i] = _cubic(c, 0, x[i], y[i], z[i]) / _cubic(c, 20, x[i], y[i], z[i])
+            line[i] = cubic(c, 0, x[i], y[i], z[i]) / cubic(c, 20, x[i], y[i], z[i])
         for i in range(size):
-            sample[i] = _cubic(c, 40, x[i], y[i], z[i]) / _cubic(c, 60, x[i], y[i], z[i])
+            sample[i] = cubic(c, 40, x[i], y[i], z[i]) / cubic(c, 60, x[i], y[i], z[i])
         for i in range(size):
             inside = abs(x[i]) <= VALIDITY and abs(y[i]) <= VALIDITY and abs(z[i]) <= VALIDITY
             out[first + i, 0] = line[i] * c[82] + c[80] if inside else np.nan
@@ -297,8 +297,8 @@ def _value_and_gradient(
     c: Array, o: int, x: float, y: float, z: float
 ) -> tuple[float, float, float, float]:
     """Value of one normalised ratio, and its derivatives by x, y, z."""
-    num = _cubic(c, o, x, y, z)
-    den = _cubic(c, o + 20, x, y, z)
+    num = cubic(c, o, x, y, z)
+    den = cubic(c, o + 20, x, y, z)
     nx, ny, nz = _cubic_gradient(c, o, x, y, z)
     dx, dy, dz = _cubic_gradient(c, o + 20, x, y, z)
     inverse = 1.0 / den

@@ -23,7 +23,13 @@ from services.sensors.piecewise import (
     lagrange,
     polynomial,
 )
-from services.sensors.pushbroom import MAX_SIZE, TERRAIN_M, PushbroomModel, check_pushbroom
+from services.sensors.pushbroom import (
+    MAX_SIZE,
+    TERRAIN_M,
+    PushbroomModel,
+    check_pushbroom,
+    used_times,
+)
 from services.types import Array
 
 _PERIOD_UNITS_S = {"microsecond": 1e-6, "ms": 1e-3, "millisecond": 1e-3, "s": 1.0, "second": 1.0}
@@ -69,8 +75,8 @@ def parse_dimap_physical(text: str, source: str = "DIMAP") -> PushbroomModel:
     period_s = _PERIOD_UNITS_S[unit] * number(
         refined, "Time/Time_Stamp/LINE_PERIOD", source, (1e-9, 1e6)
     )
-    duration_s = period_s * shape[0]
-    used = (start_s - duration_s, start_s + 2.0 * duration_s)
+    line_time = polynomial(0.0, 1.0, np.array([[start_s, period_s]]))
+    used = used_times(line_time, shape[0])
 
     def times(entries: list[ElementTree.Element], name: str, needed: int) -> Array:
         """Times (n,) of entries, seconds after midnight."""
@@ -98,7 +104,7 @@ def parse_dimap_physical(text: str, source: str = "DIMAP") -> PushbroomModel:
         number(refined, f"Instrument_Biases/{name}", source, (0.0, 0.0))
     model = PushbroomModel(
         image_shape=shape,
-        line_time=polynomial(0.0, 1.0, np.array([[start_s, period_s]])),
+        line_time=line_time,
         orbit=extended(orbit, used, 2),
         attitude=extended(interpolated_attitude(attitude_s, quaternions), used, 1),
         look=polynomial(0.0, 1.0, _look(refined, source)),

@@ -13,8 +13,14 @@ from services.formats.sensor_models.xml_values import (
     single,
     whole_number,
 )
-from services.sensors.piecewise import lagrange, polynomial
-from services.sensors.pushbroom import MAX_SIZE, TERRAIN_M, PushbroomModel, check_pushbroom
+from services.sensors.piecewise import extended, lagrange, polynomial
+from services.sensors.pushbroom import (
+    MAX_SIZE,
+    TERRAIN_M,
+    PushbroomModel,
+    check_pushbroom,
+    used_times,
+)
 from services.types import Array
 
 _ROOT = "PHR_Dimap_Document"
@@ -41,9 +47,9 @@ def parse_phr_dimap(text: str, source: str = "PHRDIMAP") -> PushbroomModel:
     sensor = single(root, "Sensor_Model_Characteristics", source)
     start = single(sensor, "UTC_Sensor_Model_Range/START", source)
     midnight = midnight_before(start, source)
-    shape = tuple(
-        whole_number(root, f"Raster_Dimensions/{name}", source, (1, MAX_SIZE))
-        for name in ("NROWS", "NCOLS")
+    shape = (
+        whole_number(root, "Raster_Dimensions/NROWS", source, (1, MAX_SIZE)),
+        whole_number(root, "Raster_Dimensions/NCOLS", source, (1, MAX_SIZE)),
     )
     period_s = 1e-3 * number(sensor, "SENSOR_LINE_PERIOD", source, (1e-3, 100.0))
     points = sensor.findall("Sensor_Ephemeris/Point_List/Point")
@@ -61,10 +67,11 @@ def parse_phr_dimap(text: str, source: str = "PHRDIMAP") -> PushbroomModel:
             out[i, : len(row)] = row
         return out
 
+    line_time = polynomial(0.0, 1.0, np.array([[seconds(start, midnight, source), period_s]]))
     model = PushbroomModel(
-        image_shape=(shape[0], shape[1]),
-        line_time=polynomial(0.0, 1.0, np.array([[seconds(start, midnight, source), period_s]])),
-        orbit=lagrange(times, position),
+        image_shape=shape,
+        line_time=line_time,
+        orbit=extended(lagrange(times, position), used_times(line_time, shape[0]), 2),
         attitude=polynomial(
             number(sensor, "Sensor_Attitudes/OFFSET", source),
             number(sensor, "Sensor_Attitudes/SCALE", source, (1e-3, 1e5)),

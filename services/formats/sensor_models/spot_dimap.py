@@ -24,11 +24,16 @@ from services.sensors.piecewise import (
     linear,
     polynomial,
 )
-from services.sensors.pushbroom import MAX_SIZE, TERRAIN_M, PushbroomModel, check_pushbroom
+from services.sensors.pushbroom import (
+    MAX_SIZE,
+    TERRAIN_M,
+    PushbroomModel,
+    check_pushbroom,
+    used_times,
+)
 from services.types import Array
 
 _ANGLES = ("YAW", "PITCH", "ROLL")
-_MARGIN_S = 60.0
 _TABLE_FROM = 100
 """Detectors from which look angles are a table with straight lines, and not two ends of a row."""
 
@@ -80,13 +85,13 @@ def parse_spot_dimap(text: str, source: str = "DIMAP") -> PushbroomModel:
         lagrange(orbit_s, np.array([_vector(point, name, source) for point in points]))
         for name in ("Location", "Velocity")
     )
-    image_s = centre_s + period_s * (np.array([0.0, shape[0]]) - centre_line)
-    used = (image_s[0] - _MARGIN_S, image_s[1] + _MARGIN_S)
+    line_time = polynomial(centre_line, 1.0, np.array([[centre_s, period_s]]))
+    used = used_times(line_time, shape[0])
     angles = _angles(single(strip, "Satellite_Attitudes", source), midnight, source)
     model = PushbroomModel(
         image_shape=shape,
-        line_time=polynomial(centre_line, 1.0, np.array([[centre_s, period_s]])),
-        orbit=position,
+        line_time=line_time,
+        orbit=extended(position, used, 2),
         attitude=orbital_attitude(position, velocity, extended(angles, used, 1)),
         look=_look(strip, shape[1], source),
         height_range_m=TERRAIN_M,

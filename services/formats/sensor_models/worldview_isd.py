@@ -19,11 +19,16 @@ from services.formats.sensor_models.xml_values import (
 from services.sensors.attitude import interpolated_attitude
 from services.sensors.light_path import LightPath
 from services.sensors.piecewise import extended, lagrange, linear, polynomial
-from services.sensors.pushbroom import MAX_SIZE, TERRAIN_M, PushbroomModel, check_pushbroom
+from services.sensors.pushbroom import (
+    MAX_SIZE,
+    TERRAIN_M,
+    PushbroomModel,
+    check_pushbroom,
+    used_times,
+)
 from services.types import Array
 
 _LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=True)
-_MARGIN_S = 60.0
 
 
 def parse_worldview_isd(
@@ -81,10 +86,11 @@ def parse_worldview_isd(
     camera = [number(geometry, f"CAMERA_ATTITUDE/QCS{k}", source, (-1.0, 1.0)) for k in (1, 2, 3, 4)]
     quaternions = (Rotation.from_quat(quaternions) * Rotation.from_quat(camera)).as_quat()
     tlc_s = seconds(start, midnight, source)
-    used = (tlc_s - _MARGIN_S, tlc_s + _MARGIN_S)
+    line_time = linear(lines[:, 0], tlc_s + lines[:, 1:])
+    used = used_times(line_time, shape[0])
     model = PushbroomModel(
         image_shape=shape,
-        line_time=linear(lines[:, 0], tlc_s + lines[:, 1:]),
+        line_time=line_time,
         orbit=extended(lagrange(orbit_s, position), used, 2),
         attitude=extended(interpolated_attitude(attitude_s, quaternions), used, 1),
         look=polynomial(0.0, 1.0, _look(geometry, source)),

@@ -11,7 +11,7 @@ from services.sensors.light_path import (
     EARTH_ROTATION_RAD_S,
     SPEED_OF_LIGHT_M_S,
     LightPath,
-    refraction_lift_m,
+    zenith_path_excess_m,
 )
 from services.sensors.pushbroom import PushbroomModel
 from services.simulation.orbit import pushbroom_over
@@ -110,7 +110,7 @@ def test_refraction_agrees_with_rays_traced_through_a_spherical_atmosphere(
     bent, straight = turned_rad(index, invariant), turned_rad(1.0, invariant)
     displacement_m = (straight - bent) * (radius + ground_m)
     zenith = np.arcsin(invariant / (radius + ground_m))
-    lift_m = refraction_lift_m(ground_m, np.cos(zenith))
+    lift_m = zenith_path_excess_m(ground_m) / np.cos(zenith) ** 2
     assert lift_m * np.tan(zenith) == pytest.approx(displacement_m, rel=0.02)
 
 

@@ -53,7 +53,10 @@ def test_a_polynomial_of_samples_goes_on_by_its_value_and_rate_beyond_them() -> 
     for end, beyond in ((2.0, -0.7), (4.0, 3.1)):
         line = wave(np.array([end])) + beyond * wave.derivative(np.array([end]))
         np.testing.assert_allclose(longer(np.array([end + beyond])), line, atol=rounding)
-    assert extended(wave, (2.5, 3.5), 1).breaks is wave.breaks
+    part = extended(wave, (2.5, 3.5), 1)
+    inside = np.linspace(2.5, 3.5, 30)
+    np.testing.assert_array_equal(part(inside), wave(inside))
+    assert part.breaks[0] <= 2.5 < part.breaks[1] < part.breaks[-2] < 3.5 <= part.breaks[-1]
 
 
 def test_straight_lines_between_samples_and_one_polynomial_have_their_values() -> None:
