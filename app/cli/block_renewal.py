@@ -36,7 +36,7 @@ def renew(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Stage a version of a block with views of scenes registered on it, without vanished points.
+    """Stage a version of a block with views of registered scenes and new points, without vanished ones.
 
     Nothing changes for readers before `amers block publish`.
     """

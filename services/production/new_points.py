@@ -218,9 +218,13 @@ def _in_frame(
     views = point_views(adjusted, observations, points.lon_lat_h, np.unique(block.views.gsd_m).tolist())
     of_block, of_scenes = block.frames[0], made.points.frames[0]
     placed_m2 = of_scenes.covariance_m2 + of_block.shared_m2
+    surface = points.surface
+    if surface is not None:
+        surface = replace(surface, sigma_m=np.hypot(surface.sigma_m, np.sqrt(placed_m2[2, 2])))
     in_block = replace(
         points,
         covariance_m2=points.covariance_m2 + placed_m2,
+        surface=surface,
         frames=(replace(of_block, shared_m2=placed_m2 + of_scenes.shared_m2),),
         views=views,
     )

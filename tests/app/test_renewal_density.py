@@ -89,7 +89,7 @@ def test_a_renewal_fills_the_hole_of_a_block(
     assert document["proposed_withdrawals"] == []
 
     (old, nothing), (new, shared_m2) = of_version(database, "1"), of_version(database, "2")
-    assert document["new_points"] == len(new) - len(old) >= 6
+    assert results["new_points"] == document["new_points"] == len(new) - len(old) >= 6
     kept = {place.tobytes(): row for row, place in enumerate(old.lon_lat_h)}
     old_row = np.array([kept.get(place.tobytes(), -1) for place in new.lon_lat_h])
     is_new = old_row < 0

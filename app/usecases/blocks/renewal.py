@@ -164,12 +164,14 @@ def renew_block(
         new, note = _new_points(base, kept, seen, part_of(progress, 0.5, 0.3))
         document = _document(base, seen, renewed, vanished)
         document |= {"new_points": sum(len(one.points) for one in new), "new_points_note": note}
+        metadata = _metadata(base, seen, document)
         for one in new:
             renewed = with_new_points(renewed, one)
+            metadata = replace(metadata, frame=renewed.points.frames[0])
         typology = [base.typology[row] for row in kept] + [None] * document["new_points"]
         write_block(
             folder,
-            replace(_metadata(base, seen, document), frame=renewed.points.frames[0]),
+            metadata,
             renewed.points,
             renewed.chips,
             {},

@@ -81,6 +81,7 @@ def _run(work: Work) -> Commit:
             "points": block.n_points,
             "renews": document["renews"],
             "new_views": document["new_views"],
+            "new_points": document["new_points"],
             "proposed_withdrawals": len(document["proposed_withdrawals"]),
             "files": keys,
         }
@@ -91,11 +92,11 @@ def _run(work: Work) -> Commit:
 RENEW_BLOCK = Process(
     id="renew-block",
     title="Renew a block",
-    description="Stage a version of a block with views of scenes registered on it, without the points "
-    "that later scenes no longer find.",
+    description="Stage a version of a block with views of scenes registered on it, with new points "
+    "where it is short of them, without the points that later scenes no longer find.",
     scope=Scope.ADMIN,
     inputs=RenewBlock,
-    outputs={DOCUMENT: "What is renewed: scenes, new views, proposed withdrawals."},
+    outputs={DOCUMENT: "What is renewed: scenes, new views, new points, proposed withdrawals."},
     check=_check,
     run=_run,
     values={
@@ -106,6 +107,7 @@ RENEW_BLOCK = Process(
         "points": {"type": "integer", "title": "Points of the version"},
         "renews": {"type": "string", "title": "Version that it renews"},
         "new_views": {"type": "integer", "title": "Views added"},
+        "new_points": {"type": "integer", "title": "Points added where the block was short of them"},
         "proposed_withdrawals": {"type": "integer", "title": "Points left out as vanished"},
     },
 )

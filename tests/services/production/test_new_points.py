@@ -24,7 +24,7 @@ from services.production.renewed_views import SeeingScene, with_new_points, with
 from services.quality.stability import image_places
 from services.registration.on_points import register_scene
 from services.registration.options import RegistrationOptions
-from services.types import Array, ControlPoints
+from services.types import Array, ChipSource, ControlPoints
 from tests.services.block_with_hole import (
     HOLE_M,
     OLDER_SEED,
@@ -169,7 +169,7 @@ def as_block(made: NewPoints) -> tuple[ControlPoints, MemoryChips]:
     return points, MemoryChips(np.concatenate([made.chips(row) for row in range(n)]))
 
 
-def squares_on(points: ControlPoints, chips: MemoryChips, of: int) -> Array:
+def squares_on(points: ControlPoints, chips: ChipSource, of: int) -> Array:
     """Errors (k, 5) of later scenes on points, over what is declared, squared; corners and centre."""
     frame_m = np.mean([frame_error_m(sun) for sun in range(len(SUNS))], axis=0)
     squares = []
@@ -191,7 +191,7 @@ def test_scenes_registered_on_new_points_alone_are_as_precise_as_they_declare() 
     on_new = np.concatenate(
         [squares_on(*as_block(filled(seed)), of) for seed in SEEDS for of in SEEDS if of != seed]
     )
-    on_block = np.concatenate([squares_on(block.points, block.chips, of) for of in SEEDS])  # type: ignore[arg-type]
+    on_block = np.concatenate([squares_on(block.points, block.chips, of) for of in SEEDS])
     print(f"normalised {on_new.mean():.2f}, on the block {on_block.mean():.2f}")
     assert 0.4 < on_new.mean() < 1.5
 
