@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 
 from app.usecases.registration.result_folder import replacing
+from services.formats.addresses import without_query
 from services.formats.stac.catalogue import StacCatalogue, parse_area, read_catalogue
 from services.formats.stac.writer import write_items
 from services.formats.text_files import load_json, read_text
@@ -76,7 +77,7 @@ def run_selection(
             catalogue.images,
             selection,
             SourceFacts(
-                request.source,
+                without_query(request.source),
                 catalogue.bad,
                 catalogue.problems,
                 catalogue.older,

@@ -70,7 +70,7 @@ class Address:
 
     def __str__(self) -> str:
         """The address without its query, for messages, reports and names."""
-        return self.url if self._is_key else self.url.partition("#")[0].partition("?")[0]
+        return without_query(self.url)
 
     def __repr__(self) -> str:
         """As its text: logs of workers show the arguments of tasks."""
@@ -202,6 +202,12 @@ FilePlace = Path | Address
 
 class _AbsentError(FormatError):
     """Nothing can be read at an address, whose server answers."""
+
+
+def without_query(address: str) -> str:
+    """An address as messages and reports show it: queries of servers have signatures and tokens."""
+    is_server = address.partition("://")[0].lower() in ("http", "https")
+    return address.partition("#")[0].partition("?")[0] if is_server else address
 
 
 def file_place(text: str) -> FilePlace:

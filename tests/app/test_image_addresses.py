@@ -187,6 +187,30 @@ def test_a_path_is_never_an_address(path) -> None:
         open_raster(Path(path))
 
 
+def test_only_the_operator_s_production_makes_addresses() -> None:
+    """Nothing that the API or its workers read becomes one."""
+    root = Path(__file__).parents[2]
+    makers = {
+        str(file.relative_to(root))
+        for folder in ("app", "services")
+        for file in (root / folder).rglob("*.py")
+        if re.search(r"\b(file_place|read_item_scene)\b|\bAddress\(", file.read_text())
+    }
+    assert makers == {
+        "app/cli/image_production.py",
+        "app/usecases/image_production.py",
+        "services/formats/addresses.py",
+        "services/formats/stac/documents.py",
+        "services/formats/stac/scenes.py",
+    }
+    importers = [
+        file
+        for file in (root / "app").rglob("*.py")
+        if re.search(r"image_production|image_selection|formats\.stac", file.read_text())
+    ]
+    assert not [file for file in importers if {"api", "worker"} & set(file.relative_to(root).parts)]
+
+
 @pytest.mark.parametrize("url", ["https://me:pass-word@host/a.tif", "s3://key:pass-word@bucket/a.tif"])
 def test_a_password_in_an_address_is_refused_and_not_repeated(url) -> None:
     with pytest.raises(FormatError, match=r"an address without them expected; set the AWS_") as caught:

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 
 from services.errors import FormatError
+from services.formats.addresses import without_query
 from services.formats.stac.documents import Documents, absolute_address, json_bytes
 from services.formats.stac.items import StacImage, parse_item, parse_polygons
 from services.formats.stac.walk import walk
@@ -143,6 +144,7 @@ class _Reader:
 
     def catalogue(self, source: str) -> StacCatalogue:
         """All that was collected."""
+        source = without_query(source)
         if not self._images:
             if self._older:
                 raise FormatError(
@@ -210,7 +212,7 @@ def read_masks(documents: Documents, image: StacImage, base: str) -> shapely.Geo
     polygons: list[shapely.Geometry] = []
     for written in image.masks:
         address = documents.resolved(written, base)
-        polygons += parse_mask(documents.read(address), address)
+        polygons += parse_mask(documents.read(address), without_query(address))
     return shapely.MultiPolygon(polygons)
 
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 from urllib.parse import unquote, urljoin, urlsplit
 
 from services.errors import FormatError
-from services.formats.addresses import SCHEMES, Address
+from services.formats.addresses import SCHEMES, Address, without_query
 from services.formats.text_files import load_json
 
 LARGEST_DOCUMENT_BYTES = 512_000_000
@@ -76,7 +76,8 @@ class Documents:
             path = unquote(urlsplit(address).path if address.startswith("file:") else address)
             return _beside(base, path)
         raise FormatError(
-            f"{base}: {address:.200} leads away from the catalogue; links there are not read"
+            f"{without_query(base)}: {without_query(address):.200} leads away from the catalogue; links "
+            "there are not read"
         )
 
     def read(self, address: str, body: dict[str, Any] | None = None) -> Any:
@@ -96,11 +97,13 @@ class Documents:
             )
         if self._client is None:
             return load_json(_file_text(Path(address)), address)
-        return load_json(self._reply(address, body).decode("utf-8", "replace"), address)
+        content = self._reply(address, body).decode("utf-8", "replace")
+        return load_json(content, without_query(address))
 
     def _reply(self, address: str, body: dict[str, Any] | None) -> bytes:
         import httpx
 
+        shown = without_query(address)
         request = self._client.build_request(
             "GET" if body is None else "POST",
             address,
@@ -111,13 +114,13 @@ class Documents:
             for _ in range(_MOST_REDIRECTS):
                 reply = self._client.send(request, stream=True)
                 if not reply.has_redirect_location:
-                    return _content(reply, address)
+                    return _content(reply, shown)
                 reply.close()
                 request = reply.next_request
                 self.resolved(str(request.url), address)
         except httpx.HTTPError as error:
-            raise FormatError(f"{address}: no reply ({error or type(error).__name__})") from None
-        raise FormatError(f"{address}: more than {_MOST_REDIRECTS} redirects")
+            raise FormatError(f"{shown}: no reply ({error or type(error).__name__})") from None
+        raise FormatError(f"{shown}: more than {_MOST_REDIRECTS} redirects")
 
 
 def absolute_address(address: str, base: str) -> str:

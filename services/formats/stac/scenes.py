@@ -81,8 +81,9 @@ def image_place(item: Json, source: str) -> FilePlace:
         return place
     parts = urlsplit(address)
     if parts.scheme != "file" or parts.netloc:
+        shown = address.partition("?")[0]
         raise FormatError(
-            f"{source}: {address:.200}: a file on this machine, in a shared folder, in a bucket (s3://) "
+            f"{source}: {shown:.200}: a file on this machine, in a shared folder, in a bucket (s3://) "
             "or on a server (https://) expected"
         )
     return Path(unquote(parts.path))

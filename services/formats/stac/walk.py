@@ -7,6 +7,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from services.errors import FormatError
+from services.formats.addresses import without_query
 from services.formats.stac.documents import Documents, is_address
 from services.formats.text_files import load_json
 
@@ -112,7 +113,7 @@ def _linked(documents: Documents, start: str) -> Iterator[Found]:
         except FormatError as error:
             if address == start:
                 raise
-            yield Found(address, address, error)
+            yield Found(without_query(address), address, error)
             continue
         if document.get("type") in ("Feature", "FeatureCollection"):
             yield from _items_of(document, address)
@@ -123,11 +124,11 @@ def _linked(documents: Documents, start: str) -> Iterator[Found]:
                 try:
                     targets.append(documents.resolved(link["href"], address))
                 except FormatError as error:
-                    yield Found(address, address, error)
+                    yield Found(without_query(address), address, error)
         waiting += [target for target in reversed(targets) if target not in met]
         met.update(targets)
         if len(met) > MOST_DOCUMENTS:
-            raise FormatError(f"{start}: links to more than {MOST_DOCUMENTS} documents")
+            raise FormatError(f"{without_query(start)}: links to more than {MOST_DOCUMENTS} documents")
 
 
 def _stac_document(documents: Documents, address: str) -> dict[str, Any]:
@@ -137,8 +138,8 @@ def _stac_document(documents: Documents, address: str) -> dict[str, Any]:
     if kind in ("Feature", "FeatureCollection", "Catalog", "Collection") or is_old_catalog:
         return dict(document)
     raise FormatError(
-        f"{address}: type {kind!r:.80} found, a STAC item, item collection, catalog or collection "
-        "expected"
+        f"{without_query(address)}: type {kind!r:.80} found, a STAC item, item collection, catalog or "
+        "collection expected"
     )
 
 
@@ -155,15 +156,15 @@ def _links(document: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _items_of(document: dict[str, Any], address: str) -> Iterator[Found]:
     if document["type"] == "Feature":
-        yield Found(address, address, document)
+        yield Found(without_query(address), address, document)
         return
-    features = document.get("features")
+    features, shown = document.get("features"), without_query(address)
     if not isinstance(features, list):
-        wrong = FormatError(f"{address}: features: {features!r:.80} found, a list expected")
-        yield Found(address, address, wrong)
+        wrong = FormatError(f"{shown}: features: {features!r:.80} found, a list expected")
+        yield Found(shown, address, wrong)
         return
     for number, item in enumerate(features):
-        yield Found(f"{address}: features[{number}]", address, item)
+        yield Found(f"{shown}: features[{number}]", address, item)
 
 
 def _on_server(documents: Documents, query: dict[str, str]) -> Iterator[Found]:
@@ -180,7 +181,7 @@ def _on_server(documents: Documents, query: dict[str, str]) -> Iterator[Found]:
         # Relative addresses of a landing page refer to it as a folder.
         address = documents.resolved(search, address if "://" in search else address.rstrip("/") + "/")
     if not has_box:
-        raise FormatError(f"{address}: a search of all the Earth; state an area (--area)")
+        raise FormatError(f"{without_query(address)}: a search of all the Earth; state an area (--area)")
     yield from _pages(documents, _with_query(address, query))
 
 
@@ -194,10 +195,11 @@ def _with_query(address: str, query: dict[str, str]) -> str:
 def _pages(documents: Documents, address: str) -> Iterator[Found]:
     body: dict[str, Any] | None = None
     asked: set[str] = set()
+    shown = without_query(address)
     for _ in range(MOST_PAGES):
         page = documents.read(address, body)
         if not isinstance(page, dict) or page.get("type") != "FeatureCollection":
-            raise FormatError(f"{address}: a page of a search (FeatureCollection) expected")
+            raise FormatError(f"{shown}: a page of a search (FeatureCollection) expected")
         yield from _items_of(page, address)
         following = next((link for link in _links(page) if link["rel"] == "next"), None)
         if following is None:
@@ -211,5 +213,5 @@ def _pages(documents: Documents, address: str) -> Iterator[Found]:
         else:
             body = None
         if f"{address} {body}" in asked:
-            raise FormatError(f"{address}: the next page is one that was already read")
-    raise FormatError(f"{address}: more than {MOST_PAGES} pages; ask for a smaller area or time")
+            raise FormatError(f"{shown}: the next page is one that was already read")
+    raise FormatError(f"{shown}: more than {MOST_PAGES} pages; ask for a smaller area or time")

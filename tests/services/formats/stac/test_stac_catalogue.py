@@ -381,6 +381,25 @@ def server():
 BOX = (10.0, -1.0, 12.0, 2.0)
 
 
+def test_keys_in_addresses_are_in_no_message(server):
+    """A search with a key: a page with a broken item and a signed mask elsewhere, then no page."""
+    key = "a-key-of-mine"
+    signed = f"https://elsewhere.example/mask.json?sig={key}"
+    server.pages["/search", None] = collection(
+        item("a"), item("b", assets=mask_asset(signed)), {"type": "Feature", "id": "c"}
+    )
+    address = f"{server.address}/search?api_key={key}"
+    read = read_catalogue(address, BOX)
+    assert (names(read), read.bad) == (["a"], 2)
+    assert server.asked[0][2]["api_key"] == key
+    for words in read.problems:
+        assert key not in words
+    for path in ("none", "search?token=2&x=1"):
+        with pytest.raises(FormatError) as caught:
+            read_catalogue(f"{server.address}/{path}{'&' if '?' in path else '?'}api_key={key}", BOX)
+        assert key not in str(caught.value)
+
+
 def test_the_pages_of_a_search_are_read_to_the_end(server):
     landing = {"type": "Catalog", "links": [link("search", f"{server.address}/api/search")]}
     second = {**link("next", f"{server.address}/api/search?token=t2")}
