@@ -18,7 +18,7 @@ from services.sensors.rpc import VALIDITY, cubic_terms
 from services.types import Array
 
 TERRAIN_M = (-500.0, 9000.0)
-"""Heights of all ground on the Earth, above the ellipsoid: physical models hold everywhere."""
+"""Heights of all ground on the Earth, above the ellipsoid: rigorous models hold everywhere."""
 
 MAX_SIZE = 10_000_000
 """Largest number of lines or samples of an image."""

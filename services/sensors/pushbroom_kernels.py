@@ -116,7 +116,7 @@ def _aberration(
     the turn of the Earth while the light travels; `s` is the distance to a sphere through the ground.
     """
     ax, ay, az = 0.0, 0.0, 0.0
-    ox, oy, oz = pose[0]
+    ox, oy, oz = pose[0, 0], pose[0, 1], pose[0, 2]
     dx, dy, dz = apparent
     if m.per_light_speed > 0.0:
         ax = -m.per_light_speed * (pose[1, 0] - EARTH_ROTATION_RAD_S * oy)
@@ -336,14 +336,14 @@ def line_slope(m: Packed, line: float, ground: Array) -> float:
 
 @njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
 def _tangents(
-    m: Packed, line: float, renew_shift: bool, ground: Array, work: Array
+    m: Packed, line: float, renew_shift: bool, ground: Array, work: tuple[Array, Array, Array]
 ) -> tuple[float, float]:
     """Tangents along and across of a ground point from the pose at a line; NaN where it is behind.
 
-    `work` (7, 3) has the pose, the direction to the point and the shift by light, which is computed
-    again when `renew_shift` says so.
+    `work` has the pose (5, 3), the direction to the point (3,) and the shift by light (3,), which is
+    computed again when `renew_shift` says so.
     """
-    pose, direction, shift = work[:5], work[5], work[6]
+    pose, direction, shift = work
     _pose(m, line, pose)
     if renew_shift:
         _light_shift(m, pose, ground, shift)
@@ -356,7 +356,7 @@ def _tangents(
 
 
 @njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _project_one(m: Packed, ground: Array, work: Array) -> tuple[float, float]:
+def _project_one(m: Packed, ground: Array, work: tuple[Array, Array, Array]) -> tuple[float, float]:
     """Line and sample of a ground point, NaN where the secant steps leave the model."""
     middle, reach = (m.lines - 1.0) / 2.0, VALIDITY * m.lines / 2.0
     line = min(max(_guess(m, ground), middle - reach), middle + reach)
@@ -385,9 +385,9 @@ def _project_one(m: Packed, ground: Array, work: Array) -> tuple[float, float]:
 def project(m: Packed, lon_lat_h: Array) -> Array:
     """Line and sample (n, 2) of ground points (n, 3)."""
     out = np.full((len(lon_lat_h), 2), np.nan)
-    ground, work = np.empty(7), np.zeros((7, 3))
+    ground, work = np.empty(7), (np.empty((5, 3)), np.empty(3), np.zeros(3))
     for i in range(len(lon_lat_h)):
-        if np.isfinite(lon_lat_h[i]).all():
+        if math.isfinite(lon_lat_h[i, 0] + lon_lat_h[i, 1] + lon_lat_h[i, 2]):
             _ground_point(m, lon_lat_h[i], ground)
             line, sample = _project_one(m, ground, work)
             if _inside(line, m.lines) and _inside(sample, m.samples):
@@ -404,8 +404,8 @@ def project_derivative(m: Packed, lon_lat_h: Array, image: Array) -> Array:
     ground, by the line (a difference over one line) and by the sample give that of the position.
     """
     out = np.full((len(lon_lat_h), 2, 3), np.nan)
-    ground, work, axis = np.empty(7), np.zeros((7, 3)), np.empty(3)
-    pose, direction = work[:5], work[5]
+    pose, direction, axis, ground = np.empty((5, 3)), np.empty(3), np.empty(3), np.empty(7)
+    work = (pose, direction, np.zeros(3))
     for i in range(len(lon_lat_h)):
         if np.isnan(image[i, 0]):
             continue

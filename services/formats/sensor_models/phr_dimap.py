@@ -1,4 +1,4 @@
-"""PHRDIMAP: the physical model of the primary Pléiades products of CNES (`PHR_Dimap_Document`)."""
+"""PHRDIMAP: the rigorous model of the primary Pléiades products of CNES (`PHR_Dimap_Document`)."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ _ROOT = "PHR_Dimap_Document"
 
 
 def parse_phr_dimap(text: str, source: str = "PHRDIMAP") -> PushbroomModel:
-    """The physical model of a PHRDIMAP document.
+    """The rigorous model of a PHRDIMAP document.
 
     The document has the model of an ideal sensor: quaternions as polynomials of time, one straight row
     of detectors, an ephemeris in the Earth-fixed frame. The centre of the first line has the time START.

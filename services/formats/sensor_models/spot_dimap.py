@@ -1,4 +1,4 @@
-"""DIMAP version 1: the physical model of SPOT 1 to 5 scenes of level 1A."""
+"""DIMAP version 1: the rigorous model of SPOT 1 to 5 scenes of level 1A."""
 
 from datetime import datetime
 from xml.etree import ElementTree
@@ -39,7 +39,7 @@ _TABLE_FROM = 100
 
 
 def parse_spot_dimap(text: str, source: str = "DIMAP") -> PushbroomModel:
-    """The physical model of a DIMAP document of SPOT 1 to 5, for its first band.
+    """The rigorous model of a DIMAP document of SPOT 1 to 5, for its first band.
 
     Look angles are those of the scene's mirror step. The attitude is relative to the orbit: corrected by
     the star tracker where the product has it (SPOT 5), otherwise from the first measured angles and the
@@ -65,7 +65,7 @@ def parse_spot_dimap(text: str, source: str = "DIMAP") -> PushbroomModel:
     level = (single(root, "Data_Processing/PROCESSING_LEVEL", source).text or "").strip()
     if level != "1A":
         raise FormatError(
-            f"{source}: PROCESSING_LEVEL: {level[:20]!r} found, '1A' expected: the physical model is "
+            f"{source}: PROCESSING_LEVEL: {level[:20]!r} found, '1A' expected: the rigorous model is "
             "that of images before resampling"
         )
     shape = (

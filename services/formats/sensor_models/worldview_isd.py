@@ -1,4 +1,4 @@
-"""WorldView ISD: the physical model of basic (1B) products of WorldView satellites."""
+"""WorldView ISD: the rigorous model of basic (1B) products of WorldView satellites."""
 
 from xml.etree import ElementTree
 
@@ -34,7 +34,7 @@ _LIGHT_PATH = LightPath(velocity_aberration=True, light_time=True, refraction=Tr
 def parse_worldview_isd(
     text: str, source: str = "ISD", light_path: LightPath = _LIGHT_PATH
 ) -> PushbroomModel:
-    """The physical model of the XML of a basic WorldView product.
+    """The rigorous model of the XML of a basic WorldView product.
 
     The attitude is that of the camera at the time of a line, without aberration, light time and
     refraction: the RPC of the product contains these effects.

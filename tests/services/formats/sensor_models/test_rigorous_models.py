@@ -1,4 +1,4 @@
-"""Readers of physical models find the satellite that wrote the metadata, or say what is wrong."""
+"""Readers of rigorous models find the satellite that wrote the metadata, or say what is wrong."""
 
 import re
 from collections.abc import Callable
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from services.errors import FormatError
-from services.formats.sensor_models.dimap_physical import parse_dimap_physical
+from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
 from services.formats.sensor_models.phr_dimap import parse_phr_dimap
-from services.formats.sensor_models.physical_model import read_physical_model
+from services.formats.sensor_models.rigorous_model import read_rigorous_model
 from services.formats.sensor_models.spot_dimap import parse_spot_dimap
 from services.formats.sensor_models.worldview_isd import parse_worldview_isd
 from services.sensors.light_path import GEOMETRIC, LightPath
@@ -25,7 +25,7 @@ PRODUCTS: dict[str, tuple[Writer, Reader, LightPath]] = {
     "PHRDIMAP": (simulated.phr_dimap, parse_phr_dimap, GEOMETRIC),
     "SPOT 5": (simulated.spot5_dimap, parse_spot_dimap, GEOMETRIC),
     "SPOT 4": (simulated.spot4_dimap, parse_spot_dimap, GEOMETRIC),
-    "DIMAP 2": (simulated.dimap_v2, parse_dimap_physical, GEOMETRIC),
+    "DIMAP 2": (simulated.dimap_v2, parse_dimap_rigorous, GEOMETRIC),
 }
 a_thousandth_of_a_pixel = 1e-3
 """Times in the metadata have seven decimals: 0.05 microseconds are 0.0005 lines."""
@@ -117,12 +117,12 @@ def test_the_format_of_a_file_is_recognised(product: str, tmp_path: Path) -> Non
     path.write_text(text)
     image = np.array([[10.0, 20.0]])
     height = np.array([1000.0])
-    found = read_physical_model(path).locate(image, height)
+    found = read_rigorous_model(path).locate(image, height)
     np.testing.assert_array_equal(found, read(text, "METADATA.DIM").locate(image, height))
 
 
-def test_a_file_without_a_physical_model_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_a_rigorous_model_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "RPC.XML"
     path.write_text("<Dimap_Document><METADATA_FORMAT version='3.0'/></Dimap_Document>")
     with pytest.raises(FormatError, match=re.escape("<Dimap_Document> of version unknown found")):
-        read_physical_model(path)
+        read_rigorous_model(path)

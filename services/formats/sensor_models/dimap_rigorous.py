@@ -1,4 +1,4 @@
-"""DIMAP version 2: the physical model of SPOT 6/7 and Pléiades products that have `Refined_Model`."""
+"""DIMAP version 2: the rigorous model of SPOT 6/7 and Pléiades products that have `Refined_Model`."""
 
 from xml.etree import ElementTree
 
@@ -36,8 +36,8 @@ _PERIOD_UNITS_S = {"microsecond": 1e-6, "ms": 1e-3, "millisecond": 1e-3, "s": 1.
 _MAX_DEGREE = 9
 
 
-def parse_dimap_physical(text: str, source: str = "DIMAP") -> PushbroomModel:
-    """The physical model of a DIMAP document of version 2, for its first band.
+def parse_dimap_rigorous(text: str, source: str = "DIMAP") -> PushbroomModel:
+    """The rigorous model of a DIMAP document of version 2, for its first band.
 
     The first line has the time START. Orbit and attitude are in the Earth-fixed frame. The frame corners
     of SPOT 6 in the document are reproduced without aberration, light time and refraction.

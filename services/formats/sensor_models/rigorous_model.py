@@ -1,10 +1,10 @@
-"""The physical model of a product, whichever of the supported formats its metadata have."""
+"""The rigorous model of a product, whichever of the supported formats its metadata have."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 from services.errors import FormatError
-from services.formats.sensor_models.dimap_physical import parse_dimap_physical
+from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
 from services.formats.sensor_models.phr_dimap import parse_phr_dimap
 from services.formats.sensor_models.spot_dimap import parse_spot_dimap
 from services.formats.sensor_models.worldview_isd import parse_worldview_isd
@@ -16,13 +16,13 @@ _READERS: dict[tuple[str, str], Callable[[str, str], PushbroomModel]] = {
     ("PHR_Dimap_Document", ""): parse_phr_dimap,
     ("isd", ""): parse_worldview_isd,
     ("Dimap_Document", "1"): parse_spot_dimap,
-    ("Dimap_Document", "2"): parse_dimap_physical,
+    ("Dimap_Document", "2"): parse_dimap_rigorous,
 }
 """Readers by root element and major version of DIMAP."""
 
 
-def read_physical_model(path: Path) -> PushbroomModel:
-    """The physical model in the metadata of a product.
+def read_rigorous_model(path: Path) -> PushbroomModel:
+    """The rigorous model in the metadata of a product.
 
     Read are PHRDIMAP (CNES), DIMAP of version 1 (SPOT 1 to 5, level 1A) and of version 2 (SPOT 6/7,
     Pléiades) and the XML of basic WorldView products.
