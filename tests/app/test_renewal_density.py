@@ -1,7 +1,7 @@
 """A renewal fills a hole of a block from scenes that were registered on it; the other points stay."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,16 +59,33 @@ def of_version(database: Database, version: str) -> tuple[ControlPoints, Array]:
         return points_of_block(connection, number).points, document.metadata.frame.shared_m2
 
 
-def test_a_renewal_fills_the_hole_of_a_block(
+@dataclass(frozen=True)
+class Holed:
+    """A published block with a hole, and scenes registered on it by jobs.
+
+    Attributes:
+        outline: of the block.
+        run: runs a process to its end as an administrator.
+        headers: of the administrator.
+        jobs: that registered the scenes.
+    """
+
+    outline: Array
+    run: Callable[..., Any]
+    headers: dict[str, str]
+    jobs: list[str]
+
+
+@pytest.fixture
+def holed(
     dsn: str,
     client: TestClient,
     bearer: Callable[[str], dict[str, str]],
     database: Database,
     settings: Settings,
     storage: Storage,
-    monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
-) -> None:
+) -> Holed:
     outline = publish_block_with_hole(dsn, storage, tmp_path / "holed")
     admin = bearer("admin")
     run = job_runner(client, database, settings, admin)
@@ -81,10 +98,17 @@ def test_a_renewal_fills_the_hole_of_a_block(
         registered = run("register-scene", scene=scene, options={"max_points": 0})
         assert registered["status"] == "successful", registered
         jobs.append(registered["jobID"])
-    renewed = run("renew-block", block="holed", jobs=jobs)
+    return Holed(outline, run, admin, jobs)
+
+
+def test_a_renewal_fills_the_hole_of_a_block(
+    holed: Holed, client: TestClient, database: Database
+) -> None:
+    renewed = holed.run("renew-block", block="holed", jobs=holed.jobs)
     assert renewed["status"] == "successful", renewed
-    results = client.get(f"/jobs/{renewed['jobID']}/results", headers=admin).json()
-    document: dict[str, Any] = client.get(results["renewal.json"]["href"], headers=admin).json()
+    results = client.get(f"/jobs/{renewed['jobID']}/results", headers=holed.headers).json()
+    page = client.get(results["renewal.json"]["href"], headers=holed.headers)
+    document: dict[str, Any] = page.json()
     assert "shown by two scenes" in document["new_points_note"]
     assert document["proposed_withdrawals"] == []
 
@@ -95,7 +119,7 @@ def test_a_renewal_fills_the_hole_of_a_block(
     is_new = old_row < 0
     assert is_new.sum() == document["new_points"]
     assert (new.covariance_m2[~is_new] == old.covariance_m2[old_row[~is_new]]).all()
-    enu = east_north_up(new.lon_lat_h[is_new], np.array([*outline.mean(axis=0), 0.0]))
+    enu = east_north_up(new.lon_lat_h[is_new], np.array([*holed.outline.mean(axis=0), 0.0]))
     assert (np.abs(enu[:, :2]) < HOLE_M).all(axis=1).sum() >= 6
     of_view = np.repeat(np.arange(len(new)), np.diff(new.views.start))
     names = np.array([image.image_id for image in new.views.images])[new.views.image]
@@ -106,11 +130,20 @@ def test_a_renewal_fills_the_hole_of_a_block(
     own_m2 = new.covariance_m2[is_new] - shared_m2
     assert np.median(np.linalg.eigvalsh(own_m2)[:, 0]) > 0.0
 
+
+@pytest.mark.endurance
+def test_the_command_adds_the_points_that_the_job_adds(
+    holed: Holed, database: Database, dsn: str, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renewed = holed.run("renew-block", block="holed", jobs=holed.jobs)
+    assert renewed["status"] == "successful", renewed
     monkeypatch.setenv("AMERS_DATABASE_URL", dsn)
     monkeypatch.setenv("AMERS_DATA_FOLDER", str(settings.data_folder))
-    words = ["block", "renew", "holed", "--job", jobs[0], "--job", jobs[1], "--version", "by-command"]
+    words = ["block", "renew", "holed", "--version", "by-command"]
+    words += [word for job in holed.jobs for word in ("--job", job)]
     printed = CliRunner().invoke(amers, words)
     assert printed.exit_code == 0, printed.output
-    again, _ = of_version(database, "by-command")
-    np.testing.assert_array_equal(again.lon_lat_h, new.lon_lat_h)
-    np.testing.assert_array_equal(again.covariance_m2, new.covariance_m2)
+    (by_job, _), (by_command, _) = of_version(database, "2"), of_version(database, "by-command")
+    assert len(by_job) > len(of_version(database, "1")[0])
+    np.testing.assert_array_equal(by_command.lon_lat_h, by_job.lon_lat_h)
+    np.testing.assert_array_equal(by_command.covariance_m2, by_job.covariance_m2)
