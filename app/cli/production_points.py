@@ -1,4 +1,4 @@
-"""`amers production points`: a block of the points of another base, with chips from images."""
+"""`amers production points`: a block of the points of another base, with their chips or from images."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +12,7 @@ from app.cli.progress import shown_progress
 from app.usecases.points_production import KnownPointFiles, run_points_production
 from app.usecases.production import BlockIdentity
 from app.usecases.terrain_file import TerrainFile
+from services.formats.gcp.csv_points import PIXEL_ORIGINS
 from services.formats.gcp.text_formats import ECEF, LAT_LON_HEIGHT
 from services.production.from_points import KnownPointOptions
 
@@ -26,14 +27,24 @@ def points(
         ),
     ],
     *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     images: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Option(
             "--images",
             help="Image with a registered model, or on a map; repeat, the most accurate first.",
         ),
-    ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    ] = None,
+    chips: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database."
+        ),
+    ] = None,
+    chip_origin: Annotated[
+        str | None,
+        typer.Option(help=f"Origin of the pixels of GCPLib's chips: {', '.join(PIXEL_ORIGINS)}."),
+    ] = None,
     vertical: Annotated[
         str | None,
         typer.Option(help="Vertical datum of the points: ellipsoid, EGM96, EGM2008, EPSG:…"),
@@ -103,11 +114,13 @@ def points(
     ] = "proprietary",
     as_json: AsJson = False,
 ) -> None:
-    """Make a block of the points of another base, with chips from images that show them."""
+    """Make a block of the points of another base, with its own chips or from images that show them."""
     fine_m, coarse_m = (None, None) if gsd_m is None else sampling_pair(gsd_m)
     files = KnownPointFiles(
         points=file,
-        images=tuple(images),
+        images=tuple(images or ()),
+        chips=chips,
+        chip_origin=chip_origin,
         stated=stated_by_caller(geoid or vertical, crs, columns, sigma_axes),
         point_sigma_m=sigma_pair(point_sigma_m, "--point-sigma-m"),
         terrain=None if dem is None else TerrainFile(dem, dem_vertical, dem_geoid),

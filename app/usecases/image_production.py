@@ -224,7 +224,7 @@ def _metadata(
     relative, n_points = production.relative_accuracy, len(production.points)
     return block_metadata(
         identity,
-        scenes,
+        [scene.acquisition for scene in scenes],
         production.points,
         description=f"{n_points} ground control points with chips, from {len(scenes)} images",
         outline=production.outline,

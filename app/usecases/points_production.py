@@ -1,9 +1,10 @@
-"""Make a block of the points of another base: read them, cut chips from images, write the folder."""
+"""Make a block of the points of another base: read them, give them chips, write the folder."""
 
 import math
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from app.usecases.production import (
     refuse_existing,
 )
 from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
-from services.formats.block.document import BlockSpecification
+from services.formats.block.document import AccuracyFigure, BlockMetadata, BlockSpecification
 from services.formats.block.writer import write_block
+from services.formats.gcp.base_chips import open_base_chip, read_base_chips
 from services.formats.gcp.reader import StatedByCaller, read_ground_points
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
+from services.production.from_chips import OwnChips, produce_points_with_chips
 from services.production.from_points import KnownPointOptions, KnownPoints, produce_known_points
 from services.sensors.rpc import RpcModel
 from services.types import Frame, GroundPoints, Progress, no_progress, part_of
@@ -28,11 +31,14 @@ from services.types import Frame, GroundPoints, Progress, no_progress, part_of
 
 @dataclass(frozen=True)
 class KnownPointFiles:
-    """Points of another base in a file, and the images that give them chips.
+    """Points of another base in a file, and the images or the folder that give them chips.
 
     Attributes:
         points: in any format of `services.formats.gcp.reader`.
-        images: with registered models, or ortho-images; the most accurate first.
+        images: with registered models, or ortho-images; the most accurate first. None where the base has
+            chips of its own.
+        chips: folder of the chips of the base; None where images give them.
+        chip_origin: see `services.formats.gcp.base_chips.read_base_chips`.
         stated: what the file of the points does not state.
         point_sigma_m: horizontal and up, one standard deviation, of points whose file states none.
         terrain: gives the heights of points without any.
@@ -45,7 +51,9 @@ class KnownPointFiles:
     """
 
     points: Path
-    images: tuple[Path, ...]
+    images: tuple[Path, ...] = ()
+    chips: Path | None = None
+    chip_origin: str | None = None
     stated: StatedByCaller = field(default_factory=StatedByCaller)
     point_sigma_m: tuple[float, float] | None = None
     terrain: TerrainFile | None = None
@@ -66,7 +74,7 @@ def run_points_production(
     """Make a block of points of another base and write its folder.
 
     Args:
-        files: the points and the images.
+        files: the points, and the images or their own chips.
         folder: of the block; must not exist.
         identity: of the block.
         options: of the points.
@@ -77,26 +85,21 @@ def run_points_production(
         ComputationError: too few points have chips.
     """
     refuse_existing(folder)
+    _check_sources(files, options)
     ground = _ground_points(files)
-    bands = None if files.bands is None else parse_bands(files.bands)
     frame = Frame.from_sigmas(_or_nan(files.frame_sigma_m), _or_nan(files.frame_sigma_up_m))
+    make = part_of(progress, 0.0, 0.8)
     with ExitStack() as stack:
-        scenes = []
-        for image in files.images:
-            scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands))
-            stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
-        production = produce_known_points(ground, scenes, frame, options, part_of(progress, 0.0, 0.8))
-        n_points = len(production.points)
-        metadata = block_metadata(
-            identity,
-            scenes,
-            production.points,
-            description=f"{n_points} points of {files.points.name}, chips from {len(scenes)} images",
-            outline=production.outline,
-            specification=BlockSpecification(production.gsds_m, fewest_views(production.points), None),
-            options=asdict(options) | {"points": files.points.name, "left_out": production.left_out},
-            accuracy=image_accuracy(production.points, production.local_sigma_m, len(scenes)),
-        )
+        if files.chips is not None:
+            own = _own_chips(files.points, files.chips, files.chip_origin)
+            production = produce_points_with_chips(ground, own, frame, make)
+        else:
+            bands = None if files.bands is None else parse_bands(files.bands)
+            scenes = []
+            for image in files.images:
+                scenes.append(read_scene(image, sigma_m=files.sigma_m, bands=bands))
+                stack.callback(scenes[-1].image.close)  # type: ignore[attr-defined]
+            production = produce_known_points(ground, scenes, frame, options, make)
         models = {
             scene.acquisition.image_id: scene.model
             for scene in production.scenes
@@ -104,13 +107,72 @@ def run_points_production(
         }
         write_block(
             folder,
-            metadata,
+            _metadata(files, identity, production, options),
             production.points,
             production.chips,
             models,
             progress=part_of(progress, 0.8, 0.2),
         )
     return production
+
+
+def _check_sources(files: KnownPointFiles, options: KnownPointOptions) -> None:
+    """Refuse images and chips together, neither of them, and options of the other one."""
+    if bool(files.images) == (files.chips is not None):
+        raise InputError(
+            f"{files.points.name}: either images that show its points (--images) or the folder of its "
+            "own chips (--chips) is expected"
+        )
+    of_images = (files.sigma_m, files.bands, options.fine_gsd_m)
+    if files.chips is not None and of_images != (None, None, None):
+        raise InputError(
+            f"{files.points.name}: --sigma-m, --bands and --gsd-m are for images; with the chips of the "
+            "base (--chips), leave them out"
+        )
+    if files.chips is None and files.chip_origin is not None:
+        raise InputError(f"{files.points.name}: --chip-origin is for --chips; leave it out")
+
+
+def _own_chips(points: Path, folder: Path, origin: str | None) -> OwnChips:
+    chips = read_base_chips(points, folder, origin)
+    images = {chip.acquisition.image_id: chip.acquisition for chip in chips}
+    number = {name: row for row, name in enumerate(images)}
+    return OwnChips(
+        point_id=np.array([chip.point_id for chip in chips], dtype=np.str_),
+        image=np.array([number[chip.acquisition.image_id] for chip in chips], dtype=np.int64),
+        images=tuple(images.values()),
+        open=lambda k: open_base_chip(chips[k]),
+    )
+
+
+def _metadata(
+    files: KnownPointFiles, identity: BlockIdentity, production: KnownPoints, options: KnownPointOptions
+) -> BlockMetadata:
+    points = production.points
+    stated: dict[str, Any] = {"points": files.points.name, "left_out": production.left_out}
+    if files.chips is None:
+        chips = f"from {len(production.scenes)} images"
+        accuracy = image_accuracy(points, production.local_sigma_m, len(production.scenes))
+        stated = asdict(options) | stated
+    else:
+        chips = "of the base itself"
+        frame_m = points.frames[0].sigma_m
+        of_base = "the stated accuracy of the base, not measured"
+        accuracy = ()
+        if math.isfinite(frame_m):
+            accuracy = (AccuracyFigure("absolute", "frame_sigma_m", frame_m, len(points), of_base),)
+        if files.chip_origin is not None:
+            stated["chip_origin"] = files.chip_origin
+    return block_metadata(
+        identity,
+        points.views.images,
+        points,
+        description=f"{len(points)} points of {files.points.name}, chips {chips}",
+        outline=production.outline,
+        specification=BlockSpecification(production.gsds_m, fewest_views(points), None),
+        options=stated,
+        accuracy=accuracy,
+    )
 
 
 def _ground_points(files: KnownPointFiles) -> GroundPoints:

@@ -24,7 +24,7 @@ from services.production.from_ortho import (
     OrthoPoints,
     produce_ortho_points,
 )
-from services.types import Array, ControlPoints, Progress, no_progress, part_of
+from services.types import Acquisition, Array, ControlPoints, Progress, no_progress, part_of
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _ortho_metadata(
     n_images = f"{len(scenes)} ortho-images" if len(scenes) > 1 else "one ortho-image"
     return block_metadata(
         identity,
-        scenes,
+        [scene.acquisition for scene in scenes],
         production.points,
         description=f"{n_points} ground control points with chips, from {n_images}",
         outline=production.outline,
@@ -192,7 +192,7 @@ def image_accuracy(
 
 def block_metadata(
     identity: BlockIdentity,
-    scenes: Sequence[Scene],
+    images: Sequence[Acquisition],
     points: ControlPoints,
     *,
     description: str,
@@ -202,7 +202,7 @@ def block_metadata(
     accuracy: tuple[AccuracyFigure, ...],
 ) -> BlockMetadata:
     """What a block states of itself: its identity, images, outline, specification and accuracy."""
-    dates = [s.acquisition.acquired_at for s in scenes if s.acquisition.acquired_at is not None]
+    dates = [image.acquired_at for image in images if image.acquired_at is not None]
     return BlockMetadata(
         id=identity.id,
         version=identity.version,
@@ -215,7 +215,7 @@ def block_metadata(
         provenance=Provenance(
             software="amers",
             version=version("amers"),
-            sources=tuple(scene.acquisition.image_id for scene in scenes),
+            sources=tuple(image.image_id for image in images),
             options=options,
         ),
         epoch=None if not dates else _decimal_year(max(dates)),

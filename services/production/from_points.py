@@ -27,7 +27,7 @@ from services.types import (
     part_of,
 )
 
-_MIN_POINTS = 6
+MIN_POINTS = 6
 """Fewest points of a block."""
 
 NO_HEIGHT = "no height"
@@ -66,9 +66,10 @@ class KnownPoints:
     Attributes:
         points: as in `Production`.
         chips: from the row of a point to its chips, (views, 101, 101) uint16; 0 is nodata.
-        gsds_m: ground samplings of the chips, fine and coarse, metres.
+        gsds_m: ground samplings of the chips, finest first, metres.
         outline: (m, 2) lon, lat of a rectangle that contains the points, counter-clockwise, not closed.
-        scenes: the images, with models that are shifted onto the earlier ones.
+        scenes: the images, with models that are shifted onto the earlier ones; none when the base has
+            chips of its own.
         source_id: (n,) id of each point in its own base.
         left_out: number of points left out, by the reason.
         shift_m: (k, 2) east, north, by which each image lay off the earlier ones.
@@ -78,7 +79,7 @@ class KnownPoints:
 
     points: ControlPoints
     chips: Callable[[int], ChipArray]
-    gsds_m: tuple[float, float]
+    gsds_m: tuple[float, ...]
     outline: Array
     scenes: list[Scene]
     source_id: StrArray
@@ -114,11 +115,12 @@ def produce_known_points(
         InputError: a point has no sigmas, two images have one name, or the samplings are wrong.
         NotEnoughPoints: too few points have chips; the message counts the others by their reason.
     """
-    _check(ground, scenes)
+    check_sigmas(ground)
+    check_image_names(scenes)
     fine_m, coarse_m = _gsds_m(scenes, options)
     reason = np.full(len(ground), "", dtype=object)
     reason[np.isnan(ground.lon_lat_h).any(axis=1)] = NO_HEIGHT
-    reason[_repeated(ground.lon_lat_h) & (reason == "")] = SAME_PLACE
+    reason[repeated_places(ground.lon_lat_h) & (reason == "")] = SAME_PLACE
     rows = np.flatnonzero(reason == "")
     agreed = agreed_views(scenes, ground.lon_lat_h[rows], fine_m, progress=part_of(progress, 0.0, 0.7))
     saliency = np.zeros(len(rows))
@@ -135,9 +137,9 @@ def produce_known_points(
     reason[rows] = of_rows
     taken = np.flatnonzero(of_rows == "")
     left_out = dict(Counter(reason[reason != ""].tolist()).most_common())
-    if len(taken) < _MIN_POINTS:
+    if len(taken) < MIN_POINTS:
         counts = ", ".join(f"{count} {why}" for why, count in left_out.items())
-        raise NotEnoughPoints(len(taken), _MIN_POINTS, f"of {len(ground)} points: {counts}")
+        raise NotEnoughPoints(len(taken), MIN_POINTS, f"of {len(ground)} points: {counts}")
     lon_lat_h = ground.lon_lat_h[rows[taken]]
     points = detail_points(
         agreed,
@@ -162,7 +164,8 @@ def produce_known_points(
     )
 
 
-def _check(ground: GroundPoints, scenes: Sequence[Scene]) -> None:
+def check_sigmas(ground: GroundPoints) -> None:
+    """Raise `InputError` when a point has no sigmas."""
     unknown = np.isnan(ground.sigma_m)
     if unknown.any():
         row = int(np.flatnonzero(unknown.any(axis=1))[0])
@@ -172,7 +175,6 @@ def _check(ground: GroundPoints, scenes: Sequence[Scene]) -> None:
             f"no sigma {', '.join(axes)}: state it (--point-sigma-m HORIZONTAL,UP); for an ASP file, "
             "state the axes of its sigmas (--sigma-axes) where you know them"
         )
-    check_image_names(scenes)
 
 
 def _gsds_m(scenes: Sequence[Scene], options: KnownPointOptions) -> tuple[float, float]:
@@ -194,7 +196,7 @@ def _inside(scenes: Sequence[Scene], lon_lat_h: Array, gsd_m: float) -> BoolArra
     return inside
 
 
-def _repeated(lon_lat_h: Array) -> BoolArray:
+def repeated_places(lon_lat_h: Array) -> BoolArray:
     """Which points (n, 3) have the place of an earlier one."""
     first = np.unique(lon_lat_h, axis=0, return_index=True)[1]
     repeated = np.ones(len(lon_lat_h), dtype=bool)

@@ -23,6 +23,7 @@ from services.formats.block.tables import (
     read_views,
 )
 from services.formats.chips.npy_files import ChipFile, read_chip_file
+from services.formats.members import folder_member
 from services.types import ChipArray, ControlPoints, IntArray, Views
 
 
@@ -124,17 +125,7 @@ def block_member(folder: Path, name: str) -> Path:
     Raises:
         FormatError: the name leads out of the folder or through a symbolic link.
     """
-    parts = name.split("/")
-    if not name or name.startswith("/") or "\\" in name or {"", ".", ".."} & set(parts) or "\0" in name:
-        raise FormatError(f"{name!r:.200} found, a relative path inside the block expected")
-    path = Path(folder)
-    for part in parts:
-        path = path / part
-        if path.is_symlink():
-            raise FormatError(
-                f"{name!r:.200}: leads through a symbolic link; replace the link by the file"
-            )
-    return path
+    return folder_member(folder, name, "the block")
 
 
 class FolderChips:

@@ -46,13 +46,8 @@ def parse_copernicus(
             not that of its longitude and latitude.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
-    document = load_json(text, source)
-    root = document.get(COPERNICUS_KEY) if isinstance(document, dict) else None
-    if not isinstance(root, dict) or "GCP" not in root:
-        raise FormatError(f"{source}: expected {COPERNICUS_KEY} with a list GCP")
-    gcps = root["GCP"] if isinstance(root["GCP"], list) else [root["GCP"]]
     points: dict[str, tuple[float, float, float]] = {}
-    for count, gcp in enumerate(gcps, start=1):
+    for count, gcp in enumerate(_gcps(text, source), start=1):
         where = f"{source}, GCP {count}"
         name, position = _point(gcp, where)
         if points.setdefault(name, position) != position:
@@ -62,6 +57,46 @@ def parse_copernicus(
             )
     ground = to_wgs84(coordinate_array(list(points.values())), WGS84_3D.to_2d(), heights, source)
     return marked_points(list(points), ground, np.full((len(points), 2), np.nan))
+
+
+def copernicus_chips(text: str, source: str = "Copernicus GCP database") -> list[tuple[str, int, str]]:
+    """The chips of a file of the database: ID of the point, number of the measure, name of the file.
+
+    A measure without a name has the chip `{ID}_00.TIF`, as in the software that reads the database. A
+    chip that the file repeats is listed once.
+
+    Args:
+        text: contents of the file.
+        source: its name, for messages.
+
+    Raises:
+        FormatError: the document or a point has another form.
+    """
+    chips: dict[tuple[str, str], int] = {}
+    for count, gcp in enumerate(_gcps(text, source), start=1):
+        name, _ = _point(gcp, f"{source}, GCP {count}")
+        measures = gcp.get("GRI_List")
+        measures = measures.get("GRI_Measure") if isinstance(measures, dict) else None
+        for number, measure in enumerate(measures if isinstance(measures, list) else [measures]):
+            chips.setdefault((name, _chip_file(measure) or f"{name}_00.TIF"), number)
+    return [(name, number, file) for (name, file), number in chips.items()]
+
+
+def _chip_file(measure: Any) -> str:
+    """The name of the chip of a measure, in an element or in two of the same name; "" for none."""
+    chips = measure.get("Chips") if isinstance(measure, dict) else None
+    node = chips.get("Chip_File") if isinstance(chips, dict) else None
+    if isinstance(node, dict) and "Chip_File" in node:
+        node = node["Chip_File"]
+    return _text(node)
+
+
+def _gcps(text: str, source: str) -> list[Any]:
+    document = load_json(text, source)
+    root = document.get(COPERNICUS_KEY) if isinstance(document, dict) else None
+    if not isinstance(root, dict) or "GCP" not in root:
+        raise FormatError(f"{source}: expected {COPERNICUS_KEY} with a list GCP")
+    return root["GCP"] if isinstance(root["GCP"], list) else [root["GCP"]]
 
 
 def _point(gcp: Any, where: str) -> tuple[str, tuple[float, float, float]]:

@@ -40,9 +40,9 @@ COLUMNS = [
 ]
 """Names of the columns. x and y, easting first, replace lon and lat in another reference system;
 `sigma_horizontal_m` stands for both horizontal coordinates. Other columns are ignored."""
-PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "corner-1": 1.5}
+PIXEL_ORIGINS = {"centre": 0.0, "corner": 0.5, "centre-1": 1.0, "corner-1": 1.5}
 """Line and sample of the centre of the first pixel, by the names of conventions: the centre is (0, 0),
-the corner is (0, 0), the corner is (1, 1)."""
+the corner is (0, 0), the centre is (1, 1), the corner is (1, 1)."""
 _ORIGIN, _CRS = "pixel-origin", "crs"
 """What a line before the names may state: `# pixel-origin=corner crs=EPSG:32633`."""
 _STATEMENT = re.compile(r"#\s*(?:(?:pixel-origin|crs)=\S+\s*)+")

@@ -8,6 +8,7 @@ The structure is that of this software. No real file was available to try it on.
 """
 
 import re
+from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
@@ -54,6 +55,25 @@ def is_gcplib(text: str) -> bool:
     return next((line for _, line in content_lines(text, "#", "")), "") == _BEGIN
 
 
+@dataclass(frozen=True)
+class GcplibRecord:
+    """One record: a ground point and a chip of it.
+
+    Attributes:
+        where: file and line, for messages.
+        words: the fields by their names.
+        numbers: those that are numbers.
+        crs: code of the UTM zone of the chip; None for other maps.
+        acquired_on: date of the image of the chip.
+    """
+
+    where: str
+    words: dict[str, str]
+    numbers: dict[str, float]
+    crs: str | None
+    acquired_on: date
+
+
 def parse_gcplib(text: str, heights: Heights | None = None, source: str = "GCPLib") -> MarkedPoints:
     """The ground points of a GCPLib, which have no marks: its pixels are those of its own chips.
 
@@ -69,6 +89,24 @@ def parse_gcplib(text: str, heights: Heights | None = None, source: str = "GCPLi
             longitude, or their number is not the stated one.
         VerticalDatumError: the caller does not state the datum of the heights.
     """
+    records = gcplib_records(text, source)
+    places = [[r.numbers[key] for key in ("longitude", "latitude", "elevation")] for r in records]
+    coordinates = coordinate_array([(lon, lat, height_m) for lon, lat, height_m in places])
+    ground = to_wgs84(coordinates, WGS84_3D.to_2d(), heights, source)
+    ids = [record.words["point_id"] for record in records]
+    return marked_points(ids, ground, np.full((len(ids), 2), np.nan))
+
+
+def gcplib_records(text: str, source: str = "GCPLib") -> list[GcplibRecord]:
+    """The records of a GCPLib.
+
+    Args:
+        text: contents of the file.
+        source: its name, for messages.
+
+    Raises:
+        FormatError: as for `parse_gcplib`.
+    """
     lines = list(content_lines(text, "#", source))
     if not lines or lines[0][1] != _BEGIN:
         raise FormatError(f"{source}: expected a line {_BEGIN} after the comments")
@@ -81,46 +119,45 @@ def parse_gcplib(text: str, heights: Heights | None = None, source: str = "GCPLi
             f"{source}: {lines[1][1]} records stated, {len(records)} found: the file is cut or has "
             "records that its own software would ignore; mend the number or the file"
         )
-    ids, coordinates = [], []
-    for where, line in records:
-        fields = line.split()
-        if len(fields) != len(_FIELDS):
-            raise FormatError(
-                f"{where}: expected the {len(_FIELDS)} fields {' '.join(_FIELDS)}, found {len(fields)}"
-            )
-        record = dict(zip(_FIELDS, fields, strict=True))
-        numbers = dict(zip(_NUMBERS, parse_numbers(fields[2:13], _NUMBERS, where), strict=True))
-        _check_words(record, where)
-        lon, lat = numbers["longitude"], numbers["latitude"]
-        check_lon_lat(lon, lat, where)
-        code = _utm_code(record, where)
-        if code is not None:
-            xy = numbers["projection_x"], numbers["projection_y"]
-            tolerance_m = max(abs(numbers["pixel_size_x"]), abs(numbers["pixel_size_y"]))
-            check_map_position((lon, lat), xy, code, tolerance_m, where)
-        ids.append(record["point_id"])
-        coordinates.append((lon, lat, numbers["elevation"]))
-    ground = to_wgs84(coordinate_array(coordinates), WGS84_3D.to_2d(), heights, source)
-    return marked_points(ids, ground, np.full((len(ids), 2), np.nan))
+    return [_record(line, where) for where, line in records]
 
 
-def _check_words(record: dict[str, str], where: str) -> None:
-    """Refuse a date or a kind of reference that no record has."""
-    month_day_year = re.fullmatch(r"(\d{1,2})-(\d{1,2})-(\d{4})", record["date"])
+def _record(line: str, where: str) -> GcplibRecord:
+    fields = line.split()
+    if len(fields) != len(_FIELDS):
+        raise FormatError(
+            f"{where}: expected the {len(_FIELDS)} fields {' '.join(_FIELDS)}, found {len(fields)}"
+        )
+    words = dict(zip(_FIELDS, fields, strict=True))
+    numbers = dict(zip(_NUMBERS, parse_numbers(fields[2:13], _NUMBERS, where), strict=True))
+    acquired_on = _date(words["date"], where)
+    if words["absolute_or_relative"] not in ("ABS", "REL"):
+        raise FormatError(
+            f"{where}: absolute_or_relative: expected ABS or REL, "
+            f"found {words['absolute_or_relative'][:20]!r}"
+        )
+    lon, lat = numbers["longitude"], numbers["latitude"]
+    check_lon_lat(lon, lat, where)
+    code = _utm_code(words, where)
+    if code is not None:
+        xy = numbers["projection_x"], numbers["projection_y"]
+        tolerance_m = max(abs(numbers["pixel_size_x"]), abs(numbers["pixel_size_y"]))
+        check_map_position((lon, lat), xy, code, tolerance_m, where)
+    return GcplibRecord(where, words, numbers, code, acquired_on)
+
+
+def _date(text: str, where: str) -> date:
+    """The date of a record; refuses what is none."""
+    month_day_year = re.fullmatch(r"(\d{1,2})-(\d{1,2})-(\d{4})", text)
     try:
         if month_day_year is None:
             raise ValueError
         month, day, year = (int(part) for part in month_day_year.groups())
-        date(year, month, day)
+        return date(year, month, day)
     except ValueError:
         raise FormatError(
-            f"{where}: date: expected month-day-year, such as 07-14-1999, found {record['date'][:20]!r}"
+            f"{where}: date: expected month-day-year, such as 07-14-1999, found {text[:20]!r}"
         ) from None
-    if record["absolute_or_relative"] not in ("ABS", "REL"):
-        raise FormatError(
-            f"{where}: absolute_or_relative: expected ABS or REL, "
-            f"found {record['absolute_or_relative'][:20]!r}"
-        )
 
 
 def _utm_code(record: dict[str, str], where: str) -> str | None:
