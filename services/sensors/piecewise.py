@@ -6,6 +6,7 @@ between breaks, so that one kernel evaluates them all.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -33,11 +34,15 @@ class PiecewisePolynomial:
 
     def __call__(self, x: Array) -> Array:
         """Values (n, values) at positions (n,)."""
-        return _evaluate(self.breaks, self.coefficients, np.ascontiguousarray(x, dtype=np.float64))[0]
+        return self._both(x)[0]
 
     def derivative(self, x: Array) -> Array:
         """Derivatives (n, values) at positions (n,)."""
-        return _evaluate(self.breaks, self.coefficients, np.ascontiguousarray(x, dtype=np.float64))[1]
+        return self._both(x)[1]
+
+    def _both(self, x: Array) -> tuple[Array, Array]:
+        table, (place,) = tabulate([self])
+        return _evaluate(table, place, np.ascontiguousarray(x, dtype=np.float64))
 
 
 def from_function(breaks: Array, function: Callable[[Array], Array], degree: int) -> PiecewisePolynomial:
@@ -174,51 +179,85 @@ def lagrange(x: Array, values: Array) -> PiecewisePolynomial:
     return from_function(np.asarray(x, dtype=np.float64), interpolated, LAGRANGE_NODES - 1)
 
 
+class Pieces(NamedTuple):
+    """Where a piecewise polynomial lies in a table: its breaks, then its coefficients.
+
+    Kernels get one table and numbers: each array in a tuple would cost more than a polynomial.
+
+    Attributes:
+        first: index of the first break.
+        pieces: number of polynomials.
+        values: values of each.
+        terms: coefficients of each value.
+    """
+
+    first: int
+    pieces: int
+    values: int
+    terms: int
+
+
+def tabulate(functions: list[PiecewisePolynomial]) -> tuple[Array, list[Pieces]]:
+    """One table (n,) of piecewise polynomials, and where each of them lies in it."""
+    parts, places, first = [], [], 0
+    for function in functions:
+        places.append(Pieces(first, *function.coefficients.shape))
+        parts += [function.breaks, function.coefficients.ravel()]
+        first += len(parts[-2]) + len(parts[-1])
+    return np.concatenate(parts), places
+
+
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def piece_at(breaks: Array, x: float) -> tuple[int, float]:
+def piece_at(table: Array, p: Pieces, x: float) -> tuple[int, float]:
     """Index of the piece that holds at x, and its variable there; fastest for pieces of equal width."""
-    last = len(breaks) - 2
-    piece = 0
-    if x >= breaks[last]:
-        piece = last
-    elif x > breaks[0]:
-        guess = (x - breaks[0]) / (breaks[last + 1] - breaks[0]) * (last + 1)
-        piece = min(int(guess), last)
-        while x < breaks[piece]:
-            piece -= 1
-        while x > breaks[piece + 1]:
-            piece += 1
-    low, high = breaks[piece], breaks[piece + 1]
-    return piece, (2.0 * x - low - high) / (high - low)
+    start, end = p.first, p.first + p.pieces
+    at = start
+    if x >= table[end - 1]:
+        at = end - 1
+    elif x > table[start]:
+        at += min(int((x - table[start]) / (table[end] - table[start]) * p.pieces), p.pieces - 1)
+        while x < table[at]:
+            at -= 1
+        while x > table[at + 1]:
+            at += 1
+    low, high = table[at], table[at + 1]
+    return at - start, (2.0 * x - low - high) / (high - low)
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def horner(coefficients: Array, piece: int, k: int, u: float) -> float:
+def half_width(table: Array, p: Pieces, piece: int) -> float:
+    """Half the width of a piece."""
+    return (table[p.first + piece + 1] - table[p.first + piece]) / 2.0
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def horner(table: Array, p: Pieces, piece: int, k: int, u: float) -> float:
     """Value k of a piece at its variable u."""
-    value = coefficients[piece, k, 0]
-    for j in range(1, coefficients.shape[2]):
-        value = value * u + coefficients[piece, k, j]
+    at = p.first + p.pieces + 1 + (piece * p.values + k) * p.terms
+    value = table[at]
+    for j in range(at + 1, at + p.terms):
+        value = value * u + table[j]
     return value
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def horner_with_slope(coefficients: Array, piece: int, k: int, u: float) -> tuple[float, float]:
+def horner_with_slope(table: Array, p: Pieces, piece: int, k: int, u: float) -> tuple[float, float]:
     """Value k of a piece at its variable u, and its derivative by u."""
-    value, slope = coefficients[piece, k, 0], 0.0
-    for j in range(1, coefficients.shape[2]):
+    at = p.first + p.pieces + 1 + (piece * p.values + k) * p.terms
+    value, slope = table[at], 0.0
+    for j in range(at + 1, at + p.terms):
         slope = slope * u + value
-        value = value * u + coefficients[piece, k, j]
+        value = value * u + table[j]
     return value, slope
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def _evaluate(breaks: Array, coefficients: Array, x: Array) -> tuple[Array, Array]:
+def _evaluate(table: Array, p: Pieces, x: Array) -> tuple[Array, Array]:
     """The function and its derivative (n, values) at positions (n,)."""
-    values = np.empty((len(x), coefficients.shape[1]))
-    rates = np.empty((len(x), coefficients.shape[1]))
+    values, rates = np.empty((len(x), p.values)), np.empty((len(x), p.values))
     for i in range(len(x)):
-        piece, u = piece_at(breaks, x[i])
-        for k in range(coefficients.shape[1]):
-            values[i, k], slope = horner_with_slope(coefficients, piece, k, u)
-            rates[i, k] = slope * 2.0 / (breaks[piece + 1] - breaks[piece])
+        piece, u = piece_at(table, p, x[i])
+        for k in range(p.values):
+            values[i, k], slope = horner_with_slope(table, p, piece, k, u)
+            rates[i, k] = slope / half_width(table, p, piece)
     return values, rates

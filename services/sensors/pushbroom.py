@@ -13,7 +13,7 @@ from services.sensors.light_path import (
     SPEED_OF_LIGHT_M_S,
     LightPath,
 )
-from services.sensors.piecewise import PiecewisePolynomial
+from services.sensors.piecewise import PiecewisePolynomial, tabulate
 from services.sensors.rpc import VALIDITY, cubic_terms
 from services.types import Array
 
@@ -26,6 +26,7 @@ MAX_SIZE = 10_000_000
 _CHECK_NODES = 5
 _CHECK_TOLERANCE_PX = 1e-4
 _GUESS_NODES = (13, 7, 4)
+_GUESS_NEEDED = 40
 """Lines, samples and heights of the grid on which the first guess of a line is fitted."""
 
 
@@ -64,7 +65,7 @@ class PushbroomModel:
         Returns:
             (n, 2) line, sample in pixels; NaN more than half an image beyond the border.
         """
-        return kernels.project(self._packed, np.ascontiguousarray(lon_lat_h, dtype=np.float64))
+        return kernels.project(*self._packed, np.ascontiguousarray(lon_lat_h, dtype=np.float64))
 
     def project_derivative(self, lon_lat_h: Array) -> Array:
         """Derivative of `project`, from the implicit equations of the projection.
@@ -73,7 +74,7 @@ class PushbroomModel:
             (n, 2, 3) pixels per metre east, north, up; NaN where `project` is.
         """
         ground = np.ascontiguousarray(lon_lat_h, dtype=np.float64)
-        return kernels.project_derivative(self._packed, ground, kernels.project(self._packed, ground))
+        return kernels.project_derivative(*self._packed, ground, kernels.project(*self._packed, ground))
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
         """Ground position of image points at given heights, by Newton steps along the line of sight.
@@ -87,7 +88,7 @@ class PushbroomModel:
             an image beyond the border.
         """
         return kernels.locate(
-            self._packed,
+            *self._packed,
             np.ascontiguousarray(line_sample, dtype=np.float64),
             np.ascontiguousarray(height_m, dtype=np.float64),
         )
@@ -100,33 +101,32 @@ class PushbroomModel:
             downwards; NaN more than half an image beyond the border.
         """
         image = np.ascontiguousarray(line_sample, dtype=np.float64)
-        return kernels.line_of_sight(self._packed, image, sum(self.height_range_m) / 2.0)
+        return kernels.line_of_sight(*self._packed, image, sum(self.height_range_m) / 2.0)
 
     @cached_property
-    def _packed(self) -> kernels.Packed:
-        """The model as the kernels read it, with a first guess of lines for `project`."""
+    def _packed(self) -> tuple[kernels.Packed, Array]:
+        """The model as the kernels read it: numbers, and a table of its polynomials."""
         path = self.light_path
         lines, samples = (float(size) for size in self.image_shape)
+        functions = [self.line_time, self.orbit, self.attitude, self.look]
+        table, (line_time, orbit, attitude, look) = tabulate(functions)
         packed = kernels.Packed(
             lines=lines,
             samples=samples,
-            line_breaks=self.line_time.breaks,
-            line_times=self.line_time.coefficients,
-            orbit_breaks=self.orbit.breaks,
-            orbit=self.orbit.coefficients,
-            attitude_breaks=self.attitude.breaks,
-            attitude=self.attitude.coefficients,
-            look_breaks=self.look.breaks,
-            look=self.look.coefficients,
+            line_time=line_time,
+            orbit=orbit,
+            attitude=attitude,
+            look=look,
             per_light_speed=1.0 / SPEED_OF_LIGHT_M_S if path.velocity_aberration else 0.0,
             turn_per_m=EARTH_ROTATION_RAD_S / SPEED_OF_LIGHT_M_S if path.light_time else 0.0,
             refraction=1.0 if path.refraction else 0.0,
             ground_radius=0.0,
-            guess_frame=np.zeros((2, 3)),
-            guess=np.zeros(20),
+            guess=len(table),
+            guess_centre=(0.0, 0.0, 0.0),
+            guess_per_m=(0.0, 0.0, 0.0),
             line_slope=1.0,
         )
-        return _with_guess(packed, self.height_range_m)
+        return _with_guess(packed, table, self.height_range_m)
 
 
 def used_times(line_time: PiecewisePolynomial, lines: int) -> tuple[float, float]:
@@ -164,24 +164,29 @@ def check_pushbroom(model: PushbroomModel, source: str) -> PushbroomModel:
     return model
 
 
-def _with_guess(packed: kernels.Packed, height_range_m: tuple[float, float]) -> kernels.Packed:
-    """The model with the radius of its ground and a cubic polynomial from ECEF to the line."""
+def _with_guess(
+    packed: kernels.Packed, table: Array, height_range_m: tuple[float, float]
+) -> tuple[kernels.Packed, Array]:
+    """The model with the radius of its ground, and a first guess of lines, for `project`."""
     centre = np.array([[(packed.lines - 1.0) / 2.0, (packed.samples - 1.0) / 2.0]])
     low, high = height_range_m
-    below = kernels.locate_ecef(packed, centre, np.array([(low + high) / 2.0]))[0]
+    below = kernels.locate_ecef(packed, table, centre, np.array([(low + high) / 2.0]))[0]
     packed = packed._replace(
         ground_radius=float(np.linalg.norm(below)),
-        line_slope=kernels.line_slope(packed, float(centre[0, 0]), below),
+        line_slope=kernels.line_slope(packed, table, float(centre[0, 0]), below),
     )
     reach = 0.5 * VALIDITY * np.array([packed.lines, packed.samples])
     u, v, h = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in _GUESS_NODES)))
     image = centre + np.column_stack([u, v]) * reach
-    ecef = kernels.locate_ecef(packed, image, (low + high) / 2.0 + h * (high - low) / 2.0)
+    ecef = kernels.locate_ecef(packed, table, image, (low + high) / 2.0 + h * (high - low) / 2.0)
     valid = np.isfinite(ecef[:, 0])
-    if valid.sum() < 40:
-        return packed._replace(guess=np.concatenate([centre[0, :1], np.zeros(19)]))
+    if valid.sum() < _GUESS_NEEDED:
+        return packed, np.concatenate([table, centre[0, :1], np.zeros(19)])
     ecef, image = ecef[valid], image[valid]
-    frame = np.stack([ecef.mean(axis=0), 1.0 / np.maximum(ecef.std(axis=0), 1.0)])
-    terms = cubic_terms((ecef - frame[0]) * frame[1])
-    guess: Array = np.linalg.lstsq(terms, image[:, 0], rcond=1e-10)[0].astype(np.float64)
-    return packed._replace(guess_frame=frame, guess=guess)
+    middle, per_m = ecef.mean(axis=0), 1.0 / np.maximum(ecef.std(axis=0), 1.0)
+    guess = np.linalg.lstsq(cubic_terms((ecef - middle) * per_m), image[:, 0], rcond=1e-10)[0]
+    packed = packed._replace(
+        guess_centre=(float(middle[0]), float(middle[1]), float(middle[2])),
+        guess_per_m=(float(per_m[0]), float(per_m[1]), float(per_m[2])),
+    )
+    return packed, np.concatenate([table, guess])

@@ -12,7 +12,13 @@ from services.sensors.light_path import (
     height_and_vertical,
     zenith_path_excess_m,
 )
-from services.sensors.piecewise import horner, horner_with_slope, piece_at
+from services.sensors.piecewise import (
+    Pieces,
+    half_width,
+    horner,
+    horner_with_slope,
+    piece_at,
+)
 from services.sensors.rpc import VALIDITY, cubic
 from services.types import Array
 
@@ -31,62 +37,58 @@ _LIGHT_ROUNDS = 2
 
 
 class Packed(NamedTuple):
-    """A pushbroom model as arrays and numbers.
+    """The numbers of a pushbroom model; its polynomials are in a table, an array beside this tuple.
 
     Attributes:
         lines, samples: size of the image.
-        line_breaks, line_times, orbit_breaks, orbit, attitude_breaks, attitude, look_breaks, look:
-            breaks and coefficients of the piecewise polynomials of the model.
+        line_time, orbit, attitude, look: the piecewise polynomials of the model.
         per_light_speed: s/m, 0 without velocity aberration.
         turn_per_m: rotation of the Earth while light travels a metre, radians; 0 without light time.
         refraction: 1, or 0 without refraction.
         ground_radius: distance of the ground at the image centre from the centre of the Earth, metres.
-        guess_frame: (2, 3) centre in metres and inverse scale of ECEF positions.
-        guess: (20,) cubic polynomial from there to the line, in the order of `rpc.cubic_terms`.
+        guess: where the table has a cubic polynomial from ECEF to the line, as `rpc.cubic_terms`.
+        guess_centre, guess_per_m: centre and scale of its variables, metres and 1/m.
         line_slope: change per line of the tangent along the track of the ground at the image centre.
     """
 
     lines: float
     samples: float
-    line_breaks: Array
-    line_times: Array
-    orbit_breaks: Array
-    orbit: Array
-    attitude_breaks: Array
-    attitude: Array
-    look_breaks: Array
-    look: Array
+    line_time: Pieces
+    orbit: Pieces
+    attitude: Pieces
+    look: Pieces
     per_light_speed: float
     turn_per_m: float
     refraction: float
     ground_radius: float
-    guess_frame: Array
-    guess: Array
+    guess: int
+    guess_centre: tuple[float, float, float]
+    guess_per_m: tuple[float, float, float]
     line_slope: float
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _pose(m: Packed, line: float, pose: Array) -> None:
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _pose(m: Packed, table: Array, line: float, pose: Array) -> None:
     """Write the pose (5, 3) at a line: position, velocity in ECEF, and the rotation ecef_from_body.
 
     The velocity is written only where aberration needs it.
     """
-    piece, u = piece_at(m.line_breaks, line)
-    time = horner(m.line_times, piece, 0, u)
-    piece, u = piece_at(m.orbit_breaks, time)
+    piece, u = piece_at(table, m.line_time, line)
+    time = horner(table, m.line_time, piece, 0, u)
+    piece, u = piece_at(table, m.orbit, time)
     if m.per_light_speed > 0.0:
-        per_s = 2.0 / (m.orbit_breaks[piece + 1] - m.orbit_breaks[piece])
+        per_s = 1.0 / half_width(table, m.orbit, piece)
         for k in range(3):
-            pose[0, k], slope = horner_with_slope(m.orbit, piece, k, u)
+            pose[0, k], slope = horner_with_slope(table, m.orbit, piece, k, u)
             pose[1, k] = slope * per_s
     else:
         for k in range(3):
-            pose[0, k] = horner(m.orbit, piece, k, u)
-    piece, u = piece_at(m.attitude_breaks, time)
-    x = horner(m.attitude, piece, 0, u)
-    y = horner(m.attitude, piece, 1, u)
-    z = horner(m.attitude, piece, 2, u)
-    w = horner(m.attitude, piece, 3, u)
+            pose[0, k] = horner(table, m.orbit, piece, k, u)
+    piece, u = piece_at(table, m.attitude, time)
+    x = horner(table, m.attitude, piece, 0, u)
+    y = horner(table, m.attitude, piece, 1, u)
+    z = horner(table, m.attitude, piece, 2, u)
+    w = horner(table, m.attitude, piece, 3, u)
     scale = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)
     x, y, z, w = x * scale, y * scale, z * scale, w * scale
     pose[2, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -100,13 +102,13 @@ def _pose(m: Packed, line: float, pose: Array) -> None:
     pose[4, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _inside(position: float, size: float) -> bool:
     """Whether a line or sample is within the model, up to half an image beyond the border."""
     return abs(position - (size - 1.0) / 2.0) <= VALIDITY * size / 2.0
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _aberration(
     m: Packed, pose: Array, apparent: tuple[float, float, float]
 ) -> tuple[float, float, float]:
@@ -131,12 +133,14 @@ def _aberration(
     return ax, ay, az
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _ray(m: Packed, line: float, sample: float, pose: Array, direction: Array) -> None:
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _ray(
+    m: Packed, table: Array, line_sample: tuple[float, float], pose: Array, direction: Array
+) -> None:
     """Write pose (5, 3) and unit direction (3,) in ECEF of the straight ray of an image position."""
-    piece, u = piece_at(m.look_breaks, sample)
-    along, across = horner(m.look, piece, 0, u), horner(m.look, piece, 1, u)
-    _pose(m, line, pose)
+    piece, u = piece_at(table, m.look, line_sample[1])
+    along, across = horner(table, m.look, piece, 0, u), horner(table, m.look, piece, 1, u)
+    _pose(m, table, line_sample[0], pose)
     norm = 1.0 / math.sqrt(along * along + across * across + 1.0)
     for k in range(3):
         direction[k] = norm * (pose[2 + k, 0] * along + pose[2 + k, 1] * across + pose[2 + k, 2])
@@ -185,7 +189,7 @@ def _meet_height(m: Packed, o: Array, d: Array, height: float, ground: Array) ->
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def line_of_sight(m: Packed, image: Array, height: float) -> tuple[Array, Array]:
+def line_of_sight(m: Packed, table: Array, image: Array, height: float) -> tuple[Array, Array]:
     """Origins and unit directions (n, 3) of the rays of image positions (n, 2)."""
     origin = np.full((len(image), 3), np.nan)
     direction = np.full((len(image), 3), np.nan)
@@ -193,7 +197,7 @@ def line_of_sight(m: Packed, image: Array, height: float) -> tuple[Array, Array]
     for i in range(len(image)):
         if not (_inside(image[i, 0], m.lines) and _inside(image[i, 1], m.samples)):
             continue
-        _ray(m, image[i, 0], image[i, 1], pose, direction[i])
+        _ray(m, table, (image[i, 0], image[i, 1]), pose, direction[i])
         origin[i] = pose[0]
         if m.refraction > 0.0:
             tan_lat = _meet_height(m, origin[i], direction[i], height, ground)
@@ -211,26 +215,26 @@ def line_of_sight(m: Packed, image: Array, height: float) -> tuple[Array, Array]
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def locate_ecef(m: Packed, image: Array, height: Array) -> Array:
+def locate_ecef(m: Packed, table: Array, image: Array, height: Array) -> Array:
     """Ground (n, 3) in ECEF of image positions (n, 2) at heights (n,)."""
     out = np.full((len(image), 3), np.nan)
     pose, direction = np.empty((5, 3)), np.empty(3)
     for i in range(len(image)):
         if _inside(image[i, 0], m.lines) and _inside(image[i, 1], m.samples):
-            _ray(m, image[i, 0], image[i, 1], pose, direction)
+            _ray(m, table, (image[i, 0], image[i, 1]), pose, direction)
             _meet_height(m, pose[0], direction, height[i], out[i])
     return out
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def locate(m: Packed, image: Array, height: Array) -> Array:
+def locate(m: Packed, table: Array, image: Array, height: Array) -> Array:
     """Longitude, latitude, height (n, 3) of image positions (n, 2) at heights (n,)."""
     out = np.full((len(image), 3), np.nan)
     pose, direction, ground = np.empty((5, 3)), np.empty(3), np.empty(3)
     for i in range(len(image)):
         if not (_inside(image[i, 0], m.lines) and _inside(image[i, 1], m.samples)):
             continue
-        _ray(m, image[i, 0], image[i, 1], pose, direction)
+        _ray(m, table, (image[i, 0], image[i, 1]), pose, direction)
         tan_lat = _meet_height(m, pose[0], direction, height[i], ground)
         if not np.isnan(tan_lat):
             out[i, 0] = math.degrees(math.atan2(ground[1], ground[0]))
@@ -239,7 +243,7 @@ def locate(m: Packed, image: Array, height: Array) -> Array:
     return out
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _ground_point(m: Packed, lon_lat_h: Array, ground: Array) -> None:
     """Write ECEF position, upward unit vector and excess path of refraction (7,) of a ground point."""
     lon, lat = math.radians(lon_lat_h[0]), math.radians(lon_lat_h[1])
@@ -254,7 +258,7 @@ def _ground_point(m: Packed, lon_lat_h: Array, ground: Array) -> None:
     ground[2] = (n * (1.0 - WGS84_E2) + h) * sin_lat
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _light_shift(m: Packed, pose: Array, ground: Array, shift: Array) -> None:
     """Write the vector (3,) in metres from a ground point to where it appears from a pose.
 
@@ -283,10 +287,9 @@ def _light_shift(m: Packed, pose: Array, ground: Array, shift: Array) -> None:
     shift[0], shift[1], shift[2] = dx - ox, dy - oy, dz - oz
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _in_body(pose: Array, direction: Array) -> tuple[float, float, float]:
-    """A direction (3,) in ECEF in the body frame of a pose."""
-    x, y, z = direction[0], direction[1], direction[2]
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _in_body(pose: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A direction in ECEF in the body frame of a pose."""
     return (
         pose[2, 0] * x + pose[3, 0] * y + pose[4, 0] * z,
         pose[2, 1] * x + pose[3, 1] * y + pose[4, 1] * z,
@@ -294,27 +297,26 @@ def _in_body(pose: Array, direction: Array) -> tuple[float, float, float]:
     )
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _guess(m: Packed, ground: Array) -> float:
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _guess(m: Packed, table: Array, ground: Array) -> float:
     """The line of a ground point by the cubic polynomial of the model."""
-    f, g = m.guess_frame, m.guess
-    x = (ground[0] - f[0, 0]) * f[1, 0]
-    y = (ground[1] - f[0, 1]) * f[1, 1]
-    z = (ground[2] - f[0, 2]) * f[1, 2]
-    return cubic(g, 0, x, y, z)
+    x = (ground[0] - m.guess_centre[0]) * m.guess_per_m[0]
+    y = (ground[1] - m.guess_centre[1]) * m.guess_per_m[1]
+    z = (ground[2] - m.guess_centre[2]) * m.guess_per_m[2]
+    return cubic(table, m.guess, x, y, z)
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _detector(m: Packed, across: float, start: float) -> tuple[float, float]:
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _detector(m: Packed, table: Array, across: float, start: float) -> tuple[float, float]:
     """The sample whose detector looks at a tangent across, and its tangent along."""
     sample, along = start, 0.0
     for _ in range(_LOOK_ITERATIONS):
-        piece, u = piece_at(m.look_breaks, sample)
-        value, slope = horner_with_slope(m.look, piece, 1, u)
+        piece, u = piece_at(table, m.look, sample)
+        value, slope = horner_with_slope(table, m.look, piece, 1, u)
         step = (across - value) / slope
-        along, along_slope = horner_with_slope(m.look, piece, 0, u)
+        along, along_slope = horner_with_slope(table, m.look, piece, 0, u)
         along += step * along_slope
-        step *= (m.look_breaks[piece + 1] - m.look_breaks[piece]) / 2.0
+        step *= half_width(table, m.look, piece)
         sample += step
         if abs(step) < _LOOK_TOLERANCE_PX:
             break
@@ -322,49 +324,48 @@ def _detector(m: Packed, across: float, start: float) -> tuple[float, float]:
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def line_slope(m: Packed, line: float, ground: Array) -> float:
+def line_slope(m: Packed, table: Array, line: float, ground: Array) -> float:
     """Change per line of the tangent along the track of a ground point (3,) in ECEF, without light."""
-    pose, direction = np.empty((5, 3)), np.empty(3)
+    pose, shift = np.empty((5, 3)), np.zeros(3)
     slope = 0.0
     for sign in (-1.0, 1.0):
-        _pose(m, line + 0.5 * sign, pose)
-        direction[:] = ground - pose[0]
-        along, _, depth = _in_body(pose, direction)
-        slope += sign * along / depth
+        _pose(m, table, line + 0.5 * sign, pose)
+        slope += sign * _tangents(pose, ground, shift)[0]
     return slope
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _tangents(
-    m: Packed, line: float, renew_shift: bool, ground: Array, work: tuple[Array, Array, Array]
-) -> tuple[float, float]:
-    """Tangents along and across of a ground point from the pose at a line; NaN where it is behind.
-
-    `work` has the pose (5, 3), the direction to the point (3,) and the shift by light (3,), which is
-    computed again when `renew_shift` says so.
-    """
-    pose, direction, shift = work
-    _pose(m, line, pose)
-    if renew_shift:
-        _light_shift(m, pose, ground, shift)
-    for k in range(3):
-        direction[k] = ground[k] - pose[0, k] + shift[k]
-    along, across, depth = _in_body(pose, direction)
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _tangents(pose: Array, ground: Array, shift: Array) -> tuple[float, float]:
+    """Tangents along and across of a ground point, moved by light, from a pose; NaN if behind it."""
+    along, across, depth = _in_body(
+        pose,
+        ground[0] - pose[0, 0] + shift[0],
+        ground[1] - pose[0, 1] + shift[1],
+        ground[2] - pose[0, 2] + shift[2],
+    )
     if not depth > 0.0:
         return np.nan, np.nan
     return along / depth, across / depth
 
 
-@njit(cache=True, inline="always", fastmath={"contract"}, error_model="numpy")
-def _project_one(m: Packed, ground: Array, work: tuple[Array, Array, Array]) -> tuple[float, float]:
-    """Line and sample of a ground point, NaN where the secant steps leave the model."""
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _project_one(
+    m: Packed, table: Array, ground: Array, pose: Array, shift: Array
+) -> tuple[float, float]:
+    """Line and sample of a ground point, NaN where the secant steps leave the model.
+
+    The effects of light change so slowly along the orbit that the first steps compute them.
+    """
     middle, reach = (m.lines - 1.0) / 2.0, VALIDITY * m.lines / 2.0
-    line = min(max(_guess(m, ground), middle - reach), middle + reach)
+    line = min(max(_guess(m, table, ground), middle - reach), middle + reach)
     sample = (m.samples - 1.0) / 2.0
     last, last_sample, last_misfit, slope = line, sample, 0.0, m.line_slope
     for iteration in range(_PROJECT_ITERATIONS):
-        along, across = _tangents(m, line, iteration < _LIGHT_ROUNDS, ground, work)
-        sample, own_along = _detector(m, across, sample)
+        _pose(m, table, line, pose)
+        if iteration < _LIGHT_ROUNDS:
+            _light_shift(m, pose, ground, shift)
+        along, across = _tangents(pose, ground, shift)
+        sample, own_along = _detector(m, table, across, sample)
         misfit = along - own_along
         moved = line - last
         if abs(moved) > _MOVED_PX:
@@ -382,14 +383,14 @@ def _project_one(m: Packed, ground: Array, work: tuple[Array, Array, Array]) -> 
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def project(m: Packed, lon_lat_h: Array) -> Array:
+def project(m: Packed, table: Array, lon_lat_h: Array) -> Array:
     """Line and sample (n, 2) of ground points (n, 3)."""
     out = np.full((len(lon_lat_h), 2), np.nan)
-    ground, work = np.empty(7), (np.empty((5, 3)), np.empty(3), np.zeros(3))
+    ground, pose, shift = np.empty(7), np.empty((5, 3)), np.zeros(3)
     for i in range(len(lon_lat_h)):
         if math.isfinite(lon_lat_h[i, 0] + lon_lat_h[i, 1] + lon_lat_h[i, 2]):
             _ground_point(m, lon_lat_h[i], ground)
-            line, sample = _project_one(m, ground, work)
+            line, sample = _project_one(m, table, ground, pose, shift)
             if _inside(line, m.lines) and _inside(sample, m.samples):
                 out[i, 0] = line
                 out[i, 1] = sample
@@ -397,44 +398,41 @@ def project(m: Packed, lon_lat_h: Array) -> Array:
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def project_derivative(m: Packed, lon_lat_h: Array, image: Array) -> Array:
+def project_derivative(m: Packed, table: Array, lon_lat_h: Array, image: Array) -> Array:
     """Derivative (n, 2, 3) of `project` by metres east, north, up, at its results (n, 2).
 
     The tangents along and across of a ground point equal those of its detector: their derivatives by the
     ground, by the line (a difference over one line) and by the sample give that of the position.
     """
     out = np.full((len(lon_lat_h), 2, 3), np.nan)
-    pose, direction, axis, ground = np.empty((5, 3)), np.empty(3), np.empty(3), np.empty(7)
-    work = (pose, direction, np.zeros(3))
+    pose, ground, shift, axis = np.empty((5, 3)), np.empty(7), np.zeros(3), np.empty((3, 3))
     for i in range(len(lon_lat_h)):
         if np.isnan(image[i, 0]):
             continue
         _ground_point(m, lon_lat_h[i], ground)
         along_line, across_line = 0.0, 0.0
         for sign in (-1.0, 1.0):
-            along, across = _tangents(m, image[i, 0] + 0.5 * sign, True, ground, work)
+            _pose(m, table, image[i, 0] + 0.5 * sign, pose)
+            _light_shift(m, pose, ground, shift)
+            along, across = _tangents(pose, ground, shift)
             along_line += sign * along
             across_line += sign * across
-        piece, u = piece_at(m.look_breaks, image[i, 1])
-        per_px = 2.0 / (m.look_breaks[piece + 1] - m.look_breaks[piece])
-        along_sample = -horner_with_slope(m.look, piece, 0, u)[1] * per_px
-        across_sample = -horner_with_slope(m.look, piece, 1, u)[1] * per_px
+        piece, u = piece_at(table, m.look, image[i, 1])
+        per_px = 1.0 / half_width(table, m.look, piece)
+        along_sample = -horner_with_slope(table, m.look, piece, 0, u)[1] * per_px
+        across_sample = -horner_with_slope(table, m.look, piece, 1, u)[1] * per_px
         inverse = -1.0 / (along_line * across_sample - along_sample * across_line)
-        _pose(m, image[i, 0], pose)
-        for k in range(3):
-            direction[k] = ground[k] - pose[0, k]
-        along, across, depth = _in_body(pose, direction)
+        _pose(m, table, image[i, 0], pose)
+        along, across, depth = _in_body(
+            pose, ground[0] - pose[0, 0], ground[1] - pose[0, 1], ground[2] - pose[0, 2]
+        )
         horizontal = math.sqrt(ground[3] * ground[3] + ground[4] * ground[4])
-        east_x, east_y = -ground[4] / horizontal, ground[3] / horizontal
+        axis[0, 0], axis[0, 1], axis[0, 2] = -ground[4] / horizontal, ground[3] / horizontal, 0.0
+        axis[1, 0], axis[1, 1] = -ground[5] * axis[0, 1], ground[5] * axis[0, 0]
+        axis[1, 2] = horizontal
+        axis[2, 0], axis[2, 1], axis[2, 2] = ground[3], ground[4], ground[5]
         for k in range(3):
-            if k == 0:
-                axis[0], axis[1], axis[2] = east_x, east_y, 0.0
-            elif k == 1:
-                axis[0], axis[1] = -ground[5] * east_y, ground[5] * east_x
-                axis[2] = horizontal
-            else:
-                axis[0], axis[1], axis[2] = ground[3], ground[4], ground[5]
-            x, y, z = _in_body(pose, axis)
+            x, y, z = _in_body(pose, axis[k, 0], axis[k, 1], axis[k, 2])
             by_along = (x - z * along / depth) / depth
             by_across = (y - z * across / depth) / depth
             out[i, 0, k] = inverse * (by_along * across_sample - by_across * along_sample)
