@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 from services.errors import FormatError
 from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
@@ -11,6 +12,7 @@ from services.formats.sensor_models.worldview_isd import parse_worldview_isd
 from services.formats.sensor_models.xml_values import parse_xml
 from services.formats.text_files import read_text
 from services.sensors.pushbroom import PushbroomModel
+from services.sensors.rpc_fit import RpcFit, fit_rpc
 
 _READERS: dict[tuple[str, str], Callable[[str, str], PushbroomModel]] = {
     ("PHR_Dimap_Document", ""): parse_phr_dimap,
@@ -32,16 +34,46 @@ def read_rigorous_model(path: Path) -> PushbroomModel:
     """
     text = read_text(path)
     root = parse_xml(text, path.name)
-    version = ""
-    if root.tag == "Dimap_Document":
-        versions = [
-            root.find(f"{place}/METADATA_FORMAT") for place in ("Metadata_Id", "Metadata_Identification")
-        ]
-        version = next((found.get("version", "") for found in versions if found is not None), "")
-    reader = _READERS.get((root.tag, version.partition(".")[0]))
+    reader = _READERS.get(_kind(root))
     if reader is None:
         raise FormatError(
-            f"{path.name}: <{root.tag[:60]}> of version {version[:20] or 'unknown'} found, one of "
-            "PHR_Dimap_Document, isd, Dimap_Document 1 and Dimap_Document 2 expected"
+            f"{path.name}: <{root.tag[:60]}> of version {_version(root)[:20] or 'unknown'} found, "
+            "one of PHR_Dimap_Document, isd, Dimap_Document 1 and Dimap_Document 2 expected"
         )
     return reader(text, path.name)
+
+
+def rpc_of_rigorous_model(text: str, source: str) -> RpcFit | None:
+    """The RPC fitted to the rigorous model of an XML document; None without such a model.
+
+    A DIMAP document of version 2 has one where it has `Refined_Model`.
+
+    Args:
+        text: contents of the file.
+        source: its name, for messages.
+
+    Raises:
+        FormatError: a value of the model is missing, impossible or not supported.
+    """
+    root = parse_xml(text, source)
+    kind = _kind(root)
+    if kind not in _READERS or (kind[1] == "2" and root.find(".//Refined_Model") is None):
+        return None
+    model = _READERS[kind](text, source)
+    return fit_rpc(model, model.image_shape, model.height_range_m)
+
+
+def _kind(root: ElementTree.Element) -> tuple[str, str]:
+    """Root element and major version, as the readers are listed."""
+    return root.tag, _version(root).partition(".")[0]
+
+
+def _version(root: ElementTree.Element) -> str:
+    """The version of a DIMAP document; empty for other documents."""
+    if root.tag != "Dimap_Document":
+        return ""
+    for part in ("Metadata_Id", "Metadata_Identification"):
+        declared = root.find(f"{part}/METADATA_FORMAT")
+        if declared is not None:
+            return declared.get("version", "")
+    return ""

@@ -13,6 +13,7 @@ from services.formats.addresses import Address, FilePlace
 from services.formats.images.raster import RasterImage, copy_with_rpc, open_raster
 from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
 from services.formats.sensor_models.geom import format_geom, is_geom, parse_geom
+from services.formats.sensor_models.rigorous_model import rpc_of_rigorous_model
 from services.formats.sensor_models.rpc_text import (
     RPC00A_ORDER,
     format_rpb,
@@ -25,7 +26,7 @@ from services.formats.sensor_models.rpc_text import (
 from services.formats.text_files import parse_number, read_text
 from services.sensors.rpc import RpcModel, check_rpc
 
-Convention = Literal["tags", "text", "rpb", "dimap", "geom"]
+Convention = Literal["tags", "text", "rpb", "dimap", "geom", "rigorous"]
 
 _Found = tuple[RpcModel, FilePlace, Convention, str]
 """A model, its file and format, and what was mended in it."""
@@ -72,7 +73,8 @@ def read_rpc(
 
     Args:
         path: of the image.
-        model_path: `_RPC.TXT`, `.RPB`, DIMAP or `.geom` file of any name; by default the one found.
+        model_path: `_RPC.TXT`, `.RPB`, DIMAP or `.geom` file of any name, or metadata with a rigorous
+            model, to which an RPC is fitted; by default the one found.
         crop_origin: line and sample of the first pixel of the image in the image that the RPC is for;
             (0, 0) when the RPC is in the pixels of the image; by default decided as above.
 
@@ -97,7 +99,7 @@ def write_model(
 
     Args:
         delivered: the delivered model; None for a model that is not an RPC, which is only written as
-            `refined_RPC.TXT`.
+            `refined_RPC.TXT`, and so is one fitted to a rigorous model.
         model: the refined model.
         folder: where to write; created when missing.
         image_path: the image, when a copy with the refined model in its tags is to be written too.
@@ -131,6 +133,8 @@ def write_model(
 def _in_delivered_format(delivered: DeliveredModel, model: RpcModel) -> dict[str, str]:
     """The text of the file that replaces the delivered one, by its name."""
     path = delivered.path
+    if delivered.convention == "rigorous":
+        return {}
     if delivered.convention == "rpb":
         return {path.name: format_rpb(model, rpb_satellite(read_text(path)))}
     if delivered.convention == "dimap":
@@ -156,7 +160,7 @@ def model_of_image(
         origin, reason = crop_origin, "shifted as requested" if any(crop_origin) else "as requested"
     elif offset is not None:
         origin, reason = _choose_origin(model, offset, image)
-    elif tile and convention == "dimap" and (int(tile[1]), int(tile[2])) != (1, 1):
+    elif tile and convention in ("dimap", "rigorous") and (int(tile[1]), int(tile[2])) != (1, 1):
         raise FormatError(
             f"{image.path}: the image is a tile, and its RPC is for the whole image: give the position "
             "of its first pixel in the whole image as crop_origin=(line, sample)"
@@ -208,6 +212,10 @@ def _read_model_file(path: FilePlace) -> _Found:
     """The RPC of a model file, whose content, not its name, decides on the format."""
     text = read_text(path)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
+        fit = rpc_of_rigorous_model(text, path.name)
+        if fit is not None:
+            note = f"RPC fitted to it within {fit.max_error_px:.2g} px"
+            return fit.model, path, "rigorous", note
         return parse_dimap_rpc(text, path.name), path, "dimap", ""
     if re.search(r"\bBEGIN_GROUP\b", text):
         return parse_rpb(text, path.name), path, "rpb", ""

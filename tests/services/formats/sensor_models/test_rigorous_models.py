@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from services.errors import FormatError
 from services.formats.sensor_models.dimap_rigorous import parse_dimap_rigorous
 from services.formats.sensor_models.phr_dimap import parse_phr_dimap
 from services.formats.sensor_models.rigorous_model import read_rigorous_model
+from services.formats.sensor_models.rpc_files import read_rpc, write_model
 from services.formats.sensor_models.spot_dimap import parse_spot_dimap
 from services.formats.sensor_models.worldview_isd import parse_worldview_isd
 from services.sensors.light_path import GEOMETRIC, LightPath
@@ -126,3 +128,26 @@ def test_a_file_without_a_rigorous_model_is_refused(tmp_path: Path) -> None:
     path.write_text("<Dimap_Document><METADATA_FORMAT version='3.0'/></Dimap_Document>")
     with pytest.raises(FormatError, match=re.escape("<Dimap_Document> of version unknown found")):
         read_rigorous_model(path)
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_an_image_takes_the_rpc_fitted_to_the_rigorous_model_of_its_product(
+    product: str, tmp_path: Path
+) -> None:
+    write, read, light_path = PRODUCTS[product]
+    text = write(simulated.truth(light_path))
+    (tmp_path / "product.xml").write_text(text)
+    with rasterio.open(
+        tmp_path / "image.tif", "w", driver="GTiff", width=300, height=400, count=1, dtype="uint8"
+    ) as image:
+        image.write(np.ones((1, 400, 300), dtype=np.uint8))
+    delivered = read_rpc(tmp_path / "image.tif", tmp_path / "product.xml")
+    assert delivered.convention == "rigorous"
+    assert "RPC fitted to it within" in delivered.note
+    rng = np.random.default_rng(9)
+    positions = rng.uniform(0.0, 1.0, (200, 2)) * simulated.SHAPE
+    ground = read(text, product).locate(positions, rng.uniform(0.0, 4000.0, 200))
+    a_hundredth_of_a_pixel = 0.01
+    np.testing.assert_allclose(delivered.model.project(ground), positions, atol=a_hundredth_of_a_pixel)
+    written = write_model(delivered, delivered.model, tmp_path / "out")
+    assert [path.name for path in written] == ["refined_RPC.TXT"]
