@@ -58,7 +58,7 @@ def placed(seed: int, images: int) -> Production:
     return produce_points(scenes(seed), OPTIONS, control=control)
 
 
-@pytest.mark.parametrize("images", [3, 1])
+@pytest.mark.parametrize("images", [3, pytest.param(1, marks=pytest.mark.endurance)])
 def test_typed_points_place_the_block_as_precisely_as_it_declares(images: int) -> None:
     normalised = []
     for seed in SEEDS:

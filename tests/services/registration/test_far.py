@@ -34,7 +34,7 @@ def largest_error_px(registration: Registration, case: tuple[float, float, int])
 @pytest.mark.parametrize(
     ("gsds_m", "error_km"),
     [
-        ((2.0, 20.0), 4.9),
+        pytest.param((2.0, 20.0), 4.9, marks=pytest.mark.endurance),
         pytest.param((2.0,), 1.0, marks=pytest.mark.endurance),
         ((2.0,), 4.9),
     ],
