@@ -72,12 +72,15 @@ def step(
 def least_squares(
     problem: BlockProblem, priors: BlockPriors, gauge: Gauge, state: State, weight: Array
 ) -> Solved:
-    """The solution of given weights, with the equations of its last step."""
+    """The solution of given weights, with the equations of its last step.
+
+    A ray that cannot be computed stays out: a point at the limit of what a model is valid for would
+    cross it with every step.
+    """
     while True:
-        solved = step(
-            problem, priors, gauge, state, problem.equations(state.values, state.lon_lat_h, weight)
-        )
-        state = solved.state
+        equations = problem.equations(state.values, state.lon_lat_h, weight)
+        solved = step(problem, priors, gauge, state, equations)
+        state, weight = solved.state, equations.weight
         if solved.change_px <= problem.options.converged_px:
             return solved
         if state.iterations >= problem.options.max_iterations:

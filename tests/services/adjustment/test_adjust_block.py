@@ -11,6 +11,7 @@ from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.intersection import intersect
 from services.adjustment.parameters import image_parameters
 from services.errors import NoConvergence, NotEnoughPoints
+from services.sensors.correction import CorrectedModel
 from services.simulation.view import ViewGeometry
 from services.types import Array, Observations
 from tests.services.simulated import ring_of_geometries
@@ -277,6 +278,35 @@ def test_a_block_that_does_not_settle_says_so(five: list[ViewGeometry]) -> None:
     ties = make_ties(five, np.random.default_rng(0), 50, NOISE_PX, 0.05, np.full((5, 2), 3.0))
     with pytest.raises(NoConvergence, match="after 1 iterations"):
         adjusted(five, ties.observations, options=BlockOptions(max_iterations=1))
+
+
+class UpTo(CorrectedModel):
+    """A model that is not valid above 200 m."""
+
+    def project(self, lon_lat_h: Array) -> Array:
+        return np.where(lon_lat_h[:, 2:] > 200.0, np.nan, super().project(lon_lat_h))
+
+
+def test_points_at_the_limit_of_some_models_stop_no_block(five: list[ViewGeometry]) -> None:
+    """All rays may meet above the limit, and those that are valid there below it."""
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.1, 0.9, (200, 2)) * five[0].plan.shape
+    height_m = np.where(np.arange(200) < 100, 150.0, rng.uniform(199.7, 200.0, 200))
+    truth = five[0].rpc.locate(image, height_m)
+    positions = np.stack([geometry.rpc.project(truth) for geometry in five], axis=1).reshape(-1, 2)
+    observations = Observations(
+        np.repeat(np.arange(200), 5),
+        np.tile(np.arange(5), 200),
+        positions + rng.normal(0.0, NOISE_PX, positions.shape),
+        np.full(1000, NOISE_PX),
+    )
+    images = [
+        image_parameters(g.plan.image_id, g.rpc, g.plan.shape, shift_px=PRIOR_PX, order="shift")
+        for g in five
+    ]
+    limited = [replace(image, model=UpTo(image.model, image.zero)) for image in images[:2]]
+    block = adjust_block(limited + images[2:], observations)
+    assert np.isfinite(block.lon_lat_h[:, 0]).all()
 
 
 def test_the_same_ties_give_the_same_block(five: list[ViewGeometry], trials: list[Trial]) -> None:
