@@ -1,4 +1,4 @@
-"""Terrain as a grid of heights, and the intersection of lines of sight with it."""
+"""Terrain as a grid of heights above the ellipsoid, read by windows."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -8,11 +8,10 @@ import numpy as np
 from numba import njit
 
 from services.errors import CoverageError
-from services.geodesy import metres_per_degree, metres_per_degree_at, wrapped_degrees
+from services.geodesy import metres_per_degree_at
 from services.imagery.source import ArrayImage, ImageSource, Window
 from services.map_grid import MapGrid
-from services.sensors.base import SensorModel
-from services.types import Array, BoolArray, FloatImage, IntArray
+from services.types import Array, FloatImage, IntArray
 
 Geoid = Callable[[Array], Array]
 """Height (n,) of a geoid above the ellipsoid at longitudes and latitudes (n, 2), metres."""
@@ -21,8 +20,6 @@ _TILE = 2048
 """Side of the windows in which a grid is read, cells."""
 _MAX_CELLS_IN_MEMORY = 32_000_000
 """Largest part of a terrain that is kept in memory: 128 MB."""
-_INTERSECTION_TOLERANCE_M = 1e-4
-_MAX_LEVELS = 5000
 
 
 @dataclass(frozen=True)
@@ -163,99 +160,21 @@ class _CroppedImage:
         return self.whole.read(Window(line, sample, window.lines, window.samples))
 
 
-def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
-    """First intersection (n, 3) of the lines of sight of image positions with the terrain.
-
-    The heights along each line are searched from above the highest ground downwards, in steps over
-    which the line moves by at most one posting, until the line is below the ground. Regula falsi
-    (Illinois variant) then finds the crossing. The search finds the visible side of a ridge, also where
-    a fixed-point iteration would jump.
-
-    Args:
-        model: of the image.
-        line_sample: (n, 2) pixels.
-        terrain: the ground.
-
-    Returns:
-        (n, 3) lon, lat, height; NaN where the line meets a void or no ground.
-
-    Raises:
-        CoverageError: no line comes near the grid.
-    """
-    low_m, high_m = terrain.around(_ray_ends(model, line_sample, model.height_range_m)).range_m()
-    ends = _ray_ends(model, line_sample, (low_m, high_m))
-    ground = terrain.around(ends)
-    low_m, high_m = ground.range_m()
-    levels = _levels(ends, low_m, high_m, ground.posting_m)
-    above = np.full(len(line_sample), levels[0])
-    below = np.full(len(line_sample), np.nan)
-    falling = np.arange(len(line_sample))
-    for level in levels[1:]:
-        gap = _gap(model, line_sample[falling], np.full(len(falling), level), ground)
-        crossed = gap >= 0.0
-        below[falling[crossed]] = level
-        falling = falling[~crossed]
-        above[falling] = level
-        if not len(falling):
-            break
-    rows = np.flatnonzero(np.isfinite(below))
-    height_m = np.full(len(line_sample), np.nan)
-    height_m[rows] = _crossing(model, line_sample[rows], above[rows], below[rows], ground)
-    return model.locate(line_sample, height_m)
-
-
-def _ray_ends(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
-    """Longitudes and latitudes (2n, 2) of lines of sight at two heights."""
-    return np.concatenate(
-        [model.locate(line_sample, np.full(len(line_sample), h))[:, :2] for h in heights_m]
-    )
-
-
-def _levels(ends: Array, low_m: float, high_m: float, posting_m: float) -> Array:
-    """Heights from above the highest to below the lowest ground, at most a posting apart on any line."""
-    low, high = np.split(ends, 2)
-    east, north = metres_per_degree(float(np.nanmean(low[:, 1])), high_m)
-    shift = low - high
-    shift[:, 0] = wrapped_degrees(shift[:, 0])
-    moved_m = float(np.nanmax(np.hypot(shift[:, 0] * east, shift[:, 1] * north)))
-    count = int(np.clip(math.ceil(moved_m / posting_m), 1, _MAX_LEVELS))
-    return np.linspace(high_m + 1.0, low_m - 1.0, count + 2)
-
-
-def _gap(model: SensorModel, line_sample: Array, height_m: Array, terrain: Terrain) -> Array:
-    """Height (n,) of the ground above the lines of sight at given heights; NaN where unknown."""
-    lon_lat = model.locate(line_sample, height_m)[:, :2]
-    gap = np.full(len(lon_lat), np.nan)
-    valid = np.isfinite(lon_lat).all(axis=1)
-    gap[valid] = terrain.height_m(lon_lat[valid]) - height_m[valid]
-    return gap
-
-
-def _crossing(
-    model: SensorModel, line_sample: Array, above: Array, below: Array, terrain: Terrain
-) -> Array:
-    """Height (n,) where lines of sight cross the ground, between a height above it and one below it."""
-    gap_above = _gap(model, line_sample, above, terrain)
-    gap_below = _gap(model, line_sample, below, terrain)
-    # A line above a void crosses the ground at an unknown position.
-    height = np.where(np.isfinite(gap_above), below, np.nan)
-    for _ in range(60):
-        open_: BoolArray = np.isfinite(height) & (np.abs(above - below) > _INTERSECTION_TOLERANCE_M)
-        if not open_.any():
-            break
-        weight = gap_above / np.where(gap_above == gap_below, 1.0, gap_above - gap_below)
-        height = np.where(open_, above + np.clip(weight, 0.0, 1.0) * (below - above), height)
-        gap = np.full(len(height), np.nan)
-        gap[open_] = _gap(model, line_sample[open_], height[open_], terrain)
-        height = np.where(open_ & ~np.isfinite(gap), np.nan, height)
-        settled = open_ & (np.abs(gap) < _INTERSECTION_TOLERANCE_M)
-        under = open_ & (gap >= 0.0)
-        over = open_ & (gap < 0.0)
-        gap_above = np.where(under, gap_above / 2.0, np.where(over, gap, gap_above))
-        gap_below = np.where(over, gap_below / 2.0, np.where(under, gap, gap_below))
-        below = np.where(under | settled, height, below)
-        above = np.where(over | settled, height, above)
-    return height
+@njit(inline="always")
+def bilinear_height(heights: FloatImage, line: float, sample: float) -> float:
+    """Bilinear height of a grid at one position; see `bilinear_heights`."""
+    lines, samples = heights.shape
+    if not (-0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5):
+        return np.nan
+    line = min(max(line, 0.0), lines - 1.0)
+    sample = min(max(sample, 0.0), samples - 1.0)
+    r0, c0 = int(line), int(sample)
+    fr, fc = line - r0, sample - c0
+    r1 = r0 + 1 if fr > 0.0 else r0
+    c1 = c0 + 1 if fc > 0.0 else c0
+    top = heights[r0, c0] + fc * (np.float64(heights[r0, c1]) - heights[r0, c0])
+    bottom = heights[r1, c0] + fc * (np.float64(heights[r1, c1]) - heights[r1, c0])
+    return top + fr * (bottom - top)
 
 
 @njit(cache=True)
@@ -264,22 +183,9 @@ def bilinear_heights(heights: FloatImage, line_sample: Array) -> Array:
 
     NaN more than half a step outside the grid, and where a node with a nonzero weight is NaN.
     """
-    lines, samples = heights.shape
     out = np.empty(len(line_sample))
     for i in range(len(line_sample)):
-        line, sample = line_sample[i, 0], line_sample[i, 1]
-        if not (-0.5 <= line <= lines - 0.5 and -0.5 <= sample <= samples - 0.5):
-            out[i] = np.nan
-            continue
-        line = min(max(line, 0.0), lines - 1.0)
-        sample = min(max(sample, 0.0), samples - 1.0)
-        r0, c0 = int(line), int(sample)
-        fr, fc = line - r0, sample - c0
-        r1 = r0 + 1 if fr > 0.0 else r0
-        c1 = c0 + 1 if fc > 0.0 else c0
-        top = heights[r0, c0] + fc * (np.float64(heights[r0, c1]) - heights[r0, c0])
-        bottom = heights[r1, c0] + fc * (np.float64(heights[r1, c1]) - heights[r1, c0])
-        out[i] = top + fr * (bottom - top)
+        out[i] = bilinear_height(heights, line_sample[i, 0], line_sample[i, 1])
     return out
 
 

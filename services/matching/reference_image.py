@@ -17,10 +17,11 @@ from services.imagery.source import (
     low_pass,
     sample_image,
 )
+from services.lines_of_sight import intersect_terrain
 from services.matching.control_points import PointMatches
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.sensors.base import SensorModel
-from services.terrain import Terrain, intersect_terrain
+from services.terrain import Terrain
 from services.types import (
     UNKNOWN_FRAME,
     Array,

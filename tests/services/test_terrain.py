@@ -9,11 +9,12 @@ from scipy.ndimage import map_coordinates
 from services import terrain as terrain_module
 from services.errors import CoverageError
 from services.imagery.source import ArrayImage, FloatImage, Window
+from services.lines_of_sight import intersect_terrain
 from services.map_grid import MapGrid
 from services.sensors.ortho import OrthoModel
 from services.sensors.pushbroom import PushbroomModel
 from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain, intersect_terrain
+from services.terrain import Terrain
 from services.types import Array
 
 a_tenth_of_a_millimetre = 1e-4
@@ -144,6 +145,22 @@ def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersecti
     far = replace(GRID, origin_xy=GRID.origin_xy + 1e5)
     with pytest.raises(CoverageError, match="does not cover"):
         intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
+
+
+def test_lines_of_sight_end_on_ground_above_a_geoid() -> None:
+    model, flat = view(35.0), terrain(60.0)
+    ground = replace(flat, geoid=lambda at: 40.0 * np.sin(2.0 * at[:, 0]) + 80.0 * (at[:, 1] - 43.3))
+    met = intersect_terrain(model, pixels_of(), ground)
+    assert np.isfinite(met).all()
+    np.testing.assert_allclose(met[:, 2], ground.height_m(met[:, :2]), atol=a_millimetre)
+
+
+def test_a_terrain_too_large_for_the_memory_is_read_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, ground = view(35.0), terrain(60.0)
+    whole = intersect_terrain(model, pixels_of(), ground)
+    monkeypatch.setattr(terrain_module, "_MAX_CELLS_IN_MEMORY", 800)
+    parts = intersect_terrain(model, pixels_of(), ground)
+    np.testing.assert_allclose(parts[:, 2], whole[:, 2], atol=a_tenth_of_a_millimetre)
 
 
 def test_the_lines_of_sight_of_an_ortho_image_end_vertically_below() -> None:

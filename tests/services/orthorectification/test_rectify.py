@@ -12,6 +12,7 @@ from services.errors import CoverageError
 from services.formats.images.ortho import write_cog
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
+from services.lines_of_sight import intersect_terrain
 from services.map_grid import MapGrid
 from services.orthorectification import rectify as module
 from services.orthorectification.mapping import map_into_image, occluded_ground
@@ -24,7 +25,7 @@ from services.orthorectification.rectify import (
 )
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
-from services.terrain import Terrain, intersect_terrain
+from services.terrain import Terrain
 from services.types import Acquisition, FloatImage
 
 the_tolerance_px = 0.1

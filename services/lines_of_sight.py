@@ -1,0 +1,236 @@
+"""The intersection of lines of sight with a terrain."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from services.errors import CoverageError
+from services.imagery.source import ArrayImage, Window
+from services.sensors.base import SensorModel
+from services.terrain import Terrain, bilinear_height
+from services.types import Array, FloatImage
+
+_TOLERANCE_M = 1e-5
+_BOX_NODES = 17
+_BOX_MARGIN = 0.01
+_BLOCK = 8
+"""Side, in nodes, of the blocks whose highest node decides whether a stretch of a line is skipped."""
+_STEPS_PER_NODE = 2.0
+_MAX_NODES = 20_000
+_MARGIN_M = 1.0
+"""The search starts this far above the highest ground, and ends this far below the lowest."""
+
+
+class _Line(NamedTuple):
+    """A line of sight, by u from -1 at the lowest height to 1 at the highest; a tuple for the kernels.
+
+    Attributes:
+        row, col: coefficients of 1, u and u^2 of its position in the grid of the terrain.
+        geoid_m: coefficients of 1 and u of the geoid below it.
+        middle_m, half_m: coefficients of 1 and u of its height above the ellipsoid.
+    """
+
+    row: tuple[float, float, float]
+    col: tuple[float, float, float]
+    geoid_m: tuple[float, float]
+    middle_m: float
+    half_m: float
+
+
+def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
+    """First intersection (n, 3) of the lines of sight of image positions with the terrain.
+
+    Each line is followed from above the highest ground downwards, by at most half a node of the terrain
+    a step, until it is below the ground; stretches that are above all nodes around are skipped. Regula
+    falsi (Illinois variant) then finds the crossing. The search finds the visible side of a ridge, also
+    where a fixed-point iteration would jump. Between the lowest and the highest ground, the position of
+    a line in the grid is a quadratic of the height.
+
+    Args:
+        model: of the image.
+        line_sample: (n, 2) pixels.
+        terrain: the ground.
+
+    Returns:
+        (n, 3) lon, lat, height; NaN where the line meets a void or no ground.
+
+    Raises:
+        CoverageError: no line comes near the grid.
+    """
+    box = _box_of(line_sample)
+    low_m, high_m = terrain.around(_ray_ends(model, box, model.height_range_m)).range_m()
+    ground = terrain.around(_ray_ends(model, box, (low_m, high_m)))
+    if not isinstance(ground.heights, ArrayImage) and len(line_sample) > 1:
+        return _in_halves(model, line_sample, terrain)
+    low_m, high_m = ground.range_m()
+    low_m, high_m = low_m - _MARGIN_M, high_m + _MARGIN_M
+    heights = ground.heights.read(Window(0, 0, *ground.grid.shape))
+    places = [
+        model.locate(line_sample, np.full(len(line_sample), height_m))[:, :2]
+        for height_m in (low_m, (low_m + high_m) / 2.0, high_m)
+    ]
+    low, middle, high = (ground.grid.line_sample(lon_lat) for lon_lat in places)
+    track = np.column_stack([middle, (high - low) / 2.0, (high + low) / 2.0 - middle])
+    undulation_m = np.zeros((len(track), 2))
+    if ground.geoid is not None:
+        undulation_m = np.column_stack([_defined(ground.geoid, places[k]) for k in (0, 2)])
+    summits = _summits(heights)
+    height_m = _first_crossings(heights, summits, track, undulation_m, (low_m, high_m))
+    met = model.locate(line_sample, height_m)
+    if ground.geoid is not None:
+        # Between the ends of a line, the geoid is not exactly linear.
+        exact_m = _defined(ground.height_m, met)
+        met = model.locate(line_sample, np.where(np.isfinite(exact_m), exact_m, height_m))
+    return met
+
+
+def _in_halves(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
+    """As `intersect_terrain`, of each half of the image positions along their longer axis."""
+    axis = int(np.argmax(np.ptp(line_sample, axis=0)))
+    order = np.argsort(line_sample[:, axis], kind="stable")
+    out = np.empty((len(line_sample), 3))
+    for half in np.array_split(order, 2):
+        try:
+            out[half] = intersect_terrain(model, line_sample[half], terrain)
+        except CoverageError:
+            out[half] = np.nan
+    return out
+
+
+def _box_of(line_sample: Array) -> Array:
+    """A grid of image positions around others (n, 2); models are smooth between its nodes."""
+    known = line_sample[np.isfinite(line_sample).all(axis=1)]
+    if not len(known):
+        return line_sample
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = _BOX_MARGIN * (high - low) + 1.0
+    axes = [np.linspace(*ends, _BOX_NODES) for ends in zip(low - margin, high + margin, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _ray_ends(model: SensorModel, line_sample: Array, heights_m: tuple[float, float]) -> Array:
+    """Longitudes and latitudes (2n, 2) of lines of sight at two heights."""
+    return np.concatenate(
+        [model.locate(line_sample, np.full(len(line_sample), h))[:, :2] for h in heights_m]
+    )
+
+
+def _defined(heights_of: Callable[[Array], Array], ground: Array) -> Array:
+    """Heights (n,) at those ground positions (n, 2 or 3) that are known; NaN elsewhere."""
+    out = np.full(len(ground), np.nan)
+    known = np.isfinite(ground).all(axis=1)
+    out[known] = heights_of(ground[known, :2])
+    return out
+
+
+@njit(inline="always", error_model="numpy")
+def _gap_m(heights: FloatImage, line: _Line, u: float) -> float:
+    """Height of the ground above a line of sight, metres."""
+    row = line.row[0] + u * (line.row[1] + u * line.row[2])
+    col = line.col[0] + u * (line.col[1] + u * line.col[2])
+    ground_m = bilinear_height(heights, row, col) + line.geoid_m[0] + u * line.geoid_m[1]
+    return ground_m - line.middle_m - u * line.half_m
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing(heights: FloatImage, line: _Line, above: float, below: float) -> float:
+    """u where a line crosses the ground, between u above the ground and u below it; NaN at a void."""
+    gap_above, gap_below = _gap_m(heights, line, above), _gap_m(heights, line, below)
+    u, gap = below, gap_below
+    for _ in range(100):
+        if (above - below) * line.half_m < _TOLERANCE_M:
+            break
+        u = above + gap_above / (gap_above - gap_below) * (below - above)
+        gap = _gap_m(heights, line, u)
+        if not abs(gap) > _TOLERANCE_M / 10.0:
+            break
+        if gap > 0.0:
+            below, gap_below, gap_above = u, gap, gap_above / 2.0
+        else:
+            above, gap_above, gap_below = u, gap, gap_below / 2.0
+    return np.nan if np.isnan(gap) else u
+
+
+@njit(cache=True, error_model="numpy")
+def _summits(heights: FloatImage) -> FloatImage:
+    """Highest node of each block and of the blocks beside it; minus infinity where there is none."""
+    rows, cols = (heights.shape[0] - 1) // _BLOCK + 1, (heights.shape[1] - 1) // _BLOCK + 1
+    own = np.full((rows, cols), -np.inf, dtype=np.float32)
+    for i in range(heights.shape[0]):
+        for j in range(heights.shape[1]):
+            if heights[i, j] > own[i // _BLOCK, j // _BLOCK]:
+                own[i // _BLOCK, j // _BLOCK] = heights[i, j]
+    out = np.full((rows, cols), -np.inf, dtype=np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            for k in range(max(i - 1, 0), min(i + 2, rows)):
+                for m in range(max(j - 1, 0), min(j + 2, cols)):
+                    out[i, j] = max(out[i, j], own[k, m])
+    return out
+
+
+@njit(inline="always", error_model="numpy")
+def _summit_m(summits: FloatImage, line: _Line, u: float) -> float:
+    """Highest ground within a block's side of the position of a line."""
+    row = (line.row[0] + u * (line.row[1] + u * line.row[2])) / _BLOCK
+    col = (line.col[0] + u * (line.col[1] + u * line.col[2])) / _BLOCK
+    i = min(max(int(row), 0), summits.shape[0] - 1)
+    j = min(max(int(col), 0), summits.shape[1] - 1)
+    return summits[i, j] + line.geoid_m[0] + abs(line.geoid_m[1])
+
+
+@njit(cache=True, error_model="numpy")
+def _first_crossing(heights: FloatImage, summits: FloatImage, line: _Line) -> float:
+    """u where a line of sight first meets the ground; NaN where unknown."""
+    nodes = 2.0 * (abs(line.row[1]) + abs(line.row[2]) + abs(line.col[1]) + abs(line.col[2]))
+    if not nodes < _MAX_NODES:
+        return np.nan
+    stretches = math.ceil(nodes / (_BLOCK - 1)) + 1
+    steps = math.ceil(_STEPS_PER_NODE * nodes / stretches) + 1
+    above, is_above = 1.0, _gap_m(heights, line, 1.0) < 0.0
+    for k in range(stretches):
+        start, end = 1.0 - 2.0 * k / stretches, 1.0 - 2.0 * (k + 1) / stretches
+        if _summit_m(summits, line, start) < line.middle_m + end * line.half_m:
+            above, is_above = end, _gap_m(heights, line, end) < 0.0
+            continue
+        for m in range(1, steps + 1):
+            u = start + (end - start) * m / steps
+            gap_m = _gap_m(heights, line, u)
+            if gap_m >= 0.0:
+                # A line above a void crosses the ground at an unknown position.
+                return _crossing(heights, line, above, u) if is_above else np.nan
+            above, is_above = u, gap_m < 0.0
+    return np.nan
+
+
+@njit(cache=True, error_model="numpy")
+def _first_crossings(
+    heights: FloatImage,
+    summits: FloatImage,
+    track: Array,
+    undulation_m: Array,
+    between_m: tuple[float, float],
+) -> Array:
+    """Heights (n,) where lines of sight first meet the ground; NaN where unknown.
+
+    With u from -1 at the lowest height to 1 at the highest, a line is at `a + b u + c u^2` in the grid.
+
+    Args:
+        heights: of the grid, above its vertical datum.
+        summits: of the same grid, see `_summits`.
+        track: (n, 6) a, b and c, line and sample.
+        undulation_m: (n, 2) of the geoid at both ends of the line.
+        between_m: lowest and highest height, above the ellipsoid.
+    """
+    middle_m, half_m = (between_m[0] + between_m[1]) / 2.0, (between_m[1] - between_m[0]) / 2.0
+    out = np.full(len(track), np.nan)
+    for i in range(len(track)):
+        t = track[i]
+        low_m, high_m = undulation_m[i]
+        geoid_m = ((low_m + high_m) / 2.0, (high_m - low_m) / 2.0)
+        line = _Line((t[0], t[2], t[4]), (t[1], t[3], t[5]), geoid_m, middle_m, half_m)
+        out[i] = middle_m + half_m * _first_crossing(heights, summits, line)
+    return out
