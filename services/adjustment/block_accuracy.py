@@ -10,8 +10,8 @@ from services.adjustment.known_images import Tie
 from services.adjustment.normal_equations import Equations, Pairs, Points, shared_covariance
 from services.adjustment.parameters import (
     PASS_SHARE,
+    AdjustableImage,
     BlockPriors,
-    ImageParameters,
     sharing_covariance,
     shift_rows,
 )
@@ -105,7 +105,7 @@ _LITTLE_M = 0.1
 def earth_frames(
     accuracy: BlockAccuracy,
     priors: BlockPriors,
-    images: Sequence[ImageParameters],
+    images: Sequence[AdjustableImage],
     passes: Sequence[BoolArray],
     tie: Tie | None = None,
 ) -> tuple[Frame, ...]:

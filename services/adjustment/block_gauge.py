@@ -49,7 +49,9 @@ def connected_groups(equations: Equations, n_images: int, n_blocks: int) -> IntA
     return np.where(seen, number[label], -1).astype(np.int64)
 
 
-def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deformable: BoolArray) -> Gauge:
+def block_gauge(
+    equations: Equations, group: IntArray, lon_lat_h: Array, deformable: BoolArray, sigma: Array
+) -> Gauge:
     """The effect of translations and linear deformations of each group on its parameters.
 
     Tie points do not determine the position of a block. Its images see it under slightly different
@@ -72,8 +74,9 @@ def block_gauge(equations: Equations, group: IntArray, lon_lat_h: Array, deforma
     place = np.zeros((len(used), 2))
     place[used] = east_north / (2.0 * east_north.std(axis=0) + 1e-12)
     normal, right = _sums(equations, place, n)
-    ridge = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None, None] * 1e-9
-    change = np.linalg.solve(normal + ridge * np.eye(normal.shape[1]), right)
+    told = np.maximum((np.diagonal(normal, 0, 1, 2) * sigma**2).sum(axis=1), 1e-300)
+    ridge = 1e-9 * told[:, None] * sigma**-2.0
+    change = np.linalg.solve(normal + ridge[:, :, None] * np.eye(normal.shape[1]), right)
     move, *linear = np.split(change, 3, axis=2)
     of_groups = np.stack([group == g for g in range(groups)])
     bends = [members for members in of_groups if deformable[members].all()]

@@ -9,7 +9,7 @@ import numpy as np
 from services.adjustment.control_ground import ControlGround
 from services.adjustment.known_images import Tie
 from services.adjustment.normal_equations import Equations, Pairs, seen_pairs
-from services.adjustment.parameters import ImageParameters
+from services.adjustment.parameters import AdjustableImage
 from services.geodesy import metres_per_degree_at, wrapped_degrees
 from services.types import Array, BoolArray, IntArray, Observations
 
@@ -46,7 +46,7 @@ class BlockProblem:
         tie: images in common with an adjusted block.
     """
 
-    images: Sequence[ImageParameters]
+    images: Sequence[AdjustableImage]
     observations: Observations
     control: ControlGround
     options: BlockOptions
@@ -58,6 +58,14 @@ class BlockProblem:
     def n_blocks(self) -> int:
         """Images, and behind them the frames of the control."""
         return len(self.images) + len(self.control.frames)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(n, k) a priori standard deviations; 1 for the parameters of frames, and absent ones."""
+        sigma = np.ones((self.n_blocks, self.size))
+        for i, image in enumerate(self.images):
+            sigma[i, : len(image.sigma)] = image.sigma
+        return sigma
 
     @cached_property
     def common(self) -> BoolArray:
@@ -155,14 +163,11 @@ class BlockProblem:
         residual, by_ground = np.empty((m + 2 * c, 2)), np.zeros((m + 2 * c, 2, 3))
         by_parameters = np.zeros((m + 2 * c, 2, self.size))
         for i, (image, rows) in enumerate(zip(self.images, self.rows_of_images, strict=True)):
-            ground = lon_lat_h[self.observations.point[rows]]
-            computed = image.model.project(ground)
-            design, k = image.design(computed), len(image.sigma)
-            sigma = self.observations.sigma_px[rows, None]
-            moved = design @ values[i, :k]
-            residual[rows] = (self.observations.line_sample[rows] - computed - moved) / sigma
-            by_ground[rows] = image.model.project_derivative(ground) / sigma[:, :, None]
-            by_parameters[rows, :, :k] = design / sigma[:, :, None]
+            k, sigma = len(image.sigma), self.observations.sigma_px[rows, None]
+            computed = image.computed(values[i, :k], lon_lat_h[self.observations.point[rows]])
+            residual[rows] = (self.observations.line_sample[rows] - computed.line_sample) / sigma
+            by_ground[rows] = computed.by_ground / sigma[:, :, None]
+            by_parameters[rows, :, :k] = computed.by_parameters / sigma[:, :, None]
         if c:
             whitening = self.control.whitening()
             misfit = self.control_misfit_m(values, lon_lat_h)

@@ -114,8 +114,8 @@ def checked_gauge(
             f"{' | '.join(names)}. Make a block of each, or give control points to each"
         )
     deformable = np.zeros(problem.n_blocks, dtype=np.bool_)
-    deformable[:n] = [image.free.all() for image in problem.images]
-    return block_gauge(equations, group, lon_lat_h, deformable)
+    deformable[:n] = [image.deformable for image in problem.images]
+    return block_gauge(equations, group, lon_lat_h, deformable, problem.sigma)
 
 
 def unsettled(problem: BlockProblem, change_px: float, state: State) -> NoConvergence:

@@ -18,11 +18,11 @@ from services.adjustment.block_solution import checked_gauge, least_squares
 from services.adjustment.control_check import agreeing_control
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.known_images import KnownImages, known_images, tie
-from services.adjustment.parameters import BlockPriors, ImageParameters, block_priors
+from services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
 from services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
 from services.adjustment.robust_start import active_observations, robust_start
 from services.errors import NoConsensus
-from services.sensors.correction import CorrectedModel
+from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, Frame, IntArray, Observations
 
 
@@ -34,7 +34,8 @@ class BlockAdjustment:
         models: the images' models with their corrections.
         values: (n, k) parameters of the images; 0 where an image has fewer.
         accuracy: covariance of the parameters, with and without the doubt about the frame.
-        slope_factor: standard deviation of drifts and skews over what was stated, by the residuals.
+        slope_factor: standard deviation of drifts and skews over what was stated, by the residuals; for
+            the parameters that are `estimated`.
         lon_lat_h: (p, 3) the points; NaN where they cannot be intersected.
         point_covariance_m2: (p, 3, 3) east, north, up, relative to the frame of the point's group: with
             the errors that points take over from images.
@@ -50,7 +51,7 @@ class BlockAdjustment:
         iterations: number of iterations.
     """
 
-    models: tuple[CorrectedModel, ...]
+    models: tuple[SensorModel, ...]
     values: Array
     accuracy: BlockAccuracy
     slope_factor: float
@@ -80,7 +81,7 @@ _SETTLED = 0.02
 
 
 def adjust_block(
-    images: Sequence[ImageParameters],
+    images: Sequence[AdjustableImage],
     observations: Observations,
     *,
     control: ControlGround = NO_CONTROL,
@@ -185,7 +186,7 @@ def adjust_block(
 
 
 def _known(
-    images: Sequence[ImageParameters],
+    images: Sequence[AdjustableImage],
     values: Array,
     group: IntArray,
     frames: Sequence[Frame],
@@ -211,7 +212,7 @@ def _determined(priors: BlockPriors, variance: Array) -> Array:
 
 def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far: float) -> float:
     """By how much the standard deviation of drifts and skews changes (MacKay's fixed point)."""
-    slopes = priors.shape > 0.0
+    slopes = priors.estimated & (priors.shape > 0.0)
     if not slopes.any():
         return 1.0
     stated = priors.shape[slopes] * so_far**2

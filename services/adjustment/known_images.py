@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from services.adjustment.parameters import BlockPriors, ImageParameters
+from services.adjustment.parameters import AdjustableImage, BlockPriors
 from services.errors import InputError
 from services.types import Array, BoolArray, Frame, IntArray
 
@@ -54,7 +54,7 @@ class KnownImages:
 
 
 def known_images(
-    images: Sequence[ImageParameters], values: Array, relative: Array, frame: Frame
+    images: Sequence[AdjustableImage], values: Array, relative: Array, frame: Frame
 ) -> KnownImages:
     """What later blocks may be tied to."""
     places = [_probes(image) for image in images]
@@ -69,11 +69,12 @@ def known_images(
     )
 
 
-def _probes(image: ImageParameters) -> tuple[Array, Array]:
+def _probes(image: AdjustableImage) -> tuple[Array, Array]:
     """Places (q, 3) all over an image, low and high, and where its delivered model shows them."""
     side = np.linspace(-0.9, 0.9, _PROBES)
     t = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    line_sample = np.tile(image.zero.centre + t * image.zero.half_size, (2, 1))
+    size = np.array(image.shape, dtype=np.float64)
+    line_sample = np.tile((size - 1.0) / 2.0 + t * size / 2.0, (2, 1))
     height_m = np.repeat(image.model.height_range_m, len(t))
     ground = image.model.locate(line_sample, np.asarray(height_m, dtype=np.float64))
     return ground, image.model.project(ground)
@@ -132,7 +133,7 @@ class Tie:
         return members
 
 
-def tie(images: Sequence[ImageParameters], known: KnownImages) -> Tie:
+def tie(images: Sequence[AdjustableImage], known: KnownImages) -> Tie:
     """The images of a block that a neighbour has adjusted.
 
     Raises:

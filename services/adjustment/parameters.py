@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy import sparse
@@ -17,12 +18,81 @@ PASS_SHARE = 0.5
 weights them. Nobody states it: the frame of the block covers every share between none and all."""
 
 
+class Computed(NamedTuple):
+    """Positions in an image and their derivatives; NaN where there is no position.
+
+    Attributes:
+        line_sample: (m, 2) pixels.
+        by_ground: (m, 2, 3) by metres east, north, up.
+        by_parameters: (m, 2, k).
+    """
+
+    line_sample: Array
+    by_ground: Array
+    by_parameters: Array
+
+
+class AdjustableImage(Protocol):
+    """An image of a block with its k free parameters; all that the adjustment asks of it.
+
+    A parameter of one displaces some position in the image by a pixel, and none by much more. All are
+    zero for the model as delivered.
+    """
+
+    @property
+    def name(self) -> str:
+        """Of the image, for messages."""
+        ...
+
+    @property
+    def model(self) -> SensorModel:
+        """As delivered."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        ...
+
+    @property
+    def sigma(self) -> Array:
+        """(k,) a priori standard deviations, pixels."""
+        ...
+
+    @property
+    def locating(self) -> BoolArray:
+        """(k,) parameters whose a priori sigma is the accuracy of the image on the Earth."""
+        ...
+
+    @property
+    def estimated(self) -> BoolArray:
+        """(k,) parameters, none of them locating, whose sigmas the block multiplies by one factor."""
+        ...
+
+    @property
+    def deformable(self) -> bool:
+        """Whether the parameters together follow any affine displacement of its positions."""
+        ...
+
+    def computed(self, values: Array, lon_lat_h: Array) -> Computed:
+        """Where the model with parameters (k,) shows ground points (m, 3)."""
+        ...
+
+    def corrected(self, values: Array) -> SensorModel:
+        """The model with parameters (k,)."""
+        ...
+
+    def shared_direction(self) -> Array:
+        """Derivative (l, 2) of the locating parameters by an error of unit variance on the ground.
+
+        The images of a pass may have that error in common. It takes at most the a priori variance.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class ImageParameters:
-    """The free parameters of one image: a delivered model, and what a correction may add to it.
-
-    The adjustment reads `model`, `sigma`, `locating`, `design` and `corrected`, and nothing else: a
-    rigorous model joins with parameters of its own (attitude, orbit) by the same five.
+    """The free parameters of a correction in image space, which follows a delivered model.
 
     Attributes:
         name: of the image, for messages.
@@ -35,6 +105,12 @@ class ImageParameters:
     model: SensorModel
     zero: ImageCorrection
     prior_px: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Lines and samples."""
+        lines, samples = np.round(2.0 * self.zero.half_size).astype(np.int64).tolist()
+        return lines, samples
 
     @property
     def free(self) -> BoolArray:
@@ -53,6 +129,16 @@ class ImageParameters:
         constant[:, 0] = True
         return constant[self.free]
 
+    @property
+    def estimated(self) -> BoolArray:
+        """(k,) drifts and skews: what is stated of their size is a guess."""
+        return ~self.locating
+
+    @property
+    def deformable(self) -> bool:
+        """Whether the correction is affine."""
+        return bool(self.free.all())
+
     @cached_property
     def _column(self) -> Array:
         return np.asarray(np.nonzero(self.free)[1])
@@ -66,6 +152,12 @@ class ImageParameters:
         for coordinate in range(2):
             design[:, coordinate, row == coordinate] = terms[:, row == coordinate]
         return design
+
+    def computed(self, values: Array, lon_lat_h: Array) -> Computed:
+        """Where the corrected model shows ground points (m, 3), with parameters (k,)."""
+        delivered = self.model.project(lon_lat_h)
+        design = self.design(delivered)
+        return Computed(delivered + design @ values, self.model.project_derivative(lon_lat_h), design)
 
     def corrected(self, values: Array) -> CorrectedModel:
         """The model with parameters of the given values (k,)."""
@@ -117,21 +209,23 @@ class BlockPriors:
         size: parameters of the image that has most; those that others lack have no derivative.
         locating: (K, K) sparse, inverse covariance of the parameters that tell where images lie.
         shape: (K,) inverse variances of the others: drifts and skews.
+        estimated: (K,) those of them whose size the block tells.
         mean: (K,) what is expected: 0, or what a neighbouring block tells.
     """
 
     size: int
     locating: sparse.csc_matrix
     shape: Array
+    estimated: BoolArray
     mean: Array
 
     def with_slopes(self, factor: float) -> "BlockPriors":
-        """The same where standard deviations of drifts and skews are multiplied by a factor."""
-        return replace(self, shape=self.shape / factor**2)
+        """The same where the standard deviations that are estimated are multiplied by a factor."""
+        return replace(self, shape=np.where(self.estimated, self.shape / factor**2, self.shape))
 
 
 def block_priors(
-    images: Sequence[ImageParameters], passes: Sequence[BoolArray], frames: Sequence[Array] = ()
+    images: Sequence[AdjustableImage], passes: Sequence[BoolArray], frames: Sequence[Array] = ()
 ) -> BlockPriors:
     """The priors of images and, behind them, of the frames of control points.
 
@@ -144,6 +238,7 @@ def block_priors(
     n = len(images) + len(frames)
     # Parameters that an image lacks keep a unit weight, so that the matrix has an inverse.
     locating, shape = sparse.lil_matrix((n * size, n * size)), np.zeros(n * size)
+    estimated = np.zeros(n * size, dtype=np.bool_)
     for i, image in enumerate(images):
         k = len(image.sigma)
         weight = np.ones(size)
@@ -153,6 +248,7 @@ def block_priors(
         rows = i * size + np.arange(size)
         locating[rows, rows] = np.where(tells, weight, 0.0)
         shape[rows] = np.where(tells, 0.0, weight)
+        estimated[rows[:k]] = image.estimated
     for members in passes:
         rows = shift_rows(images, members, size)
         covariance = sharing_covariance(images, members, PASS_SHARE)
@@ -162,7 +258,7 @@ def block_priors(
         locating[np.ix_(rows, rows)] = frame_weight(covariance)
         rest = np.arange(rows[-1] + 1, (len(images) + i + 1) * size)
         locating[rest, rest] = 1.0
-    return BlockPriors(size, locating.tocsc(), shape, np.zeros(n * size))
+    return BlockPriors(size, locating.tocsc(), shape, estimated, np.zeros(n * size))
 
 
 def frame_weight(covariance_m2: Array) -> Array:
@@ -178,17 +274,21 @@ _EXACT_M = 1e-3
 """Standard deviation of a frame that is stated to be exact."""
 
 
-def shift_rows(images: Sequence[ImageParameters], members: BoolArray, size: int) -> IntArray:
-    """Rows (2 s,) of the shifts of some images (n,) among the parameters of a block."""
+def shift_rows(images: Sequence[AdjustableImage], members: BoolArray, size: int) -> IntArray:
+    """Rows (s,) of the locating parameters of some images (n,) among the parameters of a block."""
     rows = [i * size + np.flatnonzero(images[i].locating) for i in np.flatnonzero(members).tolist()]
     return np.concatenate(rows)
 
 
-def sharing_covariance(images: Sequence[ImageParameters], members: BoolArray, share: float) -> Array:
-    """Covariance (2 s, 2 s) of the shifts of a pass, of which images have a share in common."""
-    directions = np.concatenate([images[i].shared_direction() for i in np.flatnonzero(members).tolist()])
+def sharing_covariance(images: Sequence[AdjustableImage], members: BoolArray, share: float) -> Array:
+    """Covariance (s, s) of the locating parameters of a pass, of which images have a share in common."""
+    chosen = [images[i] for i in np.flatnonzero(members).tolist()]
+    directions = np.concatenate([image.shared_direction() for image in chosen])
     covariance = share * directions @ directions.T
-    for i in range(0, len(covariance), 2):
-        own = np.s_[i : i + 2, i : i + 2]
-        covariance[own] = directions[i : i + 2] @ directions[i : i + 2].T
+    first = 0
+    for image in chosen:
+        sigma = image.sigma[image.locating]
+        own = np.s_[first : first + len(sigma)]
+        covariance[own, own] = np.diag(sigma**2)
+        first += len(sigma)
     return np.asarray(covariance)

@@ -8,6 +8,7 @@ import numpy as np
 from services.adjustment.bundle import BlockAdjustment
 from services.conventions import MAX_ERROR_SIGMAS
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from services.sensors.base import SensorModel
 from services.types import Array, IntArray, Observations
 
 FITS = "fits"
@@ -81,13 +82,20 @@ def image_fits(
     return tuple(
         _image_fit(
             scene,
-            adjustment.models[i].correction.parameters[:, 0],
+            _shift_px(scene, adjustment.models[i]),
             tuple(count[i].tolist()),
             rms_px[i],
             middle_px,
         )
         for i, scene in enumerate(scenes)
     )
+
+
+def _shift_px(scene: Scene, adjusted: SensorModel) -> Array:
+    """By how much (2,) the middle of an image moved."""
+    middle = (np.array([scene.image.shape]) - 1.0) / 2.0
+    height_m = np.array([np.mean(scene.model.height_range_m)])
+    return np.asarray((adjusted.project(scene.model.locate(middle, height_m)) - middle)[0])
 
 
 def _image_fit(

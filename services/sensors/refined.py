@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from services.errors import CoverageError
+from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, fold_into_rpc
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_rpc
@@ -14,11 +15,11 @@ REFIT_LIMIT_PX = 0.01
 
 @dataclass(frozen=True)
 class RefinedRpc:
-    """The RPC of a corrected model.
+    """The RPC of a refined model.
 
     Attributes:
         model: the RPC, None when none is close enough.
-        max_error_px: largest difference from the corrected model in the image; 0 when the RPC is exact,
+        max_error_px: largest difference from the refined model in the image; 0 when the RPC is exact,
             infinite when none could be fitted.
     """
 
@@ -26,22 +27,27 @@ class RefinedRpc:
     max_error_px: float
 
 
-def refined_rpc(model: CorrectedModel, shape: tuple[int, int]) -> RefinedRpc:
-    """The RPC of a corrected model over its image and the height range of the delivered model.
+def refined_rpc(
+    model: SensorModel, shape: tuple[int, int], height_range_m: tuple[float, float] | None = None
+) -> RefinedRpc:
+    """The RPC of a refined model over its image.
 
     A correction of each coordinate separately folds into a delivered RPC exactly. For a correction that
     mixes the coordinates, and for a model that is not an RPC, a new RPC is fitted and accepted within
     `REFIT_LIMIT_PX`.
 
     Args:
-        model: the delivered model with its correction.
+        model: refined: a delivered model with its correction, or a rigorous model.
         shape: lines and samples of the image.
+        height_range_m: lowest and highest ground that an RPC is fitted over; by default those of the
+            model, which are all ground on the Earth for rigorous models of products.
     """
-    mixed = bool(model.correction.parameters[[0, 1], [2, 1]].any())
-    if isinstance(model.base, RpcModel) and not mixed:
-        return RefinedRpc(fold_into_rpc(model.base, model.correction), 0.0)
+    if isinstance(model, CorrectedModel) and isinstance(model.base, RpcModel):
+        mixed = bool(model.correction.parameters[[0, 1], [2, 1]].any())
+        if not mixed:
+            return RefinedRpc(fold_into_rpc(model.base, model.correction), 0.0)
     try:
-        fitted = fit_rpc(model, shape, model.height_range_m)
+        fitted = fit_rpc(model, shape, height_range_m or model.height_range_m)
     except CoverageError:
         return RefinedRpc(None, math.inf)
     close = fitted.max_error_px < REFIT_LIMIT_PX
