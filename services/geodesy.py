@@ -131,16 +131,17 @@ def lon_lat_h_from_ecef(ecef: Array) -> Array:
 
 
 def ecef_from_east_north_up(origin_lon_lat_h: Array) -> Array:
-    """Rotation (3, 3) whose columns are the east, north and up axes at an origin (3,)."""
-    lon, lat = np.radians(origin_lon_lat_h[:2])
+    """Rotations (..., 3, 3) whose columns are the east, north and up axes at origins (..., 3)."""
+    lon, lat = np.radians(origin_lon_lat_h[..., 0]), np.radians(origin_lon_lat_h[..., 1])
     sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
-    return np.array(
+    axes = np.array(
         [
             [-sin_lon, -sin_lat * cos_lon, cos_lat * cos_lon],
             [cos_lon, -sin_lat * sin_lon, cos_lat * sin_lon],
-            [0.0, cos_lat, sin_lat],
+            [0.0 * lat, cos_lat, sin_lat],
         ]
     )
+    return np.moveaxis(axes, (0, 1), (-2, -1))
 
 
 def east_north_up(lon_lat_h: Array, origin_lon_lat_h: Array) -> Array:

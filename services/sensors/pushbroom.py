@@ -73,8 +73,18 @@ class PushbroomModel:
         Returns:
             (n, 2, 3) pixels per metre east, north, up; NaN where `project` is.
         """
+        return self.project_with_derivatives(lon_lat_h)[1]
+
+    def project_with_derivatives(self, lon_lat_h: Array) -> tuple[Array, Array, Array]:
+        """Image positions of ground points with their derivatives.
+
+        Returns:
+            (n, 2) as `project`, (n, 2, 3) as `project_derivative`, and (n, 2, 2) pixels by the tangents
+            along and across the track under which the ground is seen in the body frame.
+        """
         ground = np.ascontiguousarray(lon_lat_h, dtype=np.float64)
-        return kernels.project_derivative(*self._packed, ground, kernels.project(*self._packed, ground))
+        image = kernels.project(*self._packed, ground)
+        return image, *kernels.project_derivative(*self._packed, ground, image)
 
     def locate(self, line_sample: Array, height_m: Array) -> Array:
         """Ground position of image points at given heights, by Newton steps along the line of sight.

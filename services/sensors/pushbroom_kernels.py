@@ -398,13 +398,14 @@ def project(m: Packed, table: Array, lon_lat_h: Array) -> Array:
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
-def project_derivative(m: Packed, table: Array, lon_lat_h: Array, image: Array) -> Array:
-    """Derivative (n, 2, 3) of `project` by metres east, north, up, at its results (n, 2).
+def project_derivative(m: Packed, table: Array, lon_lat_h: Array, image: Array) -> tuple[Array, Array]:
+    """Derivatives of `project` at its results (n, 2): (n, 2, 3) by metres east, north, up, and (n, 2, 2)
+    by the tangents along and across under which the ground is seen.
 
     The tangents along and across of a ground point equal those of its detector: their derivatives by the
     ground, by the line (a difference over one line) and by the sample give that of the position.
     """
-    out = np.full((len(lon_lat_h), 2, 3), np.nan)
+    out, by_tangents = np.full((len(lon_lat_h), 2, 3), np.nan), np.full((len(lon_lat_h), 2, 2), np.nan)
     pose, ground, shift, axis = np.empty((5, 3)), np.empty(7), np.zeros(3), np.empty((3, 3))
     for i in range(len(lon_lat_h)):
         if np.isnan(image[i, 0]):
@@ -422,6 +423,8 @@ def project_derivative(m: Packed, table: Array, lon_lat_h: Array, image: Array) 
         along_sample = -horner_with_slope(table, m.look, piece, 0, u)[1] * per_px
         across_sample = -horner_with_slope(table, m.look, piece, 1, u)[1] * per_px
         inverse = -1.0 / (along_line * across_sample - along_sample * across_line)
+        by_tangents[i, 0, 0], by_tangents[i, 0, 1] = inverse * across_sample, -inverse * along_sample
+        by_tangents[i, 1, 0], by_tangents[i, 1, 1] = -inverse * across_line, inverse * along_line
         _pose(m, table, image[i, 0], pose)
         along, across, depth = _in_body(
             pose, ground[0] - pose[0, 0], ground[1] - pose[0, 1], ground[2] - pose[0, 2]
@@ -435,6 +438,6 @@ def project_derivative(m: Packed, table: Array, lon_lat_h: Array, image: Array) 
             x, y, z = _in_body(pose, axis[k, 0], axis[k, 1], axis[k, 2])
             by_along = (x - z * along / depth) / depth
             by_across = (y - z * across / depth) / depth
-            out[i, 0, k] = inverse * (by_along * across_sample - by_across * along_sample)
-            out[i, 1, k] = inverse * (by_across * along_line - by_along * across_line)
-    return out
+            for row in range(2):
+                out[i, row, k] = by_tangents[i, row, 0] * by_along + by_tangents[i, row, 1] * by_across
+    return out, by_tangents

@@ -1,0 +1,108 @@
+"""Terms of a rigorous model move its image as the geometry says, and derivatives as differences do."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.geodesy import ecef_from_lon_lat_h
+from services.sensors.light_path import LightPath
+from services.sensors.pushbroom import PushbroomModel
+from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
+from services.simulation.orbit import pushbroom_over
+
+SHAPE = (3000, 2000)
+size = np.array([1e-5, 1e-5, 1e-3, 1e-5, 1e-5, 1e-3, 10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 1e-3, 1e-3])
+"""Terms that displace an image of 2.5 m by some pixels, orbit drifts by less: they change aberration."""
+a_millipixel = 1e-3
+
+
+def a_model(azimuth_deg: float = 75.0) -> PushbroomModel:
+    rng = np.random.default_rng(4)
+    target = np.array([5.4, 43.6, 250.0])
+    view = (25.0, azimuth_deg)
+    return pushbroom_over(target, SHAPE, 2.5, view, (0.0, 1500.0), jitter_px=0.5, rng=rng)
+
+
+def with_a_mirror(model: PushbroomModel) -> PushbroomModel:
+    """The same with central tangents along and across of 0.01 and 0.4, as SPOT 1 to 5 have them."""
+    look = model.look.coefficients.copy()
+    look[:, :, -1] += [0.01, 0.4]
+    return replace(model, look=replace(model.look, coefficients=look))
+
+
+def ground_in(model: PushbroomModel, count: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(11)
+    return model.locate(rng.uniform(0.0, 1.0, (count, 2)) * SHAPE, rng.uniform(0.0, 1500.0, count))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [a_model(), a_model(250.0), replace(a_model(), light_path=LightPath(True, True, True))],
+    ids=["east", "west", "light"],
+)
+@pytest.mark.parametrize("term", range(len(TERMS)), ids=TERMS)
+def test_derivatives_agree_with_differences_of_exact_models(model: PushbroomModel, term: int) -> None:
+    errors, ground = PushbroomErrors(model), ground_in(model)
+    at = size * np.random.default_rng(7).uniform(-0.3, 0.3, len(TERMS))
+    step = np.zeros(len(TERMS))
+    step[term] = size[term]
+    after, before = (errors.corrected(at + sign * step).project(ground) for sign in (0.5, -0.5))
+    image, _, by_terms = errors.projected(at, ground)
+    np.testing.assert_allclose(image, errors.corrected(at).project(ground), atol=1e-9)
+    predicted = by_terms[:, :, term] * size[term]
+    assert np.abs(predicted).max() > 20.0 * a_millipixel
+    np.testing.assert_allclose(predicted, after - before, atol=a_millipixel)
+
+
+def test_no_terms_leave_the_model_as_it_is() -> None:
+    model = a_model()
+    ground = ground_in(model)
+    unchanged = PushbroomErrors(model).corrected(np.zeros(len(TERMS)))
+    np.testing.assert_allclose(unchanged.project(ground), model.project(ground), atol=1e-9)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_turns_are_about_the_axes_of_the_central_line_of_sight(mirror: bool) -> None:
+    model = with_a_mirror(a_model()) if mirror else a_model()
+    centre = (np.array([SHAPE]) - 1.0) / 2.0
+    directions = {}
+    for name, turn in (("none", 0), ("roll", 1), ("pitch", 2), ("yaw", 3)):
+        terms = np.zeros(len(TERMS))
+        terms[turn - 1] = 1e-3 if turn else 0.0
+        corrected = PushbroomErrors(model).corrected(terms)
+        directions[name] = corrected.line_of_sight(centre)[1][0]
+    # A turn by a milliradian moves the line of sight by as much, but for the one about itself.
+    angle = {name: np.linalg.norm(d - directions["none"]) for name, d in directions.items()}
+    assert angle["yaw"] < 1e-12
+    assert angle["roll"] == pytest.approx(1e-3, rel=1e-6)
+    assert angle["pitch"] == pytest.approx(1e-3, rel=1e-6)
+    velocity = model.orbit.derivative(np.zeros(1))[0]
+    forwards = velocity / np.linalg.norm(velocity)
+    moved = {name: (directions[name] - directions["none"]) @ forwards for name in ("roll", "pitch")}
+    # To pitch is to look forwards, in the sense of x to z about y.
+    assert abs(moved["pitch"]) > 0.9e-3
+    assert abs(moved["roll"]) < 0.4e-3
+
+
+def test_drifts_are_zero_at_the_middle_and_whole_at_the_last_line() -> None:
+    model = a_model()
+    lines = np.column_stack([[0.0, (SHAPE[0] - 1.0) / 2.0, SHAPE[0] - 1.0], np.full(3, 1000.0)])
+    origin = model.line_of_sight(lines)[0]
+    terms = np.zeros(len(TERMS))
+    terms[TERMS.index("radial drift")] = 5.0
+    moved = PushbroomErrors(model).corrected(terms).line_of_sight(lines)[0] - origin
+    upwards = (moved * origin).sum(axis=1) / np.linalg.norm(origin, axis=1)
+    np.testing.assert_allclose(upwards, [-5.0, 0.0, 5.0], atol=1e-4)
+
+
+def test_a_displaced_satellite_sees_the_ground_displaced_the_other_way() -> None:
+    model = a_model()
+    ground = ground_in(model)
+    terms = np.zeros(len(TERMS))
+    terms[TERMS.index("across track")] = 30.0
+    moved = PushbroomErrors(model).corrected(terms)
+    position = model.project(ground)
+    found = moved.locate(position, ground[:, 2])
+    step = ecef_from_lon_lat_h(found) - ecef_from_lon_lat_h(ground)
+    np.testing.assert_allclose(np.linalg.norm(step, axis=1), 30.0, rtol=0.02)
