@@ -6,10 +6,12 @@ import numpy as np
 
 from services.adjustment.intersection import intersect
 from services.imagery.scene import Scene
-from services.production.from_images import Production
+from services.production.control import Control
+from services.production.from_images import Production, produce_points
 from services.simulation.view import SimulatedView, simulate_block
+from services.tasks import Work
 from services.types import Array, Observations
-from tests.services.simulated import GSD_M, SHAPE, world
+from tests.services.simulated import GSD_M, OPTIONS, SHAPE, world
 from tests.services.ties import difference_m
 
 SIGMA_M = 5.0
@@ -35,6 +37,26 @@ def views(seed: int, error_m: float = SIGMA_M) -> tuple[SimulatedView, ...]:
 
 def scenes(seed: int) -> list[Scene]:
     return [view.as_scene(SIGMA_M) for view in views(seed)]
+
+
+@cache
+def _without_control(seed: int) -> tuple[Production, Work]:
+    work = Work()
+    return produce_points(scenes(seed), OPTIONS, work=work), work
+
+
+def free(seed: int) -> Production:
+    """The block of a seed without control."""
+    return _without_control(seed)[0]
+
+
+def placed(seed: int, control: Control) -> Production:
+    """The block of a seed with control: what its images show of each other is measured once."""
+    kept = _without_control(seed)[1].kept
+    shown = {
+        name: kept[name] for name in kept if name.startswith(("features/", "matches/", "measures/"))
+    }
+    return produce_points(scenes(seed), OPTIONS, control=control, work=Work(kept=shown))
 
 
 def frame_error_m(made: Production, seen: tuple[SimulatedView, ...]) -> Array:

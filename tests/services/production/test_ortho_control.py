@@ -9,16 +9,16 @@ import pytest
 from services.errors import NotEnoughPoints
 from services.imagery.source import ArrayImage
 from services.production.control import Control
-from services.production.from_images import Production, produce_points
+from services.production.from_images import Production
 from services.production.height_control import ControlHeights
 from services.production.ortho_control import ControlOrtho
 from services.sensors.ortho import OrthoModel
 from services.terrain import Terrain
 from services.types import BoolArray, Frame
-from tests.services.production.simulated_control import CHI2_3, frame_error_m, scenes, views
+from tests.services.production.simulated_control import CHI2_3, frame_error_m, free, placed, views
 from tests.services.quality.test_site_images import vertical_ortho
 from tests.services.registration.test_on_reference import grid, positions
-from tests.services.simulated import OPTIONS, world
+from tests.services.simulated import world
 
 pytestmark = pytest.mark.long
 
@@ -65,29 +65,25 @@ def heights(seed: int, bias_m: float = 0.0, wrong: BoolArray | None = None) -> C
 
 
 @cache
-def free(seed: int) -> Frame:
-    return produce_points(scenes(seed), OPTIONS).points.frames[0]
-
-
-@cache
-def placed(seed: int, kinds: str) -> Production:
+def placed_by(seed: int, kinds: str) -> Production:
     control = Control(
         orthos=(ortho(seed),) if "ortho" in kinds else (),
         heights=(heights(seed),) if "dem" in kinds else (),
     )
-    return produce_points(scenes(seed), OPTIONS, control=control)
+    return placed(seed, control)
 
 
 def squares(kinds: str) -> list[float]:
     """Squares of the errors of the frames in units of what is declared, of three coordinates."""
     out = []
     for seed in SEEDS:
-        made = placed(seed, kinds)
+        made = placed_by(seed, kinds)
         error_m, frame_m2 = frame_error_m(made, views(seed)), made.points.frames[0].covariance_m2
+        without = free(seed).points.frames[0]
         sigma_m, used = np.sqrt(np.diag(frame_m2)), made.adjustment.control_active
         print(
             f"{kinds} {seed}: {error_m.round(2)} m of {sigma_m.round(2)}, {used.sum()} of {len(used)}, "
-            f"without {free(seed).sigma_m:.1f}, {free(seed).sigma_up_m:.1f}"
+            f"without {without.sigma_m:.1f}, {without.sigma_up_m:.1f}"
         )
         out.append(float(error_m @ np.linalg.solve(frame_m2, error_m)))
     return out
@@ -100,14 +96,14 @@ def test_the_frame_is_within_what_is_declared(kinds: str) -> None:
     assert max(found) < CHI2_3
     assert 0.2 < np.mean(found) / 3.0 < 1.9
     for seed in SEEDS:
-        assert placed(seed, kinds).adjustment.control_active.mean() > 0.8
+        assert placed_by(seed, kinds).adjustment.control_active.mean() > 0.8
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_each_kind_of_control_tells_what_it_knows_alone(seed: int) -> None:
-    without = free(seed)
+    without = free(seed).points.frames[0]
     by_ortho, by_heights, by_both = (
-        placed(seed, kinds).points.frames[0] for kinds in ("ortho", "dem", "ortho and dem")
+        placed_by(seed, kinds).points.frames[0] for kinds in ("ortho", "dem", "ortho and dem")
     )
     assert by_ortho.sigma_m < 0.7
     assert by_ortho.sigma_up_m > 0.3 * without.sigma_up_m
@@ -119,7 +115,7 @@ def test_each_kind_of_control_tells_what_it_knows_alone(seed: int) -> None:
 
 def test_a_damaged_part_of_an_ortho_image_is_left_out_by_place() -> None:
     control = Control(orthos=(ortho(21, damaged=True),))
-    made = produce_points(scenes(21), OPTIONS, control=control)
+    made = placed(21, control)
     used, known = made.adjustment.control_active, made.control
     at = known.lon_lat_h[:, :2]
     lines = reference().model.project(known.lon_lat_h)
@@ -137,14 +133,14 @@ def test_an_ortho_image_of_another_place_is_refused_with_its_name() -> None:
     far = replace(away, origin_xy=away.origin_xy + 300.0)
     elsewhere = replace(exact, reference=replace(exact.reference, model=OrthoModel(far)))
     with pytest.raises(NotEnoughPoints, match=r"ortho\.tif: it shows other ground"):
-        produce_points(scenes(12), OPTIONS, control=Control(orthos=(elsewhere,)))
+        placed(12, Control(orthos=(elsewhere,)))
 
 
 def test_wrong_heights_are_left_out() -> None:
     nodes = grid(POSTING_M)
     wrong = np.zeros(nodes.shape, dtype=np.bool_)
     wrong[25:45, 25:45] = True
-    made = produce_points(scenes(22), OPTIONS, control=Control(heights=(heights(22, wrong=wrong),)))
+    made = placed(22, Control(heights=(heights(22, wrong=wrong),)))
     used, known = made.adjustment.control_active, made.control
     line_sample = nodes.line_sample(known.lon_lat_h[:, :2])
     inside = ((line_sample > 26) & (line_sample < 43)).all(axis=1)
@@ -160,4 +156,4 @@ def test_heights_of_other_ground_are_refused_with_their_name() -> None:
     away = replace(own.terrain.grid, origin_xy=own.terrain.grid.origin_xy + 5000.0)
     elsewhere = replace(own, terrain=replace(own.terrain, grid=away))
     with pytest.raises(NotEnoughPoints, match=r"dem\.tif: \d+ tried, 0 where it has heights"):
-        produce_points(scenes(12), OPTIONS, control=Control(heights=(elsewhere,)))
+        placed(12, Control(heights=(elsewhere,)))

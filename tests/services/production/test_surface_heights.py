@@ -40,6 +40,7 @@ honest = (0.7, 1.5)
 """Mean square of errors over their sigmas."""
 five_sigma = 5.0
 chips_m = (0.5, 2.0)
+TRIPLET = ProductionOptions(fine_gsd_m=chips_m[0], coarse_gsd_m=chips_m[1])
 dsm_sigma_m = 0.3
 """Of the noise of the elevation model. Its roughness over 2.5 m is 0.1 m; the scatter of tie points
 against it, without their own noise, is 0.5 m at most."""
@@ -156,9 +157,10 @@ def read_triplet(folder: Path, names: Sequence[str]) -> list[Scene]:
 
 
 @pytest.fixture(scope="module")
-def triplet(real_data: Path) -> tuple[list[Scene], Production]:
+def triplet(real_data: Path) -> tuple[list[Scene], Production, Work]:
     scenes = read_triplet(real_data / "phr_calanques_triplet", ("img_01", "img_02", "img_03"))
-    return scenes, produce_points(scenes, ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0))
+    work = Work()
+    return scenes, produce_points(scenes, TRIPLET, work=work), work
 
 
 @dataclass(frozen=True)
@@ -209,12 +211,12 @@ def test_real_surfaces_agree_with_an_elevation_model_as_stated(triplet, real_dat
             raster.transform,
             Transformer.from_crs(4326, 32631, always_xy=True),
         )
-    scenes, made = triplet
+    scenes, made, work = triplet
     points = made.points
     assert points.surface is not None
     stated, sigma_m = points.surface.height_m, points.surface.sigma_m
     # Some thirty heights tell where the raster lies to a metre; thousands of ties, to a decimetre.
-    ties = find_tie_points(scenes, [], FeatureOptions(), Work(), no_progress)
+    ties = find_tie_points(scenes, [], FeatureOptions(), work, no_progress)
     tied = intersect(made.adjustment.models, ties, int(ties.point[-1]) + 1).lon_lat_h
     tied = tied[np.isfinite(tied[:, 0])]
     east, north, up = model.translation(tied, tied[:, 2])
@@ -247,8 +249,9 @@ def test_real_surfaces_agree_with_an_elevation_model_as_stated(triplet, real_dat
 
 @pytest.mark.real_data
 def test_points_of_two_views_are_where_a_third_view_shows_their_chips(triplet) -> None:
-    scenes, all_three = triplet
-    pair = produce_points(scenes[:2], ProductionOptions(fine_gsd_m=0.5, coarse_gsd_m=2.0))
+    scenes, all_three, work = triplet
+    features = {name: work.kept[name] for name in work.kept if name.startswith("features/")}
+    pair = produce_points(scenes[:2], TRIPLET, work=Work(kept=features))
     third, model = scenes[2], all_three.adjustment.models[2]
     points, gsd_m = pair.points, chips_m[0]
     rows, displacement_m, covariance_m2 = [], [], []
