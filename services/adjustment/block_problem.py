@@ -169,7 +169,7 @@ class BlockProblem:
             by_ground[rows] = computed.by_ground / sigma[:, :, None]
             by_parameters[rows, :, :k] = computed.by_parameters / sigma[:, :, None]
         if c:
-            whitening = self.control.whitening()
+            whitening = self.control.whitening
             misfit = self.control_misfit_m(values, lon_lat_h)
             misfit = np.where(whitening.any(axis=1), misfit, 0.0)
             halves = np.zeros((c, 4, 3))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,6 +41,7 @@ class ControlGround:
     def __len__(self) -> int:
         return len(self.point)
 
+    @cached_property
     def whitening(self) -> Array:
         """Square roots (c, 3, 3) of the inverse covariances: rows of unknown coordinates are zero."""
         out = np.zeros((len(self), 3, 3))
