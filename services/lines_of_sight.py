@@ -18,8 +18,10 @@ _BOX_NODES = 17
 _BOX_MARGIN = 0.01
 _BLOCK = 8
 """Side, in nodes, of the blocks whose highest node decides whether a stretch of a line is skipped."""
-_STEPS_PER_NODE = 2.0
 _MAX_NODES = 20_000
+_GRID_LINE = 1e-9
+"""A position nearer than this to a line of the grid is on it, nodes."""
+_NONE = -2.0
 _MARGIN_M = 1.0
 """The search starts this far above the highest ground, and ends this far below the lowest."""
 
@@ -43,11 +45,11 @@ class _Line(NamedTuple):
 def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
     """First intersection (n, 3) of the lines of sight of image positions with the terrain.
 
-    Each line is followed from above the highest ground downwards, by at most half a node of the terrain
-    a step, until it is below the ground; stretches that are above all nodes around are skipped. Regula
-    falsi (Illinois variant) then finds the crossing. The search finds the visible side of a ridge, also
-    where a fixed-point iteration would jump. Between the lowest and the highest ground, the position of
-    a line in the grid is a quadratic of the height.
+    Each line is followed from above the highest ground downwards, cell by cell of the terrain, until it
+    is below the ground; stretches that are above all nodes around are skipped. Regula falsi (Illinois
+    variant) then finds the crossing. The search finds the visible side of a ridge, also where a
+    fixed-point iteration would jump, and the tip of one that a line only touches. Between the lowest and
+    the highest ground, the position of a line in the grid is a quadratic of the height.
 
     Args:
         model: of the image.
@@ -182,6 +184,46 @@ def _summit_m(summits: FloatImage, line: _Line, u: float) -> float:
     return summits[i, j] + line.geoid_m[0] + abs(line.geoid_m[1])
 
 
+@njit(inline="always", error_model="numpy")
+def _to_grid_line(position: float, speed: float) -> float:
+    """The way to the next line of the grid, in u, from a position that moves by -speed per u."""
+    cell = np.floor(position)
+    way = position - cell if speed > 0.0 else cell + 1.0 - position
+    return (way if way > _GRID_LINE else 1.0) / max(abs(speed), _GRID_LINE)
+
+
+@njit(cache=True, error_model="numpy")
+def _next_grid_line(line: _Line, u: float) -> float:
+    """The u below a given one where a line of sight reaches the next line of the grid."""
+    row = line.row[0] + u * (line.row[1] + u * line.row[2])
+    col = line.col[0] + u * (line.col[1] + u * line.col[2])
+    to_row = _to_grid_line(row, line.row[1] + 2.0 * u * line.row[2])
+    to_col = _to_grid_line(col, line.col[1] + 2.0 * u * line.col[2])
+    return u - min(to_row, to_col)
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing_in_cell(  # noqa: PLR0917 - numbers of one line of sight, in its innermost loop
+    heights: FloatImage, line: _Line, start: float, end: float, gap_start: float, gap_end: float
+) -> float:
+    """u where a line first crosses the ground of one cell, a quadratic of u; below -1 for none."""
+    middle = (start + end) / 2.0
+    gap_middle = _gap_m(heights, line, middle)
+    below = end
+    if not gap_end >= 0.0:
+        below = middle
+        if not gap_middle >= 0.0:
+            bend = 2.0 * (gap_start - 2.0 * gap_middle + gap_end)
+            peak = -(4.0 * gap_middle - 3.0 * gap_start - gap_end) / (2.0 * bend)
+            if not (bend < 0.0 and 0.0 < peak < 1.0):
+                return _NONE
+            below = start + peak * (end - start)
+            if not _gap_m(heights, line, below) >= 0.0:
+                return _NONE
+    # A line above a void crosses the ground at an unknown position.
+    return _crossing(heights, line, start, below) if gap_start < 0.0 else np.nan
+
+
 @njit(cache=True, error_model="numpy")
 def _first_crossing(heights: FloatImage, summits: FloatImage, line: _Line) -> float:
     """u where a line of sight first meets the ground; NaN where unknown."""
@@ -189,20 +231,18 @@ def _first_crossing(heights: FloatImage, summits: FloatImage, line: _Line) -> fl
     if not nodes < _MAX_NODES:
         return np.nan
     stretches = math.ceil(nodes / (_BLOCK - 1)) + 1
-    steps = math.ceil(_STEPS_PER_NODE * nodes / stretches) + 1
-    above, is_above = 1.0, _gap_m(heights, line, 1.0) < 0.0
     for k in range(stretches):
-        start, end = 1.0 - 2.0 * k / stretches, 1.0 - 2.0 * (k + 1) / stretches
-        if _summit_m(summits, line, start) < line.middle_m + end * line.half_m:
-            above, is_above = end, _gap_m(heights, line, end) < 0.0
+        u, end = 1.0 - 2.0 * k / stretches, 1.0 - 2.0 * (k + 1) / stretches
+        if _summit_m(summits, line, u) < line.middle_m + end * line.half_m:
             continue
-        for m in range(1, steps + 1):
-            u = start + (end - start) * m / steps
-            gap_m = _gap_m(heights, line, u)
-            if gap_m >= 0.0:
-                # A line above a void crosses the ground at an unknown position.
-                return _crossing(heights, line, above, u) if is_above else np.nan
-            above, is_above = u, gap_m < 0.0
+        gap_m = _gap_m(heights, line, u)
+        while u > end:
+            below = max(_next_grid_line(line, u), end)
+            gap_below_m = _gap_m(heights, line, below)
+            crossing = _crossing_in_cell(heights, line, u, below, gap_m, gap_below_m)
+            if not crossing <= _NONE:
+                return crossing
+            u, gap_m = below, gap_below_m
     return np.nan
 
 

@@ -133,12 +133,7 @@ class SceneAdjustment:
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
-        delivered = self.correction.invert(line_sample)
-        t = (delivered - self.correction.centre) / self.correction.half_size
-        design = np.zeros((len(t), 2, 6))
-        design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
-        of_correction = design @ self.covariance @ design.transpose(0, 2, 1)
-        return np.asarray(of_correction + np.diag(self.local_sigma_px**2))
+        return self.correction.covariance_at(line_sample, self.covariance, self.local_sigma_px)
 
 
 def adjust_scene(

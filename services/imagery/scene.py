@@ -44,11 +44,15 @@ def scene_gsd_m(scene: Scene) -> float:
     return image_gsd_m(scene.model, scene_centre(scene))
 
 
-def scene_footprint(scene: Scene) -> Array:
-    """Outline of the ground that the image can show at any height of its model.
+def scene_footprint(scene: Scene, heights_m: tuple[float, float] | None = None) -> Array:
+    """Outline of the ground that the image can show between two heights.
+
+    Args:
+        scene: the image.
+        heights_m: lowest and highest ground; None for those of the model.
 
     Returns:
-        (m, 2) lon, lat of the convex hull of the border of the image at both ends of the height range,
+        (m, 2) lon, lat of the convex hull of the border of the image at both heights,
         counter-clockwise, not closed. Longitudes are continuous: they exceed 180 degrees where the
         outline crosses the antimeridian.
     """
@@ -67,7 +71,7 @@ def scene_footprint(scene: Scene) -> Array:
     )
     rings = [
         scene.model.locate(border, np.full(len(border), height_m))[:, :2]
-        for height_m in scene.model.height_range_m
+        for height_m in heights_m or scene.model.height_range_m
     ]
     outline = np.concatenate(rings)
     outline = outline[np.isfinite(outline).all(axis=1)]

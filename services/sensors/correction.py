@@ -37,6 +37,20 @@ class ImageCorrection:
         moved = line_sample - self.centre - self.parameters[:, 0]
         return np.asarray(self.centre + moved @ np.linalg.inv(self.jacobian).T)
 
+    def covariance_at(self, line_sample: Array, covariance_px2: Array, local_sigma_px: Array) -> Array:
+        """Covariance (n, 2, 2) of corrected positions (n, 2), px^2.
+
+        Args:
+            line_sample: corrected positions.
+            covariance_px2: (6, 6) of `parameters`, row by row.
+            local_sigma_px: (2,) line and sample, of what parts of the image are off by beyond them.
+        """
+        t = (self.invert(line_sample) - self.centre) / self.half_size
+        design = np.zeros((len(t), 2, 6))
+        design[:, 0, :3] = design[:, 1, 3:] = np.column_stack([np.ones(len(t)), t])
+        of_parameters = design @ covariance_px2 @ design.transpose(0, 2, 1)
+        return np.asarray(of_parameters + np.diag(local_sigma_px**2))
+
     @property
     def jacobian(self) -> Array:
         """Derivative (2, 2) of `apply`."""

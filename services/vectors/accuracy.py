@@ -1,0 +1,97 @@
+"""Predicted accuracy of ground that a model and a terrain give, vertex by vertex."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.quality.accuracy import normal_ce90
+from services.quality.correction_accuracy import CorrectionAccuracy
+from services.sensors.base import SensorModel
+from services.terrain import Terrain
+from services.types import Array
+
+
+@dataclass(frozen=True)
+class ErrorSources:
+    """What makes the position of a vertex uncertain.
+
+    Attributes:
+        registration: of the model; None for a scene that is not registered.
+        model_sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation a
+            coordinate; NaN when unknown.
+        height_sigma_m: one standard deviation of the heights of the terrain.
+        vertex_sigma_px: one standard deviation of each coordinate of a digitised vertex.
+    """
+
+    registration: CorrectionAccuracy | None
+    model_sigma_m: float
+    height_sigma_m: float
+    vertex_sigma_px: float
+
+
+@dataclass(frozen=True)
+class VertexAccuracy:
+    """Predicted covariances of n vertices, east and north, m^2.
+
+    Attributes:
+        relative_m2: (n, 2, 2) relative to the control points; NaN when unknown.
+        on_the_earth_m2: (n, 2, 2) with their frame; NaN when unknown.
+    """
+
+    relative_m2: Array
+    on_the_earth_m2: Array
+
+    @property
+    def relative_ce90_m(self) -> Array:
+        """CE90 (n,) relative to the control points; NaN when unknown."""
+        return normal_ce90(self.relative_m2)
+
+    @property
+    def on_the_earth_ce90_m(self) -> Array:
+        """CE90 (n,) on the Earth; NaN when unknown."""
+        return normal_ce90(self.on_the_earth_m2)
+
+
+def predict_vertices(
+    model: SensorModel, terrain: Terrain, line_sample: Array, lon_lat_h: Array, sources: ErrorSources
+) -> VertexAccuracy:
+    """The covariance of ground where lines of sight meet a terrain.
+
+    With the derivative (A | a) of the model by the horizontal position and the height, and the slope g
+    of the ground, an error of the image position and one of the terrain's height move the intersection
+    by `(A + a g^T)^-1 (image error - a height error)`: on level ground, the height error times the
+    tangent of the incidence.
+
+    Args:
+        model: of the image.
+        terrain: the ground.
+        line_sample: (n, 2) the vertices in the image.
+        lon_lat_h: (n, 3) the same on the ground.
+        sources: of the errors.
+    """
+    derivative = model.project_derivative(lon_lat_h)
+    horizontal, vertical = derivative[:, :, :2], derivative[:, :, 2:]
+    slope = np.nan_to_num(terrain.slope(lon_lat_h))
+    to_ground = _inverse(horizontal + vertical * slope[:, None, :])
+    own_px2 = sources.vertex_sigma_px**2 * np.eye(2)
+    own_px2 = own_px2 + sources.height_sigma_m**2 * _outer(vertical)
+    if sources.registration is None:
+        relative_px2 = np.full_like(own_px2, np.nan)
+        earth_px2 = own_px2 + sources.model_sigma_m**2 * _outer(horizontal)
+    else:
+        relative_px2 = own_px2 + sources.registration.relative_px2(line_sample)
+        earth_px2 = relative_px2 + sources.registration.frame_px2(derivative)
+    on_ground = (to_ground @ one @ to_ground.transpose(0, 2, 1) for one in (relative_px2, earth_px2))
+    return VertexAccuracy(*on_ground)
+
+
+def _outer(matrices: Array) -> Array:
+    """Each matrix (n, i, j) times its transpose, (n, i, i)."""
+    return np.asarray(matrices @ matrices.transpose(0, 2, 1))
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses of matrices (n, 2, 2); infinite where a line of sight grazes the ground."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((np.array([[d, -b], [-c, a]]) / (a * d - b * c)).transpose(2, 0, 1))
