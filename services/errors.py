@@ -10,6 +10,7 @@ AmersError
     ├── NoConsensus
     ├── UndeterminedCorrection
     ├── DisconnectedBlock
+    ├── DoesNotFit
     └── NoConvergence
 
 Every message states the values found and expected.
@@ -65,6 +66,10 @@ class UndeterminedCorrection(ComputationError):
 
 class DisconnectedBlock(ComputationError):
     """Images of one block that nothing ties together."""
+
+
+class DoesNotFit(ComputationError):
+    """A scene that does not fit the others of its block."""
 
 
 class NoConvergence(ComputationError):

@@ -232,7 +232,7 @@ def adjust_scene(
     correction = replace(no_correction(shape), parameters=parameters[:, :3])
     deformation = np.zeros((6, 6))
     if observations.deformation_px2 is not None:
-        deformation[:] = np.kron(observations.deformation_px2, _deformed_parameters(correction))
+        deformation[:] = deformation_covariance(observations.deformation_px2, correction)
     misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
@@ -333,6 +333,11 @@ def _sigma0(
     chi2 = float((fit.residual(parameters)[active] ** 2 / fit.variance[active]).sum())
     freedom = fit.freedom(active, free, slope_px, covariance)
     return float(np.sqrt(chi2 / freedom / kept_variance)) if freedom > 0 else 1.0
+
+
+def deformation_covariance(deformation_px2: Array, correction: ImageCorrection) -> Array:
+    """Covariance (6, 6) of a correction by what its points are deformed by, (2, 2) line and sample."""
+    return np.asarray(np.kron(deformation_px2, _deformed_parameters(correction)), np.float64)
 
 
 def _deformed_parameters(correction: ImageCorrection) -> Array:

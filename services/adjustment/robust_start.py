@@ -69,7 +69,8 @@ def _falling_scale(problem: BlockProblem) -> float:
 
 
 def _check_points(problem: BlockProblem, step_m: Array) -> None:
-    intersected = int(np.isfinite(step_m[:, 0]).sum())
+    # A ray of a known point needs no second one.
+    intersected = int(np.isfinite(step_m[:, 0]).sum()) + len(problem.single_rays[0])
     if intersected < problem.options.min_points:
         raise NotEnoughPoints(
             intersected, problem.options.min_points, f"tie points between {len(problem.images)} images"

@@ -1,5 +1,6 @@
 """What points share with their neighbours: the adjustment repeated without one cell at a time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +10,13 @@ from services.quality.stability import (
     Displacement,
     GroupMeans,
     ImageResiduals,
+    Repetition,
     displacements_of,
-    repeat_without,
+    repetitions_without,
     residuals_in_image,
+    what_repetitions_show,
 )
-from services.types import IntArray
+from services.types import IntArray, Measures
 
 CELLS = 4
 """Cells along each side of the area of the active points."""
@@ -50,24 +53,35 @@ class CellStability:
 
 def measure_cell_stability(scene: AdjustedScene) -> CellStability:
     """Displacements and residuals when the active points of one cell at a time are held out."""
-    active = np.flatnonzero(scene.measures.active)
-    line_sample = scene.measures.line_sample[active]
-    groups: list[IntArray] = []
-    if len(active):
-        first, last = line_sample.min(axis=0), line_sample.max(axis=0)
-        inside = (line_sample - first) / np.maximum(last - first, 1.0)
-        row, column = np.minimum((inside * CELLS).astype(int), CELLS - 1).T
-        cell = row * CELLS + column
-        groups = [active[cell == one] for one in np.unique(cell)]
-    repeated = repeat_without(scene, groups if len(groups) > 1 else [])
+    groups = cells_of(scene.measures)
+    return cell_stability_of(scene, repetitions_without(scene, groups if len(groups) > 1 else []))
+
+
+def cells_of(measures: Measures) -> list[IntArray]:
+    """The active points of every cell that has some."""
+    active = np.flatnonzero(measures.active)
+    if not len(active):
+        return []
+    line_sample = measures.line_sample[active]
+    first, last = line_sample.min(axis=0), line_sample.max(axis=0)
+    inside = (line_sample - first) / np.maximum(last - first, 1.0)
+    row, column = np.minimum((inside * CELLS).astype(int), CELLS - 1).T
+    cell = row * CELLS + column
+    return [active[cell == one] for one in np.unique(cell)]
+
+
+def cell_stability_of(scene: AdjustedScene, repetitions: Sequence[Repetition]) -> CellStability:
+    """Displacements and residuals of adjustments, each without the active points of one cell."""
+    active, cells = int(scene.measures.active.sum()), len(cells_of(scene.measures))
+    repeated = what_repetitions_show(scene, repetitions)
     left_out = len(repeated.moved_px)
-    note = f"{len(active)} active points gave no solution without any of {len(groups)} cells"
-    if len(groups) < 2:
-        note = f"{len(active)} active points in {len(groups)} cells leave none to hold out"
+    note = f"{active} active points gave no solution without any of {cells} cells"
+    if cells < 2:
+        note = f"{active} active points in {cells} cells leave none to hold out"
     return CellStability(
         cells=CELLS,
         left_out=left_out,
-        failed=len(groups) - left_out,
+        failed=cells - left_out,
         displacements=displacements_of(repeated.moved_px, scene.gsd_m),
         held_out_px=residuals_in_image(repeated.residual_px),
         held_out_m=residuals_in_image(repeated.residual_px * scene.gsd_m),

@@ -21,6 +21,9 @@ from services.quality.stability import (
 )
 from services.types import Array, Frame, Measures
 
+_ENOUGH_RESIDUALS = 6
+"""Active points whose residuals tell a standard deviation."""
+
 
 @dataclass(frozen=True)
 class QualificationOptions:
@@ -169,17 +172,41 @@ def qualify(
         options: thresholds and sampling.
         rng: draws the points that are held out.
     """
+    stability = measure_stability(scene, options.draws, options.kept_share, rng)
+    return qualify_repeated(scene, options, stability, measure_cell_stability(scene))
+
+
+def qualify_repeated(
+    scene: AdjustedScene,
+    options: QualificationOptions,
+    stability: Stability,
+    cell_stability: CellStability,
+    *,
+    tie_residual_px: float = np.nan,
+) -> Qualification:
+    """The quality figures of a registration whose adjustment was repeated already; see `qualify`.
+
+    Args:
+        scene: after its final adjustment.
+        options: thresholds and sampling.
+        stability: the adjustment repeated without a part of its points.
+        cell_stability: the same without cells.
+        tie_residual_px: standard deviation of the residuals of tie points, of the worse coordinate; it
+            stands in where fewer active points than a usable registration needs have residuals.
+    """
     measures, adjustment, shape = scene.measures, scene.adjustment, scene.shape
     point_counts = count_points(measures)
     residuals = residuals_in_image(measures.residual_px[measures.active])
-    stability = measure_stability(scene, options.draws, options.kept_share, rng)
+    residual_std_px = unexplained_px(measures, adjustment.point_sigma_px)
+    if point_counts.active < _ENOUGH_RESIDUALS and np.isfinite(tie_residual_px):
+        residual_std_px = tie_residual_px
     predicted = predict_accuracy(scene, options.grid)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     figures = _Figures(
         active_points=point_counts.active,
         active_of_matched=point_counts.active_of_matched,
         coverage_percent=coverage.percent,
-        residual_std_px=unexplained_px(measures, adjustment.point_sigma_px),
+        residual_std_px=residual_std_px,
         displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
         predicted_ce90_px=predicted.worst_px,
         unit_weight=adjustment.sigma0,
@@ -195,7 +222,7 @@ def qualify(
         image_residuals_px=residuals,
         ground_residuals_m=_residuals_on_ground(measures.residual_m[measures.active]),
         stability=stability,
-        cell_stability=measure_cell_stability(scene),
+        cell_stability=cell_stability,
         predicted=predicted,
         accuracy=scene_accuracy(predicted.worst_m, predicted.on_the_earth_worst_m, scene.frame),
         coverage=coverage,

@@ -25,7 +25,8 @@ class AdjustedScene:
         shape: lines and samples of the image.
         gsd_m: ground sampling of the image; it converts pixels to metres.
         frame: of the control on the Earth.
-        refit: repeats the adjustment on the measures of a mask (n,).
+        refit: repeats the adjustment on the measures of a mask (n,); None for a scene whose repetitions
+            are those of a block.
     """
 
     model: SensorModel
@@ -34,7 +35,11 @@ class AdjustedScene:
     shape: tuple[int, int]
     gsd_m: float
     frame: Frame
-    refit: Callable[[BoolArray], SceneAdjustment]
+    refit: Callable[[BoolArray], SceneAdjustment] | None = None
+
+
+Repetition = tuple[IntArray, SceneAdjustment | None]
+"""Measures that were held out, and the adjustment without them; None where there was no solution."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +155,19 @@ def measure_stability(
     active = np.flatnonzero(scene.measures.active)
     held_count = len(active) - round(kept_share * len(active))
     drawn = [rng.permutation(active)[:held_count] for _ in range(draws if held_count else 0)]
-    repeated = repeat_without(scene, drawn)
+    return stability_of(scene, kept_share, repetitions_without(scene, drawn))
+
+
+def stability_of(scene: AdjustedScene, kept_share: float, drawn: Sequence[Repetition]) -> Stability:
+    """Displacements and residuals of repeated adjustments, each on a random part of the points.
+
+    Args:
+        scene: after its final adjustment.
+        kept_share: share of the active points in each draw.
+        drawn: the draws.
+    """
+    repeated = what_repetitions_show(scene, drawn)
+    held_count = round(float(np.mean([len(held) for held, _ in drawn]))) if drawn else 0
     return Stability(
         kept_share=kept_share,
         draws=len(repeated.moved_px),
@@ -160,7 +177,9 @@ def measure_stability(
         held_out_px=residuals_in_image(repeated.residual_px),
         held_out_m=residuals_in_image(repeated.residual_px * scene.gsd_m),
         group_means=repeated.means,
-        note="" if len(repeated.moved_px) else _why_no_stability(len(active), held_count),
+        note=""
+        if len(repeated.moved_px)
+        else _why_no_stability(int(scene.measures.active.sum()), held_count),
     )
 
 
@@ -179,20 +198,33 @@ class Repeated:
     means: GroupMeans
 
 
-def repeat_without(scene: AdjustedScene, groups: Sequence[IntArray]) -> Repeated:
-    """The adjustment repeated without each of these groups of measures."""
+def repetitions_without(scene: AdjustedScene, groups: Sequence[IntArray]) -> list[Repetition]:
+    """The adjustment of a scene alone repeated without each of these groups of measures."""
+    repetitions: list[Repetition] = []
+    for held in groups:
+        used = scene.measures.active.copy()
+        used[held] = False
+        try:
+            repetitions.append((held, scene.refit(used) if scene.refit else None))
+        except ComputationError:
+            repetitions.append((held, None))
+    return repetitions
+
+
+def what_repetitions_show(scene: AdjustedScene, repetitions: Sequence[Repetition]) -> Repeated:
+    """Displacements and residuals of the points held out, of the repetitions that succeeded."""
     measures, correction = scene.measures, scene.adjustment.correction
     places = image_places(scene.shape)
     moved, residuals, means = [], [np.empty((0, 2))], []
     independent, stated = [], []
-    for held in groups:
-        used = measures.active.copy()
-        used[held] = False
-        try:
-            repeated = scene.refit(used)
-        except ComputationError:
+    for held, repeated in repetitions:
+        if repeated is None:
             continue
         moved.append(repeated.correction.apply(places) - correction.apply(places))
+        if not len(held):
+            continue
+        used = measures.active.copy()
+        used[held] = False
         seen = measures.line_sample[held]
         residuals.append(seen - repeated.correction.apply(measures.predicted[held]))
         means.append(residuals[-1].mean(axis=0))

@@ -90,6 +90,22 @@ def register_scene(
         NotEnoughPoints: too few points were found.
         NoConsensus: the points found do not agree on one correction.
     """
+    context, search, adjustment = search_scene(
+        scene, points, chips, options, progress=progress, stages=stages
+    )
+    return build_registration(context, context.points, search, adjustment)
+
+
+def search_scene(
+    scene: Scene,
+    points: ControlPoints,
+    chips: ChipSource,
+    options: RegistrationOptions = RegistrationOptions(),
+    *,
+    progress: Progress = no_progress,
+    stages: list[SearchStage] | None = None,
+) -> tuple[PointContext, Search, SceneAdjustment]:
+    """The last search of the points of a scene, and the adjustment on it: see `register_scene`."""
     points = points.take(visible_points(scene, points))
     prediction = initial_prediction(scene, points)
     context = PointContext(
@@ -109,11 +125,28 @@ def register_scene(
         search = _match(part, prediction, rows)
         adjustment = adjust_search(scene, search, options.adjustment)
         prediction = predict(scene, points, adjustment)
-    return build_registration(context, points, search, adjustment)
+    return context, search, adjustment
 
 
 def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Search:
-    """A search of some of the points with the fine chips, within the error of their prediction."""
+    """A search of some of the points with the fine chips, of which enough have to agree."""
+    search, tolerance_px = search_near(context, prediction, rows)
+    reason, min_points = search.matches.reason, context.options.adjustment.min_points
+    check_inliers(context.stages[-1], tolerance_px, reason, context.scene, min_points)
+    return search
+
+
+def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -> tuple[Search, float]:
+    """A search of some of the points with the fine chips, within the error of their prediction.
+
+    Args:
+        context: of the registration; the summary of the search is added to it.
+        prediction: of all its points.
+        rows: of the points to search.
+
+    Returns:
+        The search, and the tolerance within which its inliers agree, pixels.
+    """
     options, gsd_m = context.options, context.fine_gsd_m
     points = context.points.take(rows)
     error_m = largest_error_m(prediction.uncertainty_m[rows])
@@ -134,8 +167,7 @@ def _match(context: PointContext, prediction: Prediction, rows: IntArray) -> Sea
         lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
-    check_inliers(stage, tolerance_px, matches.reason, context.scene, options.adjustment.min_points)
-    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m)
+    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m), tolerance_px
 
 
 def build_registration(

@@ -87,12 +87,19 @@ def adjust_search(
         min_points: smallest number of active measures; that of the options when None.
         like: an adjustment of these matches and others, whose prior and shared errors hold.
     """
+    observations = control_observations(scene, search, search.inliers if usable is None else usable)
+    return adjust_scene(
+        scene.model, scene.image.shape, observations, options, min_points=min_points, like=like
+    )
+
+
+def control_observations(scene: Scene, search: Search, usable: BoolArray) -> ControlObservations:
+    """What a scene shows of the points of a search, of which those of a mask (k,) may be used."""
     matches = search.matches
-    usable = search.inliers if usable is None else usable
     derivative = scene.model.project_derivative(scene_centre(scene)[None, :])[0]
     ground_to_px = derivative[:, :2]
     shared_m2 = shared_frame(search.points, usable).shared_m2
-    observations = ControlObservations(
+    return ControlObservations(
         lon_lat_h=search.points.lon_lat_h,
         line_sample=matches.line_sample,
         sigma_px=matches.sigma_px,
@@ -103,9 +110,6 @@ def adjust_search(
         block=search.points.block,
         frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
         chip_side_px=search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5),
-    )
-    return adjust_scene(
-        scene.model, scene.image.shape, observations, options, min_points=min_points, like=like
     )
 
 

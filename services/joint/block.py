@@ -1,0 +1,268 @@
+"""The least squares of scenes adjusted together: tie points between them, and control points in each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.adjustment.block_problem import BlockOptions
+from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.control_ground import ControlGround
+from services.adjustment.known_images import KnownImages
+from services.adjustment.parameters import ImageParameters, image_parameters
+from services.imagery.scene import scene_gsd_m
+from services.joint.measured import MeasuredScene
+from services.quality.frames import why_unknown
+from services.registration.options import RegistrationOptions
+from services.sensors.correction import CorrectedModel
+from services.types import (
+    Array,
+    BoolArray,
+    Frame,
+    IntArray,
+    Observations,
+    joined_observations,
+)
+
+_FREE_SLOPE_PX = 1000.0
+"""A priori standard deviation of drift and skew where their order is given."""
+_GRID = 5
+"""Places a side of an image at which covariances are compared."""
+
+
+@dataclass(frozen=True)
+class JointBlock:
+    """Scenes with all that they observe, and their adjustment.
+
+    Attributes:
+        scenes: the n scenes.
+        images: what may move.
+        ties: m observations of tie points, with sigmas as the residuals show them.
+        rows: for every scene, the points (k,) of its search that are observed.
+        at: for every scene, rows (k,) of these among all observations.
+        control: the known ground of all observed control points.
+        held_by: for every scene, rows (k,) of its points among `control`.
+        adjustment: of all observations: those of ties, then those of control points.
+    """
+
+    scenes: tuple[MeasuredScene, ...]
+    images: tuple[ImageParameters, ...]
+    ties: Observations
+    rows: tuple[IntArray, ...]
+    at: tuple[IntArray, ...]
+    control: ControlGround
+    held_by: tuple[IntArray, ...]
+    adjustment: BlockAdjustment
+
+    def model(self, scene: int) -> CorrectedModel:
+        """The adjusted model of a scene."""
+        image = self.images[scene]
+        return image.corrected(self.adjustment.values[scene, : len(image.sigma)])
+
+    def active(self, scene: int) -> BoolArray:
+        """Points (k,) of the search of a scene that the adjustment uses."""
+        active = np.zeros(len(self.scenes[scene].search.points), dtype=np.bool_)
+        agrees = self.adjustment.active[self.at[scene]]
+        agrees &= self.adjustment.control_active[self.held_by[scene]]
+        active[self.rows[scene]] = agrees
+        return active
+
+    def of_ties(self, scene: int) -> IntArray:
+        """Rows of the observations of tie points in a scene."""
+        return np.flatnonzero(self.ties.image == scene)
+
+    def covariance(self, scene: int) -> Array:
+        """Covariance (k, k) of the parameters of a scene, relative to the control points."""
+        accuracy, k = self.adjustment.accuracy, len(self.images[scene].sigma)
+        own = accuracy.covariance()[accuracy.pairs.start[scene]]
+        return np.asarray(own[:k, :k])
+
+
+def adjust_together(
+    scenes: Sequence[MeasuredScene],
+    ties: Observations,
+    options: RegistrationOptions = RegistrationOptions(),
+    *,
+    neighbour: KnownImages | None = None,
+) -> JointBlock:
+    """The block of scenes on their control points and tie points.
+
+    The block lies in the frame of the control points: their own errors are errors of the result, that of
+    their frame is not. It is adjusted twice: the first residuals show how precise tie points are.
+
+    Args:
+        scenes: with their control points.
+        ties: of the scenes, by their order.
+        options: of the correction.
+        neighbour: scenes that were adjusted before, some of which are among these.
+
+    Raises:
+        ComputationError: the observations do not allow a solution.
+    """
+    images = tuple(_image(measured, options) for measured in scenes)
+    block = _adjusted(scenes, images, ties, neighbour)
+    shown = replace(ties, sigma_px=ties.sigma_px * block.adjustment.sigma_px)
+    return _adjusted(scenes, images, shown, neighbour) if len(ties) else block
+
+
+def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages | None) -> JointBlock:
+    """The block adjusted without some control points of its scenes, on the tie points that agree.
+
+    Args:
+        block: adjusted.
+        held: for every scene, those of its control points that are held out.
+        neighbour: see `adjust_together`.
+    """
+    rows = np.flatnonzero(block.adjustment.active[: len(block.ties)])
+    ties = block.ties.take(rows)
+    ties = replace(ties, point=np.unique(ties.point, return_inverse=True)[1].astype(np.int64))
+    return _adjusted(block.scenes, block.images, ties, neighbour, held=held)
+
+
+def _adjusted(
+    scenes: Sequence[MeasuredScene],
+    images: tuple[ImageParameters, ...],
+    ties: Observations,
+    neighbour: KnownImages | None,
+    *,
+    held: Sequence[IntArray] | None = None,
+) -> JointBlock:
+    rows = []
+    for number, measured in enumerate(scenes):
+        usable = measured.usable.copy()
+        if held is not None:
+            usable[np.isin(measured.search.rows, held[number])] = False
+        rows.append(np.flatnonzero(usable))
+    first = int(ties.point.max(initial=-1)) + 1
+    found, control, place = _control(scenes, images, rows, first)
+    common = neighbour and not set(neighbour.names).isdisjoint(image.name for image in images)
+    adjustment = adjust_block(
+        images,
+        joined_observations([ties, found]),
+        control=control,
+        neighbour=neighbour if common else None,
+        options=BlockOptions(min_points=1),
+    )
+    order = np.argsort(place, kind="stable")
+    ends = np.cumsum([len(own) for own in rows])[:-1]
+    at = np.split(len(ties) + np.argsort(order, kind="stable"), ends)
+    held_by = np.split(place, ends)
+    return JointBlock(
+        tuple(scenes), images, ties, tuple(rows), tuple(at), control, tuple(held_by), adjustment
+    )
+
+
+def _image(measured: MeasuredScene, options: RegistrationOptions) -> ImageParameters:
+    """What may move in a scene: by what it is stated to be off, and by what its own points show."""
+    scene, alone = measured.scene, measured.alone
+    shift_px, slope_px = scene.sigma_m / scene_gsd_m(scene), options.adjustment.prior_slope_sigma_px
+    if alone is not None:
+        shift_px = float(np.hypot(shift_px, np.abs(alone.correction.parameters[:, 0]).max()))
+        slope_px = alone.slope_px
+    order = options.adjustment.order
+    return image_parameters(
+        measured.name,
+        scene.model,
+        scene.image.shape,
+        shift_px=shift_px,
+        slope_px=_FREE_SLOPE_PX if order else slope_px,
+        order=order or "affine",
+    )
+
+
+def _control(
+    scenes: Sequence[MeasuredScene],
+    images: Sequence[ImageParameters],
+    rows: Sequence[IntArray],
+    first: int,
+) -> tuple[Observations, ControlGround, IntArray]:
+    """Observations of control points, by point, their known ground, and its row for every one of `rows`.
+
+    A control point that several scenes show is one point, whose error they share.
+    """
+    parts = [measured.search.points.take(own) for measured, own in zip(scenes, rows, strict=True)]
+    identity = np.concatenate([part.id for part in parts])
+    _, index, place = np.unique(identity, return_index=True, return_inverse=True)
+    image = np.repeat(np.arange(len(scenes)), [len(own) for own in rows])
+    factor = np.array([_shared_factor(*both) for both in zip(scenes, images, strict=True)])
+    counts = np.bincount(place, minlength=len(index))
+    of_point = np.bincount(place, factor[image], len(index)) / np.maximum(counts, 1)
+    line_sample = np.concatenate(
+        [m.search.matches.line_sample[own] for m, own in zip(scenes, rows, strict=True)]
+    )
+    sigma_px = np.concatenate(
+        [m.search.matches.sigma_px[own] for m, own in zip(scenes, rows, strict=True)]
+    )
+    order = np.argsort(place, kind="stable")
+    block = np.concatenate([part.block for part in parts])[index]
+    covariance_m2 = np.concatenate([part.covariance_m2 for part in parts])[index]
+    control = ControlGround(
+        point=first + np.arange(len(index)),
+        lon_lat_h=np.concatenate([part.lon_lat_h for part in parts])[index],
+        covariance_m2=covariance_m2 * of_point[:, None, None],
+        source=block,
+        frames=_frames(scenes, block),
+        names=tuple(str(one) for one in identity[index]),
+    )
+    found = Observations(
+        first + place[order],
+        image[order],
+        line_sample[order],
+        (sigma_px * np.sqrt(factor[image]))[order],
+    )
+    return found, control, place.astype(np.int64)
+
+
+def _frames(scenes: Sequence[MeasuredScene], block: IntArray) -> tuple[Frame, ...]:
+    """The frames of blocks of control points, as seen from the block of most of them.
+
+    What the block of most points is off by is not seen. Another one lies apart by the errors of both;
+    where nobody stated them, by a pixel, as for one scene alone.
+    """
+    stated = scenes[0].points.frames
+    if not len(block):
+        return ()
+    counts = np.bincount(block, minlength=len(stated))
+    most = int(counts.argmax())
+    datum = stated[most]
+    pixel_m = float(np.median([scene_gsd_m(measured.scene) for measured in scenes]))
+    unstated = Frame.from_sigmas(pixel_m, pixel_m)
+    frames = []
+    for number, frame in enumerate(stated):
+        if number == most:
+            frames.append(Frame(np.zeros((3, 3))))
+        elif why_unknown(frame) or why_unknown(datum):
+            frames.append(unstated)
+        else:
+            frames.append(Frame(frame.covariance_m2 + datum.covariance_m2))
+    return tuple(frames)
+
+
+def _shared_factor(measured: MeasuredScene, image: ImageParameters) -> float:
+    """Variance of the control of a scene over what is stated, for errors taken to be independent.
+
+    Errors that neighbouring points share do not average out. The adjustment of the scene alone knows
+    them; that of the block takes all errors to be independent, and larger, so that both state the same.
+    """
+    alone = measured.alone
+    if alone is None:
+        return 1.0
+    if alone.apart_px > 0.0:
+        return alone.shared.factor
+    seen = measured.observations()
+    rows = np.flatnonzero(alone.active)
+    derivative = measured.scene.model.project_derivative(seen.lon_lat_h[rows])
+    of_points = derivative @ seen.covariance_m2[rows] @ derivative.transpose(0, 2, 1)
+    variance = seen.sigma_px[rows, None] ** 2 + np.diagonal(of_points, 0, 1, 2)
+    design = image.design(measured.scene.model.project(seen.lon_lat_h[rows]))
+    normal = np.einsum("nck,nc,ncl->kl", design, 1.0 / variance, design) + np.diag(image.sigma**-2.0)
+    side = np.linspace(-1.0, 1.0, _GRID)
+    t = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    at = image.design(image.zero.centre + t * image.zero.half_size)
+    free = image.free.ravel()
+    known = (alone.covariance - alone.deformation)[np.ix_(free, free)]
+    if seen.common_covariance_px2 is not None:
+        shifts = np.flatnonzero(image.locating)
+        known[np.ix_(shifts, shifts)] -= seen.common_covariance_px2
+    stated = np.einsum("nck,kl,ncl->", at, np.linalg.inv(normal), at)
+    return float(max(1.0, np.einsum("nck,kl,ncl->", at, known, at) / stated))

@@ -1,0 +1,178 @@
+"""The result of each scene of a block: its correction with covariance, its measures, its quality."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from services.adjustment.image_correction import SceneAdjustment, deformation_covariance
+from services.adjustment.shared_errors import SharedErrors
+from services.imagery.scene import scene_gsd_m
+from services.joint.block import JointBlock
+from services.quality.cell_stability import cell_stability_of, cells_of
+from services.quality.frames import shared_frame
+from services.quality.qualification import QualificationOptions, qualify_repeated
+from services.quality.stability import AdjustedScene, Repetition, stability_of
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
+from services.registration.point_results import point_results
+from services.types import Array, BoolArray, IntArray, Measures
+
+_INDEPENDENT = SharedErrors(1.0, np.zeros(3), 0.0)
+
+
+def scene_adjustment(block: JointBlock, number: int, options: RegistrationOptions) -> SceneAdjustment:
+    """The correction of one scene of a block, as that of a scene alone is stated.
+
+    Residuals are those at the known ground. The covariance is that of the block, with the errors that
+    the measures of the scene share, and with what the points are deformed by.
+    """
+    measured, image = block.scenes[number], block.images[number]
+    corrected = block.model(number)
+    correction, alone = corrected.correction, measured.alone
+    active = block.active(number)
+    seen = measured.observations()
+    free = np.flatnonzero(image.free.ravel())
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = block.covariance(number)
+    if active.any() and seen.common_covariance_px2 is not None:
+        covariance[np.ix_([0, 3], [0, 3])] += seen.common_covariance_px2
+    deformation = np.zeros((6, 6))
+    if active.any() and seen.deformation_px2 is not None:
+        deformation = deformation_covariance(seen.deformation_px2, correction)
+    residual_px = seen.line_sample - corrected.project(seen.lon_lat_h)
+    derivative = measured.scene.model.project_derivative(seen.lon_lat_h)
+    projected = derivative @ seen.covariance_m2 @ derivative.transpose(0, 2, 1)
+    of_points = np.diagonal(projected, 0, 1, 2)
+    normalised = residual_px**2 / (seen.sigma_px[:, None] ** 2 + of_points)
+    return SceneAdjustment(
+        correction=correction,
+        order=options.adjustment.order or (alone.order if alone else "affine"),
+        validation_px=alone.validation_px if alone else (),
+        slope_px=alone.slope_px if alone else options.adjustment.prior_slope_sigma_px,
+        covariance=covariance + deformation,
+        deformation=deformation,
+        local_sigma_px=alone.local_sigma_px if alone else np.zeros(2),
+        shared=alone.shared if alone else _INDEPENDENT,
+        apart_px=alone.apart_px if alone else 0.0,
+        residual_px=np.where(measured.usable[:, None], residual_px, np.nan),
+        active=active,
+        sigma0=float(np.sqrt(normalised[active].mean())) if active.any() else 1.0,
+        point_sigma_px=np.sqrt(of_points[active].mean(axis=0)) if active.any() else np.zeros(2),
+    )
+
+
+def scene_measures(block: JointBlock, number: int, options: RegistrationOptions) -> Measures:
+    """What became of the control points that a scene may show."""
+    measured = block.scenes[number]
+    adjustment = scene_adjustment(block, number, options)
+    return point_results(measured.scene, measured.points, measured.search, adjustment)
+
+
+def held_cells(measures: Sequence[Measures]) -> list[list[IntArray]]:
+    """For every repetition, the measures of each scene that are held out: those of one of its cells."""
+    cells = [cells_of(of_scene) for of_scene in measures]
+    none = np.zeros(0, dtype=np.int64)
+    most = max(map(len, cells), default=0)
+    return [[own[k] if k < len(own) > 1 else none for own in cells] for k in range(most)]
+
+
+def held_draws(
+    measures: Sequence[Measures], draws: int, kept_share: float, rng: np.random.Generator
+) -> list[list[IntArray]]:
+    """For every repetition, the measures of each scene that are held out: of control points drawn once.
+
+    A point is held out of all scenes that show it, as in the published tables.
+    """
+    used = np.unique(np.concatenate([of_scene.point_id[of_scene.active] for of_scene in measures]))
+    count = len(used) - round(kept_share * len(used))
+    out = []
+    for _ in range(draws if count else 0):
+        drawn = rng.permutation(used)[:count]
+        out.append([np.flatnonzero(one.active & np.isin(one.point_id, drawn)) for one in measures])
+    return out
+
+
+def registered_scene(
+    block: JointBlock,
+    number: int,
+    options: RegistrationOptions,
+    *,
+    drawn: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
+    cells: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
+) -> Registration:
+    """The registration of one scene of a block.
+
+    Args:
+        block: adjusted.
+        number: of the scene.
+        options: of the registration.
+        drawn, cells: measures of each scene that were held out, and the block without them; None where
+            there was no solution.
+    """
+    measured = block.scenes[number]
+    adjustment = scene_adjustment(block, number, options)
+    measures = point_results(measured.scene, measured.points, measured.search, adjustment)
+    frame = shared_frame(measured.points, measures.active)
+    model = block.model(number)
+    scene = AdjustedScene(
+        model, measures, adjustment, measured.scene.image.shape, scene_gsd_m(measured.scene), frame
+    )
+
+    def of_scene(
+        repetitions: Sequence[tuple[Sequence[IntArray], JointBlock | None]],
+    ) -> list[Repetition]:
+        return [
+            (held[number], None if without is None else scene_adjustment(without, number, options))
+            for held, without in repetitions
+        ]
+
+    of_cells = [one for one in of_scene(cells) if len(one[0])]
+    qualification = qualify_repeated(
+        scene,
+        _held_by_ties(options.qualification),
+        stability_of(scene, options.qualification.kept_share, of_scene(drawn)),
+        cell_stability_of(scene, of_cells),
+        tie_residual_px=tie_residual_px(block, number),
+    )
+    views = measured.search.matches.view_measures
+    return Registration(
+        model,
+        adjustment,
+        measures,
+        replace(views, point=measured.search.rows[views.point]),
+        measured.stages,
+        frame,
+        qualification,
+    )
+
+
+def _held_by_ties(options: QualificationOptions) -> QualificationOptions:
+    """The thresholds for a scene that others hold as well: it may have few control points of its own."""
+    return replace(options, usable_active_points=0)
+
+
+def tie_residual_px(block: JointBlock, number: int) -> float:
+    """Standard deviation of the residuals of tie points in a scene, of the worse coordinate, pixels."""
+    rows = block.of_ties(number)
+    rows = rows[block.adjustment.active[rows]]
+    if len(rows) < 2:
+        return float("nan")
+    return float(block.adjustment.residual_px[rows].std(axis=0, ddof=1).max())
+
+
+def ground_misfits_m(block: JointBlock, number: int) -> Array:
+    """Known minus adjusted ground (k, 3) of the active control points of a scene, east, north, up.
+
+    Of points that two scenes or more show: the ground of the others is not measured.
+    """
+    adjustment = block.adjustment
+    rays = np.bincount(
+        np.concatenate(block.held_by),
+        np.concatenate([adjustment.active[own] for own in block.at]),
+        len(block.control),
+    )
+    agrees: BoolArray = adjustment.active[block.at[number]]
+    own = block.held_by[number][agrees]
+    own = own[adjustment.control_active[own] & (rays[own] >= 2)]
+    return np.asarray(adjustment.control_misfit_m[own])

@@ -1,0 +1,173 @@
+"""Scenes adjusted together are as accurate as stated; a wrong one leaves by name."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks._joint_scenes import (
+    ImagePlan,
+    JointTruth,
+    errors_px,
+    image_truth,
+    joint_truth,
+    measured_scene,
+    places,
+    tie_points,
+)
+from services.imagery.scene import scene_gsd_m
+from services.joint.block import JointBlock, adjust_together, repeated
+from services.joint.fitting import adjust_fitting
+from services.joint.measured import MeasuredScene
+from services.joint.results import (
+    held_cells,
+    held_draws,
+    registered_scene,
+    scene_adjustment,
+    scene_measures,
+)
+from services.quality.frames import frame_in_image
+from services.quality.stability import image_places
+from services.registration.options import RegistrationOptions
+from services.simulation.world import World, make_world
+from services.types import Array, Frame, Observations
+
+OPTIONS = RegistrationOptions()
+SHAPE, GSD_M = (8000, 8000), 0.5
+EXTENT_M = np.array([-2600.0, 2600.0, -2600.0, 2600.0])
+FRAME = Frame.from_sigmas(1.5, 2.0)
+VIEWS = ((-400.0, -400.0, 25.0, 80.0), (400.0, -300.0, 8.0, 200.0), (-300.0, 400.0, 20.0, 300.0))
+TRIALS = 12
+
+
+@cache
+def world() -> World:
+    return make_world(np.random.default_rng(1), size_m=1000.0, posting_m=2.0)
+
+
+@cache
+def origin() -> Array:
+    return np.append(world().centre_lon_lat, 150.0)
+
+
+def truth_of(rng: np.random.Generator, points: int = 80, **last: object) -> JointTruth:
+    """Three overlapping images of 4 x 4 km; the last has features of its own."""
+    plans = [
+        ImagePlan(f"image {k + 1}", view[:2], view[2], view[3], SHAPE, GSD_M)
+        for k, view in enumerate(VIEWS)
+    ]
+    plans[-1] = replace(plans[-1], **last)  # type: ignore[arg-type]
+    images = [image_truth(plan, world(), origin(), rng) for plan in plans]
+    ground = places(rng, origin(), EXTENT_M, points, 60.0)
+    return joint_truth(images, ground, rng, frame=FRAME)
+
+
+def observed(truth: JointTruth, rng: np.random.Generator) -> tuple[list[MeasuredScene], Observations]:
+    scenes = [measured_scene(truth, k, rng) for k in range(len(truth.images))]
+    return scenes, tie_points(truth.images, places(rng, origin(), EXTENT_M, 900, 60.0), rng)
+
+
+def normalised(truth: JointTruth, block: JointBlock, number: int) -> tuple[float, float]:
+    """Mean squares of the errors at corners and centre over what is declared: relative, on the Earth."""
+    adjustment = scene_adjustment(block, number, OPTIONS)
+    at = image_places(SHAPE) * 0.98 + 0.01 * np.array(SHAPE)
+    model = block.model(number)
+    relative, earth = errors_px(truth, number, model, at)
+    covariance = adjustment.covariance_at(at)
+    ground = model.locate(at, np.full(len(at), origin()[2]))
+    of_frame = frame_in_image(FRAME, model.project_derivative(ground), 0.0)
+    return tuple(
+        float((error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1).mean() / 2.0)
+        for error, stated in ((relative, covariance), (earth, covariance + of_frame))
+    )  # type: ignore[return-value]
+
+
+def test_errors_are_those_stated_relative_and_on_the_earth() -> None:
+    squares = []
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([1, trial])
+        truth = truth_of(rng)
+        scenes, ties = observed(truth, rng)
+        block, left = adjust_fitting(scenes, ties, OPTIONS)
+        assert not left
+        squares += [normalised(truth, block, number) for number in range(3)]
+    relative, earth = np.mean(squares, axis=0)
+    assert 0.4 < relative < 1.5
+    assert 0.5 < earth < 1.7
+
+
+def test_a_scene_with_few_points_is_held_by_the_ties_of_its_neighbours() -> None:
+    alone, together = [], []
+    for trial in range(4):
+        rng = np.random.default_rng([2, trial])
+        truth = truth_of(rng, found=0.14)
+        scenes, ties = observed(truth, rng)
+        block, left = adjust_fitting(scenes, ties, OPTIONS)
+        assert not left
+        at = image_places(SHAPE)
+        together.append(errors_px(truth, 2, block.model(2), at)[0])
+        own = adjust_together([scenes[2]], ties.take(np.zeros(len(ties), bool)), OPTIONS)
+        alone.append(errors_px(truth, 2, own.model(0), at)[0])
+        assert normalised(truth, block, 2)[0] < 4.0
+    rms = [float(np.sqrt(np.mean(np.square(each)))) for each in (alone, together)]
+    assert rms[1] < 0.6 * rms[0]
+
+
+def test_a_single_scene_is_adjusted_as_it_is_alone() -> None:
+    for trial in range(6):
+        rng = np.random.default_rng([3, trial])
+        truth = truth_of(rng)
+        measured = measured_scene(truth, 0, rng)
+        none = tie_points(truth.images[:1], truth.true_lon_lat_h, rng)
+        block = adjust_together([measured], none, OPTIONS)
+        assert measured.alone is not None
+        at = image_places(SHAPE)
+        joint, alone = scene_adjustment(block, 0, OPTIONS), measured.alone
+        moved_px = joint.correction.apply(at) - alone.correction.apply(at)
+        sigma_px = np.sqrt(np.diagonal(alone.covariance_at(at), 0, 1, 2))
+        assert (np.abs(moved_px) < 1.0 * sigma_px).all()
+        stated = np.sqrt(np.diagonal(joint.covariance_at(at), 0, 1, 2))
+        assert 0.6 < np.median(stated / sigma_px) < 1.5
+
+
+@pytest.mark.parametrize("bend_px", [(8.0, 0.0), (6.0, 6.0)])
+def test_a_bent_scene_is_named_and_does_not_spoil_the_others(bend_px: tuple[float, float]) -> None:
+    rng = np.random.default_rng(4)
+    truth = truth_of(rng, bend_px=bend_px)
+    scenes, ties = observed(truth, rng)
+    block, left = adjust_fitting(scenes, ties, OPTIONS)
+    assert [one.measured.name for one in left] == ["image 3"]
+    assert "image 3" in str(left[0].error)
+    assert max(normalised(truth, block, number)[0] for number in range(2)) < 4.0
+
+
+def test_a_scene_of_other_ground_is_named() -> None:
+    rng = np.random.default_rng(5)
+    truth = truth_of(rng, found=0.0)
+    scenes, ties = observed(truth, rng)
+    ties = ties.take(ties.image != 2)
+    ties = ties.take(np.bincount(ties.point)[ties.point] >= 2)
+    ties = replace(ties, point=np.unique(ties.point, return_inverse=True)[1].astype(np.int64))
+    block, left = adjust_fitting(scenes, ties, OPTIONS)
+    assert [one.measured.name for one in left] == ["image 3"]
+    assert [one.name for one in block.scenes] == ["image 1", "image 2"]
+
+
+def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
+    rng = np.random.default_rng(6)
+    truth = truth_of(rng)
+    scenes, ties = observed(truth, rng)
+    block, _ = adjust_fitting(scenes, ties, OPTIONS)
+    measures = [scene_measures(block, number, OPTIONS) for number in range(3)]
+    draws = held_draws(measures, 3, 0.8, rng)
+    drawn = [(held, repeated(block, held, None)) for held in draws]
+    registration = registered_scene(block, 0, OPTIONS, drawn=drawn, cells=[])
+    stability = registration.qualification.stability
+    assert stability.draws == 3
+    assert stability.held_out_per_draw >= 4
+    largest_m = max(place.max_m for place in stability.displacements)
+    assert 0.0 < largest_m < 1.0
+    assert registration.qualification.verdict in ("good", "usable")
+    assert scene_gsd_m(scenes[0].scene) == pytest.approx(GSD_M, rel=0.1)
+    assert held_cells(measures)
