@@ -76,7 +76,10 @@ def block_accuracy(system: ReducedSystem, pairs: Pairs, gauge: Gauge, of_images:
         corner = np.zeros((len(move), len(move) - of_images))
         corner[of_images:] = np.eye(len(move) - of_images)
         own = system.times(corner)[of_images:]
-        move[of_images:] = -np.linalg.solve(own, system.times(move)[of_images:])
+        # Where no image follows, as ortho-images do not follow heights, the frames of heights do alone.
+        alone = ~move[:of_images].any(axis=0)
+        followed = -np.linalg.solve(own, system.times(move)[of_images:])
+        move[of_images:] = np.where(alone, gauge.move[of_images:], followed)
     weight = system.times(move)
     frame_m2 = np.asarray(np.linalg.inv(move.T @ weight), dtype=np.float64)
     # M + (a - 1) M D F D^T M has the inverse R + D F D^T / a: taking off a small F loses nothing.

@@ -34,7 +34,10 @@ class Gauge:
 
 
 def connected_groups(equations: Equations, n_images: int, n_blocks: int) -> IntArray:
-    """Group (n,) of images and frames of control that points tie together; -1 for the unseen."""
+    """Group (n,) of images and frames of control that points tie together; -1 for the unseen.
+
+    A frame whose points no image shows belongs to no group.
+    """
     used = equations.weight > 0.0
     keys, common = common_pairs(equations.point[used], equations.block[used], n_blocks)
     first, second = keys // n_blocks, keys % n_blocks
@@ -42,6 +45,7 @@ def connected_groups(equations: Equations, n_images: int, n_blocks: int) -> IntA
     graph = sparse.coo_matrix((np.ones(tied.sum()), (first[tied], second[tied])), (n_blocks, n_blocks))
     count, label = connected_components(graph, directed=False)
     seen = np.bincount(equations.block[used], minlength=n_blocks) > 0
+    seen &= np.isin(label, label[:n_images][seen[:n_images]])
     number = np.full(count, -1)
     for i in np.flatnonzero(seen):
         if number[label[i]] < 0:

@@ -11,6 +11,7 @@ from services.adjustment.known_images import Tie
 from services.adjustment.normal_equations import Equations, Pairs, seen_pairs
 from services.adjustment.parameters import AdjustableImage
 from services.geodesy import metres_per_degree_at, wrapped_degrees
+from services.sensors.ortho import OrthoModel
 from services.types import Array, BoolArray, IntArray, Observations
 
 
@@ -116,6 +117,36 @@ class BlockProblem:
         return np.searchsorted(self.observations.point, self.control.point[known]), known
 
     @cached_property
+    def flat(self) -> BoolArray:
+        """Points (p,) that ortho-images alone show: their rays tell no height."""
+        ortho = np.array([isinstance(image.model, OrthoModel) for image in self.images], dtype=np.bool_)
+        others = np.bincount(
+            self.observations.point[~ortho[self.observations.image]], minlength=self.n_points
+        )
+        return np.asarray(others == 0)
+
+    @cached_property
+    def known_heights(self) -> tuple[Array, Array]:
+        """Height (p,) known of every point, and its variance (p,) with that of its frame; else NaN.
+
+        Of several, the most precise; a frame whose height is unknown adds nothing.
+        """
+        height_m, variance_m2 = np.full(self.n_points, np.nan), np.full(self.n_points, np.inf)
+        frame_m2 = np.array([frame.covariance_m2[2, 2] for frame in self.control.frames])
+        own_m2 = self.control.covariance_m2[:, 2, 2]
+        own_m2 = own_m2 + (np.nan_to_num(frame_m2)[self.control.source] if len(own_m2) else 0.0)
+        for row in np.argsort(-own_m2, kind="stable"):
+            if np.isfinite(own_m2[row]):
+                point = self.control.point[row]
+                height_m[point], variance_m2[point] = self.control.lon_lat_h[row, 2], own_m2[row]
+        return height_m, np.where(np.isfinite(height_m), variance_m2, np.nan)
+
+    @cached_property
+    def ray_coordinates(self) -> Array:
+        """Coordinates (p,) of every point that its rays determine: two where they tell no height."""
+        return np.where(self.flat, 2.0, 3.0)
+
+    @cached_property
     def by_hand(self) -> BoolArray:
         """Observations (m,) that people made."""
         return self.control.marks(self.observations.point)
@@ -140,10 +171,14 @@ class BlockProblem:
     def start(self) -> Array:
         """Points (p, 3) on the first ray of each, at the middle height of its model, or where known."""
         lon_lat_h = np.full((self.n_points, 3), np.nan)
+        known_m = self.known_heights[0]
         first = np.unique(self.observations.point, return_index=True)[1]
         for i, image in enumerate(self.images):
             rows = first[self.observations.image[first] == i]
-            height_m = np.full(len(rows), np.mean(image.model.height_range_m))
+            known_of = known_m[self.observations.point[rows]]
+            height_m = np.where(
+                np.isfinite(known_of), known_of, float(np.mean(image.model.height_range_m))
+            )
             lon_lat_h[self.observations.point[rows]] = image.model.locate(
                 self.observations.line_sample[rows], height_m
             )

@@ -9,29 +9,36 @@ from services.types import Array, BoolArray, IntArray
 MAX_SCALE = 5.0
 """Residuals so many times as large as stated are not those of the observations that were stated."""
 
+LEAST_SCALE = 0.5
+"""Sigmas are scaled by the residuals, at least by this: those of two rays only show the errors across
+the epipolar line, so that the scale may be too small; and images with few points fit some of them
+exactly."""
+
 _LOW = 0.2
 """Quantile of the residuals that a third of blunders, and what they spoil in a pair, leaves alone."""
 _REACH = 3.5
 """Residuals up to so many standard deviations tell the scale."""
 
 
-def magnitude(square: Array, point: IntArray, active: BoolArray) -> Array:
+def magnitude(square: Array, point: IntArray, active: BoolArray, coordinates: Array) -> Array:
     """Sizes (m,) of residuals, near 1 on average for true sigmas whatever the number of rays.
 
     A point with k rays takes three of their 2 k values: the residuals of a pair are small and
-    perpendicular to the rays, whatever the error was.
+    perpendicular to the rays, whatever the error was. Where rays tell no height it takes two.
 
     Args:
         square: (m,) squared length of the residuals in units of their sigmas.
         point: (m,) of the observations.
         active: (m,) observations that the points were intersected from.
+        coordinates: (p,) of every point, that its rays determine.
     """
     rays = np.bincount(point[active], minlength=int(point.max(initial=-1)) + 1)[point]
-    redundancy = np.where(active & (rays >= 2), (2.0 * rays - 3.0) / np.maximum(rays, 2), 1.0)
+    free = 2.0 * rays - coordinates[point]
+    redundancy = np.where(active & (rays >= 2), free / np.maximum(rays, 2), 1.0)
     return np.asarray(np.sqrt(square / redundancy))
 
 
-def low_scale(square: Array, point: IntArray) -> float:
+def low_scale(square: Array, point: IntArray, coordinates: Array) -> float:
     """Standard deviation of observations in units of their sigmas, by the smallest residuals.
 
     Within a factor of two where a third of the observations are wrong, also in pairs, of which half are
@@ -40,17 +47,19 @@ def low_scale(square: Array, point: IntArray) -> float:
     Args:
         square: (m,) squared length of the residuals after a robust intersection; NaN where unusable.
         point: (m,) of the observations.
+        coordinates: (p,) of every point, that its rays determine.
     """
     usable = np.isfinite(square)
     rays = np.bincount(point[usable], minlength=int(point.max(initial=-1)) + 1)[point]
     several = usable & (rays >= 2)
     if not several.any():
         return 1.0
-    low = np.quantile(square[several] / (1.0 - 1.5 / rays[several]), _LOW)
+    lost = coordinates[point[several]] / 2.0 / rays[several]
+    low = np.quantile(square[several] / (1.0 - lost), _LOW)
     return float(np.sqrt(max(low / (-2.0 * np.log(1.0 - _LOW)), 1e-12)))
 
 
-def robust_scale(square: Array, point: IntArray) -> float:
+def robust_scale(square: Array, point: IntArray, coordinates: Array) -> float:
     """Standard deviation of observations in units of their sigmas, from those within its reach.
 
     From the smallest residuals on, the variance of what lies within its reach moves until it agrees with
@@ -59,13 +68,14 @@ def robust_scale(square: Array, point: IntArray) -> float:
     Args:
         square: (m,) squared length of the residuals after a robust intersection; NaN where unusable.
         point: (m,) of the observations.
+        coordinates: (p,) of every point, that its rays determine.
     """
-    scale2 = low_scale(square, point) ** 2
+    scale2 = max(low_scale(square, point, coordinates), LEAST_SCALE) ** 2
     for _ in range(50):
         within = np.nan_to_num(square, nan=np.inf) <= _REACH**2 * scale2
-        rays = np.bincount(point[within], minlength=int(point.max(initial=-1)) + 1)
+        rays = np.bincount(point[within], minlength=len(coordinates))
         counted = within & (rays[point] >= 2)
-        freedom = float((2 * rays - 3)[rays >= 2].sum())
+        freedom = float((2.0 * rays - coordinates)[rays >= 2].sum())
         if freedom <= 0.0:
             break
         last, scale2 = scale2, square[counted].sum() / freedom / _WITHIN_REACH
@@ -78,7 +88,7 @@ _WITHIN_REACH = 1.0 - (_REACH**2 / 2.0) * np.exp(-(_REACH**2) / 2.0) / (1.0 - np
 """Variance of a normal law in the plane, cut off at the reach."""
 
 
-def posterior_scale(square: Array, point: IntArray, parameters: float) -> float:
+def posterior_scale(square: Array, point: IntArray, coordinates: Array, parameters: float) -> float:
     """A posteriori standard deviation of unit weight of active observations.
 
     The residuals of real measures have longer tails than the normal law, and a few of them would make
@@ -88,10 +98,12 @@ def posterior_scale(square: Array, point: IntArray, parameters: float) -> float:
     Args:
         square: (m,) squared length of their residuals in units of their sigmas.
         point: (m,) of the observations.
+        coordinates: (p,) of every point, that its rays determine.
         parameters: number of parameters that they determine besides their points.
     """
-    rays = np.bincount(point)
-    of_point, freedom = np.bincount(point, square)[rays >= 2], 2.0 * rays[rays >= 2] - 3.0
+    rays = np.bincount(point, minlength=len(coordinates))
+    of_point = np.bincount(point, square, minlength=len(coordinates))[rays >= 2]
+    freedom = (2.0 * rays - coordinates)[rays >= 2]
     if not len(freedom):
         return 1.0
     most = chdtri(freedom, 1.0 - _COUNTED)

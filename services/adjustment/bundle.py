@@ -13,7 +13,7 @@ from services.adjustment.block_accuracy import (
     joint_relative,
 )
 from services.adjustment.block_problem import BlockOptions, BlockProblem
-from services.adjustment.block_scale import check_scale, posterior_scale
+from services.adjustment.block_scale import LEAST_SCALE, check_scale, posterior_scale
 from services.adjustment.block_solution import checked_gauge, least_squares
 from services.adjustment.control_check import agreeing_control
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
@@ -21,7 +21,7 @@ from services.adjustment.known_images import KnownImages, known_images, tie
 from services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
 from services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
 from services.adjustment.robust_start import active_observations, robust_start
-from services.errors import NoConsensus
+from services.errors import InputError, NoConsensus
 from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, Frame, IntArray, Observations
 
@@ -68,9 +68,6 @@ class BlockAdjustment:
     iterations: int
 
 
-_LEAST_SCALE = 0.5
-"""Sigmas are scaled by the residuals, at least by this: those of two rays only show the errors across
-the epipolar line, so that the scale may be too small."""
 _SLOPE_OBSERVATIONS = 0.3
 """Drifts and skews that what is stated of them counts for, when their variance is estimated. A pair
 shows two, and those may be small by chance: counted for one, regions of 90 % hold 75 % where images
@@ -107,7 +104,8 @@ def adjust_block(
         options: thresholds.
 
     Raises:
-        InputError: the neighbour has no image of the block, or one with another model.
+        InputError: the neighbour has no image of the block, or one with another model; or ortho-images
+            alone have heights whose common error nobody states.
         NotEnoughPoints: too few points can be intersected.
         NoConsensus: the residuals are too large for the sigmas of the observations, or most control
             points disagree.
@@ -120,11 +118,12 @@ def adjust_block(
     priors = block_priors(images, apart, control.frame_covariances())
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
+    _check_heights(problem)
     state, scale, active, control_active = robust_start(problem, priors)
     _check_control(control, control_active)
     slope_factor = 1.0
     for _ in range(_ROUNDS):
-        weight = problem.weights(active / problem.scales(max(scale, _LEAST_SCALE)) ** 2, control_active)
+        weight = problem.weights(active / problem.scales(max(scale, LEAST_SCALE)) ** 2, control_active)
         equations = problem.equations(state.values, state.lon_lat_h, weight)
         gauge = checked_gauge(problem, equations, state.lon_lat_h)
         solved = least_squares(problem, priors, gauge, state, weight)
@@ -134,7 +133,12 @@ def adjust_block(
         square = problem.squares(state.values, state.lon_lat_h)
         determined = _determined(solved.system.priors, accuracy.variance())
         computed = used & np.isfinite(square) & ~problem.by_hand
-        scale = posterior_scale(square[computed], observations.point[computed], float(determined.sum()))
+        scale = posterior_scale(
+            square[computed],
+            observations.point[computed],
+            problem.ray_coordinates,
+            float(determined.sum()),
+        )
         check_scale(scale)
         factor = _slope_factor(state.values.ravel(), solved.system.priors, determined, slope_factor)
         active = active_observations(problem, square, used, scale, control_active)
@@ -147,8 +151,10 @@ def adjust_block(
             break
         priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
     # Known ground that no image shows any more, as its rays have left, takes no part.
-    used_control = used_control & np.isin(control.point, observations.point[used])
-    _check_control(control, used_control)
+    shown = np.isin(control.point, observations.point[used])
+    used_control = used_control & shown
+    # A height alone contradicts nothing where no two rays show its point.
+    _check_control(control, used_control | ~shown & ~control.known[:, :2].any(axis=1))
     of_points = np.full(n_points, -1)
     of_points[observations.point[used][::-1]] = gauge.group[observations.image[used][::-1]]
     carried_m2 = carried_covariances(solved.equations, solved.points, accuracy, of_points)
@@ -221,6 +227,18 @@ def _slope_factor(values: Array, priors: BlockPriors, determined: Array, so_far:
     # Few slopes tell their variance badly: regions of Student's law, relative to the normal law's.
     few = freedom * (0.1 ** (-2.0 / freedom) - 1.0) / (2.0 * np.log(10.0))
     return float(np.sqrt((_SLOPE_OBSERVATIONS + found) / freedom * few) / so_far)
+
+
+def _check_heights(problem: BlockProblem) -> None:
+    """Refuse a block of ortho-images alone whose heights have an error that nobody states."""
+    control = problem.control
+    stated = [np.isfinite(frame.covariance_m2[2, 2]) for frame in control.frames]
+    known = control.known[:, 2] & np.array(stated, dtype=np.bool_)[control.source]
+    if problem.flat.all() and control.known[:, 2].any() and not known.any():
+        raise InputError(
+            "the heights of ortho-images alone come from elevation models, and nobody states how far "
+            "off these are as a whole: state it (--control-dem-frame-sigma-m HORIZONTAL,UP)"
+        )
 
 
 def _check_control(control: ControlGround, active: BoolArray) -> None:

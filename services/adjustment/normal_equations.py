@@ -73,18 +73,33 @@ def _add(normal: Array, right: Array, derivative: Array, residual: Array, weight
                 normal[a, b] += scaled * derivative[r, b]
 
 
+class RobustTerms(NamedTuple):
+    """How points are intersected robustly, and what holds the heights of those whose rays tell none.
+
+    Attributes:
+        scale: of the Cauchy weights, in sigmas of the observations.
+        coordinates: (p,) that the rays of every point determine: 2 or 3.
+        height_weight: (p,) of the known height, beside rays of weight one; 0 where it is not needed.
+        height_step_m: (p,) known minus present height.
+    """
+
+    scale: float
+    coordinates: Array
+    height_weight: Array
+    height_step_m: Array
+
+
 @njit(cache=True)
-def robust_points(
-    equations: Equations, n_images: int, n_points: int, scale: float
-) -> tuple[Array, Array]:
+def robust_points(equations: Equations, n_images: int, terms: RobustTerms) -> tuple[Array, Array]:
     """Step (p, 3) of every point to where most of its rays intersect, and robust weights (m,).
 
     Every two rays of a point propose a position, and the one with the smallest Cauchy cost over all rays
     wins: with three rays or more a wrong one does not move the point. Re-weighted least squares from
     there give the weights, relative to what three unknowns leave of the residuals. Rows that are not of
-    images do not count. A step is NaN where fewer than two rays are usable, or none intersect.
+    images do not count. A step is NaN where fewer than two rays are usable, or none intersect, or where
+    they tell no height and none is known.
     """
-    step = np.full((n_points, 3), np.nan)
+    step = np.full((len(terms.height_weight), 3), np.nan)
     weight = np.where(equations.weight > 0.0, 1.0, 0.0)
     usable = (equations.weight > 0.0) & (equations.block < n_images)
     best = np.empty(3)
@@ -94,8 +109,10 @@ def robust_points(
             continue
         rays = np.flatnonzero(usable[first:last]) + first
         if len(rays) >= 2:
-            if _best_pair(equations, rays, scale, best):
-                _reweight(equations, rays, scale, best, weight)
+            held = terms.coordinates[equations.point[first]] == 3.0
+            held = held or terms.height_weight[equations.point[first]] > 0.0
+            if held and _best_pair(equations, rays, terms, best):
+                _reweight(equations, rays, terms, best, weight)
                 step[equations.point[first]] = best
             else:
                 weight[rays] = 0.0
@@ -104,15 +121,17 @@ def robust_points(
 
 
 @njit(cache=True)
-def _best_pair(equations: Equations, rays: IntArray, scale: float, best: Array) -> bool:
+def _best_pair(equations: Equations, rays: IntArray, terms: RobustTerms, best: Array) -> bool:
     """Fill in the step (3,) that two rays propose and all like best; False where no two intersect."""
     normal, right, x = np.empty((3, 3)), np.empty(3), np.empty(3)
-    lowest = np.inf
+    lowest, point = np.inf, equations.point[rays[0]]
     limit = _PARALLEL if len(rays) > 2 else _SINGULAR
     for i in range(0, len(rays), 1 + len(rays) // 12):
         for j in range(i + 1, len(rays)):
             normal[:] = 0.0
             right[:] = 0.0
+            normal[2, 2] = terms.height_weight[point]
+            right[2] = terms.height_weight[point] * terms.height_step_m[point]
             for ray in (rays[i], rays[j]):
                 _add(normal, right, equations.by_ground[ray], equations.residual[ray], 1.0)
             if not _invert(normal, limit):
@@ -121,7 +140,7 @@ def _best_pair(equations: Equations, rays: IntArray, scale: float, best: Array) 
             cost = 0.0
             for ray in rays:
                 square = _square(equations.residual[ray], equations.by_ground[ray], x)
-                cost += np.log1p(square / scale**2)
+                cost += np.log1p(square / terms.scale**2)
             if cost < lowest:
                 lowest = cost
                 best[:] = x
@@ -144,15 +163,18 @@ def _square(residual: Array, derivative: Array, x: Array) -> float:
 
 
 @njit(cache=True)
-def _reweight(equations: Equations, rays: IntArray, scale: float, x: Array, weight: Array) -> None:
+def _reweight(equations: Equations, rays: IntArray, terms: RobustTerms, x: Array, weight: Array) -> None:
     """Re-weighted least squares of one point from a start, which moves; its weights are filled in."""
     normal, right = np.empty((3, 3)), np.empty(3)
-    effective = float(len(rays))
+    effective, point = float(len(rays)), equations.point[rays[0]]
     for _ in range(6):
-        reach = (2.0 * effective - 3.0) / effective * (CAUCHY_TUNING * scale) ** 2
+        free = 2.0 * effective - terms.coordinates[point]
+        reach = free / effective * (CAUCHY_TUNING * terms.scale) ** 2
         effective = 0.0
         normal[:] = 0.0
         right[:] = 0.0
+        normal[2, 2] = terms.height_weight[point]
+        right[2] = terms.height_weight[point] * terms.height_step_m[point]
         for ray in rays:
             square = _square(equations.residual[ray], equations.by_ground[ray], x)
             weight[ray] = 1.0 / (1.0 + square / reach)

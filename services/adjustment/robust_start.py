@@ -3,10 +3,10 @@
 import numpy as np
 
 from services.adjustment.block_problem import BlockProblem
-from services.adjustment.block_scale import check_scale, low_scale, magnitude, robust_scale
+from services.adjustment.block_scale import LEAST_SCALE, check_scale, low_scale, magnitude, robust_scale
 from services.adjustment.block_solution import State, checked_gauge, moved, step, unsettled
 from services.adjustment.control_check import robust_control, robust_single_rays
-from services.adjustment.normal_equations import robust_points
+from services.adjustment.normal_equations import RobustTerms, robust_points
 from services.adjustment.parameters import BlockPriors
 from services.errors import NotEnoughPoints
 from services.types import Array, BoolArray
@@ -35,13 +35,13 @@ def robust_start(
     alone = np.isin(np.arange(len(point)), problem.single_rays[0])
     while True:
         equations = problem.equations(state.values, state.lon_lat_h)
-        step_m, weight = robust_points(equations, n, problem.n_points, max(scale, falling))
+        step_m, weight = robust_points(equations, n, _terms(problem, state, max(scale, falling)))
         _check_points(problem, step_m)
         equations, state = moved(equations, state, step_m)
         square = problem.image_rows((equations.residual**2).sum(axis=1))
         square = np.where(np.isfinite(step_m[point, 0]) | alone, square, np.nan)
         measured = np.where(problem.by_hand, np.nan, square)
-        scale = low_scale(measured, point)
+        scale = max(low_scale(measured, point, problem.ray_coordinates), LEAST_SCALE)
         weight = problem.image_rows(weight * (equations.weight > 0)) / max(scale, falling) ** 2
         weight[problem.single_rays[0]] = robust_single_rays(problem, state, equations)
         control_weight, near = robust_control(problem, equations, weight)
@@ -54,7 +54,7 @@ def robust_start(
         solved = step(problem, priors, gauge, state, equations)
         state, change_px = solved.state, solved.change_px
         falling *= 0.5
-    scale = robust_scale(measured, point)
+    scale = robust_scale(measured, point, problem.ray_coordinates)
     check_scale(scale)
     small = square <= (problem.options.tolerance * problem.scales(scale)) ** 2
     active = active_observations(problem, square, small, scale, near)
@@ -68,22 +68,44 @@ def _falling_scale(problem: BlockProblem) -> float:
     return float(np.sqrt(np.mean(sigmas**2)) / np.median(observed_px)) if len(observed_px) else 1.0
 
 
+def _terms(problem: BlockProblem, state: State, scale: float) -> RobustTerms:
+    """The terms of a scale; known heights hold the points that ortho-images alone show."""
+    known_m, variance_m2 = problem.known_heights
+    held = problem.flat & np.isfinite(known_m)
+    return RobustTerms(
+        scale=scale,
+        coordinates=problem.ray_coordinates,
+        height_weight=np.where(held, scale**2 / np.where(held, variance_m2, 1.0), 0.0),
+        height_step_m=np.where(held, known_m - state.lon_lat_h[:, 2], 0.0),
+    )
+
+
 def _check_points(problem: BlockProblem, step_m: Array) -> None:
     # A ray of a known point needs no second one.
     intersected = int(np.isfinite(step_m[:, 0]).sum()) + len(problem.single_rays[0])
     if intersected < problem.options.min_points:
-        raise NotEnoughPoints(
-            intersected, problem.options.min_points, f"tie points between {len(problem.images)} images"
-        )
+        rays = np.bincount(problem.observations.point, minlength=problem.n_points)
+        without = int((problem.flat & (rays >= 2) & np.isnan(problem.known_heights[0])).sum())
+        explanation = f"tie points between {len(problem.images)} images"
+        if without:
+            explanation += (
+                f"; {without} points that ortho-images alone show have no height: "
+                "give an elevation model (--control-dem)"
+            )
+        raise NotEnoughPoints(intersected, problem.options.min_points, explanation)
 
 
 def active_observations(
     problem: BlockProblem, square: Array, active: BoolArray, scale: float, control_active: BoolArray
 ) -> BoolArray:
-    """Observations (m,) within the tolerance, of points with two such rays, or one and known ground."""
+    """Observations (m,) within the tolerance, of points with two such rays, or one and a known position.
+
+    A height alone does not check a ray.
+    """
     point = problem.observations.point
-    size = magnitude(square, point, active)
+    size = magnitude(square, point, active, problem.ray_coordinates)
     within = np.nan_to_num(size, nan=np.inf) <= problem.options.tolerance * problem.scales(scale)
     rays = np.bincount(point[within], minlength=problem.n_points)
-    rays[problem.control.point[control_active]] += 1
+    places = problem.control.known[:, :2].all(axis=1)
+    rays[problem.control.point[control_active & places]] += 1
     return np.asarray(within & (rays[point] >= 2))

@@ -1,12 +1,13 @@
-"""The model of an ortho-image has no parallax, and corrections fold into its map grid."""
+"""The model of an ortho-image: a map grid into which corrections fold, and errors of its terrain."""
 
 import numpy as np
 
 from services.adjustment.image_correction import AdjustmentOptions, ControlObservations, adjust_scene
+from services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
 from services.imagery.scene import view_direction
 from services.map_grid import MapGrid
 from services.sensors.correction import CorrectedModel, ImageCorrection
-from services.sensors.ortho import OrthoModel, fold_into_ortho
+from services.sensors.ortho import OrthoModel, ReliefDisplacement, fold_into_ortho
 
 a_micropixel = 1e-6
 a_nanometre = 1e-9
@@ -18,6 +19,14 @@ GRID = MapGrid(
 MODEL = OrthoModel(GRID)
 PARAMETERS = np.array([[3.2, -0.4, 0.7], [-1.1, 0.5, 0.3]])
 CORRECTION = ImageCorrection(PARAMETERS, (np.array(SHAPE) - 1.0) / 2.0, np.array(SHAPE) / 2.0)
+
+
+TANGENT = np.array([[0.1, 0.0, 0.08], [-0.05, 0.0, 0.02]])
+
+
+def sloping_m(lon_lat: np.ndarray) -> np.ndarray:
+    """Heights that rise by some 30 m per 100 m eastwards."""
+    return np.asarray(200.0 + 20_000.0 * (lon_lat[:, 0] - MODEL.locate(pixels(1), np.zeros(1))[0, 0]))
 
 
 def pixels(n: int = 100) -> np.ndarray:
@@ -41,6 +50,33 @@ def test_lines_of_sight_are_vertical() -> None:
     origin, direction = MODEL.line_of_sight(pixels())
     np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=a_nanometre)
     assert ((origin * direction).sum(axis=1) < 0.0).all()
+
+
+def test_what_lies_off_the_terrain_is_displaced_by_the_tangent_of_the_incidence() -> None:
+    model = OrthoModel(GRID, displacement=ReliefDisplacement(sloping_m, TANGENT))
+    on_terrain = MODEL.locate(pixels(), np.zeros(100))
+    on_terrain[:, 2] = sloping_m(on_terrain[:, :2])
+    np.testing.assert_allclose(model.project(on_terrain), pixels(), atol=a_micropixel)
+    ground = model.locate(pixels(), on_terrain[:, 2] + 12.0)
+    t = (pixels() - CORRECTION.centre) / CORRECTION.half_size
+    east_north_m = 12.0 * (TANGENT[:, 0] + t @ TANGENT[:, 1:].T)
+    moved = (on_terrain - ground)[:, :2] * metres_per_degree_at(ground)
+    np.testing.assert_allclose(moved, east_north_m, atol=1e-4)
+    # Three steps on a slope of 0.3 with a tangent of 0.2 leave a ten thousandth of the displacement.
+    np.testing.assert_allclose(model.project(ground), pixels(), atol=1e-4)
+
+
+def test_the_displaced_line_of_sight_passes_the_terrain_where_the_pixel_lies() -> None:
+    model = OrthoModel(GRID, displacement=ReliefDisplacement(sloping_m, TANGENT))
+    origin, direction = model.line_of_sight(pixels())
+    low = model.locate(pixels(), np.full(100, 150.0))
+    across = np.cross(ecef_from_lon_lat_h(low) - origin, direction)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=1), 0.0, atol=0.5)
+    derivative = model.project_derivative(low)[:, :, 2]
+    higher = low + [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(
+        derivative, model.project(higher) - model.project(low), rtol=0.12, atol=1e-6
+    )
 
 
 def test_a_correction_folds_exactly_into_the_map_grid() -> None:
