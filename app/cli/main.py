@@ -22,6 +22,7 @@ COMMANDS = {
     "block": "Blocks of control points: ingest, publish, withdraw, export.",
     "points": "Control points of published blocks: query, suspend, reinstate.",
     "scene": "Register and orthorectify scenes.",
+    "vectors": "Vectors digitised on raw scenes, onto the map and back.",
     "reference": "Reference images, for scenes on ground without control points.",
     "production": "Make new blocks of points from images.",
     "db": "The database: schema, backup and restore with the stored files.",

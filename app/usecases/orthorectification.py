@@ -19,6 +19,7 @@ from app.usecases import quotas
 from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.quotas import FREE_ROOM
+from app.usecases.registered_scene import REFINED_NAME
 from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from app.usecases.scenes import local_image, stored_keys
@@ -34,8 +35,6 @@ from services.orthorectification.rectify import OrthoOptions, OrthoWindow, choos
 from services.types import Progress, no_progress
 
 ORTHO_NAME = "ortho.tif"
-REFINED_NAME = "refined_RPC.TXT"
-"""Name of the refined model among the outputs of a registration."""
 FINEST_GSD = 0.5
 """A job makes no map that is finer than this share of the ground sampling of its scene."""
 MOST_MAP_PIXELS = 16

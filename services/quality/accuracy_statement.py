@@ -98,6 +98,30 @@ def points_accuracy(covariance_m2: Array, frame: Frame, of: str) -> AccuracyStat
     )
 
 
+def vertices_accuracy(
+    relative_m: Array, on_the_earth_m: Array, frame: Frame | None
+) -> AccuracyStatement:
+    """The statement for vertices that were located through the model of a scene and a terrain.
+
+    Args:
+        relative_m: CE90 (n,) of the vertices relative to the control points; NaN when unknown.
+        on_the_earth_m: the same with the frame of the control points.
+        frame: of the control points; None for a scene that is not registered.
+    """
+    worst_m, worst_on_the_earth_m = (_worst_known(one) for one in (relative_m, on_the_earth_m))
+    relative, earth = (_of_vertices(one) for one in (relative_m, on_the_earth_m))
+    if frame is None:
+        relative = "none: the scene is not registered"
+        if np.isnan(worst_on_the_earth_m):
+            earth = f"{earth}: the scene is not registered, and nobody stated the accuracy of its model"
+    else:
+        earth = _with_reason(earth, frame)
+    return AccuracyStatement(
+        StatedAccuracy(RELATIVE, worst_m, np.nan, relative),
+        StatedAccuracy(ON_THE_EARTH, worst_on_the_earth_m, np.nan, earth),
+    )
+
+
 def no_accuracy(reason: str) -> AccuracyStatement:
     """The statement where there is no accuracy, such as for a scene that could not be registered."""
     words = f"none: {reason}"
@@ -120,6 +144,18 @@ def accuracy_document(statement: AccuracyStatement) -> dict[str, dict[str, str |
         name: {key: None if value != value else value for key, value in asdict(stated).items()}
         for name, stated in vars(statement).items()
     }
+
+
+def _worst_known(values_m: Array) -> float:
+    return float(np.nanmax(values_m)) if np.isfinite(values_m).any() else float("nan")
+
+
+def _of_vertices(ce90_m: Array) -> str:
+    worst_m = _worst_known(ce90_m)
+    if np.isnan(worst_m):
+        return "CE90 unknown"
+    median_m = _metres(float(np.nanmedian(ce90_m)))
+    return f"CE90 {_metres(worst_m)} (worst vertex), {median_m} (median vertex)"
 
 
 def _with_reason(words: str, frame: Frame) -> str:

@@ -34,8 +34,9 @@ class VertexAccuracy:
     """Predicted covariances of n vertices, east and north, m^2.
 
     Attributes:
-        relative_m2: (n, 2, 2) relative to the control points; NaN when unknown.
-        on_the_earth_m2: (n, 2, 2) with their frame; NaN when unknown.
+        relative_m2: (n, 2, 2) relative to the control points; NaN when unknown, and where a line of
+            sight grazes the ground.
+        on_the_earth_m2: (n, 2, 2) with their frame; NaN likewise.
     """
 
     relative_m2: Array
@@ -81,8 +82,9 @@ def predict_vertices(
     else:
         relative_px2 = own_px2 + sources.registration.relative_px2(line_sample)
         earth_px2 = relative_px2 + sources.registration.frame_px2(derivative)
-    on_ground = (to_ground @ one @ to_ground.transpose(0, 2, 1) for one in (relative_px2, earth_px2))
-    return VertexAccuracy(*on_ground)
+    with np.errstate(invalid="ignore"):
+        on_ground = [to_ground @ one @ to_ground.transpose(0, 2, 1) for one in (relative_px2, earth_px2)]
+    return VertexAccuracy(*(np.where(np.isfinite(one), one, np.nan) for one in on_ground))
 
 
 def _outer(matrices: Array) -> Array:
@@ -91,7 +93,7 @@ def _outer(matrices: Array) -> Array:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Inverses of matrices (n, 2, 2); infinite where a line of sight grazes the ground."""
+    """Inverses of matrices (n, 2, 2); not finite where a line of sight grazes the ground."""
     (a, b), (c, d) = matrices.transpose(1, 2, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((np.array([[d, -b], [-c, a]]) / (a * d - b * c)).transpose(2, 0, 1))

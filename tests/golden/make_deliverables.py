@@ -37,6 +37,8 @@ def correction():
         "half_size_px": [make_rpc.LINE_SCALE, make_rpc.SAMP_SCALE],
         "covariance_px2": [[0.25 if i == j else None for j in range(6)] for i in range(6)],
         "local_sigma_px": [0.125, 0.0625],
+        "frame_covariance_m2": [[4.0, 0.5, None], [0.5, 9.0, None], [None, None, None]],
+        "apart_px": 0.375,
     }
     return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 

@@ -161,6 +161,7 @@ def _register_and_write(
         shape=scene.image.shape,
         folder=folder,
         copy_image=copy_image,
+        frame=registration.frame,
     )
     report = build_report(
         registration,

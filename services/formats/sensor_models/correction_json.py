@@ -12,8 +12,9 @@ import numpy as np
 
 from services.errors import FormatError
 from services.formats.text_files import load_json
+from services.quality.correction_accuracy import CorrectionAccuracy
 from services.sensors.correction import ImageCorrection
-from services.types import Array
+from services.types import UNKNOWN_FRAME, Array, Frame
 
 CORRECTION_FORMAT = "amers-image-correction/1"
 
@@ -26,6 +27,8 @@ def format_correction(
     *,
     applies_to: str,
     carried: str,
+    frame: Frame = UNKNOWN_FRAME,
+    apart_px: float = 0.0,
 ) -> str:
     """The JSON document of a correction.
 
@@ -36,6 +39,8 @@ def format_correction(
         local_sigma_px: (2,) line and sample, of what parts of the image are off by beyond it.
         applies_to: one sentence on the origin of the delivered model.
         carried: one sentence on the files that contain the correction, and their accuracy.
+        frame: of the control points on the Earth.
+        apart_px: standard deviation of the offsets of the blocks of the points.
     """
     document = {
         "format": CORRECTION_FORMAT,
@@ -48,10 +53,10 @@ def format_correction(
         "parameters_px": correction.parameters.tolist(),
         "centre_px": correction.centre.tolist(),
         "half_size_px": correction.half_size.tolist(),
-        "covariance_px2": [
-            [v if math.isfinite(v) else None for v in row] for row in covariance_px2.tolist()
-        ],
+        "covariance_px2": _rows(covariance_px2),
         "local_sigma_px": local_sigma_px.tolist(),
+        "frame_covariance_m2": _rows(frame.covariance_m2),
+        "apart_px": apart_px,
     }
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
@@ -81,6 +86,52 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
             f"{source}: parameters_px: expected a correction that neither folds nor mirrors the image"
         )
     return correction
+
+
+def parse_correction_accuracy(text: str, source: str = "correction") -> CorrectionAccuracy:
+    """The correction of a JSON document with the covariance of its errors.
+
+    The frame is unknown in documents that were written before it was stated.
+
+    Args:
+        text: contents of the file.
+        source: its name, for messages.
+
+    Raises:
+        FormatError: as `parse_correction`, or a covariance has another form.
+    """
+    correction = parse_correction(text, source)
+    document = load_json(text, source)
+    apart_px = document.get("apart_px", 0.0)
+    if not isinstance(apart_px, int | float) or not 0.0 <= apart_px < math.inf:
+        raise FormatError(f"{source}: apart_px: expected a number that is not negative")
+    return CorrectionAccuracy(
+        correction,
+        _covariance(document, "covariance_px2", 6, source),
+        _numbers(document, "local_sigma_px", (2,), source),
+        Frame(_covariance(document, "frame_covariance_m2", 3, source)),
+        float(apart_px),
+    )
+
+
+def _rows(covariance: Array) -> list[list[float | None]]:
+    """The rows of a matrix, null where it is unknown."""
+    return [[v if math.isfinite(v) else None for v in row] for row in covariance.tolist()]
+
+
+def _covariance(document: dict[str, Any], name: str, size: int, source: str) -> Array:
+    """A covariance matrix; NaN where it is null, all of it where it is missing."""
+    rows = document.get(name, [[None] * size] * size)
+    try:
+        values = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (size, size) or np.isinf(values).any():
+        raise FormatError(f"{source}: {name}: expected {size} x {size} numbers or nulls")
+    known = np.nan_to_num(values)
+    if not np.allclose(known, known.T) or (np.linalg.eigvalsh(known) < -1e-9).any():
+        raise FormatError(f"{source}: {name}: expected a covariance matrix")
+    return values
 
 
 def _numbers(document: dict[str, Any], name: str, shape: tuple[int, ...], source: str) -> Array:

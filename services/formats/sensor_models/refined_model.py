@@ -13,6 +13,7 @@ from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel, fold_into_ortho
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
 from services.sensors.rpc import RpcModel
+from services.types import UNKNOWN_FRAME, Frame
 
 CORRECTION_JSON = "correction.json"
 
@@ -43,6 +44,7 @@ def write_refined(
     shape: tuple[int, int],
     folder: Path,
     copy_image: bool = False,
+    frame: Frame = UNKNOWN_FRAME,
 ) -> RefinedFiles:
     """Write the refined model of a scene.
 
@@ -64,6 +66,7 @@ def write_refined(
         shape: lines and samples of the image.
         folder: where to write; created when missing.
         copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
+        frame: of the control points, for the errors of the model on the Earth.
 
     Raises:
         FormatError: a delivered file would be overwritten.
@@ -87,6 +90,8 @@ def write_refined(
         adjustment.local_sigma_px,
         applies_to=applies_to,
         carried=model_files.note,
+        frame=frame,
+        apart_px=adjustment.apart_px,
     )
     (folder / CORRECTION_JSON).write_text(text, encoding="utf-8")
     return RefinedFiles(

@@ -18,7 +18,11 @@ from rasterio.transform import Affine, RPCTransformer
 from rasterio.warp import transform
 
 from services.formats.images.ortho import write_refined_ortho
-from services.formats.sensor_models.correction_json import format_correction, parse_correction
+from services.formats.sensor_models.correction_json import (
+    format_correction,
+    parse_correction,
+    parse_correction_accuracy,
+)
 from services.formats.sensor_models.dimap import format_dimap_rpc, parse_dimap_rpc
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.formats.vector.residual_layers import write_residual_layers
@@ -26,7 +30,7 @@ from services.map_grid import MapGrid
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel
 from services.sensors.rpc import RpcModel
-from services.types import Measures
+from services.types import Frame, Measures
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -70,8 +74,15 @@ def test_a_written_correction_is_identical_to_the_byte() -> None:
         np.array([0.125, 0.0625]),
         applies_to=document["applies_to"],
         carried=document["carried"],
+        frame=Frame(np.array([[4.0, 0.5, np.nan], [0.5, 9.0, np.nan], [np.nan] * 3])),
+        apart_px=0.375,
     )
     assert again == CORRECTION
+    stated = parse_correction_accuracy(CORRECTION)
+    np.testing.assert_array_equal(stated.covariance_px2, covariance)
+    np.testing.assert_array_equal(stated.local_sigma_px, [0.125, 0.0625])
+    np.testing.assert_array_equal(stated.frame.covariance_m2[:2, :2], [[4.0, 0.5], [0.5, 9.0]])
+    assert stated.apart_px == 0.375
 
 
 def test_a_correction_moves_positions_as_its_formula_says() -> None:

@@ -13,7 +13,11 @@ from rasterio.transform import Affine
 
 from services.errors import FormatError
 from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.correction_json import format_correction, parse_correction
+from services.formats.sensor_models.correction_json import (
+    format_correction,
+    parse_correction,
+    parse_correction_accuracy,
+)
 from services.formats.sensor_models.refined_model import write_refined
 from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from services.geodesy import metres_per_degree_at
@@ -41,6 +45,33 @@ def test_a_correction_survives_a_round_trip() -> None:
     for name in ("parameters", "centre", "half_size"):
         np.testing.assert_array_equal(getattr(again, name), getattr(CORRECTION, name))
     assert json.loads(written())["covariance_px2"][0][0] is None
+
+
+def test_a_correction_without_a_frame_has_an_unknown_one() -> None:
+    document = json.loads(written())
+    del document["frame_covariance_m2"], document["apart_px"]
+    stated = parse_correction_accuracy(json.dumps(document))
+    assert np.isnan(stated.frame.covariance_m2).all()
+    assert stated.apart_px == 0.0
+    assert np.isnan(stated.relative_px2(np.zeros((1, 2)))).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("covariance_px2", [[1.0]], "covariance_px2: expected 6 x 6 numbers or nulls"),
+        ("frame_covariance_m2", [[1, 0, 0], [0, -1, 0], [0, 0, 1]], "expected a covariance matrix"),
+        ("frame_covariance_m2", "none", "frame_covariance_m2: expected 3 x 3 numbers or nulls"),
+        ("apart_px", -1.0, "apart_px: expected a number that is not negative"),
+        ("local_sigma_px", [1.0, None], "local_sigma_px: expected 2 finite numbers"),
+    ],
+)
+def test_errors_of_a_correction_that_make_no_sense_are_refused(
+    name: str, value: object, says: str
+) -> None:
+    document = json.loads(written()) | {name: value}
+    with pytest.raises(FormatError, match=says):
+        parse_correction_accuracy(json.dumps(document))
 
 
 def test_the_formula_in_the_document_is_the_one_applied() -> None:

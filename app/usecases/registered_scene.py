@@ -1,0 +1,89 @@
+"""A scene with its registered model and the errors of that model, from the files of a registration."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from app.errors import InputError
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.correction_json import parse_correction_accuracy
+from services.formats.sensor_models.refined_model import CORRECTION_JSON
+from services.formats.text_files import read_text
+from services.imagery.scene import Scene
+from services.quality.correction_accuracy import CorrectionAccuracy
+from services.sensors.correction import CorrectedModel
+from services.sensors.ortho import OrthoModel
+
+REFINED_NAME = "refined_RPC.TXT"
+"""Name of the refined model among the outputs of a registration."""
+
+
+@dataclass(frozen=True)
+class SceneModel:
+    """A scene and its model.
+
+    Attributes:
+        image: of the scene.
+        model: file of its model; None finds it by its name.
+        registration: folder with the outputs of its registration; None when it is not registered.
+        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation of each
+            coordinate, metres; None when unknown.
+    """
+
+    image: Path
+    model: Path | None = None
+    registration: Path | None = None
+    sigma_m: float | None = None
+
+
+def read_registered_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]:
+    """A scene with its registered model, and the errors of that model; None when it is not registered.
+
+    With a registration, the model is its refined RPC; where it made none, or a model is given, the
+    delivered model with the correction.
+
+    Raises:
+        InputError: the scene or its registration cannot be used, or the scene is an ortho-image.
+    """
+    folder = files.registration
+    accuracy = None if folder is None else _read_accuracy(folder)
+    refined = None if folder is None or files.model is not None else folder / REFINED_NAME
+    uses_refined = refined is not None and refined.is_file()
+    scene = read_scene(files.image, refined if uses_refined else files.model, sigma_m=1.0)
+    if isinstance(scene.model, OrthoModel):
+        raise InputError(
+            f"{files.image}: has a map grid, a raw image with a sensor model is expected; what is drawn "
+            "on it is on the map already"
+        )
+    if folder is not None:
+        _check_size(folder, scene)
+    if accuracy is not None and not uses_refined:
+        scene = replace(scene, model=CorrectedModel(scene.model, accuracy.correction))
+    return scene, accuracy
+
+
+def _read_accuracy(folder: Path) -> CorrectionAccuracy:
+    path = folder / CORRECTION_JSON
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: no {CORRECTION_JSON} found, the folder of a registration expected, as "
+            "`amers scene register -o` writes it"
+        )
+    return parse_correction_accuracy(read_text(path), str(path))
+
+
+def _check_size(folder: Path, scene: Scene) -> None:
+    """Refuse the registration of an image of another size."""
+    report = folder / "report.json"
+    if not report.is_file():
+        return
+    try:
+        of_report = json.loads(read_text(report))["scene"]
+        shape = of_report["lines"], of_report["samples"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{report}: the report of a registration expected: {error}") from error
+    if shape != tuple(scene.image.shape):
+        raise InputError(
+            f"{folder}: registers an image of {shape[0]} x {shape[1]} pixels, the scene has "
+            f"{scene.image.shape[0]} x {scene.image.shape[1]}; give the registration of this scene"
+        )

@@ -1,0 +1,126 @@
+"""Files of vectors that commands and jobs read and write, and what they refuse."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from app.errors import InputError
+from services.formats.vector.layers import VectorLayer, driver_of, write_layer
+from services.formats.vector.pixel_coordinates import PixelOrigin
+from services.imagery.scene import Scene, scene_centre, scene_footprint
+from services.map_grid import utm_of
+from services.types import Array, BoolArray, IntArray
+from services.vectors.shapes import Shapes
+
+Column = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class VectorFile:
+    """Vectors in a file.
+
+    Attributes:
+        path: GeoPackage, GeoJSON, shapefile or FlatGeobuf.
+        layer: its name; None for the only one.
+    """
+
+    path: Path
+    layer: str | None = None
+
+
+@dataclass(frozen=True)
+class VectorOptions:
+    """How vectors pass between a raw image and the map.
+
+    Attributes:
+        pixels: origin and signs of the pixel coordinates, see `line_sample_of_xy`.
+        tolerance_px: edges get more vertices where they bend by more, pixels.
+        skip_missed: leave out features with a place that meets no ground; refuse them otherwise.
+        margin_px: by which digitised vertices may lie outside the image.
+        sigma_px: precision of digitised vertices, one standard deviation a coordinate.
+        height_sigma_m: of the terrain, one standard deviation; by default a tenth of its posting.
+        clip: cut vectors of the map at the border of the image.
+    """
+
+    pixels: PixelOrigin = "qgis"
+    tolerance_px: float = 0.5
+    skip_missed: bool = False
+    margin_px: float = 5.0
+    sigma_px: float = 0.5
+    height_sigma_m: float | None = None
+    clip: bool = False
+
+
+def write_vertices(
+    path: Path, shapes: Shapes, entries: IntArray, columns: Mapping[str, Column], crs: str | None
+) -> None:
+    """Write the vertices of some entries of shapes as points, with the numbers of their features."""
+    numbers = {"feature": shapes.geometry_of[entries] + 1, "vertex": shapes.vertex_of[entries]}
+    table = pa.table(
+        {name: pa.array(one, from_pandas=True) for name, one in {**numbers, **columns}.items()}
+    )
+    points = shapely.points(shapes.vertices[shapes.index[entries]])
+    write_layer(path, VectorLayer("vertices", points, table, crs))
+
+
+def refuse_overwriting(source: Path, output: Path, vertices: Path | None) -> None:
+    """Refuse outputs of unknown formats, and such that would replace the input or each other.
+
+    Raises:
+        InputError: there is one.
+    """
+    driver_of(output)
+    paths = [source.resolve(), output.resolve()]
+    if vertices is not None:
+        driver_of(vertices)
+        paths.append(vertices.resolve())
+    if len(set(paths)) < len(paths):
+        raise InputError(f"{output}: inputs and outputs are one file; choose another name")
+
+
+def refuse_longitudes(xy: Array, scene: Scene) -> None:
+    """Refuse vertices (v, 2) that lie on the ground of the scene by longitude and latitude.
+
+    Raises:
+        InputError: all of them do.
+    """
+    footprint = scene_footprint(scene)
+    if not len(xy):
+        return
+    longitude = xy[:, 0] + 360.0 * np.round((footprint[:, 0].mean() - xy[:, 0]) / 360.0)
+    inside = shapely.contains_xy(shapely.Polygon(footprint), longitude, xy[:, 1])
+    if inside.all():
+        raise InputError(
+            "all vertices have longitudes and latitudes of the scene's ground: they are georeferenced, "
+            "pixel coordinates are expected. QGIS georeferences images by their RPC or their control "
+            "points: draw on a copy without them (see docs/methods/vectors.md), or use `amers vectors "
+            "project` for vectors of the map"
+        )
+
+
+def refuse_missed(missed: BoolArray, place: str, options: VectorOptions) -> None:
+    """Refuse features (n,) with places that meet no ground, unless the options leave them out.
+
+    Raises:
+        InputError: there are some; the message names the first place.
+    """
+    if missed.any() and not options.skip_missed:
+        raise InputError(
+            f"{place}: no ground found there; {int(missed.sum())} of {len(missed)} features have such "
+            "places. Give a terrain that covers them, fill its voids (--fill-px), or leave these "
+            "features out (--skip-missed)"
+        )
+
+
+def default_crs(output: Path, scene: Scene) -> str:
+    """Code of the default reference system of a map: EPSG:4326 in GeoJSON, else the UTM zone."""
+    if driver_of(output) == "GeoJSON":
+        return "EPSG:4326"
+    lon, lat, _ = scene_centre(scene)
+    return utm_of(float(lon), float(lat))

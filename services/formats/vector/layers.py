@@ -1,0 +1,222 @@
+"""Layers of vectors in files: read and written whole, with all attributes.
+
+| format | suffix | attributes |
+|---|---|---|
+| GeoPackage | `.gpkg` | all types, feature numbers |
+| GeoJSON | `.geojson`, `.json` | JSON types |
+| shapefile | `.shp` | names of 10 letters, one type of geometry |
+| FlatGeobuf | `.fgb` | all types |
+"""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import shapely
+
+from services.errors import FormatError, InputError
+from services.types import IntArray
+
+DRIVERS = {
+    ".gpkg": "GPKG",
+    ".geojson": "GeoJSON",
+    ".json": "GeoJSON",
+    ".shp": "ESRI Shapefile",
+    ".fgb": "FlatGeobuf",
+}
+"""Drivers of GDAL, by the suffix of the file; no other is used."""
+_SIGNATURES = {
+    "GPKG": b"SQLite format 3\0",
+    "GeoJSON": b"{",
+    "ESRI Shapefile": b"\0\0\x27\x0a",
+    "FlatGeobuf": b"fgb\3fgb",
+}
+_OPTIONS = {"FlatGeobuf": {"SPATIAL_INDEX": "NO"}}
+"""Options of drivers; with an index, a FlatGeobuf would have its features in another order."""
+
+Geometries = npt.NDArray[np.object_]
+
+
+@dataclass(frozen=True)
+class VectorLayer:
+    """Features of one layer.
+
+    Attributes:
+        name: of the layer.
+        geometries: (n,) of shapely; None where a feature has none.
+        attributes: n rows.
+        crs: code or WKT of the reference system; None when there is none.
+        fid: (n,) numbers of the features where the format keeps them; None otherwise.
+    """
+
+    name: str
+    geometries: Geometries
+    attributes: pa.Table
+    crs: str | None
+    fid: IntArray | None = None
+
+    def changed(
+        self, geometries: Geometries, columns: dict[str, npt.NDArray[Any]], crs: str | None
+    ) -> "VectorLayer":
+        """The layer with other geometries (n,), and more attributes (n,), of which NaN is null.
+
+        They replace attributes of the same names.
+        """
+        table = self.attributes.drop_columns([n for n in columns if n in self.attributes.column_names])
+        for name, values in columns.items():
+            table = table.append_column(name, pa.array(values, from_pandas=True))
+        return replace(self, geometries=geometries, attributes=table, crs=crs)
+
+    def take(self, rows: IntArray) -> "VectorLayer":
+        """The features of the given rows, in that order."""
+        fid = None if self.fid is None else self.fid[rows]
+        return replace(
+            self, geometries=self.geometries[rows], attributes=self.attributes.take(rows), fid=fid
+        )
+
+
+def driver_of(path: Path) -> str:
+    """The driver for a file, by its suffix.
+
+    Raises:
+        InputError: no format has that suffix.
+    """
+    driver = DRIVERS.get(path.suffix.lower())
+    if driver is None:
+        raise InputError(
+            f"{path}: {path.suffix or 'no suffix'} found, one of {', '.join(DRIVERS)} expected"
+        )
+    return driver
+
+
+def read_layer(path: Path, name: str | None = None) -> VectorLayer:
+    """A layer of a file.
+
+    Args:
+        path: of the file; the suffix states the format.
+        name: of the layer; None for the only one with geometries.
+
+    Raises:
+        InputError: the suffix is that of no format, or the layer must be named.
+        FormatError: the file is damaged, or has another format than its suffix says.
+    """
+    import pyogrio  # imported here because it takes 0.4 s and only vectors need it
+
+    driver = driver_of(path)
+    _check_signature(path, driver)
+    with _named(path, "read"):
+        layers = {str(layer): kind for layer, kind in pyogrio.list_layers(path)}
+        with_geometries = [layer for layer, kind in layers.items() if kind is not None]
+        names = ", ".join(with_geometries)[:300] or "none"
+        if name is None and len(with_geometries) != 1:
+            raise InputError(f"{path}: one layer with geometries expected, {names} found; add --layer")
+        if name is not None and name not in with_geometries:
+            raise InputError(f"{path}: no layer {name[:80]!r} with geometries; it has {names}")
+        meta, table = pyogrio.read_arrow(path, layer=name or with_geometries[0], return_fids=True)
+    geometry_name = meta["geometry_name"] or "wkb_geometry"
+    wkb = table[geometry_name].to_numpy(zero_copy_only=False)
+    # A FlatGeobuf has empty bytes for no geometry.
+    wkb = np.where(wkb == b"", None, wkb)
+    geometries = shapely.from_wkb(wkb, on_invalid="ignore")
+    unread = np.flatnonzero(shapely.is_missing(geometries) & ~np.equal(wkb, None).astype(bool))
+    if len(unread):
+        raise FormatError(
+            f"{path}: feature {unread[0] + 1}: a damaged geometry or a curve found; points, lines and "
+            "polygons with straight edges expected"
+        )
+    fid_name = table.column_names[0]
+    return VectorLayer(
+        name or with_geometries[0],
+        geometries,
+        table.drop_columns([fid_name, geometry_name]),
+        meta["crs"],
+        table[fid_name].to_numpy() if driver == "GPKG" else None,
+    )
+
+
+def write_layer(path: Path, layer: VectorLayer) -> None:
+    """Write a file with one layer; an existing one is replaced, and stays whole when writing fails.
+
+    Raises:
+        InputError: the suffix is that of no format, or the format cannot have these features.
+    """
+    import pyogrio  # imported here because it takes 0.4 s and only vectors need it
+
+    driver = driver_of(path)
+    geometries, kind = _of_one_type(layer.geometries, path)
+    table = layer.attributes.append_column("geometry", pa.array(shapely.to_wkb(geometries), pa.binary()))
+    if layer.fid is not None and driver == "GPKG" and "fid" not in table.column_names:
+        table = table.append_column("fid", pa.array(layer.fid))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".amers-", dir=path.parent) as folder:
+        with _named(path, "written"), warnings.catch_warnings():
+            # Pixel coordinates have no reference system.
+            warnings.filterwarnings("ignore", message="'crs' was not provided")
+            pyogrio.write_arrow(
+                table,
+                Path(folder) / path.name,
+                layer=layer.name,
+                driver=driver,
+                geometry_name="geometry",
+                geometry_type=kind,
+                crs=layer.crs,
+                **_OPTIONS.get(driver, {}),
+            )
+        for file in sorted(Path(folder).iterdir()):
+            file.replace(path.parent / file.name)
+
+
+def _of_one_type(geometries: Geometries, path: Path) -> tuple[Geometries, str]:
+    """Geometries with single ones as multiple ones where both occur, and the type of their layer."""
+    present = ~shapely.is_missing(geometries)
+    kinds = {shape.geom_type for shape in geometries[present]}
+    height = " Z" if shapely.has_z(geometries[present]).any() else ""
+    if len(kinds) == 2 and {kind.removeprefix("Multi") for kind in kinds} != kinds:
+        single = present & (shapely.get_type_id(geometries) < shapely.GeometryType.MULTIPOINT)
+        build = {"Point": shapely.multipoints, "LineString": shapely.multilinestrings}
+        kind = min(kinds, key=len)
+        out = geometries.copy()
+        rows = np.flatnonzero(single)
+        out[rows] = build.get(kind, shapely.multipolygons)(
+            geometries[rows], indices=np.arange(len(rows))
+        )
+        return out, f"Multi{kind}{height}"
+    if len(kinds) > 1 and path.suffix.lower() == ".shp":
+        raise InputError(
+            f"{path}: a shapefile has one type of geometry, {', '.join(sorted(kinds))} found; write a "
+            ".gpkg"
+        )
+    return geometries, (kinds.pop() if len(kinds) == 1 else "Unknown") + height
+
+
+def _check_signature(path: Path, driver: str) -> None:
+    """Refuse a file that is something else than its suffix says, before a driver opens it."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(200)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be opened: {error.strerror}") from error
+    if driver == "GeoJSON":
+        start = start.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if not start.startswith(_SIGNATURES[driver]):
+        raise FormatError(f"{path}: expected a {driver} file, found another kind of file")
+
+
+@contextmanager
+def _named(path: Path, what: str) -> Iterator[None]:
+    """Turn errors of the drivers into errors that name the file."""
+    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError
+
+    try:
+        yield
+    except (DataLayerError, DataSourceError, FeatureError, FieldError, RuntimeError, OSError) as error:
+        raise FormatError(f"{path}: cannot be {what}: {error}") from error
+    except (pa.ArrowException, ValueError) as error:
+        raise FormatError(f"{path}: damaged, cannot be {what}: {error}") from error
