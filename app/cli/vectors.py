@@ -12,6 +12,7 @@ from app.usecases.registered_scene import SceneModel
 from app.usecases.terrain_file import TerrainFile
 from app.usecases.vector_files import VectorFile, VectorOptions
 from app.usecases.vectors import correct_file, project_file
+from services.formats.images.canvas import write_canvas
 from services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
 
 app = typer.Typer(no_args_is_help=True)
@@ -50,6 +51,16 @@ SkipMissed = Annotated[
 VertexFile = Annotated[
     Path | None, typer.Option(help="Also write every vertex as a point, with its accuracy.")
 ]
+
+
+@app.command()
+def canvas(
+    scene: Annotated[Path, typer.Argument(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Virtual raster to write, .vrt.")],
+) -> None:
+    """Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS."""
+    write_canvas(scene, output)
 
 
 @app.command()

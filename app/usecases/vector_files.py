@@ -98,9 +98,8 @@ def refuse_longitudes(xy: Array, scene: Scene) -> None:
     if inside.all():
         raise InputError(
             "all vertices have longitudes and latitudes of the scene's ground: they are georeferenced, "
-            "pixel coordinates are expected. QGIS georeferences images by their RPC or their control "
-            "points: draw on a copy without them (see docs/methods/vectors.md), or use `amers vectors "
-            "project` for vectors of the map"
+            "pixel coordinates are expected. QGIS georeferences images by their RPC: draw on a view "
+            "without it (`amers vectors canvas`); vectors of the map need `amers vectors project`"
         )
 
 

@@ -271,6 +271,22 @@ def test_what_cannot_be_meant_is_refused(inputs: list[object], tmp_path: Path) -
     assert not output.exists()
 
 
+def test_a_canvas_shows_the_pixels_without_georeferencing(inputs: list[object], tmp_path: Path) -> None:
+    scene, canvas = inputs[1], tmp_path / "canvas.vrt"
+    result = CliRunner().invoke(app, ["vectors", "canvas", str(scene), "-o", str(canvas)])
+    assert result.exit_code == 0, result.output
+    with rasterio.open(str(scene)) as image, rasterio.open(canvas) as shown:
+        assert image.rpcs is not None
+        assert shown.rpcs is None
+        assert shown.crs is None
+        assert shown.transform.is_identity
+        assert shown.gcps[0] == []
+        assert shown.dtypes == image.dtypes
+        np.testing.assert_array_equal(shown.read(), image.read())
+    with pytest.raises(AmersError, match=r"\.tif found, \.vrt expected"):
+        CliRunner().invoke(app, ["vectors", "canvas", str(scene), "-o", "a.tif"], catch_exceptions=False)
+
+
 def test_an_image_on_a_map_is_refused(inputs: list[object], tmp_path: Path) -> None:
     up = drawn(tmp_path / "up.gpkg", "POINT (100 50)")
     with pytest.raises(AmersError, match="has a map grid, a raw image with a sensor model is expected"):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import shapely
 
 from services.errors import FormatError, InputError
@@ -121,11 +122,12 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
             raise InputError(f"{path}: no layer {name[:80]!r} with geometries; it has {names}")
         meta, table = pyogrio.read_arrow(path, layer=name or with_geometries[0], return_fids=True)
     geometry_name = meta["geometry_name"] or "wkb_geometry"
-    wkb = table[geometry_name].to_numpy(zero_copy_only=False)
-    # A FlatGeobuf has empty bytes for no geometry.
-    wkb = np.where(wkb == b"", None, wkb)
-    geometries = shapely.from_wkb(wkb, on_invalid="ignore")
-    unread = np.flatnonzero(shapely.is_missing(geometries) & ~np.equal(wkb, None).astype(bool))
+    geometries = shapely.from_wkb(
+        table[geometry_name].to_numpy(zero_copy_only=False), on_invalid="ignore"
+    )
+    # A FlatGeobuf has no bytes where a feature has no geometry.
+    size = pc.fill_null(pc.binary_length(table[geometry_name]), 0).to_numpy()
+    unread = np.flatnonzero(shapely.is_missing(geometries) & (size > 0))
     if len(unread):
         raise FormatError(
             f"{path}: feature {unread[0] + 1}: a damaged geometry or a curve found; points, lines and "
