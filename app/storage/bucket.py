@@ -175,6 +175,12 @@ class _RangeFile(io.RawIOBase):
         self._at += length
         return length
 
+    def readall(self) -> bytes:
+        # Otherwise `read()` asks for 8 KiB at a time.
+        rest = self._reader.read(self._at, self._size - self._at)
+        self._at += len(rest)
+        return rest
+
 
 @contextmanager
 def _storage_errors(key: str) -> Iterator[None]:

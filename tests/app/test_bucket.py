@@ -5,11 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import obstore
 import pytest
 
 from app.config import Settings
 from app.errors import DamagedFile, InputError, NotFound, TooLarge
-from app.storage import Storage, StoredChips, chips_key, open_storage
+from app.storage import Storage, StoredChips, bucket, chips_key, open_storage
 from services.conventions import CHIP_SIZE
 from tests.app.s3_server import running_bucket
 
@@ -52,6 +53,21 @@ def test_a_file_of_many_parts_arrives_whole(storage: Storage, tmp_path: Path):
     with storage.open("scenes/large") as file:
         assert file.read() == data
     assert storage.reader("scenes/large").read(5_000_000, 100) == data[5_000_000:5_000_100]
+
+
+def test_the_rest_of_a_file_is_read_by_one_request(storage: Storage, monkeypatch: pytest.MonkeyPatch):
+    asked, get_range = [], obstore.get_range
+
+    def counted(store, key: str, *, start: int, length: int):
+        asked.append((start, length))
+        return get_range(store, key, start=start, length=length)
+
+    storage.put("scenes/c", [data := bytes(range(250)) * 80_000])
+    monkeypatch.setattr(bucket.obstore, "get_range", counted)
+    with storage.open("scenes/c") as file:
+        beginning = file.read(10)
+        assert beginning + file.read() == data
+    assert len(asked) == 2
 
 
 def test_a_file_that_breaks_off_or_is_too_large_leaves_the_former_one(storage: Storage):
