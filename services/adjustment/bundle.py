@@ -15,7 +15,11 @@ from services.adjustment.block_accuracy import (
 from services.adjustment.block_problem import BlockOptions, BlockProblem
 from services.adjustment.block_scale import LEAST_SCALE, check_scale, posterior_scale
 from services.adjustment.block_solution import checked_gauge, least_squares
-from services.adjustment.control_check import agreeing_control
+from services.adjustment.control_check import (
+    agreeing_control,
+    check_place_of_control,
+    ray_coordinates,
+)
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.known_images import KnownImages, known_images, tie
 from services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
@@ -33,6 +37,8 @@ class BlockAdjustment:
     Attributes:
         models: the images' models with their corrections.
         values: (n, k) parameters of the images; 0 where an image has fewer.
+        determined: (n, k) share of every parameter that observations tell, 0 to 1; the rest is what was
+            expected of it.
         accuracy: covariance of the parameters, with and without the doubt about the frame.
         slope_factor: standard deviation of drifts and skews over what was stated, by the residuals; for
             the parameters that are `estimated`.
@@ -53,6 +59,7 @@ class BlockAdjustment:
 
     models: tuple[SensorModel, ...]
     values: Array
+    determined: Array
     accuracy: BlockAccuracy
     slope_factor: float
     lon_lat_h: Array
@@ -104,8 +111,8 @@ def adjust_block(
         options: thresholds.
 
     Raises:
-        InputError: the neighbour has no image of the block, or one with another model; or ortho-images
-            alone have heights whose common error nobody states.
+        InputError: the neighbour has no image of the block, or one with another model; control points
+            are of another scene; ortho-images alone have heights whose common error nobody states.
         NotEnoughPoints: too few points can be intersected.
         NoConsensus: the residuals are too large for the sigmas of the observations, or most control
             points disagree.
@@ -119,6 +126,7 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     _check_heights(problem)
+    check_place_of_control(problem, problem.start_values())
     state, scale, active, control_active = robust_start(problem, priors)
     _check_control(control, control_active)
     slope_factor = 1.0
@@ -133,15 +141,15 @@ def adjust_block(
         square = problem.squares(state.values, state.lon_lat_h)
         determined = _determined(solved.system.priors, accuracy.variance())
         computed = used & np.isfinite(square) & ~problem.by_hand
-        scale = posterior_scale(
-            square[computed],
-            observations.point[computed],
-            problem.ray_coordinates,
-            float(determined.sum()),
-        )
+        coordinates = ray_coordinates(problem, solved.equations, solved.points)
+        # What people marked determines the parameters as well.
+        own = float(determined.sum()) * float(computed.sum()) / max(float(used.sum()), 1.0)
+        scale = posterior_scale(square[computed], observations.point[computed], coordinates, own)
         check_scale(scale)
         factor = _slope_factor(state.values.ravel(), solved.system.priors, determined, slope_factor)
-        active = active_observations(problem, square, used, scale, control_active)
+        active = active_observations(
+            problem, square, used, scale, control_active, coordinates=coordinates
+        )
         used_control, control_active = (
             control_active,
             agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
@@ -175,6 +183,7 @@ def adjust_block(
             for image, found in zip(images, state.values[:n_images], strict=True)
         ),
         values=state.values[:n_images],
+        determined=determined.reshape(state.values.shape)[:n_images],
         accuracy=accuracy,
         slope_factor=slope_factor,
         lon_lat_h=np.where(intersected[:, None], lon_lat_h, np.nan),

@@ -9,6 +9,7 @@ from services.adjustment.block_problem import BlockProblem
 from services.adjustment.block_solution import State
 from services.adjustment.normal_equations import Equations, Pairs, Points, eliminated, pair_row
 from services.adjustment.robust import CAUCHY_TUNING
+from services.errors import InputError
 from services.types import Array, BoolArray, IntArray
 
 _AGREES = 0.9999
@@ -16,6 +17,41 @@ _AGREES = 0.9999
 
 _NEAR = 2.0
 """Least squares begin with control points up to so many times that far; those that agree stay."""
+
+
+def check_place_of_control(problem: BlockProblem, values: Array) -> None:
+    """Refuse control points of another scene or instrument: they lie where an image cannot be.
+
+    Args:
+        problem: the block.
+        values: (n, k) parameters to begin with.
+
+    Raises:
+        InputError: half of the known ground in an image is not where the model shows it, by more than
+            its a priori accuracy makes credible.
+    """
+    known = np.full((problem.n_points, 3), np.nan)
+    whole = problem.control.known.all(axis=1)
+    known[problem.control.point[whole]] = problem.control.lon_lat_h[whole]
+    for i, (image, rows) in enumerate(zip(problem.images, problem.rows_of_images, strict=True)):
+        ground = known[problem.observations.point[rows]]
+        seen = np.isfinite(ground[:, 0])
+        if not (seen.any() and np.isfinite(image.credible_px)):
+            continue
+        shown = image.computed(values[i, : len(image.sigma)], ground[seen]).line_sample
+        off_px = np.linalg.norm(shown - problem.observations.line_sample[rows[seen]], axis=1)
+        beyond = ~(off_px <= image.credible_px)
+        if 2 * beyond.sum() <= len(beyond):
+            continue
+        nearest = "by its model they lie outside the image, or far from it"
+        if np.isfinite(off_px).any():
+            nearest = f"its model shows them {np.nanmedian(off_px):,.0f} px away"
+        raise InputError(
+            f"{image.name}: {beyond.sum()} of {len(beyond)} control points are not where the image was "
+            f"taken: {nearest}, {image.credible_px:,.0f} px is the most that the accuracy stated for it "
+            "makes credible. Give the control points of this image and instrument, or state a larger "
+            "accuracy of the image"
+        )
 
 
 def robust_control(
@@ -71,6 +107,20 @@ def robust_single_rays(problem: BlockProblem, state: State, equations: Equations
     size = np.sqrt(square / 2.0)
     scale = max(1.0, float(np.median(size)))
     return np.asarray(1.0 / (1.0 + (size / (CAUCHY_TUNING * scale)) ** 2) / scale**2)
+
+
+def ray_coordinates(problem: BlockProblem, equations: Equations, points: Points) -> Array:
+    """Coordinates (p,) of every point that its rays determine: 3, less where its ground is known.
+
+    Known ground determines the rest, and the residuals of the rays are as much larger.
+    """
+    coordinates = np.full(problem.n_points, 3.0)
+    by_ground = problem.control_rows(equations.by_ground).reshape(-1, 4, 3)
+    weight = problem.control_rows(equations.weight)[:, 0]
+    inverse = points.inverse[problem.control.point]
+    known = weight * np.einsum("cra,cab,crb->c", by_ground, inverse, by_ground)
+    np.subtract.at(coordinates, problem.control.point, np.nan_to_num(known))
+    return coordinates
 
 
 def agreeing_control(

@@ -18,6 +18,13 @@ PASS_SHARE = 0.5
 weights them. Nobody states it: the frame of the block covers every share between none and all."""
 
 
+_NAMES = (
+    ("line shift", "line drift", "line skew"),
+    ("sample shift", "sample skew", "sample drift"),
+)
+"""Of the parameters of an image correction."""
+
+
 class Computed(NamedTuple):
     """Positions in an image and their derivatives; NaN where there is no position.
 
@@ -30,6 +37,20 @@ class Computed(NamedTuple):
     line_sample: Array
     by_ground: Array
     by_parameters: Array
+
+
+class FreeParameter(NamedTuple):
+    """What a parameter is.
+
+    Attributes:
+        name: for people.
+        unit: in which people state it.
+        per_px: units of a parameter of one.
+    """
+
+    name: str
+    unit: str
+    per_px: float
 
 
 class AdjustableImage(Protocol):
@@ -55,6 +76,11 @@ class AdjustableImage(Protocol):
         ...
 
     @property
+    def parameters(self) -> tuple[FreeParameter, ...]:
+        """(k,) what they are."""
+        ...
+
+    @property
     def sigma(self) -> Array:
         """(k,) a priori standard deviations, pixels."""
         ...
@@ -71,7 +97,12 @@ class AdjustableImage(Protocol):
 
     @property
     def deformable(self) -> bool:
-        """Whether the parameters together follow any affine displacement of its positions."""
+        """Whether only tie points hold the linear shape of the ground: parameters follow any."""
+        ...
+
+    @property
+    def credible_px(self) -> float:
+        """How far positions may be off, at most; infinite where what is stated is a guess."""
         ...
 
     def computed(self, values: Array, lon_lat_h: Array) -> Computed:
@@ -113,6 +144,12 @@ class ImageParameters:
         return lines, samples
 
     @property
+    def parameters(self) -> tuple[FreeParameter, ...]:
+        """(k,) names, all in pixels."""
+        named = np.array(_NAMES)[self.free]
+        return tuple(FreeParameter(str(name), "px", 1.0) for name in named)
+
+    @property
     def free(self) -> BoolArray:
         """(2, 3) parameters of the correction that are estimated."""
         return np.asarray(self.prior_px > 0.0)
@@ -138,6 +175,11 @@ class ImageParameters:
     def deformable(self) -> bool:
         """Whether the correction is affine."""
         return bool(self.free.all())
+
+    @property
+    def credible_px(self) -> float:
+        """Infinite: users state the accuracy of RPCs as they guess it."""
+        return np.inf
 
     @cached_property
     def _column(self) -> Array:

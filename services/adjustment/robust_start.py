@@ -54,7 +54,7 @@ def robust_start(
         solved = step(problem, priors, gauge, state, equations)
         state, change_px = solved.state, solved.change_px
         falling *= 0.5
-    scale = robust_scale(measured, point, problem.ray_coordinates)
+    scale = max(robust_scale(measured, point, problem.ray_coordinates), LEAST_SCALE)
     check_scale(scale)
     small = square <= (problem.options.tolerance * problem.scales(scale)) ** 2
     active = active_observations(problem, square, small, scale, near)
@@ -96,14 +96,22 @@ def _check_points(problem: BlockProblem, step_m: Array) -> None:
 
 
 def active_observations(
-    problem: BlockProblem, square: Array, active: BoolArray, scale: float, control_active: BoolArray
+    problem: BlockProblem,
+    square: Array,
+    active: BoolArray,
+    scale: float,
+    control_active: BoolArray,
+    *,
+    coordinates: Array | None = None,
 ) -> BoolArray:
     """Observations (m,) within the tolerance, of points with two such rays, or one and a known position.
 
-    A height alone does not check a ray.
+    A height alone does not check a ray. Every point has `coordinates` (p,) that its rays determine, by
+    default those of points whose ground is not known.
     """
     point = problem.observations.point
-    size = magnitude(square, point, active, problem.ray_coordinates)
+    coordinates = problem.ray_coordinates if coordinates is None else coordinates
+    size = magnitude(square, point, active, coordinates)
     within = np.nan_to_num(size, nan=np.inf) <= problem.options.tolerance * problem.scales(scale)
     rays = np.bincount(point[within], minlength=problem.n_points)
     places = problem.control.known[:, :2].all(axis=1)
