@@ -1,0 +1,123 @@
+"""How long blocks of rigorous models take beside the same blocks with RPCs.
+
+* 11 scenes over one place, three passes, 200 points that all scenes show;
+* 100 scenes of ten passes side by side, 200 control points and 2,000 tie points a scene.
+
+Run: python -m benchmarks.rigorous_block
+"""
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks._measuring import keep
+from benchmarks._rigorous_block import EXACT, Truth, drawn
+from services.adjustment.bundle import adjust_block
+from services.adjustment.control_ground import NO_CONTROL, ControlGround
+from services.adjustment.parameters import AdjustableImage, image_parameters
+from services.adjustment.rigorous_parameters import SRP, rigorous_parameters
+from services.geodesy import lon_lat_h_from_east_north_up
+from services.sensors.pushbroom import PushbroomModel
+from services.sensors.rpc_fit import fit_rpc
+from services.simulation.orbit import pushbroom_over
+from services.types import Array
+
+PLACE = np.array([-8.0, 31.6, 500.0])
+SHAPE, GSD_M, HEIGHTS_M = (6000, 6000), 1.5, (300.0, 1200.0)
+SIGMA_M, NOISE_PX, CONTROL_M = 6.0, 0.2, (0.5, 0.8)
+SIDE_M = SHAPE[0] * GSD_M
+console = Console()
+
+
+def main() -> None:
+    """Print the table and keep its figures."""
+    table = Table(title="the whole adjustment, CPU seconds")
+    for name in ("scenes", "observations", "control", "rigorous", "RPC", "iterations"):
+        table.add_column(name)
+    outcome = []
+    for case in (eleven_scenes, hundred_scenes):
+        models, truth, per_scene = case()
+        row = measured(models, truth, per_scene)
+        outcome.append(row)
+        table.add_row(
+            str(row["scenes"]),
+            f"{row['observations']:,}",
+            f"{row['control']:,}",
+            f"{row['rigorous']['cpu_s']:.2f}",
+            f"{row['rpc']['cpu_s']:.2f}",
+            f"{row['rigorous']['iterations']}, {row['rpc']['iterations']}",
+        )
+    console.print(table)
+    keep("rigorous_block", outcome)
+
+
+def eleven_scenes() -> tuple[list[PushbroomModel], Array, tuple[int, int]]:
+    """Three passes over one place: models, points (p, 3), and control points and views of others."""
+    directions = [(4.0 + 7.0 * (k % 4), (101.0, 281.0, 15.0)[k // 4]) for k in range(11)]
+    models = [pushbroom_over(PLACE, SHAPE, GSD_M, view, HEIGHTS_M) for view in directions]
+    return models, points_in(np.zeros(2), 0.8 * SIDE_M, 200, 1), (200, 11)
+
+
+def hundred_scenes() -> tuple[list[PushbroomModel], Array, tuple[int, int]]:
+    """Ten passes of ten scenes that overlap by 60 % along and across the track."""
+    step_m = 0.4 * SIDE_M
+    models = []
+    for k in range(100):
+        off = np.array([[(k // 10 - 4.5) * step_m, (k % 10 - 4.5) * step_m, 0.0]])
+        target = lon_lat_h_from_east_north_up(off, PLACE)[0]
+        target[2] = PLACE[2]
+        view = (5.0 + 3.0 * (k // 10 % 5), (101.0, 281.0)[k // 10 % 2])
+        models.append(pushbroom_over(target, SHAPE, GSD_M, view, HEIGHTS_M))
+    side_m = 9.0 * step_m + 0.8 * SIDE_M
+    return models, points_in(np.zeros(2), side_m, 2200 * 100 // 5, 2), (200, 5)
+
+
+def points_in(middle_m: Array, side_m: float, count: int, seed: int) -> Array:
+    """Points (count, 3) in a square."""
+    rng = np.random.default_rng(seed)
+    place = middle_m + rng.uniform(-0.5, 0.5, (count, 2)) * side_m
+    points = lon_lat_h_from_east_north_up(np.column_stack([place, np.zeros(count)]), PLACE)
+    points[:, 2] = rng.uniform(*HEIGHTS_M, count)
+    return points
+
+
+def measured(
+    models: Sequence[PushbroomModel], points: Array, per_scene: tuple[int, int]
+) -> dict[str, object]:
+    """CPU times of the block of rigorous models, and of that of RPCs fitted to them."""
+    control, views = per_scene
+    out: dict[str, object] = {"scenes": len(models)}
+    for kind in ("rigorous", "rpc"):
+        images: list[AdjustableImage] = []
+        for k, model in enumerate(models):
+            if kind == "rigorous":
+                images.append(rigorous_parameters(f"scene {k + 1}", model, SRP, sigma_m=SIGMA_M))
+                continue
+            rpc = fit_rpc(model, SHAPE, HEIGHTS_M).model
+            shift_px = SIGMA_M / GSD_M
+            images.append(
+                image_parameters(f"scene {k + 1}", rpc, SHAPE, shift_px=shift_px, slope_px=0.5)
+            )
+        rng = np.random.default_rng(3)
+        truth = Truth(images, drawn(images, rng), points)
+        observations = truth.observed(rng, NOISE_PX, most=views)
+        known: ControlGround = NO_CONTROL
+        number = len(points) * control // 2200 if len(models) > 11 else len(points)
+        known = truth.control(rng, np.arange(number), CONTROL_M, EXACT)
+        adjust_block(images[:3], observations.take(observations.image < 3), control=NO_CONTROL)
+        begun = time.process_time()
+        block = adjust_block(images, observations, control=known)
+        out[kind] = {
+            "cpu_s": time.process_time() - begun,
+            "iterations": block.iterations,
+            "scale": block.sigma_px,
+        }
+        out["observations"], out["control"] = len(observations), number
+    return out
+
+
+if __name__ == "__main__":
+    main()

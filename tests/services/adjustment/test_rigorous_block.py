@@ -1,0 +1,235 @@
+"""Blocks of rigorous models: positions within what is declared, and wrong use by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._rigorous_block import EXACT, Truth, drawn
+from services.adjustment.block_problem import BlockOptions
+from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.adjustment.control_ground import NO_CONTROL, ControlGround
+from services.adjustment.parameter_figures import held_parameters, parameter_figures
+from services.adjustment.parameters import AdjustableImage, image_parameters, sharing_covariance
+from services.adjustment.rigorous_parameters import (
+    PARAMETER_SETS,
+    SRP,
+    TOUTIN,
+    ParameterSet,
+    rigorous_parameters,
+)
+from services.errors import InputError
+from services.geodesy import lon_lat_h_from_east_north_up
+from services.sensors.pushbroom import PushbroomModel
+from services.sensors.rpc_fit import fit_rpc
+from services.simulation.orbit import pushbroom_over
+from services.types import Array, Frame, Observations
+from tests.services.ties import difference_m
+
+TARGET = np.array([5.4, 43.6, 250.0])
+SHAPE = (3000, 3000)
+GSD_M, SIGMA_M, NOISE_PX = 2.5, 15.0, 0.2
+HEIGHTS_M = (0.0, 1500.0)
+VIEWS = ((22.0, 95.0), (20.0, 275.0), (18.0, 10.0))
+trials = 10
+ninety_percent = 6.25
+"""Of the squares of three normal numbers, their sum is below this."""
+alone = BlockOptions(min_points=0)
+
+
+def model_from(view: tuple[float, float]) -> PushbroomModel:
+    return pushbroom_over(TARGET, SHAPE, GSD_M, view, HEIGHTS_M)
+
+
+MODELS = tuple(model_from(view) for view in VIEWS)
+
+
+def rigorous(free: ParameterSet) -> list[AdjustableImage]:
+    return [
+        rigorous_parameters(f"image {k + 1}", model, free, sigma_m=SIGMA_M)
+        for k, model in enumerate(MODELS)
+    ]
+
+
+def mixed() -> list[AdjustableImage]:
+    """The second image has an RPC instead."""
+    images = rigorous(SRP)
+    rpc = fit_rpc(MODELS[1], SHAPE, HEIGHTS_M).model
+    images[1] = image_parameters("image 2", rpc, SHAPE, shift_px=SIGMA_M / GSD_M, slope_px=0.3)
+    return images
+
+
+def ground(rng: np.random.Generator, count: int = 150) -> Array:
+    east_north = rng.uniform(-3200.0, 3200.0, (count, 2))
+    points = lon_lat_h_from_east_north_up(np.column_stack([east_north, np.zeros(count)]), TARGET)
+    points[:, 2] = rng.uniform(50.0, 1200.0, count)
+    return points
+
+
+def normalised(error: Array, covariance: Array) -> float:
+    """Mean square of errors (n, 3) in units of their covariances (n, 3, 3), one on average."""
+    whitened = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
+    return float((error * whitened).sum(axis=1).mean() / 3.0)
+
+
+def errors_of(block: BlockAdjustment, truth: Array) -> tuple[float, float]:
+    """Normalised errors of the points relative to their mean, and of that mean."""
+    found = np.isfinite(block.lon_lat_h[:, 0])
+    error_m = difference_m(block.lon_lat_h, truth[: len(block.lon_lat_h)])[found]
+    mean_m = error_m.mean(axis=0)
+    relative = normalised(error_m - mean_m, block.point_covariance_m2[found])
+    frame_m2 = block.frames[0].covariance_m2 + block.frames[0].shared_m2
+    return relative, normalised(mean_m[None], frame_m2[None])
+
+
+@pytest.mark.parametrize("controlled", [False, True], ids=["tie points", "control"])
+@pytest.mark.parametrize("kind", ["rigorous", "with an RPC"])
+def test_positions_are_recovered_within_what_is_declared(kind: str, controlled: bool) -> None:
+    images = rigorous(SRP) if kind == "rigorous" else mixed()
+    outcome = []
+    for trial in range(trials):
+        rng = np.random.default_rng([4, trial])
+        truth = Truth(images, drawn(images, rng), ground(rng))
+        control = NO_CONTROL
+        if controlled:
+            frame = Frame.from_sigmas(1.0, 1.0)
+            control = truth.control(rng, np.arange(8), (0.5, 0.5), frame)
+        block = adjust_block(images, truth.observed(rng, NOISE_PX), control=control)
+        assert (block.frames[0].sigma_m < 1.2) == controlled
+        outcome.append(errors_of(block, truth.lon_lat_h))
+    relative, frame = np.mean(outcome, axis=0)
+    assert 0.8 < relative < 1.2
+    # Thirty numbers: within two and a half standard deviations.
+    assert 0.4 < frame < 1.65
+
+
+def held_by_regions(block: BlockAdjustment, truth: Array) -> float:
+    """Share of the points whose 90 % regions hold their errors relative to the median error."""
+    found = np.isfinite(block.lon_lat_h[:, 0])
+    error_m = difference_m(block.lon_lat_h, truth)[found]
+    off_m = error_m - np.median(error_m, axis=0)
+    whitened = np.linalg.solve(block.point_covariance_m2[found], off_m[:, :, None])[:, :, 0]
+    return float(((off_m * whitened).sum(axis=1) < ninety_percent).mean())
+
+
+def test_a_tenth_of_wrong_observations_leaves_the_regions_as_good() -> None:
+    images, held = mixed(), []
+    for trial in range(trials):
+        rng = np.random.default_rng([6, trial])
+        truth = Truth(images, drawn(images, rng), ground(rng))
+        observations = truth.observed(rng, NOISE_PX)
+        right = adjust_block(images, observations)
+        wrong = rng.random(len(observations)) < 0.1
+        observations.line_sample[wrong] += rng.uniform(-30.0, 30.0, (int(wrong.sum()), 2))
+        spoilt = adjust_block(images, observations)
+        held.append([held_by_regions(block, truth.lon_lat_h) for block in (right, spoilt)])
+    without, with_blunders = np.mean(held, axis=0)
+    # Points share the deformation of their block: a few blocks hold half of theirs.
+    assert 0.75 < without < 0.95
+    assert with_blunders > without - 0.05
+
+
+def test_parameters_are_recovered_within_their_sigmas() -> None:
+    images = rigorous(TOUTIN)[:2]
+    square = []
+    for trial in range(trials):
+        rng = np.random.default_rng([5, trial])
+        values = [rng.normal(0.0, image.sigma) for image in images]
+        models = [image.corrected(own) for image, own in zip(images, values, strict=True)]
+        truth = Truth(images, models, ground(rng))
+        control = truth.control(rng, np.arange(60), (0.2, 0.2))
+        block = adjust_block(images, truth.observed(rng, NOISE_PX), control=control)
+        sigma = np.sqrt(block.accuracy.variance())[: block.values.size]
+        square.append(((block.values.ravel() - np.concatenate(values)) / sigma) ** 2)
+        # Drifts and yaw are told apart from all others; roll from a displaced orbit is not.
+        names = [parameter.name for parameter in images[0].parameters]
+        told = dict(zip(names, block.determined.mean(axis=0), strict=True))
+        assert min(told["yaw"], told["roll drift"], told["pitch drift"]) > 0.95
+        assert told["roll"] < 0.2
+    assert 0.75 < np.mean(square) < 1.25
+
+
+@pytest.mark.parametrize("free", PARAMETER_SETS.values(), ids=PARAMETER_SETS)
+def test_the_accuracy_on_the_ground_is_the_one_that_is_stated(free: ParameterSet) -> None:
+    image = rigorous(free)[0]
+    centre = (np.array([SHAPE]) - 1.0) / 2.0
+    middle = image.model.locate(centre, np.array([np.mean(HEIGHTS_M)]))
+    rng = np.random.default_rng(3)
+    moved = [model.locate(centre, middle[:, 2])[0] for model in drawn([image] * 300, rng)]
+    error_m = difference_m(np.array(moved), np.repeat(middle, 300, axis=0))
+    np.testing.assert_allclose(error_m[:, :2].std(axis=0), SIGMA_M, rtol=0.15)
+
+
+def test_the_sets_have_the_parameters_that_were_published() -> None:
+    assert {name: len(rigorous(free)[0].sigma) for name, free in PARAMETER_SETS.items()} == {
+        "SRP": 7,
+        "Toutin": 8,
+        "SPOT-HRV in a GIS": 7,
+    }
+    with pytest.raises(InputError, match="own: heading given as free, some of roll, pitch"):
+        rigorous(ParameterSet("own", {"heading": 1.0}))
+
+
+def test_images_of_a_pass_share_errors_whatever_their_model_is() -> None:
+    images = mixed()
+    full = sharing_covariance(images, np.ones(3, dtype=np.bool_), 1.0)
+    assert np.linalg.eigvalsh(full).min() > -1e-9
+    # An error that all share moves the ground under all images alike.
+    values = [image.shared_direction() @ [1.0, 0.0] for image in images]
+    moved = []
+    for image, own in zip(images, values, strict=True):
+        parameters = np.zeros(len(image.sigma))
+        parameters[image.locating] = own
+        computed = image.computed(parameters, TARGET[None])
+        shift = computed.line_sample - image.model.project(TARGET[None])
+        moved.append(np.linalg.solve(computed.by_ground[0, :, :2], shift[0]))
+    np.testing.assert_allclose(moved, np.tile(moved[0], (3, 1)), atol=0.15 * SIGMA_M)
+
+
+def single(free: ParameterSet, count: int) -> tuple[list[AdjustableImage], Observations, ControlGround]:
+    """One image and known points that it alone shows."""
+    rng = np.random.default_rng(8)
+    images = rigorous(free)[:1]
+    truth = Truth(images, drawn(images, rng), ground(rng, count))
+    return images, truth.observed(rng, NOISE_PX), truth.control(rng, np.arange(count), (0.3, 0.3))
+
+
+def test_too_few_points_say_which_parameters_they_do_not_determine() -> None:
+    images, observations, control = single(SRP, 2)
+    block = adjust_block(images, observations, control=control, options=alone)
+    figures = parameter_figures(images, block)
+    held = [figure.name for figure in figures if figure.is_held]
+    assert held == ["yaw", "yaw drift", "focal length"]
+    sentence = held_parameters(figures)[0]
+    assert sentence.startswith("image 1: the observations do not determine ")
+    assert "focal length (" in sentence
+    assert "ppm, 20 a priori)" in sentence
+    for figure in figures:
+        # What is held keeps nearly the whole of its a priori sigma.
+        assert figure.sigma <= figure.a_priori_sigma * 1.0001
+        assert figure.is_held == (figure.sigma > 0.9486 * figure.a_priori_sigma)
+    images, observations, control = single(SRP, 150)
+    block = adjust_block(images, observations, control=control, options=alone)
+    assert "focal length" not in " ".join(held_parameters(parameter_figures(images, block)))
+
+
+def test_control_points_of_another_instrument_are_refused() -> None:
+    # Two instruments side by side look 20 degrees apart; their images overlap little.
+    _, observations, control = single(SRP, 12)
+    other = pushbroom_over(TARGET, SHAPE, GSD_M, (2.0, 275.0), HEIGHTS_M)
+    aside = lon_lat_h_from_east_north_up(np.array([[5500.0, 0.0, 0.0]]), TARGET)[0]
+    for target in (aside, TARGET + [1.0, 0.5, 0.0]):
+        elsewhere = pushbroom_over(target, SHAPE, GSD_M, (2.0, 275.0), HEIGHTS_M)
+        strange = rigorous_parameters("HRV 1", elsewhere, SRP, sigma_m=SIGMA_M)
+        with pytest.raises(InputError, match=r"HRV 1: 1[0-2] of 12 control points are not where .*px"):
+            adjust_block([strange], observations, control=control, options=alone)
+    right = rigorous_parameters("HRV 2", other, SRP, sigma_m=SIGMA_M)
+    shown = replace(observations, line_sample=other.project(control.lon_lat_h))
+    assert adjust_block([right], shown, control=control, options=alone).control_active.all()
+
+
+def test_an_exact_frame_and_many_points_leave_the_noise_alone() -> None:
+    images, observations, control = single(SRP, 60)
+    block = adjust_block(images, replace(observations), control=control, options=alone)
+    assert control.frames == (EXACT,)
+    assert np.sqrt((block.residual_px**2).mean()) < 1.3 * np.hypot(NOISE_PX, 0.3 / GSD_M)
