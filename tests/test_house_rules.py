@@ -2,9 +2,11 @@
 
 import ast
 import json
+import os
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,6 +18,7 @@ from typer.main import get_command
 
 from app.cli.main import app
 from app.config import Settings
+from tests.command_line import amers_here
 from tests.composed_sql import Source, read_sources
 
 ROOT = Path(__file__).parent.parent
@@ -190,6 +193,11 @@ def test_a_registration_starts_without_the_statistics_of_scipy():
 
 def test_the_help_starts_without_the_store_and_the_science():
     assert (HEAVY | STORE) & loaded_by("--help") == set()
+
+
+def test_the_command_tells_its_version():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert amers_here(["--version"], os.environ).stdout == f"{stated}\n"
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda p: p.stem)

@@ -5,8 +5,9 @@ import signal
 import sys
 from collections import UserDict
 from importlib import import_module
+from importlib.metadata import version
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -76,8 +77,19 @@ app = typer.Typer(
 )
 
 
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(version("amers"))
+        raise typer.Exit
+
+
 @app.callback()
-def amers() -> None:
+def amers(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
     """An open base of 3D ground control points, and the registration of satellite scenes on them."""
 
 
