@@ -146,7 +146,8 @@ def project(
         TerrainFile(dem, vertical, geoid, fill_px),
         output,
         vertices=vertices,
-        options=VectorOptions(_origin(pixels), tolerance_px, skip_missed, clip=clip),
+        options=VectorOptions(_origin(pixels), tolerance_px, skip_missed),
+        clip=clip,
     )
     show_one(asdict(projected), as_json=as_json)
 

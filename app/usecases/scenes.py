@@ -30,9 +30,11 @@ MODEL_SUFFIXES = (".txt", ".xml", ".rpb", ".rpc", ".geom")
 MARK_SUFFIXES = (".geojson", ".json", ".gcp", ".points", ".pts")
 RASTER_SUFFIXES = (".tif", ".tiff", ".jp2", ".gtx")
 """Terrains, masks and geoid grids: they may be as large as images."""
-SIDE_FILE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES
+VECTOR_SUFFIXES = (".fgb",)
+"""Vectors in a format of their own; they may be GeoJSON too."""
+SIDE_FILE_SUFFIXES = MODEL_SUFFIXES + MARK_SUFFIXES + RASTER_SUFFIXES + VECTOR_SUFFIXES
 SIDE_FILE_LIMIT_BYTES = 16 << 20
-"""Largest file with a model or with check points."""
+"""Largest file with a model, with check points or with vectors."""
 MOST_SIDE_FILES = 100
 """Largest number of files beside one image."""
 
@@ -178,7 +180,7 @@ def side_file_limit(settings: Settings, file_name: str) -> int:
 
 
 def side_file_name(scene: SceneRow, name: str) -> str:
-    """The stored name of a file beside an image: a model, terrain, mask or check points.
+    """The stored name of a file beside an image: a model, terrain, mask, check points or vectors.
 
     Raises:
         Conflict: the scene's files were removed or lie on the server, or the name is that of the image.

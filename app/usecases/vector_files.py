@@ -45,7 +45,6 @@ class VectorOptions:
         margin_px: by which digitised vertices may lie outside the image.
         sigma_px: precision of digitised vertices, one standard deviation a coordinate.
         height_sigma_m: of the terrain, one standard deviation; by default a tenth of its posting.
-        clip: cut vectors of the map at the border of the image.
     """
 
     pixels: PixelOrigin = "qgis"
@@ -54,7 +53,20 @@ class VectorOptions:
     margin_px: float = 5.0
     sigma_px: float = 0.5
     height_sigma_m: float | None = None
-    clip: bool = False
+
+
+def check_options(options: VectorOptions) -> None:
+    """Refuse options that no correction can have.
+
+    Raises:
+        InputError: one is negative, or the tolerance is 0; the message names it.
+    """
+    if not options.tolerance_px > 0.0:
+        raise InputError(f"tolerance_px: {options.tolerance_px:g} found, more than 0 px expected")
+    for name in ("margin_px", "sigma_px", "height_sigma_m"):
+        value = getattr(options, name)
+        if value is not None and not value >= 0.0:
+            raise InputError(f"{name}: {value:g} found, 0 or more expected")
 
 
 def write_vertices(

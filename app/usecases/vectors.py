@@ -12,6 +12,7 @@ from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_t
 from app.usecases.vector_files import (
     VectorFile,
     VectorOptions,
+    check_options,
     default_crs,
     refuse_longitudes,
     refuse_missed,
@@ -115,6 +116,7 @@ def correct_file(
     Raises:
         InputError: a file cannot be used, vertices lie outside the image, or places meet no ground.
     """
+    check_options(options)
     refuse_overwriting(vectors.path, output, vertices)
     if crs is not None:
         check_map_code(crs)
@@ -179,6 +181,7 @@ def project_file(
     *,
     vertices: Path | None = None,
     options: VectorOptions = _DEFAULTS,
+    clip: bool = False,
 ) -> ProjectedFile:
     """Write vectors of the map in the pixel coordinates of a raw scene.
 
@@ -189,10 +192,12 @@ def project_file(
         output: file to write; an existing one is replaced.
         vertices: file to write with every vertex and its ground position; None for none.
         options: of the projection.
+        clip: cut features at the border of the image.
 
     Raises:
         InputError: a file cannot be used, or places have no height.
     """
+    check_options(options)
     refuse_overwriting(vectors.path, output, vertices)
     scene, _ = read_registered_scene(scene_model)
     ground = read_terrain(terrain)
@@ -202,7 +207,7 @@ def project_file(
     near = ground_outline(scene, ground, layer.crs)
     geometries = layer.geometries.copy()
     geometries[~shapely.intersects(geometries, near)] = None
-    if options.clip:
+    if clip:
         geometries = cut(geometries, near)
     projected = project_vectors(
         shapes_of(geometries), scene, ground, layer.crs, tolerance_px=options.tolerance_px
@@ -214,7 +219,7 @@ def project_file(
     shown = shapely.intersects(in_image, border)
     place = f"feature {int(np.argmax(missed)) + 1}" if missed.any() else ""
     refuse_missed(missed, place, options)
-    if options.clip:
+    if clip:
         in_image = cut(in_image, border)
     shapes = shapes_of(in_image)
     drawn = geometries_of(

@@ -49,6 +49,7 @@ def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any
     return {
         "register-scene": {"scene": scene},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
+        "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "ingest-block": {"path": "block"},
         "export-block": {"block": "flat"},
         "assess-block": {"block": "flat"},
@@ -178,6 +179,8 @@ def test_metadata_of_an_upload_is_text(client: TestClient, admin: dict[str, str]
     [
         ("orthorectify", ("map", "crs"), "EPSG:5773"),
         ("orthorectify", ("vertical",), "EPSG:4326"),
+        ("correct-vectors", ("crs",), "EPSG:5773"),
+        ("correct-vectors", ("vertical",), "EPSG:4326"),
         ("register-scene", ("check_heights",), "EPSG:4326"),
     ],
 )
@@ -205,6 +208,7 @@ def test_known_reference_systems_are_accepted(
         ("orthorectify", ("map", "crs"), "OGC:CRS84"),
         ("orthorectify", ("vertical",), "EGM96"),
         ("orthorectify", ("vertical",), "EPSG:5773"),
+        ("correct-vectors", ("crs",), "EPSG:2154"),
         ("register-scene", ("check_heights",), "ellipsoid"),
         ("register-scene", ("check_heights",), "EPSG:3855"),
     ):
