@@ -134,7 +134,7 @@ def register_scenes(
         try:
             older = older_result(request.folder)
         except AmersError as error:
-            outcomes[number] = _failed_outcome(request, error)
+            outcomes[number] = failed_outcome(request, error)
             continue
         if older is not None:
             replaced.add(number)
@@ -168,7 +168,7 @@ def _register_accepted(
                 return [outcome_of(register_one, requests[0])]
         return register_many(requests, control, jobs)
     except AmersError as error:
-        return [_failed_outcome(request, error) for request in requests]
+        return [failed_outcome(request, error) for request in requests]
 
 
 def outcome_of(
@@ -180,14 +180,14 @@ def outcome_of(
         with ExitStack() as shown, replacing(request.folder) as new:
             receiver = progress or shown.enter_context(shown_progress())
             try:
-                outcome = _registered_outcome(request, register_one(request, new, receiver))
+                outcome = registered_outcome(request, register_one(request, new, receiver))
             except (InputError, ComputationError) as error:
                 if isinstance(error, NothingDone):
                     raise
                 _keep_only_failure(request, new, error)
-                outcome = {**_failed_outcome(request, error), "output": request.folder}
+                outcome = {**failed_outcome(request, error), "output": request.folder}
     except (AmersError, ServiceFailure) as error:
-        return _failed_outcome(request, error)
+        return failed_outcome(request, error)
     return {**outcome, "seconds": round(time.monotonic() - started, 2)}
 
 
@@ -201,7 +201,7 @@ def _keep_only_failure(request: SceneRequest, new: Path, error: AmersError) -> N
         write_failure(new, attempt, error)
 
 
-def _failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
+def failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
     """The outcome of a scene whose registration ended with an error."""
     return {
         "scene": request.files.image,
@@ -212,7 +212,7 @@ def _failed_outcome(request: SceneRequest, error: Exception) -> Outcome:
     }
 
 
-def _registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome:
+def registered_outcome(request: SceneRequest, report: dict[str, Any]) -> Outcome:
     """The outcome of a scene with a report, by the verdict of the report."""
     is_failed = report["verdict"] == "failed"
     counts, correction = report["point_counts"], report["correction"]
@@ -388,7 +388,7 @@ def register_in_process(arguments: list[str]) -> int:
         with registrar(control) as register_one:
             outcome = outcome_of(register_one, request, no_progress)
     except AmersError as error:
-        outcome = _failed_outcome(request, error)
+        outcome = failed_outcome(request, error)
     part = outcome_file.with_suffix(".part")
     part.write_text(json.dumps(outcome, default=os.fspath))
     part.rename(outcome_file)

@@ -43,6 +43,7 @@ class JointBlock:
         control: the known ground of all observed control points.
         held_by: for every scene, rows (k,) of its points among `control`.
         adjustment: of all observations: those of ties, then those of control points.
+        tie_sigma: factor of the stated sigmas of tie points.
     """
 
     scenes: tuple[MeasuredScene, ...]
@@ -53,6 +54,7 @@ class JointBlock:
     control: ControlGround
     held_by: tuple[IntArray, ...]
     adjustment: BlockAdjustment
+    tie_sigma: float = 1.0
 
     def model(self, scene: int) -> CorrectedModel:
         """The adjusted model of a scene."""
@@ -101,8 +103,11 @@ def adjust_together(
     """
     images = tuple(_image(measured, options) for measured in scenes)
     block = _adjusted(scenes, images, ties, neighbour)
-    shown = replace(ties, sigma_px=ties.sigma_px * block.adjustment.sigma_px)
-    return _adjusted(scenes, images, shown, neighbour) if len(ties) else block
+    if not len(ties):
+        return block
+    factor = block.adjustment.sigma_px
+    shown = replace(ties, sigma_px=ties.sigma_px * factor)
+    return replace(_adjusted(scenes, images, shown, neighbour), tie_sigma=factor)
 
 
 def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages | None) -> JointBlock:

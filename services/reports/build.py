@@ -111,6 +111,8 @@ def _order_reason(adjustment: SceneAdjustment, requested: Order | None) -> str:
     """The order of a correction and why it was chosen, as one sentence."""
     if requested is not None:
         return f"{adjustment.order}, as requested"
+    if not adjustment.validation_px:
+        return f"{adjustment.order}: the points of the scene alone choose none"
     if len(adjustment.validation_px) == 1:
         return f"{adjustment.order}: the points are too few or too close together for a higher order"
     scores = ", ".join(f"{order} {value_px:.2f} px" for order, value_px in adjustment.validation_px)

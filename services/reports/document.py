@@ -17,9 +17,10 @@ import numpy as np
 from services.docstrings import attribute_descriptions
 from services.reports.block_quality import BLOCK_QUALITY_FORMAT, BlockQualityReport
 from services.reports.failure import FAILURE_FORMAT, FailureReport
+from services.reports.joint import JOINT_FORMAT, JointReport
 from services.reports.report import NOT_IN_JSON, REPORT_FORMAT, RegistrationReport
 
-Report = RegistrationReport | FailureReport | BlockQualityReport
+Report = RegistrationReport | FailureReport | BlockQualityReport | JointReport
 Json = None | bool | int | float | str | list[Any] | dict[str, Any]
 
 
@@ -65,6 +66,11 @@ def report_schema() -> dict[str, Any]:
 def failure_schema() -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of the `report.json` of a registration that failed."""
     return _schema(FailureReport, "Amers registration failure", FAILURE_FORMAT)
+
+
+def joint_schema() -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of the `report.json` of scenes registered together."""
+    return _schema(JointReport, "Amers registration of scenes together", JOINT_FORMAT)
 
 
 def block_quality_schema() -> dict[str, Any]:

@@ -231,7 +231,7 @@ def _register(
     scene: Scene, sources: ControlSources, attempt: Attempt, progress: Progress
 ) -> tuple[Registration, ControlSet, CoveringReference | None]:
     """The registration of a scene on control points, or else on a reference image; and its control."""
-    outline = _grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
+    outline = grown(scene_footprint(scene), MAX_ERROR_SIGMAS * scene.sigma_m)
     no_control = CoverageError("no reference image shows the ground of the scene")
     if sources.find_points is not None:
         progress(0.0, "looking for points")
@@ -274,7 +274,7 @@ def _check(
     return replace(registration, qualification=qualification), check
 
 
-def _grown(outline: Array, metres: float) -> Array:
+def grown(outline: Array, metres: float) -> Array:
     """An outline (n, 2) of lon, lat, grown by a distance on every side."""
     centre = outline.mean(axis=0)
     east_m, north_m = metres_per_degree(float(centre[1]), 0.0)

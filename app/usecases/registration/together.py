@@ -1,0 +1,328 @@
+"""Register scenes together: read their files, find control, adjust all at once, write each outcome."""
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+from app.usecases.control_files import IMAGES_NPZ
+from app.usecases.executors import ComputeOptions, open_executor
+from app.usecases.registration.control_sources import ControlSet, FindPoints
+from app.usecases.registration.deliverables import write_outputs
+from app.usecases.registration.failure import Attempt, write_failure
+from app.usecases.registration.register import RegisteredScene, SceneFiles, grown
+from services.conventions import MAX_ERROR_SIGMAS
+from services.errors import AmersError, FormatError, InputError
+from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
+from services.formats.images.bands import parse_bands
+from services.formats.images.scenes import read_scene
+from services.formats.sensor_models.refined_model import write_refined
+from services.imagery.scene import Scene, scene_footprint
+from services.joint.registration import AdjustedScenes, JointRegistration, register_together
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
+from services.reports.build import build_report, scene_record
+from services.reports.document import format_report
+from services.reports.figure_data import figure_data
+from services.reports.joint import JointReport, joint_report
+from services.reports.joint_pages import format_joint_html, format_joint_tables
+from services.reports.report import RefinedModelRecord, RunRecord
+from services.tasks import Work
+from services.types import Array, Progress, no_progress, part_of
+
+BLOCK_FOLDER = "block"
+"""Folder of the report on all scenes, beside those of the scenes."""
+SCENES_JSON = "scenes.json"
+SCENES_FORMAT = "amers-scenes/1"
+
+
+@dataclass(frozen=True)
+class JointPlace:
+    """Where scenes are registered together, and where their results go.
+
+    Attributes:
+        folder_of: the folder of the results of a scene, by its name, or of the block.
+        name: of the results.
+        compute: processes or a cluster.
+        joined: folder of the results of scenes that were registered together before.
+    """
+
+    folder_of: Callable[[str], Path]
+    name: str
+    compute: ComputeOptions = field(default_factory=ComputeOptions)
+    joined: Path | None = None
+
+
+@dataclass(frozen=True)
+class JointOutcome:
+    """Scenes registered together, with their outputs.
+
+    Attributes:
+        report: on all of them.
+        registered: scenes that fit, by the name of their folder.
+        failed: why others were not registered, by the name of their folder.
+        files: outputs on all of them, by name.
+    """
+
+    report: JointReport
+    registered: dict[str, RegisteredScene]
+    failed: dict[str, AmersError]
+    files: dict[str, Path]
+
+
+@dataclass(frozen=True)
+class _Read:
+    """A scene with its files."""
+
+    files: SceneFiles
+    scene: Scene
+
+    @property
+    def name(self) -> str:
+        return self.scene.acquisition.image_id
+
+
+def run_joint_registration(
+    files: Sequence[SceneFiles],
+    find_points: FindPoints,
+    place: JointPlace,
+    *,
+    options: RegistrationOptions = RegistrationOptions(),
+    copy_image: bool = False,
+    progress: Progress = no_progress,
+    command: str = "",
+) -> JointOutcome:
+    """Register scenes together and write the outputs of each, and of all, into their folders.
+
+    A scene that cannot be read or does not fit gets the report of a failure, and does not stop others.
+
+    Args:
+        files: of the scenes, whose images have different names.
+        find_points: finds control points.
+        place: of the work and of the results.
+        options: of the registration.
+        copy_image: also copy GeoTIFFs, with the refined models in their tags.
+        progress: receives the fraction done and a message.
+        command: that repeats the registration, for the reports of failures.
+
+    Raises:
+        InputError: no scene can be used, or what they join cannot be.
+        ComputationError: no scene can be registered.
+    """
+    attempts = {
+        one.image.stem: Attempt(one.image, command or f"amers scene register-many {one.image}", options)
+        for one in files
+    }
+    failed: dict[str, AmersError] = {}
+    with ExitStack() as stack:
+        before = None if place.joined is None else _joined(place.joined, stack)
+        read = _read_all(files, attempts, failed, stack)
+        try:
+            if not read:
+                raise InputError(
+                    f"none of {len(files)} scenes can be used: {next(iter(failed.values()))}"
+                )
+            progress(0.0, "looking for points")
+            control = find_points(_outline([one.scene for one in read]))
+            for one in read:
+                attempts[one.files.image.stem].control = control
+            executor, ahead = stack.enter_context(open_executor(place.compute))
+            result = register_together(
+                [one.scene for one in read],
+                control.points,
+                control.chips,
+                options,
+                joined=None if before is None else before.adjusted,
+                work=Work(executor, ahead=ahead),
+                progress=part_of(progress, 0.0, 0.85),
+            )
+        except AmersError as error:
+            for name, attempt in attempts.items():
+                write_failure(place.folder_of(name), attempt, failed.get(name, error))
+            raise
+        by_name = {one.name: one for one in read}
+        left = [by_name[one.measured.name].files.image.stem for one in result.left]
+        for name, gone in zip(left, result.left, strict=True):
+            failed[name] = gone.error
+            attempts[name].stages.extend(gone.measured.stages)
+        for name, why in failed.items():
+            write_failure(place.folder_of(name), attempts[name], why)
+        registered = {}
+        for count, registration in enumerate(result.registrations):
+            progress(0.85 + 0.15 * count / len(result.registrations), "writing the reports")
+            one = by_name[result.block.scenes[result.numbers[count]].name]
+            name = one.files.image.stem
+            registered[name] = _written(
+                one, registration, control, attempts[name], place.folder_of(name), copy_image=copy_image
+            )
+        report = joint_report(
+            result,
+            [one.report for one in registered.values()],
+            left,
+            name=place.name,
+            finished_at=datetime.now(UTC),
+        )
+        known = [*(before.read if before else ()), *read]
+        written = _write_block(place.folder_of(BLOCK_FOLDER), report, result, known)
+    return JointOutcome(report, registered, failed, written)
+
+
+def _read_all(
+    files: Sequence[SceneFiles],
+    attempts: dict[str, Attempt],
+    failed: dict[str, AmersError],
+    stack: ExitStack,
+) -> list[_Read]:
+    """The scenes that can be read, open until the stack closes; the others are noted."""
+    read = []
+    for one in files:
+        name = one.image.stem
+        try:
+            scene = _read(one, stack)
+        except InputError as error:
+            failed[name] = error
+            continue
+        attempts[name].scene = scene
+        read.append(_Read(one, scene))
+    return read
+
+
+def _read(files: SceneFiles, stack: ExitStack) -> Scene:
+    bands = None if files.bands is None else parse_bands(files.bands)
+    scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
+    stack.callback(scene.image.close)  # type: ignore[attr-defined]
+    return scene
+
+
+def _outline(scenes: Sequence[Scene]) -> Array:
+    """The outline (n, 2) of the ground of all scenes, lon and lat, as far as their models may be off."""
+    outlines = [grown(scene_footprint(one), MAX_ERROR_SIGMAS * one.sigma_m) for one in scenes]
+    for outline in outlines[1:]:
+        outline[:, 0] -= 360.0 * np.round((outline[:, 0].mean() - outlines[0][:, 0].mean()) / 360.0)
+    together = shapely.union_all([shapely.Polygon(outline) for outline in outlines])
+    if not isinstance(together, shapely.Polygon):
+        together = together.convex_hull
+    return np.array(together.exterior.coords)[:-1]
+
+
+def _written(
+    one: _Read,
+    registration: Registration,
+    control: ControlSet,
+    attempt: Attempt,
+    folder: Path,
+    *,
+    copy_image: bool,
+) -> RegisteredScene:
+    """The outputs of one scene, written as those of a scene alone are."""
+    files, scene = one.files, one.scene
+    folder.mkdir(parents=True, exist_ok=True)
+    refined = write_refined(
+        files.image,
+        files.model,
+        registration.model,
+        registration.adjustment,
+        shape=scene.image.shape,
+        folder=folder,
+        copy_image=copy_image,
+    )
+    report = build_report(
+        registration,
+        scene_record(scene, files.image.stem),
+        RunRecord(
+            software_version=version("amers"),
+            started_at=attempt.started_at,
+            finished_at=datetime.now(UTC),
+            method="control points",
+            blocks=control.blocks,
+            options=attempt.options,
+        ),
+        RefinedModelRecord(refined.max_error_px, refined.note),
+        figure_data(scene, control.points, control.chips, registration),
+    )
+    paths = write_outputs(folder, report, files.image.name, control.points)
+    outputs = {path.name: path for path in (*paths, *refined.files)}
+    return RegisteredScene(scene, registration, None, report, scene_footprint(scene), outputs)
+
+
+def _write_block(
+    folder: Path, report: JointReport, result: JointRegistration, read: Sequence[_Read]
+) -> dict[str, Path]:
+    """The report on all scenes, and what later scenes need to join them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {
+        "report.json": format_report(report),
+        "report.html": format_joint_html(report),
+        "report.txt": format_joint_tables(report),
+        SCENES_JSON: _scenes_text(result, read),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    written = {name: folder / name for name in texts}
+    if result.block.adjustment.known is not None:
+        write_adjusted_images(folder / IMAGES_NPZ, report.block.id, result.block.adjustment.known)
+        written[IMAGES_NPZ] = folder / IMAGES_NPZ
+    return written
+
+
+def _scenes_text(result: JointRegistration, read: Sequence[_Read]) -> str:
+    """The files of the scenes of a block, so that later scenes can be tied to them."""
+    names = {one.name for one in result.block.scenes}
+    scenes = [
+        {
+            "name": one.name,
+            "image": str(one.files.image.resolve()),
+            "model": None if one.files.model is None else str(one.files.model.resolve()),
+            "sigma_m": one.files.sigma_m,
+            "bands": one.files.bands,
+            "mask": None if one.files.mask is None else str(one.files.mask.resolve()),
+        }
+        for one in read
+        if one.name in names
+    ]
+    return json.dumps({"format": SCENES_FORMAT, "scenes": scenes}, indent=2) + "\n"
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """Scenes that were registered together before, with their files."""
+
+    read: tuple[_Read, ...]
+    adjusted: AdjustedScenes
+
+
+def _joined(folder: Path, stack: ExitStack) -> _Joined:
+    """The scenes of an older result, open until the stack closes.
+
+    Raises:
+        InputError: the folder is not that of scenes registered together, or an image has moved.
+    """
+    _, known = read_adjusted_images(folder / BLOCK_FOLDER / IMAGES_NPZ)
+    path = folder / BLOCK_FOLDER / SCENES_JSON
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if document["format"] != SCENES_FORMAT:
+            raise ValueError(f"format {document['format']!r:.60}, {SCENES_FORMAT!r} expected")
+        files = [
+            SceneFiles(
+                image=Path(one["image"]),
+                model=None if one["model"] is None else Path(one["model"]),
+                sigma_m=one["sigma_m"],
+                bands=one["bands"],
+                mask=None if one["mask"] is None else Path(one["mask"]),
+            )
+            for one in document["scenes"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError(
+            f"{path}: the scenes of `amers scene register-many` expected: {error}"
+        ) from None
+    read = tuple(_Read(one, _read(one, stack)) for one in files)
+    read = tuple(one for one in read if one.name in known.names)
+    return _Joined(read, AdjustedScenes(tuple(one.scene for one in read), known))

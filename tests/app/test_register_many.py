@@ -1,0 +1,172 @@
+"""`amers scene register-many`: scenes registered together, on a block folder and on the store."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from jsonschema import validate
+
+from app.config import Settings
+from app.db import engine
+from app.storage import Storage
+from services.formats.images.raster import gdal_rpc
+from services.formats.sensor_models.rpc_files import read_rpc
+from services.reports.document import failure_schema, joint_schema, report_schema
+from services.sensors.rpc import RpcModel
+from services.types import FloatImage
+from tests.app.flat_world import (
+    SIGMA_M,
+    FlatWorld,
+    flat_texture,
+    make_flat_world,
+    publish_world,
+)
+from tests.app.registration_outputs import largest_error_px
+from tests.command_line import Done, amers_here
+from tests.statements import run_sql
+
+pytestmark = pytest.mark.long
+
+Amers = Callable[..., Done]
+A_FIFTH_OF_A_PIXEL = 0.2
+SCENES = {"east": (0.05, 0.3, (12.0, -7.0)), "south": (0.3, 0.02, (-9.0, 10.0))}
+"""How scenes look, in sizes of the image by the height, and by how much their models are off."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
+    return make_flat_world(tmp_path_factory.mktemp("world"), size=800, points=30)
+
+
+@pytest.fixture(scope="module")
+def folder(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes of the ground of the block, and one of other ground."""
+    folder = tmp_path_factory.mktemp("scenes")
+    rng = np.random.default_rng(8)
+    for name, (_, _, shift_px) in SCENES.items():
+        write_scene(folder / f"{name}.tif", true_model(world, name), shift_px, world.ground, rng)
+    other = flat_texture(len(world.ground), rng)
+    write_scene(folder / "wrong.tif", true_model(world, "east"), (3.0, 3.0), other, rng)
+    return folder
+
+
+def true_model(world: FlatWorld, name: str) -> RpcModel:
+    """Flat ground looks the same from all sides."""
+    line_num, sample_num = world.true_model.line_num.copy(), world.true_model.sample_num.copy()
+    line_num[3], sample_num[3] = SCENES[name][:2]
+    return replace(world.true_model, line_num=line_num, sample_num=sample_num)
+
+
+def write_scene(
+    path: Path,
+    truth: RpcModel,
+    shift_px: tuple[float, float],
+    ground: FloatImage,
+    rng: np.random.Generator,
+) -> None:
+    pixels = np.clip(ground + rng.normal(0.0, 20.0, ground.shape), 1.0, 4095.0)
+    profile = {"driver": "GTiff", "width": len(ground), "height": len(ground), "count": 1}
+    with rasterio.open(path, "w", **profile, dtype="uint16") as file:
+        file.write(np.rint(pixels).astype(np.uint16), 1)
+        file.rpcs = gdal_rpc(replace(truth, image_offset=truth.image_offset - shift_px))
+
+
+@pytest.fixture
+def amers(settings: Settings) -> Amers:
+    assert settings.database_url is not None
+    environment = os.environ | {
+        "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
+        "AMERS_DATA_FOLDER": str(settings.data_folder),
+    }
+    return lambda *words: amers_here(words, environment)
+
+
+def documents(output: Path) -> dict[str, dict]:
+    return {path.parent.name: json.loads(path.read_text()) for path in output.glob("*/report.json")}
+
+
+def on_block(world: FlatWorld, output: Path, *words: object) -> Done:
+    """What the command does on the block folder, without any store."""
+    control = ("--block", world.block, "--sigma-m", SIGMA_M, "-o", output)
+    return amers_here(("scene", "register-many", *words, *control), os.environ)
+
+
+@pytest.fixture(scope="module")
+def three(world: FlatWorld, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Done, Path]:
+    """All scenes of the folder, registered together, and the folder of the results."""
+    output = tmp_path_factory.mktemp("three") / "out"
+    return on_block(world, output, folder, "--json"), output
+
+
+def test_scenes_are_registered_together_and_the_wrong_one_is_named(
+    world: FlatWorld, folder: Path, three: tuple[Done, Path]
+):
+    result, output = three
+    assert result.returncode == 3, result.stderr
+    assert "wrong" in result.stderr
+    printed = json.loads(result.stdout)
+    assert printed["verdict_on_all"] == "not registered"
+    verdicts = {Path(one["scene"]).stem: one["verdict"] for one in printed["scenes"]}
+    assert verdicts.pop("wrong") == "not registered"
+    assert set(verdicts.values()) <= {"good", "usable"}
+    found = documents(output)
+    assert set(found) == {"east", "south", "wrong", "block"}
+    validate(found["block"], joint_schema())
+    assert [one["name"] for one in found["block"]["left"]] == ["wrong"]
+    validate(found["wrong"], failure_schema())
+    for name in SCENES:
+        validate(found[name], report_schema())
+        refined = read_rpc(folder / f"{name}.tif", output / name / f"{name}_RPC.TXT").model
+        assert largest_error_px(refined, true_model(world, name)) < A_FIFTH_OF_A_PIXEL
+        assert found["block"]["scenes"][0]["tie_points"] > 100
+    page = (output / "block" / "report.html").read_text()
+    for words in ("ectZ_amer", "Popini_app", "dXc", "dXY_ect", "wrong"):
+        assert words in page
+    assert (output / "block" / "images.npz").exists()
+
+
+def test_a_scene_joins_later_and_the_earlier_files_stay(
+    world: FlatWorld, folder: Path, three: tuple[Done, Path], tmp_path: Path
+):
+    first, second = tmp_path / "first", tmp_path / "second"
+    done = on_block(world, first, folder / "east.tif")
+    assert done.returncode == 0, done.stderr
+    before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    done = on_block(world, second, folder / "south.tif", "--join", first)
+    assert done.returncode == 0, done.stderr
+    assert {path: path.read_bytes() for path in first.rglob("*") if path.is_file()} == before
+    assert set(documents(second)) == {"south", "block"}
+    assert documents(second)["block"]["joined"] != []
+    joined, redone = (documents(each)["south"]["correction"] for each in (second, three[1]))
+    moved_px = np.subtract(joined["parameters_px"], redone["parameters_px"])
+    assert (np.abs(moved_px) < 2.0 * np.array(joined["std_px"])).all()
+
+
+def test_registrations_on_the_store_are_recorded(
+    amers: Amers, world: FlatWorld, folder: Path, tmp_path: Path, dsn: str, storage: Storage
+):
+    publish_world(dsn, storage, world)
+    names = [folder / f"{name}.tif" for name in SCENES]
+    done = amers("scene", "register-many", *names, "--sigma-m", SIGMA_M, "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "east" in done.stdout
+    assert "2 scenes" in done.stdout
+    with engine.connect(dsn) as connection:
+        assert run_sql(connection, "select count(*) as n from registration").fetchone() == {"n": 2}
+
+
+def test_nothing_is_written_when_a_folder_holds_other_files(
+    world: FlatWorld, folder: Path, tmp_path: Path
+):
+    output = tmp_path / "out"
+    (output / "block").mkdir(parents=True)
+    (output / "block" / "mine.txt").write_text("mine")
+    done = on_block(world, output, folder / "east.tif")
+    assert done.returncode == 2
+    assert "block: holds files" in done.stderr
+    assert [path.name for path in output.iterdir()] == ["block"]
