@@ -42,6 +42,7 @@ class ImagePlan:
         bend_px: (line, sample) amplitude of what no affine correction follows: one wave along the lines.
         control_noise_px, tie_noise_px: of the measures, as stated too.
         found: share of the control points in the image that are found.
+        wrong: share of these that are found in a wrong place, up to 15 px off.
         acquired_at: UTC.
     """
 
@@ -57,6 +58,7 @@ class ImagePlan:
     control_noise_px: float = 0.3
     tie_noise_px: float = 0.2
     found: float = 0.85
+    wrong: float = 0.0
     acquired_at: datetime = datetime(2024, 6, 1, 10, tzinfo=UTC)
 
 
@@ -188,6 +190,8 @@ def measured_scene(
     found = rng.random(n) < image.plan.found
     noise = rng.normal(0.0, image.plan.control_noise_px, (n, 2))
     position = image.position(truth.true_lon_lat_h[visible]) + noise
+    off = rng.random(n) < image.plan.wrong
+    position[off] += rng.uniform(-15.0, 15.0, (int(off.sum()), 2))
     line_sample = np.where(found[:, None], position, np.nan)
     matches = PointMatches(
         line_sample=line_sample,

@@ -24,7 +24,7 @@ from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.known_images import KnownImages, known_images, tie
 from services.adjustment.parameters import AdjustableImage, BlockPriors, block_priors
 from services.adjustment.reduced_system import DENSE_ROWS, ReducedSystem
-from services.adjustment.robust_start import active_observations, robust_start
+from services.adjustment.robust_start import active_observations, robust_start, started
 from services.errors import InputError, NoConsensus
 from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, Frame, IntArray, Observations
@@ -92,6 +92,7 @@ def adjust_block(
     neighbour: KnownImages | None = None,
     passes: Sequence[BoolArray] = (),
     options: BlockOptions = BlockOptions(),
+    like: BlockAdjustment | None = None,
 ) -> BlockAdjustment:
     """The parameters of every image for which the rays of the points intersect, on the known ground.
 
@@ -109,6 +110,8 @@ def adjust_block(
         passes: masks (n,) of images that may share errors, as those of one pass do; nobody states how
             much, and the frames cover every share.
         options: thresholds.
+        like: an adjustment of these images on these observations and others, whose scale and drifts
+            hold: all observations are used, and none leaves.
 
     Raises:
         InputError: the neighbour has no image of the block, or one with another model; control points
@@ -126,10 +129,16 @@ def adjust_block(
     n_points = int(observations.point[-1]) + 1 if len(observations) else 0
     problem = BlockProblem(images, observations, control, options, n_points, priors.size, tied)
     _check_heights(problem)
-    check_place_of_control(problem, problem.start_values())
-    state, scale, active, control_active = robust_start(problem, priors)
+    if like is None:
+        check_place_of_control(problem, problem.start_values())
+        state, scale, active, control_active = robust_start(problem, priors)
+        slope_factor = 1.0
+    else:
+        state, scale, slope_factor = started(problem, like.values), like.sigma_px, like.slope_factor
+        active = np.ones(len(observations), dtype=np.bool_)
+        control_active = np.ones(len(control), dtype=np.bool_)
+        priors = priors.with_slopes(slope_factor)
     _check_control(control, control_active)
-    slope_factor = 1.0
     for _ in range(_ROUNDS):
         weight = problem.weights(active / problem.scales(max(scale, LEAST_SCALE)) ** 2, control_active)
         equations = problem.equations(state.values, state.lon_lat_h, weight)
@@ -155,7 +164,8 @@ def adjust_block(
             agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
         )
         settled = np.array_equal(active, used) and np.array_equal(control_active, used_control)
-        if settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED):
+        settled = settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED)
+        if settled or like is not None:
             break
         priors, slope_factor = priors.with_slopes(factor), slope_factor * factor
     # Known ground that no image shows any more, as its rays have left, takes no part.

@@ -61,6 +61,15 @@ def robust_start(
     return state, scale, active, near
 
 
+def started(problem: BlockProblem, values: Array) -> State:
+    """The state with known parameters (n, k) of the images, and points where most of their rays meet."""
+    state = State(problem.start_values(), problem.start())
+    state.values[: len(values), : values.shape[1]] = values
+    equations = problem.equations(state.values, state.lon_lat_h)
+    step_m, _ = robust_points(equations, len(problem.images), _terms(problem, state, 1.0))
+    return moved(equations, state, step_m)[1]
+
+
 def _falling_scale(problem: BlockProblem) -> float:
     """What images may be off, in units of the sigmas of the observations."""
     sigmas = np.concatenate([image.sigma[image.locating] for image in problem.images])

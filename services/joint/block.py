@@ -102,26 +102,30 @@ def adjust_together(
         ComputationError: the observations do not allow a solution.
     """
     images = tuple(_image(measured, options) for measured in scenes)
-    block = _adjusted(scenes, images, ties, neighbour)
+    rows = [np.flatnonzero(measured.usable) for measured in scenes]
+    block = _adjusted(scenes, images, ties, neighbour, rows)
     if not len(ties):
         return block
     factor = block.adjustment.sigma_px
     shown = replace(ties, sigma_px=ties.sigma_px * factor)
-    return replace(_adjusted(scenes, images, shown, neighbour), tie_sigma=factor)
+    return replace(_adjusted(scenes, images, shown, neighbour, rows), tie_sigma=factor)
 
 
 def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages | None) -> JointBlock:
-    """The block adjusted without some control points of its scenes, on the tie points that agree.
+    """The block adjusted without some control points of its scenes, on what agrees of the others.
 
     Args:
         block: adjusted.
         held: for every scene, those of its control points that are held out.
         neighbour: see `adjust_together`.
     """
-    rows = np.flatnonzero(block.adjustment.active[: len(block.ties)])
-    ties = block.ties.take(rows)
+    ties = block.ties.take(np.flatnonzero(block.adjustment.active[: len(block.ties)]))
     ties = replace(ties, point=np.unique(ties.point, return_inverse=True)[1].astype(np.int64))
-    return _adjusted(block.scenes, block.images, ties, neighbour, held=held)
+    rows = [
+        np.flatnonzero(block.active(number) & ~np.isin(measured.search.rows, held[number]))
+        for number, measured in enumerate(block.scenes)
+    ]
+    return _adjusted(block.scenes, block.images, ties, neighbour, rows, like=block.adjustment)
 
 
 def _adjusted(
@@ -129,15 +133,11 @@ def _adjusted(
     images: tuple[ImageParameters, ...],
     ties: Observations,
     neighbour: KnownImages | None,
+    rows: Sequence[IntArray],
     *,
-    held: Sequence[IntArray] | None = None,
+    like: BlockAdjustment | None = None,
 ) -> JointBlock:
-    rows = []
-    for number, measured in enumerate(scenes):
-        usable = measured.usable.copy()
-        if held is not None:
-            usable[np.isin(measured.search.rows, held[number])] = False
-        rows.append(np.flatnonzero(usable))
+    """The block of some of the control points (`rows` of the search of every scene) and tie points."""
     first = int(ties.point.max(initial=-1)) + 1
     found, control, place = _control(scenes, images, rows, first)
     common = neighbour and not set(neighbour.names).isdisjoint(image.name for image in images)
@@ -147,6 +147,7 @@ def _adjusted(
         control=control,
         neighbour=neighbour if common else None,
         options=BlockOptions(min_points=1),
+        like=like,
     )
     order = np.argsort(place, kind="stable")
     ends = np.cumsum([len(own) for own in rows])[:-1]

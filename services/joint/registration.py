@@ -122,7 +122,7 @@ def register_together(
     numbers = tuple(k for k, one in enumerate(block.scenes) if one.name not in names)
     if not numbers:
         raise left[0].error if left else DoesNotFit("no scene fits")
-    registrations = _qualified(block, numbers, options, known, part_of(progress, 0.8, 0.2))
+    registrations = qualified(block, numbers, options, known, part_of(progress, 0.8, 0.2))
     fits = tuple(scene_fit(block, number) for number in numbers)
     return JointRegistration(block, numbers, registrations, fits, tuple(left))
 
@@ -222,12 +222,12 @@ def _uncertainty_m(block: JointBlock, number: int, points: ControlPoints) -> Arr
     return np.asarray(np.nan_to_num(np.sqrt(variance)) * image_gsds_m(model, points.lon_lat_h))
 
 
-def _qualified(
+def qualified(
     block: JointBlock,
     numbers: Sequence[int],
-    options: RegistrationOptions,
-    known: KnownImages | None,
-    progress: Progress,
+    options: RegistrationOptions = RegistrationOptions(),
+    known: KnownImages | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[Registration, ...]:
     """The registrations of some scenes, with the adjustment repeated without parts of their points."""
     limits = options.qualification

@@ -38,7 +38,7 @@ SHAPE, GSD_M = (8000, 8000), 0.5
 EXTENT_M = np.array([-2600.0, 2600.0, -2600.0, 2600.0])
 FRAME = Frame.from_sigmas(1.5, 2.0)
 VIEWS = ((-400.0, -400.0, 25.0, 80.0), (400.0, -300.0, 8.0, 200.0), (-300.0, 400.0, 20.0, 300.0))
-TRIALS = 12
+TRIALS = 8
 
 
 @cache
@@ -152,6 +152,20 @@ def test_a_scene_of_other_ground_is_named() -> None:
     block, left = adjust_fitting(scenes, ties, OPTIONS)
     assert [one.measured.name for one in left] == ["image 3"]
     assert [one.name for one in block.scenes] == ["image 1", "image 2"]
+
+
+def test_a_repetition_without_holding_anything_out_is_the_block() -> None:
+    rng = np.random.default_rng(6)
+    truth = truth_of(rng)
+    block, _ = adjust_fitting(*observed(truth, rng), OPTIONS)
+    again = repeated(block, [np.zeros(0, dtype=np.int64)] * 3, None)
+    for number in range(3):
+        at = image_places(SHAPE)
+        one, other = (scene_adjustment(each, number, OPTIONS) for each in (block, again))
+        moved_px = one.correction.apply(at) - other.correction.apply(at)
+        sigma_px = np.sqrt(np.diagonal(one.covariance_at(at), 0, 1, 2))
+        assert (np.abs(moved_px) < 0.1 * sigma_px).all()
+        np.testing.assert_allclose(one.covariance_at(at), other.covariance_at(at), rtol=0.1, atol=1e-4)
 
 
 def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
