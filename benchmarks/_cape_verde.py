@@ -9,7 +9,7 @@ beyond their numbers; this one follows the orbits.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from services.adjustment.parameters import ImageParameters, image_parameters
 from services.geodesy import lon_lat_h_from_east_north_up, metres_per_degree_at, move_metres
 from services.imagery.source import ArrayImage
 from services.map_grid import MapGrid
+from services.quality.site_reach import KnownSite
 from services.sensors.base import SensorModel
 from services.sensors.ortho import OrthoModel, ReliefDisplacement
 from services.sensors.rpc_fit import fit_rpc
@@ -47,7 +48,7 @@ ISLANDS = (
 
 TIES = 450
 SITE_POINTS = 8
-SITE_OWN_M, SITE_FRAME_M = 0.3, 0.5
+SITE_OWN_M, SITE_FRAME_M = 0.3, 0.7
 """Of the points of a site: each its own error, and the one that all of them share."""
 ISLAND_SIGMA_M, POINT_SIGMA_M = 3.0, 2.0
 """Errors of the terrain: one of every island, one of every point."""
@@ -76,7 +77,7 @@ class Kind:
     gsd_m: float
 
 
-ORTHO = Kind((30_000, 38_000), shift_m=4.5, slope_m=1.0, noise_px=0.2, gsd_m=10.0)
+ORTHO = Kind((30_000, 38_000), shift_m=4.5, slope_m=0.5, noise_px=0.2, gsd_m=10.0)
 STEREO = Kind((24_000, 24_000), shift_m=15.0, slope_m=2.5, noise_px=0.3, gsd_m=5.0)
 FINE = Kind((44_000, 40_000), shift_m=10.0, slope_m=2.0, noise_px=0.3, gsd_m=1.5)
 """Ortho-images of a slanting swath of 290 km, stereo pairs, and images that show the sites."""
@@ -119,11 +120,11 @@ class Draw:
     truth: Array
     site: IntArray
     heights: ControlGround
-    sites: tuple[ControlGround, ...]
+    sites: tuple[KnownSite, ...]
 
     def control(self, active: Sequence[int]) -> ControlGround:
         """The heights, and the given sites."""
-        return joined_ground([self.heights, *(self.sites[row] for row in active)])
+        return joined_ground([self.heights, *(self.sites[row].ground for row in active)])
 
     def without(self, kind: Kind) -> "Draw":
         """The same without the images of a kind."""
@@ -136,13 +137,6 @@ class Draw:
             kinds=tuple(own for own in self.kinds if own != kind),
             observations=replace(seen, image=number[seen.image]),
         )
-
-
-def distance_km(first: tuple[float, float], second: tuple[float, float]) -> float:
-    """Distance of two sites."""
-    middle = np.array([[*np.mean([first, second], axis=0), 0.0]])
-    step = (np.array(second) - np.array(first)) * metres_per_degree_at(middle)[0] / 1000.0
-    return float(np.hypot(*step))
 
 
 @dataclass(frozen=True)
@@ -239,9 +233,14 @@ def orthos(terrain: Terrain) -> tuple[Image, ...]:
         )
         # North up: lines go south, samples east.
         along = np.array([0.0, -_ACROSS[1] * half_m[0], _ACROSS[0] * half_m[1]]) / _HALF_SWATH_M
-        displacement = ReliefDisplacement(terrain.height_m, _TANGENT * np.outer(_ACROSS, along))
+        displacement = ReliefDisplacement(partial(_or_sea, terrain), _TANGENT * np.outer(_ACROSS, along))
         out.append(Image(f"ortho {number + 1}", ORTHO, OrthoModel(grid, displacement=displacement)))
     return tuple(out)
+
+
+def _or_sea(terrain: Terrain, lon_lat: Array) -> Array:
+    """Heights (n,), 0 beyond the terrain."""
+    return np.nan_to_num(terrain.height_m(lon_lat))
 
 
 def across_m(grid: MapGrid, lon_lat: Array) -> Array:
@@ -299,7 +298,9 @@ def draw(rng: np.random.Generator, ties: int = TIES) -> Draw:
         truth,
         site,
         _heights(terrain, truth[:ties], land.island[nodes]),
-        tuple(_known_site(name, truth, site == row, rng) for row, name in enumerate(SITES)),
+        tuple(
+            KnownSite(name, _known_site(name, truth, site == row, rng)) for row, name in enumerate(SITES)
+        ),
     )
 
 

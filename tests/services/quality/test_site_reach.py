@@ -1,0 +1,62 @@
+"""Each known site alone as control of a block, the others as check."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks._cape_verde import SITES, STEREO, Draw, draw
+from services.errors import InputError
+from services.geodesy import move_metres
+from services.quality.site_reach import SiteReach, site_reach
+
+OFF_M = 1.0
+
+
+def reach(one: Draw, sites: int = 2) -> SiteReach:
+    return site_reach(one.images, one.observations, one.sites[:sites], one.heights)
+
+
+@pytest.fixture(scope="module")
+def one() -> Draw:
+    return draw(np.random.default_rng(47), 120).without(STEREO)
+
+
+@pytest.fixture(scope="module")
+def plain(one: Draw) -> SiteReach:
+    return reach(one)
+
+
+def test_every_site_is_checked_by_every_other_one(plain: SiteReach) -> None:
+    names = list(SITES)[:2]
+    assert [(check.active, check.check) for check in plain.checks] == [
+        (names[0], names[1]),
+        (names[1], names[0]),
+    ]
+    for check in plain.checks:
+        assert 66.0 < check.distance_km < 70.0
+        assert check.points >= 6
+        declared_m = np.sqrt(np.trace(check.covariance_m2[:2, :2]))
+        assert 0.9 < declared_m < 3.0
+        assert check.residual_m < 3.0 * declared_m
+
+
+def test_the_known_ground_of_a_check_site_takes_no_part(one: Draw, plain: SiteReach) -> None:
+    site = one.sites[1]
+    moved = move_metres(site.ground.lon_lat_h, np.tile([OFF_M, 0.0, 0.0], (len(site.ground), 1)))
+    elsewhere = replace(site, ground=replace(site.ground, lon_lat_h=moved))
+    after = reach(replace(one, sites=(one.sites[0], elsewhere)))
+    np.testing.assert_allclose(
+        after.checks[0].error_m - plain.checks[0].error_m, [-OFF_M, 0.0, 0.0], atol=1e-6
+    )
+
+
+def test_corners_of_every_image_move_by_less_than_its_model_was_off(one: Draw, plain: SiteReach) -> None:
+    assert len(plain.corners) == 2 * len(one.images)
+    of_orthos = [np.hypot(*corner.moved_m.T) for corner in plain.corners if "ortho" in corner.image]
+    assert 0.0 < np.median(of_orthos) < np.max(of_orthos) < 4.5
+
+
+def test_one_site_alone_has_no_check(one: Draw) -> None:
+    with pytest.raises(InputError, match="1 known site given, at least 2"):
+        reach(one, 1)
