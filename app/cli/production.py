@@ -8,6 +8,7 @@ import typer
 from app.cli.image_production import run
 from app.cli.image_selection import select
 from app.cli.output import AsJson, show_one
+from app.cli.planning import plan
 from app.cli.production_points import points as make_known_points
 from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from app.cli.progress import shown_progress
@@ -18,6 +19,7 @@ from services.production.from_ortho import OrthoPointOptions
 
 app = typer.Typer(no_args_is_help=True)
 app.command()(select)
+app.command()(plan)
 app.command()(run)
 app.command(name="points")(make_known_points)
 

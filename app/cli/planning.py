@@ -1,0 +1,43 @@
+"""`amers production plan`: the accuracy of a block before any image exists."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from app.cli.output import AsJson, print_json
+from app.cli.progress import shown_progress
+from app.usecases.planning import run_plan
+from services.reports.plan import plan_document
+from services.reports.plan_pages import plan_tables
+
+_TABLE_WIDTH = 100
+
+
+def plan(
+    configuration: Annotated[Path, typer.Argument(help="The plan: images, sites, sigmas, JSON.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")],
+    selection: Annotated[
+        str | None,
+        typer.Option(help="Folder of a selection, or catalogue, whose images are planned too."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Predict the accuracy of a block, and say where one more known site would help most.
+
+    No pixel is read: places and directions of the images, sigmas of measures and models, and the
+    accuracy of known sites give the covariance that the adjustment will declare.
+    """
+    with shown_progress() as progress:
+        report = run_plan(configuration, output, selection, progress)
+    if as_json:
+        print_json(plan_document(report))
+        return
+    console = Console(width=None if Console().is_terminal else _TABLE_WIDTH)
+    for table in plan_tables(report):
+        console.print(table)
+    for line in report.words:
+        typer.echo(line)
+    typer.echo(str(output / "report.html"))

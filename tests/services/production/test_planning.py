@@ -1,0 +1,155 @@
+"""A plan predicts what the adjustment declares, and proposes the site that helps most."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.bundle import BlockAdjustment, adjust_block
+from services.errors import DisconnectedBlock, InputError
+from services.production.block_plan import (
+    BlockPlan,
+    PlanGeometry,
+    PlannedHeights,
+    PlannedImage,
+    PlannedSite,
+    observed_and_known,
+    plan_geometry,
+)
+from services.production.planning import block_of, forecast
+from services.quality.accuracy import normal_ce90
+from services.sensors.correction import CorrectedModel
+from services.types import Array
+
+MIDDLE = (5.4, 43.3)
+EAST_DEG = 0.0616
+"""Five kilometres."""
+
+
+def strip(count: int = 5) -> tuple[PlannedImage, ...]:
+    """Images of 10 km in a row, each over half of the next, from both sides in turn."""
+    return tuple(
+        PlannedImage(
+            name=f"image {k + 1}",
+            lon_lat=(MIDDLE[0] + k * EAST_DEG, MIDDLE[1]),
+            size_m=(10_000.0, 10_000.0),
+            gsd_m=2.0,
+            incidence_deg=15.0,
+            azimuth_deg=100.0 if k % 2 else 280.0,
+            sigma_m=6.0,
+        )
+        for k in range(count)
+    )
+
+
+def sites(count: int = 5) -> tuple[PlannedSite, ...]:
+    """One under the middle of every image."""
+    return tuple(
+        PlannedSite(f"site {k + 1}", (MIDDLE[0] + k * EAST_DEG, MIDDLE[1] + 0.005)) for k in range(count)
+    )
+
+
+PLAN = BlockPlan(strip(), spacing_m=600.0, sites=sites()[:1], candidates=sites()[1:])
+MIXED = replace(
+    PLAN,
+    images=(
+        *strip(3)[:2],
+        replace(
+            strip(3)[2],
+            size_m=(30_000.0, 30_000.0),
+            gsd_m=10.0,
+            incidence_deg=8.0,
+            is_ortho=True,
+        ),
+    ),
+    spacing_m=1200.0,
+    heights=PlannedHeights(sigma_m=2.0, frame_sigma_m=1.5),
+    candidates=(),
+)
+
+
+def simulated(plan: BlockPlan, geometry: PlanGeometry, known: list[int], seed: int) -> BlockAdjustment:
+    """The adjustment of the plan with errors as large as it states."""
+    rng = np.random.default_rng(seed)
+    observations, control = observed_and_known(plan, geometry, known)
+    line_sample = observations.line_sample.copy()
+    for number, image in enumerate(geometry.images):
+        rows = observations.image == number
+        off = image.corrected(rng.normal(0.0, image.sigma))
+        assert isinstance(off, CorrectedModel)
+        line_sample[rows] = off.correction.apply(line_sample[rows])
+    line_sample += rng.normal(0.0, observations.sigma_px[:, None], line_sample.shape)
+    measured = replace(observations, line_sample=line_sample)
+    return adjust_block(geometry.images, measured, control=control, passes=geometry.pass_members)
+
+
+def earth_sigmas_m(relative_m2: Array, frame_m2: Array) -> Array:
+    return np.asarray(np.sqrt(np.diagonal(relative_m2 + frame_m2, 0, 1, 2)))
+
+
+@pytest.mark.parametrize("plan", [PLAN, MIXED], ids=["stereo", "with an ortho-image"])
+def test_the_prediction_is_what_the_adjustment_declares(plan: BlockPlan) -> None:
+    geometry = plan_geometry(plan)
+    predicted = block_of(plan, geometry, [0])
+    ratios = []
+    for seed in range(4):
+        block = simulated(plan, geometry, [0], seed)
+        rows = np.flatnonzero(np.isfinite(block.lon_lat_h[:, 0]))
+        declared = earth_sigmas_m(block.point_covariance_m2[rows], block.frames[0].covariance_m2)
+        frames_m2 = predicted.frames[0].covariance_m2
+        ratios.append(earth_sigmas_m(predicted.point_covariance_m2[rows], frames_m2) / declared)
+    middle = np.median(np.concatenate(ratios), axis=0)
+    np.testing.assert_allclose(middle, 1.0, atol=0.1)
+    assert np.quantile(np.abs(np.mean([np.median(r, axis=0) for r in ratios], axis=0) - 1.0), 1.0) < 0.1
+
+
+def test_the_proposed_site_is_the_best_of_all_in_the_adjustment() -> None:
+    geometry = plan_geometry(PLAN)
+    found = forecast(PLAN)
+    ground = np.flatnonzero(geometry.site < 0)
+    means_m = []
+    for candidate in range(len(PLAN.candidates)):
+        of_seeds = []
+        for seed in range(3):
+            block = simulated(PLAN, geometry, [0, 1 + candidate], seed)
+            earth_m2 = block.point_covariance_m2[ground[ground < len(block.lon_lat_h)]]
+            earth_m2 = earth_m2[:, :2, :2] + block.frames[0].covariance_m2[:2, :2]
+            of_seeds.append(np.nanmean(normal_ce90(earth_m2)))
+        means_m.append(np.mean(of_seeds))
+    (proposal,) = found.proposed
+    assert proposal.site == PLAN.candidates[int(np.argmin(means_m))]
+    assert int(np.nanargmax(proposal.gain_m)) == int(np.argmin(means_m))
+    np.testing.assert_allclose(proposal.on_the_earth.ce90_m, min(means_m), rtol=0.1)
+    assert proposal.on_the_earth.ce90_m < found.on_the_earth.ce90_m
+
+
+def test_a_larger_base_gives_better_heights_and_more_points_a_better_shape() -> None:
+    steep = replace(PLAN, candidates=())
+    slanted = tuple(replace(image, incidence_deg=30.0) for image in strip())
+    dense = replace(steep, spacing_m=250.0)
+    plain, wide, many = (forecast(plan) for plan in (steep, replace(steep, images=slanted), dense))
+    assert wide.relative.le90_m < 0.7 * plain.relative.le90_m
+    assert many.relative.ce90_m < plain.relative.ce90_m
+
+
+def test_a_second_site_is_proposed_beside_the_first() -> None:
+    found = forecast(replace(PLAN, added=2))
+    assert len({one.site.name for one in found.proposed}) == 2
+    assert found.proposed[1].on_the_earth.ce90_m < found.proposed[0].on_the_earth.ce90_m
+
+
+def test_sites_that_no_image_shows_are_not_proposed() -> None:
+    nowhere = PlannedSite("nowhere", (MIDDLE[0] - 1.0, MIDDLE[1]))
+    found = forecast(replace(PLAN, candidates=(nowhere, PLAN.candidates[0])))
+    assert found.proposed[0].site == PLAN.candidates[0]
+    assert np.isnan(found.proposed[0].gain_m[0])
+
+
+def test_what_cannot_be_computed_is_refused() -> None:
+    with pytest.raises(InputError, match="1 images"):
+        forecast(replace(PLAN, images=strip(1)))
+    with pytest.raises(InputError, match="state another spacing_m"):
+        forecast(replace(PLAN, spacing_m=20_000.0))
+    apart = (*strip(2), *(replace(one, name=f"far {one.name}", lon_lat=(7.0, 43.3)) for one in strip(2)))
+    with pytest.raises(DisconnectedBlock, match="far image 1, far image 2"):
+        forecast(replace(PLAN, images=apart, spacing_m=1000.0, candidates=()))
