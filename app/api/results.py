@@ -102,6 +102,17 @@ def failure_schema() -> JSONResponse:
 
 
 @router.get(
+    "/schemas/joint.json",
+    dependencies=[Public],
+    response_class=Response,
+    responses={200: {"description": "A JSON Schema.", "content": {SCHEMA_JSON: {}}}},
+)
+def joint_schema() -> JSONResponse:
+    """Return the JSON Schema of the `report.json` of scenes registered together."""
+    return JSONResponse(document.joint_schema(), media_type=SCHEMA_JSON)
+
+
+@router.get(
     "/schemas/block_quality.json",
     dependencies=[Public],
     response_class=Response,

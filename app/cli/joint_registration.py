@@ -143,7 +143,7 @@ def _control(request: JointRequest) -> Iterator[tuple[FindPoints, Database | Non
 def _run(request: JointRequest, find_points: FindPoints, folders: dict[str, Path]) -> JointOutcome:
     with shown_progress() as progress:
         return run_joint_registration(
-            request.files,
+            {one.image.stem: one for one in request.files},
             find_points,
             JointPlace(
                 folders.__getitem__,

@@ -34,12 +34,14 @@ from app.usecases.damage import report_damage
 from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work, WorkFailed
 from app.usecases.registration.job import REGISTER_SCENE
+from app.usecases.registration.joint_job import REGISTER_SCENES
 from app.usecases.vector_job import CORRECT_VECTORS
 
 PROCESSES: dict[str, Process] = {
     process.id: process
     for process in (
         REGISTER_SCENE,
+        REGISTER_SCENES,
         ORTHORECTIFY,
         CORRECT_VECTORS,
         INGEST_BLOCK,

@@ -1,14 +1,17 @@
-"""`amers scene register-many`: scenes registered together, on a block folder and on the store."""
+"""Scenes registered together: by `amers scene register-many`, and by the process `register-scenes`."""
 
+import io
 import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 import rasterio
+from fastapi.testclient import TestClient
 from jsonschema import validate
 
 from app.config import Settings
@@ -27,6 +30,7 @@ from tests.app.flat_world import (
     publish_world,
 )
 from tests.app.registration_outputs import largest_error_px
+from tests.app.worker_processes import ended, running_worker
 from tests.command_line import Done, amers_here
 from tests.statements import run_sql
 
@@ -170,3 +174,57 @@ def test_nothing_is_written_when_a_folder_holds_other_files(
     assert done.returncode == 2
     assert "block: holds files" in done.stderr
     assert [path.name for path in output.iterdir()] == ["block"]
+
+
+def test_a_job_registers_uploaded_scenes_together(
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    settings: Settings,
+    world: FlatWorld,
+    folder: Path,
+    tmp_path: Path,
+    dsn: str,
+    storage: Storage,
+):
+    publish_world(dsn, storage, world)
+    me, other = bearer("register"), bearer("register")
+    upload = f"/scenes?name=scene.tif&sigma_m={SIGMA_M}"
+    ids = {
+        name: client.post(upload, content=(folder / f"{name}.tif").read_bytes(), headers=me).json()["id"]
+        for name in (*SCENES, "wrong")
+    }
+    execution = "/processes/register-scenes/execution"
+    scenes = list(ids.values())
+    for wrong in ([scenes[0]], [scenes[0], scenes[0]], [*scenes, "nothing"]):
+        reply = client.post(execution, json={"inputs": {"scenes": wrong}}, headers=me)
+        assert reply.status_code == 422, reply.text
+    body = {"inputs": {"scenes": scenes}}
+    assert client.post(execution, json=body, headers=other).status_code == 404
+    assert client.post(execution, json=body, headers=bearer("read")).status_code == 403
+    job = client.post(execution, json=body, headers=me).headers["location"]
+    with running_worker(settings, tmp_path / "log"):
+        done = ended(client, job, me)
+    assert done["status"] == "successful", done
+    results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
+    assert results["verdict"] == "not registered"
+    verdicts = {one["scene"]: one["verdict"] for one in results["scenes"]}
+    assert verdicts.pop(ids["wrong"]) == "not registered"
+    assert set(verdicts.values()) <= {"good", "usable"}
+    report = client.get(results["report.json"]["href"], headers=me).json()
+    validate(report, client.get("/schemas/joint.json").json())
+    packed = client.get(results[f"{ids['east']}.zip"]["href"], headers=me)
+    assert packed.headers["content-type"] == "application/zip"
+    with ZipFile(io.BytesIO(packed.content)) as file:
+        assert {"report.json", "report.html", "refined_RPC.TXT", "correction.json"} <= set(
+            file.namelist()
+        )
+        file.extract("refined_RPC.TXT", tmp_path)
+    refined = read_rpc(folder / "east.tif", tmp_path / "refined_RPC.TXT").model
+    assert largest_error_px(refined, true_model(world, "east")) < A_FIFTH_OF_A_PIXEL
+    with ZipFile(
+        io.BytesIO(client.get(results[f"{ids['wrong']}.zip"]["href"], headers=me).content)
+    ) as file:
+        validate(json.loads(file.read("report.json")), failure_schema())
+    with engine.connect(dsn) as connection:
+        counts = run_sql(connection, "select count(*) as n from registration where scene_id is not null")
+        assert counts.fetchone() == {"n": 2}

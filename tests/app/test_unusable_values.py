@@ -45,9 +45,13 @@ def admin(bearer: Bearer) -> dict[str, str]:
 @pytest.fixture
 def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any]]:
     """Inputs of every process that lack nothing; a new process needs a line here."""
-    scene = client.post("/scenes?name=a.tif", content=TIFF, headers=admin).json()["id"]
+    scene, other = (
+        client.post(f"/scenes?name={name}.tif", content=TIFF, headers=admin).json()["id"]
+        for name in "ab"
+    )
     return {
         "register-scene": {"scene": scene},
+        "register-scenes": {"scenes": [scene, other]},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "ingest-block": {"path": "block"},

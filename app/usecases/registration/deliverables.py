@@ -47,6 +47,7 @@ MEDIA_TYPES = {
     ".xml": "application/xml",
     ".tif": "image/tiff",
     ".tiff": "image/tiff",
+    ".zip": "application/zip",
 }
 
 

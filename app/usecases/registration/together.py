@@ -1,9 +1,9 @@
 """Register scenes together: read their files, find control, adjust all at once, write each outcome."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -78,8 +78,9 @@ class JointOutcome:
 
 @dataclass(frozen=True)
 class _Read:
-    """A scene with its files."""
+    """A scene with its files, and the name of the folder of its results."""
 
+    folder: str
     files: SceneFiles
     scene: Scene
 
@@ -89,7 +90,7 @@ class _Read:
 
 
 def run_joint_registration(
-    files: Sequence[SceneFiles],
+    files: Mapping[str, SceneFiles],
     find_points: FindPoints,
     place: JointPlace,
     *,
@@ -103,7 +104,7 @@ def run_joint_registration(
     A scene that cannot be read or does not fit gets the report of a failure, and does not stop others.
 
     Args:
-        files: of the scenes, whose images have different names.
+        files: of the scenes, by the names of their folders.
         find_points: finds control points.
         place: of the work and of the results.
         options: of the registration.
@@ -116,8 +117,8 @@ def run_joint_registration(
         ComputationError: no scene can be registered.
     """
     attempts = {
-        one.image.stem: Attempt(one.image, command or f"amers scene register-many {one.image}", options)
-        for one in files
+        name: Attempt(one.image, command or f"amers scene register-many {one.image.name}", options)
+        for name, one in files.items()
     }
     failed: dict[str, AmersError] = {}
     with ExitStack() as stack:
@@ -131,7 +132,7 @@ def run_joint_registration(
             progress(0.0, "looking for points")
             control = find_points(_outline([one.scene for one in read]))
             for one in read:
-                attempts[one.files.image.stem].control = control
+                attempts[one.folder].control = control
             executor, ahead = stack.enter_context(open_executor(place.compute))
             result = register_together(
                 [one.scene for one in read],
@@ -147,7 +148,7 @@ def run_joint_registration(
                 write_failure(place.folder_of(name), attempt, failed.get(name, error))
             raise
         by_name = {one.name: one for one in read}
-        left = [by_name[one.measured.name].files.image.stem for one in result.left]
+        left = [by_name[one.measured.name].folder for one in result.left]
         for name, gone in zip(left, result.left, strict=True):
             failed[name] = gone.error
             attempts[name].stages.extend(gone.measured.stages)
@@ -157,7 +158,7 @@ def run_joint_registration(
         for count, registration in enumerate(result.registrations):
             progress(0.85 + 0.15 * count / len(result.registrations), "writing the reports")
             one = by_name[result.block.scenes[result.numbers[count]].name]
-            name = one.files.image.stem
+            name = one.folder
             registered[name] = _written(
                 one, registration, control, attempts[name], place.folder_of(name), copy_image=copy_image
             )
@@ -174,22 +175,26 @@ def run_joint_registration(
 
 
 def _read_all(
-    files: Sequence[SceneFiles],
+    files: Mapping[str, SceneFiles],
     attempts: dict[str, Attempt],
     failed: dict[str, AmersError],
     stack: ExitStack,
 ) -> list[_Read]:
-    """The scenes that can be read, open until the stack closes; the others are noted."""
-    read = []
-    for one in files:
-        name = one.image.stem
+    """The scenes that can be read, open until the stack closes; the others are noted.
+
+    A scene whose metadata name it like another one gets the name of its folder.
+    """
+    read: list[_Read] = []
+    for name, one in files.items():
         try:
             scene = _read(one, stack)
         except InputError as error:
             failed[name] = error
             continue
+        if scene.acquisition.image_id in [other.name for other in read]:
+            scene = replace(scene, acquisition=replace(scene.acquisition, image_id=name))
         attempts[name].scene = scene
-        read.append(_Read(one, scene))
+        read.append(_Read(name, one, scene))
     return read
 
 
@@ -323,6 +328,6 @@ def _joined(folder: Path, stack: ExitStack) -> _Joined:
         raise FormatError(
             f"{path}: the scenes of `amers scene register-many` expected: {error}"
         ) from None
-    read = tuple(_Read(one, _read(one, stack)) for one in files)
+    read = tuple(_Read(one.image.stem, one, _read(one, stack)) for one in files)
     read = tuple(one for one in read if one.name in known.names)
     return _Joined(read, AdjustedScenes(tuple(one.scene for one in read), known))

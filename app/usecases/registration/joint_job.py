@@ -1,0 +1,188 @@
+"""The process `register-scenes`: register uploaded scenes together on the points of the store."""
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import UUID
+from zipfile import ZIP_DEFLATED, ZipFile
+
+from app.auth import Scope
+from app.db import scenes
+from app.db.engine import Connection
+from app.db.scenes import SceneRow
+from app.db.tokens import Token
+from app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
+from app.usecases.damage import suspecting_damage
+from app.usecases.processes import Commit, Process, Work, WorkFailed
+from app.usecases.registration.control_sources import points_of_store
+from app.usecases.registration.register import SceneFiles, record_registration
+from app.usecases.registration.together import (
+    BLOCK_FOLDER,
+    JointOutcome,
+    JointPlace,
+    run_joint_registration,
+)
+from app.usecases.results import store_results
+from app.usecases.scene_inputs import check_scene, present_scene
+from app.usecases.scenes import local_image, stored_keys
+from services.formats.images.bands import parse_bands
+from services.imagery.scene import scene_gsd_m
+from services.quality.accuracy_statement import accuracy_document
+from services.registration.options import RegistrationOptions
+from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
+
+MOST_SCENES = 100
+_REPORTS = ("report.json", "report.html", "report.txt")
+
+
+@dataclass(frozen=True)
+class RegisterScenes:
+    """The inputs of a registration of scenes together.
+
+    Attributes:
+        scenes: ids of uploaded scenes, 2 to 100.
+        bands: bands to use of each, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the
+            panchromatic band or the mean of the visible ones.
+        copy_image: whether GeoTIFFs are copied to the outputs with the refined model in their tags.
+        options: of the registration.
+    """
+
+    scenes: tuple[UUID, ...]
+    bands: str | None = None
+    copy_image: bool = False
+    options: RegistrationOptions = field(default_factory=RegistrationOptions)
+
+
+def _check(connection: Connection, caller: Token, inputs: RegisterScenes) -> None:
+    count = len(inputs.scenes)
+    if not 2 <= count <= MOST_SCENES:
+        raise InputError(f"scenes: {count} given, 2 to {MOST_SCENES} expected")
+    if len(set(inputs.scenes)) < count:
+        raise InputError("scenes: one is given twice, different ones expected")
+    for scene in inputs.scenes:
+        check_scene(connection, caller, scene)
+    if inputs.bands is not None:
+        parse_bands(inputs.bands)
+
+
+def _run(work: Work) -> Commit:
+    """Register uploaded scenes and put the outputs into the storage before rows refer to them."""
+    inputs: RegisterScenes = work.inputs
+    with work.database.reading() as connection:
+        rows = {str(scene): present_scene(connection, scene) for scene in inputs.scenes}
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="amers-")))
+        files = {name: _local_files(work, row, stack) for name, row in rows.items()}
+        try:
+            with suspecting_damage(
+                work.database, work.storage, [key for row in rows.values() for key in stored_keys(row)]
+            ):
+                outcome = run_joint_registration(
+                    files,
+                    points_of_store(work.database, work.storage),
+                    JointPlace(lambda name: folder / name, f"job {work.job.id}"),
+                    options=inputs.options,
+                    copy_image=inputs.copy_image,
+                    progress=work.progress,
+                )
+        except (InputError, ComputationError) as error:
+            if is_no_memory(error):
+                raise
+            raise _with_reports(work, folder, error) from error
+        packed = _packed(folder, rows)
+        reports = {name: folder / BLOCK_FOLDER / name for name in _REPORTS}
+        keys = store_results(work, {**reports, **packed})
+        gsds_m = {name: scene_gsd_m(one.scene) for name, one in outcome.registered.items()}
+
+    def commit(connection: Connection) -> dict[str, Any]:
+        for name, registered in outcome.registered.items():
+            row = rows[name]
+            scene_key = row.sha256 or f"scene {row.id}"
+            # A job registers one scene at most: the registrations of many name their scenes only.
+            record_registration(connection, registered, scene_key, scene_id=row.id)
+            scenes.set_footprint(connection, row.id, registered.footprint)
+            acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
+            scenes.describe(connection, row.id, acquisition, shape, gsds_m[name])
+        return {
+            "verdict": outcome.report.verdict,
+            "verdict_words": outcome.report.verdict_words,
+            "scenes": [_scene_values(name, outcome) for name in rows],
+            "files": keys,
+        }
+
+    return commit
+
+
+def _local_files(work: Work, row: SceneRow, stack: ExitStack) -> SceneFiles:
+    """The files of a scene on this machine, until the stack closes."""
+    scratch = stack.enter_context(TemporaryDirectory(prefix="amers-"))
+    image = local_image(work.storage, work.settings, row, Path(scratch))
+    return SceneFiles(image=image, sigma_m=row.sigma_m, bands=work.inputs.bands)
+
+
+def _packed(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The outputs of every scene in one file each, by its name."""
+    packed = {}
+    for name in names:
+        path = folder / f"{name}.zip"
+        with ZipFile(path, "w", ZIP_DEFLATED) as file:
+            for output in sorted((folder / name).iterdir()):
+                file.write(output, output.name)
+        packed[path.name] = path
+    return packed
+
+
+def _scene_values(name: str, outcome: JointOutcome) -> dict[str, Any]:
+    """What the results state of one scene."""
+    if name not in outcome.registered:
+        reason = str(outcome.failed[name])
+        return {
+            "scene": name,
+            "verdict": NOT_REGISTERED,
+            **accuracy_document(NO_ACCURACY),
+            "reason": reason,
+        }
+    quality = outcome.registered[name].registration.qualification
+    return {
+        "scene": name,
+        "verdict": quality.verdict,
+        **accuracy_document(quality.accuracy),
+        "reason": outcome.registered[name].report.verdict_explanation,
+    }
+
+
+def _with_reports(work: Work, folder: Path, error: AmersError) -> WorkFailed | AmersError:
+    """The error of a registration with the reports of its failure; without where there is no room."""
+    try:
+        keys = store_results(work, _packed(folder, map(str, work.inputs.scenes)))
+    except (TooLarge, FileNotFoundError):
+        return error
+    return WorkFailed(error, {"verdict": NOT_REGISTERED, "files": keys})
+
+
+REGISTER_SCENES = Process(
+    id="register-scenes",
+    title="Register scenes together",
+    description="Refine the sensor models of uploaded scenes in one adjustment, on control points and "
+    "on tie points between the scenes. The outputs of each scene are in SCENE.zip.",
+    scope=Scope.REGISTER,
+    inputs=RegisterScenes,
+    outputs={
+        "report.json": "The report on all scenes as a document.",
+        "report.html": "The report on all scenes as a page.",
+        "report.txt": "The tables of the report as plain text.",
+    },
+    check=_check,
+    run=_run,
+    values={
+        "verdict": {
+            "enum": ["good", "usable", "failed", "not registered"],
+            "title": "Worst verdict on a scene",
+        },
+        "verdict_words": {"type": "string", "title": "How many scenes have which verdict"},
+        "scenes": {"type": "array", "title": "Verdict, accuracy and reason of every scene"},
+    },
+)
