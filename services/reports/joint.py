@@ -14,7 +14,6 @@ from services.quality.accuracy_statement import StatedAccuracy
 from services.quality.criteria import Verdict
 from services.quality.qualification import PointCounts
 from services.quality.stability import ImageResiduals, Stability
-from services.reports.failure import NOT_REGISTERED
 from services.reports.published import PublishedTable, published_tables
 from services.reports.report import NOT_IN_JSON, BlockUsed, RegistrationReport
 from services.types import Array
@@ -99,7 +98,7 @@ class JointReport:
     Attributes:
         format: of the document, with its version.
         block: what it is on.
-        verdict: the worst on a scene; "not registered" when one has left.
+        verdict: the worst on a scene; "incomplete" when one has left.
         verdict_words: how many scenes have which verdict.
         scenes: that fit.
         left: scenes that do not.
@@ -119,7 +118,7 @@ class JointReport:
 
     format: str
     block: JointSubject
-    verdict: Literal["good", "usable", "failed", "not registered"]
+    verdict: Literal["good", "usable", "failed", "incomplete"]
     verdict_words: str
     scenes: tuple[JointScene, ...]
     left: tuple[LeftScene, ...]
@@ -169,7 +168,7 @@ def joint_report(
     return JointReport(
         format=JOINT_FORMAT,
         block=JointSubject(name),
-        verdict=NOT_REGISTERED if gone else worst,
+        verdict="incomplete" if gone else worst,
         verdict_words=f"{len(scenes) + len(gone)} scenes: {', '.join(counts)}.",
         scenes=scenes,
         left=gone,

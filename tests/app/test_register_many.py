@@ -114,7 +114,7 @@ def test_scenes_are_registered_together_and_the_wrong_one_is_named(
     assert result.returncode == 3, result.stderr
     assert "wrong" in result.stderr
     printed = json.loads(result.stdout)
-    assert printed["verdict_on_all"] == "not registered"
+    assert printed["verdict_on_all"] == "incomplete"
     verdicts = {Path(one["scene"]).stem: one["verdict"] for one in printed["scenes"]}
     assert verdicts.pop("wrong") == "not registered"
     assert set(verdicts.values()) <= {"good", "usable"}
@@ -206,7 +206,7 @@ def test_a_job_registers_uploaded_scenes_together(
         done = ended(client, job, me)
     assert done["status"] == "successful", done
     results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
-    assert results["verdict"] == "not registered"
+    assert results["verdict"] == "incomplete"
     verdicts = {one["scene"]: one["verdict"] for one in results["scenes"]}
     assert verdicts.pop(ids["wrong"]) == "not registered"
     assert set(verdicts.values()) <= {"good", "usable"}

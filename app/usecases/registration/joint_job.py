@@ -179,8 +179,8 @@ REGISTER_SCENES = Process(
     run=_run,
     values={
         "verdict": {
-            "enum": ["good", "usable", "failed", "not registered"],
-            "title": "Worst verdict on a scene",
+            "enum": ["good", "usable", "failed", "incomplete", "not registered"],
+            "title": "Worst verdict on a scene; incomplete when one did not fit",
         },
         "verdict_words": {"type": "string", "title": "How many scenes have which verdict"},
         "scenes": {"type": "array", "title": "Verdict, accuracy and reason of every scene"},

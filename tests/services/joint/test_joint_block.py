@@ -9,6 +9,7 @@ import pytest
 from benchmarks._joint_scenes import (
     ImagePlan,
     JointTruth,
+    SceneTruth,
     errors_px,
     image_truth,
     joint_truth,
@@ -18,8 +19,8 @@ from benchmarks._joint_scenes import (
 )
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock, adjust_together, repeated
-from services.joint.fitting import adjust_fitting
-from services.joint.measured import MeasuredScene
+from services.joint.fitting import adjust_fitting, ties_between
+from services.joint.measured import MeasuredScene, nothing_found
 from services.joint.results import (
     held_cells,
     held_draws,
@@ -27,9 +28,12 @@ from services.joint.results import (
     scene_adjustment,
     scene_measures,
 )
+from services.map_grid import MapGrid
 from services.quality.frames import frame_in_image
 from services.quality.stability import image_places
 from services.registration.options import RegistrationOptions
+from services.sensors.correction import no_correction
+from services.sensors.ortho import OrthoModel
 from services.simulation.world import World, make_world
 from services.types import Array, Frame, Observations
 
@@ -185,3 +189,49 @@ def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
     assert registration.qualification.verdict in ("good", "usable")
     assert scene_gsd_m(scenes[0].scene) == pytest.approx(GSD_M, rel=0.1)
     assert held_cells(measures)
+
+
+def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
+    squares, accurate = [], []
+    for trial in range(4):
+        rng = np.random.default_rng([10, trial])
+        truth = truth_of(rng)
+        scenes, ties = observed(truth, rng)
+        redone, _ = adjust_fitting(scenes, ties, OPTIONS)
+        first, _ = adjust_fitting(scenes[:2], ties_between(ties, [0, 1]), OPTIONS)
+        known = first.adjustment.known
+        assert known is not None
+        before = [nothing_found(one.scene, one.points.take(np.zeros(0, np.int64))) for one in scenes[:2]]
+        joined, left = adjust_fitting([*before, scenes[2]], ties, OPTIONS, known)
+        assert not left
+        at = image_places(SHAPE)
+        one, other = (scene_adjustment(each, 2, OPTIONS) for each in (joined, redone))
+        moved_px = one.correction.apply(at) - other.correction.apply(at)
+        stated = one.covariance_at(at)
+        squares.append((moved_px * np.linalg.solve(stated, moved_px[:, :, None])[:, :, 0]).sum() / 10.0)
+        accurate.append(normalised(truth, joined, 2)[0])
+    assert np.mean(squares) < 0.5
+    assert 0.1 < np.mean(accurate) < 2.5
+
+
+def test_an_ortho_image_joins_images_with_rpcs() -> None:
+    """It tells positions, no heights, and is held by its own points and by ties like the others."""
+    rng = np.random.default_rng(9)
+    truth = truth_of(rng)
+    lon, lat = origin()[:2]
+    centre = MapGrid("EPSG:32631", np.zeros(2), np.eye(2), (2, 2)).line_sample(np.array([[lon, lat]]))[0]
+    step = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    grid = MapGrid("EPSG:32631", centre - step @ np.full(2, 1999.5), step, (4000, 4000))
+    plan = replace(truth.images[2].plan, shape=(4000, 4000), gsd_m=1.0)
+    zero = no_correction(plan.shape)
+    error = replace(zero, parameters=np.array([[7.0, 0.4, -0.3], [-5.0, 0.2, 0.5]]))
+    geometry = replace(truth.images[2].geometry, rpc=OrthoModel(grid))  # type: ignore[arg-type]
+    images = (*truth.images[:2], SceneTruth(plan, geometry, error))
+    truth = replace(truth, images=images)
+    scenes, ties = observed(truth, rng)
+    block, left = adjust_fitting(scenes, ties, OPTIONS)
+    assert not left
+    for number, image in enumerate(images):
+        at = image_places(image.shape)
+        relative_px, _ = errors_px(truth, number, block.model(number), at)
+        assert np.hypot(*relative_px.T).max() * image.plan.gsd_m < 0.6
