@@ -17,6 +17,7 @@ from benchmarks._joint_scenes import (
     places,
     tie_points,
 )
+from services.geodesy import move_metres
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock, adjust_together, repeated
 from services.joint.fitting import adjust_fitting, ties_between
@@ -235,3 +236,27 @@ def test_an_ortho_image_joins_images_with_rpcs() -> None:
         at = image_places(image.shape)
         relative_px, _ = errors_px(truth, number, block.model(number), at)
         assert np.hypot(*relative_px.T).max() * image.plan.gsd_m < 0.6
+
+
+def test_blocks_that_lie_apart_both_keep_their_points() -> None:
+    rng = np.random.default_rng(11)
+    truth = truth_of(rng)
+    points = truth.points
+    second = np.arange(len(points)) % 3 == 0
+    moved_m = np.where(second[:, None], [2.0, -1.0, 1.0], 0.0)
+    two = replace(
+        points,
+        lon_lat_h=move_metres(points.lon_lat_h, moved_m),
+        block=second.astype(np.int64),
+        frames=(FRAME, Frame.from_sigmas(1.5, 2.0)),
+    )
+    truth = replace(truth, points=two)
+    scenes, ties = observed(truth, rng)
+    block, left = adjust_fitting(scenes, ties, OPTIONS)
+    assert not left
+    used = block.adjustment.control_active
+    assert used[block.control.source == 0].mean() > 0.9
+    assert used[block.control.source == 1].mean() > 0.9
+    for number in range(3):
+        relative_px, _ = errors_px(truth, number, block.model(number), image_places(SHAPE))
+        assert np.hypot(*relative_px.T).max() * GSD_M < 1.0
