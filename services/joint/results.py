@@ -10,7 +10,7 @@ from services.adjustment.shared_errors import SharedErrors
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock
 from services.quality.cell_stability import cell_stability_of, cells_of
-from services.quality.frames import shared_frame
+from services.quality.frames import shared_frame, weighted_frame
 from services.quality.qualification import QualificationOptions, qualify_repeated
 from services.quality.stability import AdjustedScene, Repetition, stability_of
 from services.registration.on_points import Registration
@@ -114,6 +114,11 @@ def registered_scene(
     adjustment = scene_adjustment(block, number, options)
     measures = point_results(measured.scene, measured.points, measured.search, adjustment)
     frame = shared_frame(measured.points, measures.active)
+    if not measures.active.any():
+        # Its neighbours hold it: in the frame of their points.
+        sources = block.control.source[block.adjustment.control_active]
+        shares = np.bincount(sources, minlength=len(measured.points.frames))
+        frame = weighted_frame(measured.points.frames, shares.astype(np.float64))
     model = block.model(number)
     scene = AdjustedScene(
         model, measures, adjustment, measured.scene.image.shape, scene_gsd_m(measured.scene), frame

@@ -75,10 +75,12 @@ def predict_accuracy(scene: AdjustedScene, grid: int) -> PredictedAccuracy:
 def _derivative(scene: AdjustedScene, line_sample: Array) -> Array:
     """Derivatives (n, 2, 3) of the model at image positions (n, 2), at the middle height of the points.
 
-    Where the model reaches no ground, those of its middle stand in.
+    A scene that shows none, which others hold, has the middle height of its model. Where the model
+    reaches no ground, those of its middle stand in.
     """
     points = scene.measures.lon_lat_h
-    height_m = np.full(len(line_sample), np.median(points[:, 2]))
+    middle_m = np.median(points[:, 2]) if len(points) else np.mean(scene.model.height_range_m)
+    height_m = np.full(len(line_sample), middle_m)
     derivative = scene.model.project_derivative(scene.model.locate(line_sample, height_m))
     beyond = np.asarray(~np.isfinite(derivative).all(axis=(1, 2)))
     if beyond.any():

@@ -22,6 +22,7 @@ from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock, adjust_together, repeated
 from services.joint.fitting import adjust_fitting, ties_between
 from services.joint.measured import MeasuredScene, nothing_found
+from services.joint.registration import qualified
 from services.joint.results import (
     held_cells,
     held_draws,
@@ -260,3 +261,23 @@ def test_blocks_that_lie_apart_both_keep_their_points() -> None:
     for number in range(3):
         relative_px, _ = errors_px(truth, number, block.model(number), image_places(SHAPE))
         assert np.hypot(*relative_px.T).max() * GSD_M < 1.0
+
+
+@pytest.mark.parametrize("shows_points", [True, False])
+def test_a_scene_without_control_points_is_stated_with_those_of_its_neighbours(
+    shows_points: bool,
+) -> None:
+    rng = np.random.default_rng(21)
+    truth = truth_of(rng, found=0.0)
+    scenes, ties = observed(truth, rng)
+    if not shows_points:
+        none = scenes[2].points.take(np.zeros(0, np.int64))
+        scenes[2] = nothing_found(scenes[2].scene, none)
+    block, left = adjust_fitting(scenes, ties, OPTIONS)
+    assert not left
+    qualification = qualified(block, range(3))[2].qualification
+    assert qualification.verdict == "usable"
+    assert qualification.point_counts.active == 0
+    assert 0.1 < qualification.predicted.worst_m < 3.0
+    on_earth_m = qualification.predicted.on_the_earth_worst_m
+    assert 2.0 * FRAME.sigma_m < on_earth_m < 4.0 * FRAME.sigma_m
