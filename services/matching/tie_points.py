@@ -170,6 +170,10 @@ class _Band:
     end_px: float
 
 
+_NO_PARALLAX = 1e-3
+"""Displacement of a detail by a metre of height, pixels, below which its image has no epipolar line."""
+
+
 @dataclass(frozen=True)
 class _EpipolarLines:
     """Epipolar lines in one image of n details of another.
@@ -202,7 +206,10 @@ def _epipolar_lines(
     ground = one.locate(line_sample, np.full(len(line_sample), height_m))
     above = one.locate(line_sample, np.full(len(line_sample), height_m + 1.0))
     expected = other.project(ground)
-    return _EpipolarLines(expected, other.project(above) - expected)
+    per_metre = other.project(above) - expected
+    # Two ortho-images have no parallax: any direction is as good, and details lie beyond its ends.
+    per_metre[np.hypot(*per_metre.T) < _NO_PARALLAX] = 0.0, _NO_PARALLAX
+    return _EpipolarLines(expected, per_metre)
 
 
 def _descriptor_pairs(pair: _Pair, rows: IntArray, lines: _EpipolarLines, band: _Band) -> Matches:

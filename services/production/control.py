@@ -10,7 +10,12 @@ from services.adjustment.intersection import intersect
 from services.adjustment.known_images import KnownImages
 from services.imagery.scene import Scene
 from services.production.control_points import ControlBlock, find_control
-from services.production.height_control import ControlHeights, known_heights, surfaces_above
+from services.production.height_control import (
+    ControlHeights,
+    known_heights,
+    ortho_heights,
+    surfaces_above,
+)
 from services.production.marked_control import MarkedGround, known_marks
 from services.production.ortho_control import ControlOrtho, known_on_ortho
 from services.tasks import Work
@@ -85,25 +90,28 @@ def with_control(
     at = points.measured(scenes)
     rows = np.flatnonzero(np.isfinite(at).all(axis=1))
     share = 1.0 / (1 + len(control.orthos) + bool(control.heights))
+    ground += [ortho_heights(scenes, points.measures, heights) for heights in control.heights]
+    placed = np.unique(np.concatenate([rows, *(known.point for known in ground)]))
     for number, ortho in enumerate(control.orthos):
         known = known_on_ortho(
             scenes,
             points.frame,
-            points.lon_lat_h[rows],
+            points.lon_lat_h[placed],
             ortho,
             gsd_m=points.gsd_m,
             name=f"ortho/{number:02d}",
             work=work,
             progress=part_of(progress, number * share, share),
         )
-        ground.append(replace(known, point=rows[known.point]))
-    if control.heights:
+        ground.append(replace(known, point=placed[known.point]))
+    # Where ortho-images alone show all points, there is no surface beside them.
+    if control.heights and len(rows):
         above = surfaces_above(
             scenes, at[rows], points.gsd_m, work, part_of(progress, 1.0 - share, share)
         )
-    for heights in control.heights:
-        known = known_heights(at[rows], above, points.frame.sigma_m, heights)
-        ground.append(replace(known, point=rows[known.point]))
+        for heights in control.heights:
+            known = known_heights(at[rows], above, points.frame.sigma_m, heights)
+            ground.append(replace(known, point=rows[known.point]))
     first = len(points.lon_lat_h)
     if control.blocks:
         found, known = find_control(

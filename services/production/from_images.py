@@ -8,8 +8,8 @@ import numpy as np
 
 from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
-from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.intersection import intersect
+from services.adjustment.control_ground import NO_CONTROL, ControlGround, joined_ground
+from services.adjustment.intersection import intersect, residuals_and_derivatives
 from services.adjustment.known_images import KnownImages
 from services.adjustment.observation_noise import found_noise
 from services.adjustment.parameters import image_parameters
@@ -23,6 +23,7 @@ from services.matching.predict import rank_in_group
 from services.production.block_residuals import ImageFit, PointFits, image_fits, point_fits
 from services.production.control import Control, MeasuredPoints, with_control
 from services.production.ground_parts import CutPoints, cut_points, measure_points
+from services.production.height_control import ortho_heights
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names, shows_chip
 from services.production.tie_points import find_tie_points
@@ -169,8 +170,9 @@ def produce_points(
             0, options.block.min_points, "tie points: the images have nothing in common"
         )
     progress(0.5, "adjusting the block")
-    tied = _adjust(scenes, passes, ties, options, neighbour=control.neighbour)
-    before = intersect([scene.model for scene in scenes], ties, int(ties.point[-1]) + 1)
+    flat = joined_ground([ortho_heights(scenes, ties, heights) for heights in control.heights])
+    tied = _adjust(scenes, passes, ties, options, flat, neighbour=control.neighbour)
+    before_px = _residual_px(scenes, ties, flat)
 
     candidates = _candidates(_with_models(scenes, tied), tied, ties, options, excluded)
     measures, saliency = measure_points(
@@ -223,7 +225,7 @@ def produce_points(
     points = _control_points(adjustment, rows, saliency[rows], cut)
     relative_accuracy = RelativeAccuracy(
         tie_points=int(np.isfinite(tied.lon_lat_h[:, 0]).sum()),
-        before_px=_median_px(before.residual_px),
+        before_px=_median_px(before_px),
         after_px=_median_px(tied.residual_px),
         refined_px=_median_px(adjustment.residual_px[adjustment.active]),
         frame=adjustment.frames[0],
@@ -282,6 +284,14 @@ def _adjust(
 def _with_models(scenes: Sequence[Scene], adjustment: BlockAdjustment) -> list[Scene]:
     """The scenes with their adjusted models."""
     return [replace(scene, model=model) for scene, model in zip(scenes, adjustment.models, strict=True)]
+
+
+def _residual_px(scenes: Sequence[Scene], ties: Observations, flat: ControlGround) -> Array:
+    """Residuals (m, 2) with the models as delivered, where rays intersect or lie on a known height."""
+    models = [scene.model for scene in scenes]
+    lon_lat_h = intersect(models, ties, int(ties.point[-1]) + 1).lon_lat_h
+    lon_lat_h[flat.point] = flat.lon_lat_h
+    return residuals_and_derivatives(models, ties, lon_lat_h)[0]
 
 
 def _median_px(residual: Array) -> float:

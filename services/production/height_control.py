@@ -15,9 +15,11 @@ from services.matching.multi_image import seen_whole
 from services.matching.surface_heights import surface_height
 from services.production.ground_parts import image_parts
 from services.production.ortho_control import place_names
+from services.sensors.correction import CorrectedModel
+from services.sensors.ortho import OrthoModel
 from services.tasks import Arrays, Work
 from services.terrain import Terrain
-from services.types import Array, Frame, Progress, SurfaceHeights
+from services.types import Array, Frame, Observations, Progress, SurfaceHeights
 
 _PER_SIDE = 7
 """Heights along each side of the square around a point."""
@@ -131,6 +133,47 @@ def known_heights(
         source=np.zeros(len(rows), dtype=np.int64),
         frames=(Frame.from_sigmas(np.nan, float(np.sqrt(up_m2))),),
         names=place_names(heights.name, place),
+    )
+
+
+def ortho_heights(
+    scenes: Sequence[Scene], observations: Observations, heights: ControlHeights
+) -> ControlGround:
+    """The points that ortho-images alone show, with the heights of an elevation model where they lie.
+
+    Their rays tell no height. The place is that in the first image, so that its accuracy, that of the
+    model, and the slope of the ground are in the sigma. Voids give no height.
+
+    Args:
+        scenes: of the observations.
+        observations: of the points, by point.
+        heights: of the ground.
+    """
+    models = [scene.model for scene in scenes]
+    delivered = [model.base if isinstance(model, CorrectedModel) else model for model in models]
+    ortho = np.array([isinstance(model, OrthoModel) for model in delivered])
+    others = np.unique(observations.point[~ortho[observations.image]])
+    point, first = np.unique(observations.point, return_index=True)
+    flat = ~np.isin(point, others)
+    point, first = point[flat], first[flat]
+    place, off_m2 = np.full((len(point), 3), np.nan), np.zeros(len(point))
+    for number in np.unique(observations.image[first]).tolist():
+        rows = np.flatnonzero(observations.image[first] == number)
+        line_sample = observations.line_sample[first[rows]]
+        place[rows] = scenes[number].model.locate(line_sample, np.zeros(len(rows)))
+        off_m2[rows] = scenes[number].sigma_m ** 2 + np.nan_to_num(heights.frame.sigma_m) ** 2
+    place[:, 2] = heights.terrain.height_m(place[:, :2])
+    steep2 = (heights.terrain.slope(place[:, :2]) ** 2).sum(axis=1)
+    known = np.flatnonzero(np.isfinite(place[:, 2]) & np.isfinite(steep2))
+    covariance_m2 = np.tile(np.diag([np.inf, np.inf, 0.0]), (len(known), 1, 1))
+    covariance_m2[:, 2, 2] = heights.sigma_m**2 + steep2[known] * off_m2[known]
+    return ControlGround(
+        point=point[known],
+        lon_lat_h=place[known],
+        covariance_m2=covariance_m2,
+        source=np.zeros(len(known), dtype=np.int64),
+        frames=(Frame.from_sigmas(np.nan, heights.frame.sigma_up_m),),
+        names=place_names(heights.name, place[known]),
     )
 
 
