@@ -1,7 +1,8 @@
 """The rigorous model of a line scanner: line times, orbit, attitude and look directions of detectors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -113,9 +114,35 @@ class PushbroomModel:
         image = np.ascontiguousarray(line_sample, dtype=np.float64)
         return kernels.line_of_sight(*self._packed, image, sum(self.height_range_m) / 2.0)
 
+    def with_parts(
+        self, orbit: PiecewisePolynomial, attitude: PiecewisePolynomial, look: PiecewisePolynomial
+    ) -> "PushbroomModel":
+        """The model with other parts, which differ little: its first guess of lines stays."""
+        near = replace(self, orbit=orbit, attitude=attitude, look=look)
+        object.__setattr__(near, "_first_guess", self._first_guess)
+        return near
+
+    @cached_property
+    def _first_guess(self) -> "_FirstGuess":
+        """Where `project` begins."""
+        return _first_guess(*self._tabulated(), self.height_range_m)
+
     @cached_property
     def _packed(self) -> tuple[kernels.Packed, Array]:
         """The model as the kernels read it: numbers, and a table of its polynomials."""
+        packed, table = self._tabulated()
+        guess = self._first_guess
+        packed = packed._replace(
+            ground_radius=guess.ground_radius,
+            guess=len(table),
+            guess_centre=guess.centre,
+            guess_per_m=guess.per_m,
+            line_slope=guess.line_slope,
+        )
+        return packed, np.concatenate([table, guess.coefficients])
+
+    def _tabulated(self) -> tuple[kernels.Packed, Array]:
+        """The model without its first guess of lines."""
         path = self.light_path
         lines, samples = (float(size) for size in self.image_shape)
         functions = [self.line_time, self.orbit, self.attitude, self.look]
@@ -131,12 +158,12 @@ class PushbroomModel:
             turn_per_m=EARTH_ROTATION_RAD_S / SPEED_OF_LIGHT_M_S if path.light_time else 0.0,
             refraction=1.0 if path.refraction else 0.0,
             ground_radius=0.0,
-            guess=len(table),
+            guess=0,
             guess_centre=(0.0, 0.0, 0.0),
             guess_per_m=(0.0, 0.0, 0.0),
             line_slope=1.0,
         )
-        return _with_guess(packed, table, self.height_range_m)
+        return packed, table
 
 
 def used_times(line_time: PiecewisePolynomial, lines: int) -> tuple[float, float]:
@@ -174,29 +201,36 @@ def check_pushbroom(model: PushbroomModel, source: str) -> PushbroomModel:
     return model
 
 
-def _with_guess(
+class _FirstGuess(NamedTuple):
+    """Numbers of `kernels.Packed` that a model gets from itself, and the cubic polynomial (20,)."""
+
+    ground_radius: float
+    line_slope: float
+    centre: tuple[float, float, float]
+    per_m: tuple[float, float, float]
+    coefficients: Array
+
+
+def _first_guess(
     packed: kernels.Packed, table: Array, height_range_m: tuple[float, float]
-) -> tuple[kernels.Packed, Array]:
-    """The model with the radius of its ground, and a first guess of lines, for `project`."""
+) -> _FirstGuess:
+    """The radius of the ground of a model, and a first guess of lines, for `project`."""
     centre = np.array([[(packed.lines - 1.0) / 2.0, (packed.samples - 1.0) / 2.0]])
     low, high = height_range_m
     below = kernels.locate_ecef(packed, table, centre, np.array([(low + high) / 2.0]))[0]
-    packed = packed._replace(
-        ground_radius=float(np.linalg.norm(below)),
-        line_slope=kernels.line_slope(packed, table, float(centre[0, 0]), below),
-    )
+    radius = float(np.linalg.norm(below))
+    slope = kernels.line_slope(packed, table, float(centre[0, 0]), below)
+    packed = packed._replace(ground_radius=radius)
     reach = 0.5 * VALIDITY * np.array([packed.lines, packed.samples])
     u, v, h = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in _GUESS_NODES)))
     image = centre + np.column_stack([u, v]) * reach
     ecef = kernels.locate_ecef(packed, table, image, (low + high) / 2.0 + h * (high - low) / 2.0)
     valid = np.isfinite(ecef[:, 0])
     if valid.sum() < _GUESS_NEEDED:
-        return packed, np.concatenate([table, centre[0, :1], np.zeros(19)])
+        constant = np.concatenate([centre[0, :1], np.zeros(19)])
+        return _FirstGuess(radius, slope, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), constant)
     ecef, image = ecef[valid], image[valid]
     middle, per_m = ecef.mean(axis=0), 1.0 / np.maximum(ecef.std(axis=0), 1.0)
-    guess = np.linalg.lstsq(cubic_terms((ecef - middle) * per_m), image[:, 0], rcond=1e-10)[0]
-    packed = packed._replace(
-        guess_centre=(float(middle[0]), float(middle[1]), float(middle[2])),
-        guess_per_m=(float(per_m[0]), float(per_m[1]), float(per_m[2])),
-    )
-    return packed, np.concatenate([table, guess])
+    terms = cubic_terms((ecef - middle) * per_m)
+    guess: Array = np.linalg.lstsq(terms, image[:, 0], rcond=1e-10)[0].astype(np.float64)
+    return _FirstGuess(radius, slope, tuple(middle.tolist()), tuple(per_m.tolist()), guess)

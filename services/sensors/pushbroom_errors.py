@@ -82,10 +82,9 @@ class PushbroomErrors:
         stretch = _stretch(scale)
         look = self.model.look.coefficients * stretch[:, None]
         look[:, :, -1] += self._central_look * (1.0 - stretch)
-        return replace(
-            self.model,
-            attitude=_turned(self.model.attitude, turn @ self._view_axes.T, self._times),
+        return self.model.with_parts(
             orbit=_moved(self.model.orbit, move @ self._orbit_axes.T, self._times),
+            attitude=_turned(self.model.attitude, turn @ self._view_axes.T, self._times),
             look=replace(self.model.look, coefficients=look),
         )
 
