@@ -114,9 +114,12 @@ def posterior_scale(square: Array, point: IntArray, coordinates: Array, paramete
         if abs(scale2 - last) <= 1e-6 * last:
             break
     left = max(freedom.sum() - parameters, 1.0)
-    return float(np.sqrt(max(scale2 * freedom.sum() / left, 1e-12)))
+    missing = max(_TELLING - left, 0.0)
+    return float(np.sqrt(max((scale2 * freedom.sum() + missing) / (left + missing), 1e-12)))
 
 
+_TELLING = 10.0
+"""Degrees of freedom that tell a scale; of fewer, the rest are as large as stated."""
 _COUNTED = 0.9
 """Probability of the residuals of a point beyond which larger ones do not count for more."""
 

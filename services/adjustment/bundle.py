@@ -139,6 +139,7 @@ def adjust_block(
         control_active = np.ones(len(control), dtype=np.bool_)
         priors = priors.with_slopes(slope_factor)
     _check_control(control, control_active)
+    used = active
     for _ in range(_ROUNDS):
         weight = problem.weights(active / problem.scales(max(scale, LEAST_SCALE)) ** 2, control_active)
         equations = problem.equations(state.values, state.lon_lat_h, weight)
@@ -146,7 +147,7 @@ def adjust_block(
         solved = least_squares(problem, priors, gauge, state, weight)
         state = solved.state
         accuracy = block_accuracy(solved.system, problem.pairs, gauge, len(images) * priors.size)
-        used, previous = active, (scale, slope_factor)
+        before, used, previous = used, active, (scale, slope_factor)
         square = problem.squares(state.values, state.lon_lat_h)
         determined = _determined(solved.system.priors, accuracy.variance())
         computed = used & np.isfinite(square) & ~problem.by_hand
@@ -163,7 +164,10 @@ def adjust_block(
             control_active,
             agreeing_control(problem, solved.equations, solved.points, accuracy, control_active),
         )
-        settled = np.array_equal(active, used) and np.array_equal(control_active, used_control)
+        # Observations at the limit of the tolerance would come back and leave for ever: they stay out.
+        again = np.array_equal(active, before) and bool((used <= active).all())
+        same = again or np.array_equal(active, used)
+        settled = same and np.array_equal(control_active, used_control)
         settled = settled and np.allclose((scale, slope_factor * factor), previous, rtol=_SETTLED)
         if settled or like is not None:
             break
