@@ -1,4 +1,4 @@
-"""The RPC of a corrected model, exact or fitted, where one is close enough."""
+"""The RPC of a refined model, exact or fitted, where one is close enough."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_rpc
 
 REFIT_LIMIT_PX = 0.01
-"""Largest difference, anywhere in the image, of a delivered RPC from the corrected model."""
+"""Largest difference, anywhere in the image, of a refitted RPC from the corrected model."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,15 @@ def refined_rpc(
     """The RPC of a refined model over its image.
 
     A correction of each coordinate separately folds into a delivered RPC exactly. For a correction that
-    mixes the coordinates, and for a model that is not an RPC, a new RPC is fitted and accepted within
-    `REFIT_LIMIT_PX`.
+    mixes the coordinates, a new RPC is fitted and accepted within `REFIT_LIMIT_PX`. For a rigorous model
+    the closest RPC is delivered, whatever its error is: no RPC follows every attitude.
 
     Args:
         model: refined: a delivered model with its correction, or a rigorous model.
         shape: lines and samples of the image.
         height_range_m: lowest and highest ground that an RPC is fitted over; by default those of the
-            model, which are all ground on the Earth for rigorous models of products.
+            model. Those of the ground in the image give a closer RPC: rigorous models of products hold
+            for all ground on the Earth.
     """
     if isinstance(model, CorrectedModel) and isinstance(model.base, RpcModel):
         mixed = bool(model.correction.parameters[[0, 1], [2, 1]].any())
@@ -50,5 +51,5 @@ def refined_rpc(
         fitted = fit_rpc(model, shape, height_range_m or model.height_range_m)
     except CoverageError:
         return RefinedRpc(None, math.inf)
-    close = fitted.max_error_px < REFIT_LIMIT_PX
+    close = fitted.max_error_px < REFIT_LIMIT_PX or not isinstance(model, CorrectedModel)
     return RefinedRpc(fitted.model if close else None, fitted.max_error_px)

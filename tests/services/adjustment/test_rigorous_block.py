@@ -21,6 +21,7 @@ from services.adjustment.rigorous_parameters import (
 from services.errors import InputError
 from services.geodesy import lon_lat_h_from_east_north_up
 from services.sensors.pushbroom import PushbroomModel
+from services.sensors.refined import refined_rpc
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over
 from services.types import Array, Frame, Observations
@@ -233,3 +234,21 @@ def test_an_exact_frame_and_many_points_leave_the_noise_alone() -> None:
     block = adjust_block(images, replace(observations), control=control, options=alone)
     assert control.frames == (EXACT,)
     assert np.sqrt((block.residual_px**2).mean()) < 1.3 * np.hypot(NOISE_PX, 0.3 / GSD_M)
+
+
+def test_a_refined_model_delivers_an_rpc_with_its_error_over_the_heights_of_the_ground() -> None:
+    """The stated error is that at places between those of the fit, and smaller over fewer heights."""
+    rng = np.random.default_rng(2)
+    model = pushbroom_over(TARGET, SHAPE, GSD_M, VIEWS[0], (-500.0, 9000.0), jitter_px=0.3, rng=rng)
+    image = rigorous_parameters("image", model, SRP, sigma_m=SIGMA_M)
+    refined = image.corrected(rng.normal(0.0, image.sigma))
+    heights_m = (50.0, 1200.0)
+    everywhere, here = refined_rpc(refined, SHAPE), refined_rpc(refined, SHAPE, heights_m)
+    assert here.model is not None
+    assert here.max_error_px <= everywhere.max_error_px
+    places = rng.uniform(0.02, 0.98, (4000, 2)) * SHAPE
+    ground_there = refined.locate(places, rng.uniform(*heights_m, 4000))
+    off_px = np.linalg.norm(here.model.project(ground_there) - places, axis=1).max()
+    assert 0.8 * here.max_error_px < off_px < 1.1 * here.max_error_px
+    # Jitter of 0.3 px about three axes is what no RPC follows.
+    assert 0.1 < here.max_error_px < 1.0
