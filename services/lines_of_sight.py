@@ -138,10 +138,31 @@ def _gap_m(heights: FloatImage, line: _Line, u: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _crossing(heights: FloatImage, line: _Line, above: float, below: float) -> float:
-    """u where a line crosses the ground, between u above the ground and u below it; NaN at a void."""
-    gap_above, gap_below = _gap_m(heights, line, above), _gap_m(heights, line, below)
-    u, gap = below, gap_below
+def _crossing(  # noqa: PLR0917 - numbers of one line of sight, in its innermost loop
+    heights: FloatImage,
+    line: _Line,
+    above: float,
+    below: float,
+    gap_above: float,
+    gap_below: float,
+    u: float,
+) -> float:
+    """u where a line crosses the ground, between u above the ground and u below it; NaN at a void.
+
+    Args:
+        heights: of the grid.
+        line: that crosses.
+        above, below: u of both places.
+        gap_above, gap_below: there.
+        u: first try, between them.
+    """
+    gap = _gap_m(heights, line, u)
+    if gap >= 0.0:
+        below, gap_below = u, gap
+    else:
+        above, gap_above = u, gap
+    if not abs(gap) > _TOLERANCE_M / 10.0:
+        return u
     for _ in range(100):
         if (above - below) * line.half_m < _TOLERANCE_M:
             break
@@ -207,21 +228,25 @@ def _crossing_in_cell(  # noqa: PLR0917 - numbers of one line of sight, in its i
     heights: FloatImage, line: _Line, start: float, end: float, gap_start: float, gap_end: float
 ) -> float:
     """u where a line first crosses the ground of one cell, a quadratic of u; below -1 for none."""
-    middle = (start + end) / 2.0
-    gap_middle = _gap_m(heights, line, middle)
-    below = end
+    if not gap_start < 0.0:
+        # A line above a void crosses the ground at an unknown position.
+        return np.nan if gap_end >= 0.0 else _NONE
+    gap_middle = _gap_m(heights, line, (start + end) / 2.0)
+    # The gap is gap_start + slope t + bend t^2, with t from 0 at the start to 1 at the end.
+    slope = 4.0 * gap_middle - 3.0 * gap_start - gap_end
+    bend = 2.0 * (gap_start - 2.0 * gap_middle + gap_end)
+    below, gap_below = 1.0, gap_end
     if not gap_end >= 0.0:
-        below = middle
-        if not gap_middle >= 0.0:
-            bend = 2.0 * (gap_start - 2.0 * gap_middle + gap_end)
-            peak = -(4.0 * gap_middle - 3.0 * gap_start - gap_end) / (2.0 * bend)
-            if not (bend < 0.0 and 0.0 < peak < 1.0):
-                return _NONE
-            below = start + peak * (end - start)
-            if not _gap_m(heights, line, below) >= 0.0:
-                return _NONE
-    # A line above a void crosses the ground at an unknown position.
-    return _crossing(heights, line, start, below) if gap_start < 0.0 else np.nan
+        below = -slope / (2.0 * bend)
+        if not (bend < 0.0 and 0.0 < below < 1.0):
+            return _NONE
+        gap_below = _gap_m(heights, line, start + below * (end - start))
+        if not gap_below >= 0.0:
+            return _NONE
+    root = math.sqrt(max(slope * slope - 4.0 * bend * gap_start, 0.0))
+    t = min(max(-2.0 * gap_start / (slope + root), 0.0), below) if slope + root > 0.0 else below / 2.0
+    way = end - start
+    return _crossing(heights, line, start, start + below * way, gap_start, gap_below, start + t * way)
 
 
 @njit(cache=True, error_model="numpy")

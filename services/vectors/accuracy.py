@@ -83,13 +83,19 @@ def predict_vertices(
         relative_px2 = own_px2 + sources.registration.relative_px2(line_sample)
         earth_px2 = relative_px2 + sources.registration.frame_px2(derivative)
     with np.errstate(invalid="ignore"):
-        on_ground = [to_ground @ one @ to_ground.transpose(0, 2, 1) for one in (relative_px2, earth_px2)]
+        on_ground = [_spread(to_ground, one) for one in (relative_px2, earth_px2)]
     return VertexAccuracy(*(np.where(np.isfinite(one), one, np.nan) for one in on_ground))
 
 
 def _outer(matrices: Array) -> Array:
     """Each matrix (n, i, j) times its transpose, (n, i, i)."""
     return np.asarray(matrices @ matrices.transpose(0, 2, 1))
+
+
+def _spread(linear: Array, covariance: Array) -> Array:
+    """Covariances (n, 2, 2) after linear maps (n, 2, 2)."""
+    half = np.einsum("nij,njk->nik", linear, covariance)
+    return np.asarray(np.einsum("nij,nkj->nik", half, linear))
 
 
 def _inverse(matrices: Array) -> Array:

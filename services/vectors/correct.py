@@ -70,7 +70,7 @@ def correct_vectors(
         return np.column_stack([xy_of_lon_lat(crs, met[:, :2]), met])
 
     def pieces(start: Array, end: Array) -> Array:
-        return np.minimum(finest(start, end), np.hypot(*(end - start).T) * 2.0 * gsd_m / posting_m)
+        return np.minimum(finest(start, end), np.hypot(*(end - start).T) * gsd_m / posting_m)
 
     def finest(start: Array, end: Array) -> Array:
         return np.asarray(np.hypot(*(end - start).T) / FINEST_PIECE_PX)

@@ -17,7 +17,7 @@ from services.vectors.shapes import Shapes
 _BATCH = 2_000_000
 """Places that are transformed at once."""
 _MOST_PIECES = 1_000_000
-_SEEN = 0.75
+_SEEN = 0.5
 """Share of the tolerance for what the places show; the rest is for what lies between them."""
 _UNSEEN = (1.0 - _SEEN) / _SEEN
 
@@ -116,24 +116,32 @@ def _between(
     broken = np.zeros(len(low), dtype=bool)
     parts = []
     rows = np.arange(len(low))
+    known = np.empty((0, len(tolerance)))
     while len(rows):
-        rougher = []
+        rougher, seen, used = [], [], 0
         for batch in np.split(rows, np.flatnonzero(np.diff(np.cumsum(pieces[rows]) // _BATCH)) + 1):
             inner = pieces[batch] - 1
             owner = np.repeat(batch, inner)
             begin = np.cumsum(inner) - inner
-            t = (np.arange(inner.sum()) - np.repeat(begin, inner) + 1) / pieces[owner]
+            number = np.arange(inner.sum()) - np.repeat(begin, inner) + 1
+            t = number / pieces[owner]
             source = vertices[low[owner]] + t[:, None] * (vertices[high[owner]] - vertices[low[owner]])
-            moved = _applied(transformation, source)
+            # Of an edge with twice as many pieces, every second place is known.
+            is_new = np.full(len(number), not len(known)) | (number % 2 == 1)
+            moved = np.empty((len(source), len(tolerance)))
+            moved[is_new] = _applied(transformation, source[is_new])
+            moved[~is_new] = known[used : used + len(source) - int(is_new.sum())]
+            used += len(source) - int(is_new.sum())
             ends = target[low[batch]] * scale, target[high[batch]] * scale
             kept, is_rough = _needed(begin, inner, moved * scale, *ends)
             is_rough &= 2 * pieces[batch] <= finest[batch]
             rougher.append(batch[is_rough])
+            seen.append(moved[np.repeat(is_rough, inner)])
             kept &= ~np.repeat(is_rough, inner)
             broken[owner[~np.isfinite(moved).all(axis=1)]] = True
             size += np.bincount(owner[kept], minlength=len(low))
             parts.append((owner[kept], source[kept], moved[kept]))
-        rows = np.concatenate(rougher)
+        rows, known = np.concatenate(rougher), np.concatenate(seen)
         pieces[rows] *= 2
     if not parts:
         return _Between(size, vertices[:0], target[:0], broken)

@@ -72,7 +72,7 @@ def project_vectors(
         return np.column_stack([scene.model.project(ground), ground])
 
     def pieces(start: Array, end: Array) -> Array:
-        return np.minimum(finest(start, end), finest(start, end) * 2.0 * piece_m / posting_m)
+        return np.minimum(finest(start, end), finest(start, end) * piece_m / posting_m)
 
     def finest(start: Array, end: Array) -> Array:
         return np.asarray(np.hypot(*((end - start)[:, :2] / units).T) / piece_m)
