@@ -205,19 +205,19 @@ def rigorous_parameters(
     errors = PushbroomErrors(model)
     _, ground = _places(model)
     _, by_ground, by_terms = errors.projected(np.zeros(len(TERMS)), ground)
-    displaced_px = np.linalg.norm(by_terms, axis=1)
-    sigma = np.array([parameter_set.sigmas.get(term, 0.0) for term in TERMS]) / _PER_SI
+    displaced_px = np.linalg.norm(by_terms, axis=1).max(axis=0)
     middle = len(ground) // 2
-    stated_px = sigma_m * np.sqrt(abs(np.linalg.det(by_ground[middle, :, :2])))
+    displaced_m = np.linalg.norm(np.linalg.solve(by_ground[middle, :, :2], by_terms[middle]), axis=0)
+    sigma = np.array([parameter_set.sigmas.get(term, 0.0) for term in TERMS]) / _PER_SI
     for turn, orbit in (("pitch", ("along track",)), ("roll", ("across track", "radial"))):
         rows = [TERMS.index(term) for term in orbit]
-        of_orbit_px = np.linalg.norm(sigma[rows] * displaced_px[middle, rows])
-        shrunk = min(1.0, np.sqrt(_ORBIT_SHARE) * stated_px / max(of_orbit_px, 1e-12))
+        of_orbit_m = np.linalg.norm(sigma[rows] * displaced_m[rows])
+        shrunk = min(1.0, np.sqrt(_ORBIT_SHARE) * sigma_m / max(of_orbit_m, 1e-12))
         sigma[rows] *= shrunk
-        left_px = np.sqrt(stated_px**2 - (shrunk * of_orbit_px) ** 2)
-        sigma[TERMS.index(turn)] = left_px / displaced_px[middle, TERMS.index(turn)]
+        left_m = np.sqrt(sigma_m**2 - (shrunk * of_orbit_m) ** 2)
+        sigma[TERMS.index(turn)] = left_m / displaced_m[TERMS.index(turn)]
     free = np.flatnonzero(sigma).astype(np.int64)
-    per_px = 1.0 / displaced_px.max(axis=0)[free]
+    per_px = 1.0 / displaced_px[free]
     return RigorousParameters(name, errors, free, sigma[free] / per_px, per_px)
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks import _rigorous_oracles as oracles
+from services.adjustment.rigorous_parameters import TOUTIN, rigorous_parameters
+from services.formats.sensor_models.rigorous_model import read_rigorous_model
 
 pytestmark = pytest.mark.real_data
 
@@ -50,6 +52,26 @@ def test_spot_2_agrees_with_the_rpc_that_another_tool_fitted_to_the_same_metadat
     difference_px = oracles.spot_2_rpc(metadata).difference_px
     assert np.abs(difference_px.mean(axis=0)).max() < 0.3
     assert difference_px.std(axis=0).max() < 0.4
+
+
+@pytest.mark.parametrize("pattern", ["**/PHRDIMAP*.XML", "**/SP*.DIM", "**/SPOT6.XML", "**/WV*.XML"])
+def test_free_parameters_of_real_models_move_them_as_predicted(metadata: Path, pattern: str) -> None:
+    rng = np.random.default_rng(3)
+    files = sorted(metadata.glob(pattern))
+    assert files
+    for file in files:
+        image = rigorous_parameters(file.name, read_rigorous_model(file), TOUTIN, sigma_m=100.0)
+        places = rng.uniform(0.02, 0.98, (40, 2)) * image.shape
+        ground = image.model.locate(places, rng.uniform(0.0, 1000.0, 40))
+        for k in range(len(image.sigma)):
+            step = np.eye(len(image.sigma))[k]
+            after, before = (image.corrected(sign * step).project(ground) for sign in (0.5, -0.5))
+            predicted = image.computed(0.0 * step, ground).by_parameters[:, :, k]
+            np.testing.assert_allclose(after - before, predicted, atol=0.01)
+        middle = (np.array([image.shape]) - 1.0) / 2.0
+        computed = image.computed(np.zeros(len(image.sigma)), image.model.locate(middle, [500.0]))
+        moved_m = np.linalg.solve(computed.by_ground[0, :, :2], computed.by_parameters[0] * image.sigma)
+        np.testing.assert_allclose(np.linalg.norm(moved_m, axis=1), 100.0, rtol=0.1)
 
 
 def test_spot_6_has_its_frame_corners_at_one_height(metadata: Path) -> None:
