@@ -206,7 +206,7 @@ def test_a_job_registers_uploaded_scenes_together(
         done = ended(client, job, me)
     assert done["status"] == "successful", done
     results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
-    assert results["verdict"] == "incomplete"
+    assert results["verdict"] == "not registered"
     verdicts = {one["scene"]: one["verdict"] for one in results["scenes"]}
     assert verdicts.pop(ids["wrong"]) == "not registered"
     assert set(verdicts.values()) <= {"good", "usable"}

@@ -107,7 +107,7 @@ def _run(work: Work) -> Commit:
             acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
             scenes.describe(connection, row.id, acquisition, shape, gsds_m[name])
         return {
-            "verdict": outcome.report.verdict,
+            "verdict": NOT_REGISTERED if outcome.failed else outcome.report.verdict,
             "verdict_words": outcome.report.verdict_words,
             "scenes": [_scene_values(name, outcome) for name in rows],
             "files": keys,
@@ -179,8 +179,8 @@ REGISTER_SCENES = Process(
     run=_run,
     values={
         "verdict": {
-            "enum": ["good", "usable", "failed", "incomplete", "not registered"],
-            "title": "Worst verdict on a scene; incomplete when one did not fit",
+            "enum": ["good", "usable", "failed", "not registered"],
+            "title": "Worst verdict on a scene",
         },
         "verdict_words": {"type": "string", "title": "How many scenes have which verdict"},
         "scenes": {"type": "array", "title": "Verdict, accuracy and reason of every scene"},
