@@ -140,8 +140,8 @@ def occluded_ground(
 ) -> BoolArray:
     """Which ground (lines, samples) of a window other ground hides from the sensor.
 
-    From each pixel the line of sight is followed towards the sensor, by half a node of the terrain a
-    step, until it is higher than all the terrain around.
+    From each pixel the line of sight is followed towards the sensor, a quarter of a node of the
+    terrain a step, until it is higher than all the terrain around.
 
     Args:
         model: of the image; its direction of view is taken as constant within the window.
@@ -318,7 +318,7 @@ def _mark_occluded(
     hidden: BoolArray, height_m: FloatImage, offset: Array, heights: FloatImage, sight: _LineOfSight
 ) -> None:
     """Set `hidden` where ground is occluded; `offset` (r, c, 2) are the map nodes in `heights`."""
-    rise = 0.5 / max(abs(sight.line_per_m), abs(sight.sample_per_m))
+    rise = 0.25 / max(abs(sight.line_per_m), abs(sight.sample_per_m))
     lines, samples = hidden.shape
     for r in range(lines):
         i = min(r // NODE_PX, offset.shape[0] - 2)
