@@ -192,7 +192,7 @@ def _read_all(
             failed[name] = error
             continue
         if scene.acquisition.image_id in [other.name for other in read]:
-            scene = replace(scene, acquisition=replace(scene.acquisition, image_id=name))
+            scene = _named(scene, name)
         attempts[name].scene = scene
         read.append(_Read(name, one, scene))
     return read
@@ -203,6 +203,11 @@ def _read(files: SceneFiles, stack: ExitStack) -> Scene:
     scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     return scene
+
+
+def _named(scene: Scene, name: str) -> Scene:
+    """The scene under the name that it has among others."""
+    return replace(scene, acquisition=replace(scene.acquisition, image_id=name))
 
 
 def _outline(scenes: Sequence[Scene]) -> Array:
@@ -314,8 +319,8 @@ def _joined(folder: Path, stack: ExitStack) -> _Joined:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["format"] != SCENES_FORMAT:
             raise ValueError(f"format {document['format']!r:.60}, {SCENES_FORMAT!r} expected")
-        files = [
-            SceneFiles(
+        files = {
+            str(one["name"]): SceneFiles(
                 image=Path(one["image"]),
                 model=None if one["model"] is None else Path(one["model"]),
                 sigma_m=one["sigma_m"],
@@ -323,11 +328,14 @@ def _joined(folder: Path, stack: ExitStack) -> _Joined:
                 mask=None if one["mask"] is None else Path(one["mask"]),
             )
             for one in document["scenes"]
-        ]
+        }
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(
             f"{path}: the scenes of `amers scene register-many` expected: {error}"
         ) from None
-    read = tuple(_Read(one.image.stem, one, _read(one, stack)) for one in files)
-    read = tuple(one for one in read if one.name in known.names)
+    read = tuple(
+        _Read(one.image.stem, one, _named(_read(one, stack), name))
+        for name, one in files.items()
+        if name in known.names
+    )
     return _Joined(read, AdjustedScenes(tuple(one.scene for one in read), known))
