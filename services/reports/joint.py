@@ -134,6 +134,32 @@ class JointReport:
     reports: tuple[RegistrationReport, ...] = field(metadata=NOT_IN_JSON)
     misfits: Array = field(metadata=NOT_IN_JSON)
 
+    @property
+    def heading(self) -> str:
+        """The verdict with the accuracy that it speaks of."""
+        delivered = self.verdict in ("good", "usable")
+        return f"{self.verdict}, {self.reports[0].verdict_scope}" if delivered else self.verdict
+
+    @property
+    def accuracy_lines(self) -> tuple[str, str]:
+        """The smallest and the largest of both accuracies, each with its label."""
+        return (
+            _range_words([scene.relative_to_control_points for scene in self.scenes]),
+            _range_words([scene.on_the_earth for scene in self.scenes]),
+        )
+
+
+def _range_words(stated: Sequence[StatedAccuracy]) -> str:
+    ce90_m = np.array([one.ce90_m for one in stated])
+    unknown = int(np.isnan(ce90_m).sum())
+    if unknown == len(stated):
+        return f"{stated[0].label}: unknown"
+    words = (
+        f"{stated[0].label}: CE90 {np.nanmin(ce90_m):.2f} to {np.nanmax(ce90_m):.2f} m at the worst "
+        "places of the scenes"
+    )
+    return f"{words}, unknown for {unknown} of them" if unknown else words
+
 
 def joint_report(
     result: JointRegistration,

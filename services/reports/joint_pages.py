@@ -42,10 +42,11 @@ def format_joint_tables(report: JointReport) -> str:
 
 def joint_tables(report: JointReport) -> RenderableType:
     """All tables of the report, to print on a rich console."""
-    words = "\n".join([report.verdict_words, *(one.reason for one in report.left)])
+    reasons = (one.reason for one in report.left)
+    words = "\n".join([report.verdict_words, *report.accuracy_lines, *reasons])
     tables = [_published(one) for one in block_tables(report)]
     return Group(
-        Text(f"Verdict: {report.verdict}", style="bold"), Text(words), scene_table(report), *tables
+        Text(f"Verdict: {report.heading}", style="bold"), Text(words), scene_table(report), *tables
     )
 
 

@@ -129,9 +129,12 @@ def test_scenes_are_registered_together_and_the_wrong_one_is_named(
         refined = read_rpc(folder / f"{name}.tif", output / name / f"{name}_RPC.TXT").model
         assert largest_error_px(refined, true_model(world, name)) < A_FIFTH_OF_A_PIXEL
         assert found["block"]["scenes"][0]["tie_points"] > 100
-    page = (output / "block" / "report.html").read_text()
+    page, text = ((output / "block" / f"report.{kind}").read_text() for kind in ("html", "txt"))
     for words in ("ectZ_amer", "Popini_app", "dXc", "dXY_ect", "wrong"):
         assert words in page
+    for label in ("Relative to the control points: CE90", "On the Earth: "):
+        assert label in page
+        assert label in text
     assert (output / "block" / "images.npz").exists()
 
 
