@@ -26,9 +26,9 @@ from services.map_grid import check_map_code
 from services.quality.accuracy_statement import AccuracyStatement, accuracy_document
 
 VECTORS_NAME, VERTICES_NAME = "vectors.gpkg", "vertices.gpkg"
-SUFFIXES = (".geojson", ".json", ".fgb")
-"""Formats of uploaded vectors. A GeoPackage is a database, which strangers could fill with views and
-virtual tables; a shapefile is several files."""
+SUFFIXES = (".geojson", ".json")
+"""Formats of uploaded vectors: GeoJSON, of which GDAL gets the features alone. It decides by the content
+what a file is, so that one of another format may be a virtual dataset of files that lie here."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CorrectVectors:
 
     Attributes:
         scene: id of an uploaded scene.
-        vectors: name of the file uploaded beside the image, GeoJSON or FlatGeobuf, in pixel coordinates.
+        vectors: name of the file uploaded beside the image, GeoJSON in pixel coordinates.
         dem: name of the terrain file uploaded beside the image.
         model: name of the uploaded file with the scene's model; by default it is found by its name.
         registration: id of the job that registered the scene; its refined model and accuracy are used.

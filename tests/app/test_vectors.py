@@ -355,7 +355,7 @@ def test_a_service_corrects_vectors_uploaded_beside_a_scene(
     assert "with --pixels qgis all of them lie inside" in failed["error"]["detail"]
     for wrong, says in (
         ({"registration": str(UUID(int=1))}, "did not register scene"),
-        ({"vectors": "drawn.gpkg"}, "one of .geojson, .json, .fgb expected"),
+        ({"vectors": "drawn.gpkg"}, "one of .geojson, .json expected"),
         ({"options": {"tolerance_px": 0.0}}, "tolerance_px: 0 found, more than 0 px expected"),
         ({"options": {"sigma_px": -1.0}}, "sigma_px: -1 found, 0 or more expected"),
     ):

@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 import shapely
 
 from services.errors import FormatError, InputError
+from services.formats.vector.plain_geojson import plain_geojson
 from services.types import IntArray
 
 DRIVERS = {
@@ -112,15 +113,16 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
 
     driver = driver_of(path)
     _check_signature(path, driver)
-    with _named(path, "read"):
-        layers = {str(layer): kind for layer, kind in pyogrio.list_layers(path)}
+    with _named(path, "read"), TemporaryDirectory(prefix="amers-") as folder:
+        source = plain_geojson(path, Path(folder)) if driver == "GeoJSON" else str(path)
+        layers = {str(layer): kind for layer, kind in pyogrio.list_layers(source)}
         with_geometries = [layer for layer, kind in layers.items() if kind is not None]
         names = ", ".join(with_geometries)[:300] or "none"
         if name is None and len(with_geometries) != 1:
             raise InputError(f"{path}: one layer with geometries expected, {names} found; add --layer")
         if name is not None and name not in with_geometries:
             raise InputError(f"{path}: no layer {name[:80]!r} with geometries; it has {names}")
-        meta, table = pyogrio.read_arrow(path, layer=name or with_geometries[0], return_fids=True)
+        meta, table = pyogrio.read_arrow(source, layer=name or with_geometries[0], return_fids=True)
     geometry_name = meta["geometry_name"] or "wkb_geometry"
     geometries = shapely.from_wkb(
         table[geometry_name].to_numpy(zero_copy_only=False), on_invalid="ignore"

@@ -1,0 +1,66 @@
+"""GeoJSON that GDAL reads as GeoJSON, and as nothing else.
+
+GDAL looks into a file for what it is. A JSON document may be a pipeline of commands that read other
+files, or hold a virtual dataset, and its reference system may be an address, which GDAL fetches. So GDAL
+gets a copy with the features alone, under a name that chooses its driver.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from services.errors import FormatError
+from services.formats.text_files import load_json
+
+
+def plain_geojson(path: Path, folder: Path) -> str:
+    """What GDAL opens: a copy in a folder with features, name and named reference system of a file.
+
+    Raises:
+        FormatError: the file is not GeoJSON.
+    """
+    document = load_json(path.read_text(encoding="utf-8-sig"), str(path))
+    if not isinstance(document, dict):
+        raise FormatError(f"{path}: a JSON object expected, another value found")
+    plain: dict[str, Any] = {"type": "FeatureCollection"}
+    if isinstance(document.get("name"), str):
+        plain["name"] = document["name"]
+    crs = _named_crs(document.get("crs"))
+    if crs is not None:
+        plain["crs"] = {"type": "name", "properties": {"name": crs}}
+    plain["features"] = [_feature(one, path) for one in _features(document, path)]
+    copy = folder / path.name
+    copy.write_text(json.dumps(plain), encoding="utf-8")
+    return f"GeoJSON:{copy}"
+
+
+def _features(document: dict[str, Any], path: Path) -> list[Any]:
+    if document.get("type") == "FeatureCollection" and isinstance(document.get("features"), list):
+        return list(document["features"])
+    if document.get("type") == "Feature":
+        return [document]
+    if "coordinates" in document or "geometries" in document:
+        return [{"geometry": document}]
+    raise FormatError(f"{path}: features or a geometry of GeoJSON expected, another document found")
+
+
+def _feature(feature: Any, path: Path) -> dict[str, Any]:
+    """The identifier, the attributes and the geometry of a feature."""
+    if not isinstance(feature, dict) or not isinstance(feature.get("geometry"), dict | None):
+        raise FormatError(f"{path}: a feature with a geometry or null expected, another value found")
+    geometry = feature.get("geometry")
+    plain = {"type": "Feature", "properties": feature.get("properties"), "geometry": None}
+    if "id" in feature:
+        plain["id"] = feature["id"]
+    if geometry is not None:
+        members = ("type", "coordinates", "geometries")
+        plain["geometry"] = {key: geometry[key] for key in members if key in geometry}
+    return plain
+
+
+def _named_crs(crs: Any) -> str | None:
+    """The name of a reference system; not its address, which would be fetched."""
+    properties = crs.get("properties") if isinstance(crs, dict) and crs.get("type") == "name" else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    is_code = isinstance(name, str) and name.upper().startswith(("URN:OGC:DEF:CRS:", "EPSG:", "OGC:"))
+    return name if is_code else None
