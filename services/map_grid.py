@@ -108,19 +108,30 @@ def crs_of_code(code: str) -> CRS:
 
 
 def check_map_code(code: str) -> None:
-    """Refuse a reference system that no map on the Earth can have.
+    """Refuse a code that is not one of the reference system of a map on the Earth.
 
     Raises:
         InputError: it is not known, has no map coordinates, or is not of the Earth.
     """
-    crs = crs_of_code(code)
-    parts = crs.sub_crs_list if crs.is_compound else [crs]
+    crs_of_code(code)
+    check_map(code)
+
+
+def check_map(crs: str) -> None:
+    """Refuse a reference system, WKT or a code, that no map on the Earth can have.
+
+    Raises:
+        InputError: it has no map coordinates, or is not of the Earth.
+    """
+    parsed = CRS.from_user_input(crs)
+    parts = parsed.sub_crs_list if parsed.is_compound else [parsed]
+    name = f"{crs:.80}: {parsed.name}"
     if not (parts[0].is_projected or parts[0].is_geographic):
-        raise InputError(f"{code}: {crs.name} has no map coordinates; a projected system expected")
+        raise InputError(f"{name} has no map coordinates; a projected reference system expected")
     try:
-        xy_of_lon_lat(code, np.zeros((1, 2)))
+        xy_of_lon_lat(crs, np.zeros((1, 2)))
     except ProjError as error:
-        raise InputError(f"{code}: {crs.name} cannot be reached from WGS 84") from error
+        raise InputError(f"{name}: this reference system cannot be reached from WGS 84") from error
 
 
 def xy_of_lon_lat(crs: str, lon_lat: Array) -> Array:

@@ -10,7 +10,7 @@ from app.cli.output import AsJson, print_json, show_one
 from app.errors import InputError
 from app.usecases.registered_scene import SceneModel
 from app.usecases.terrain_file import TerrainFile
-from app.usecases.vector_files import VectorFile, VectorOptions
+from app.usecases.vector_files import CorrectionOptions, ProjectionOptions, VectorFile
 from app.usecases.vectors import correct_file, project_file
 from services.formats.images.canvas import write_canvas
 from services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
@@ -107,7 +107,7 @@ def correct(
         output,
         crs=to,
         vertices=vertices,
-        options=VectorOptions(
+        options=CorrectionOptions(
             _origin(pixels), tolerance_px, skip_missed, margin_px, sigma_px, dem_sigma_m
         ),
     )
@@ -146,8 +146,7 @@ def project(
         TerrainFile(dem, vertical, geoid, fill_px),
         output,
         vertices=vertices,
-        options=VectorOptions(_origin(pixels), tolerance_px, skip_missed),
-        clip=clip,
+        options=ProjectionOptions(_origin(pixels), tolerance_px, skip_missed, clip),
     )
     show_one(asdict(projected), as_json=as_json)
 

@@ -35,7 +35,7 @@ from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work, WorkFailed
 from app.usecases.registration.job import REGISTER_SCENE
 from app.usecases.registration.joint_job import REGISTER_SCENES
-from app.usecases.vector_job import CORRECT_VECTORS
+from app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
 
 PROCESSES: dict[str, Process] = {
     process.id: process
@@ -44,6 +44,7 @@ PROCESSES: dict[str, Process] = {
         REGISTER_SCENES,
         ORTHORECTIFY,
         CORRECT_VECTORS,
+        PROJECT_VECTORS,
         INGEST_BLOCK,
         EXPORT_BLOCK,
         ASSESS_BLOCK,

@@ -42,21 +42,41 @@ class VectorOptions:
         pixels: origin and signs of the pixel coordinates, see `line_sample_of_xy`.
         tolerance_px: edges get more vertices where they bend by more, pixels.
         skip_missed: leave out features with a place that meets no ground; refuse them otherwise.
-        margin_px: by which digitised vertices may lie outside the image.
-        sigma_px: precision of digitised vertices, one standard deviation a coordinate.
-        height_sigma_m: of the terrain, one standard deviation; by default a tenth of its posting.
     """
 
     pixels: PixelOrigin = "qgis"
     tolerance_px: float = 0.5
     skip_missed: bool = False
+
+
+@dataclass(frozen=True)
+class CorrectionOptions(VectorOptions):
+    """How vectors of a raw image come onto the map.
+
+    Attributes:
+        margin_px: by which digitised vertices may lie outside the image.
+        sigma_px: precision of digitised vertices, one standard deviation a coordinate.
+        height_sigma_m: of the terrain, one standard deviation; by default a tenth of its posting.
+    """
+
     margin_px: float = 5.0
     sigma_px: float = 0.5
     height_sigma_m: float | None = None
 
 
+@dataclass(frozen=True)
+class ProjectionOptions(VectorOptions):
+    """How vectors of the map come into a raw image.
+
+    Attributes:
+        clip: cut features at the border of the image.
+    """
+
+    clip: bool = False
+
+
 def check_options(options: VectorOptions) -> None:
-    """Refuse options that no correction can have.
+    """Refuse options that no correction and no projection can have.
 
     Raises:
         InputError: one is negative, or the tolerance is 0; the message names it.
@@ -64,7 +84,7 @@ def check_options(options: VectorOptions) -> None:
     if not options.tolerance_px > 0.0:
         raise InputError(f"tolerance_px: {options.tolerance_px:g} found, more than 0 px expected")
     for name in ("margin_px", "sigma_px", "height_sigma_m"):
-        value = getattr(options, name)
+        value = getattr(options, name, None)
         if value is not None and not value >= 0.0:
             raise InputError(f"{name}: {value:g} found, 0 or more expected")
 

@@ -1,9 +1,11 @@
-"""The process that brings vectors drawn on an uploaded scene onto the map."""
+"""The processes that bring vectors drawn on an uploaded scene onto the map, and back."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal, get_args
 from uuid import UUID
 
 from app.auth import Scope
@@ -18,36 +20,39 @@ from app.usecases.results import store_results
 from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
 from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile
-from app.usecases.vector_files import VectorFile, VectorOptions, check_options
-from app.usecases.vectors import correct_file
+from app.usecases.vector_files import (
+    CorrectionOptions,
+    ProjectionOptions,
+    VectorFile,
+    VectorOptions,
+    check_options,
+)
+from app.usecases.vectors import correct_file, project_file
 from services.formats.elevation.geoid import vertical_crs
 from services.formats.sensor_models.refined_model import CORRECTION_JSON
 from services.map_grid import check_map_code
 from services.quality.accuracy_statement import AccuracyStatement, accuracy_document
 
-VECTORS_NAME, VERTICES_NAME = "vectors.gpkg", "vertices.gpkg"
+Format = Literal["gpkg", "geojson"]
 SUFFIXES = (".geojson", ".json")
 """Formats of uploaded vectors: GeoJSON, of which GDAL gets the features alone. It decides by the content
 what a file is, so that one of another format may be a virtual dataset of files that lie here."""
 
 
 @dataclass(frozen=True)
-class CorrectVectors:
-    """The inputs of a correction of vectors.
+class VectorInputs:
+    """The inputs of both processes.
 
     Attributes:
         scene: id of an uploaded scene.
-        vectors: name of the file uploaded beside the image, GeoJSON in pixel coordinates.
+        vectors: name of the GeoJSON file uploaded beside the image.
         dem: name of the terrain file uploaded beside the image.
         model: name of the uploaded file with the scene's model; by default it is found by its name.
         registration: id of the job that registered the scene; its refined model and accuracy are used.
-        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation of each
-            coordinate, metres; null when unknown.
         vertical: vertical datum of the heights, where the terrain file does not state it.
         geoid: name of an uploaded grid file of the geoid.
         fill_px: voids are filled from heights at most this many nodes away.
-        crs: code of the reference system of the map; by default the UTM zone of the scene.
-        options: of the correction.
+        format: of the outputs, "gpkg" or "geojson".
     """
 
     scene: UUID
@@ -55,30 +60,83 @@ class CorrectVectors:
     dem: str
     model: str | None = None
     registration: UUID | None = None
-    sigma_m: float | None = None
     vertical: str | None = None
     geoid: str | None = None
     fill_px: int = 0
+    format: Format = "gpkg"
+
+
+@dataclass(frozen=True)
+class CorrectVectors(VectorInputs):
+    """The inputs of a correction of vectors.
+
+    Attributes:
+        vectors: name of the file uploaded beside the image, GeoJSON in pixel coordinates.
+        sigma_m: accuracy on the Earth of a model that is not registered, one standard deviation of each
+            coordinate, metres; null when unknown.
+        crs: code of the reference system of the map; by default the UTM zone of the scene, in GeoJSON
+            longitude and latitude.
+        options: of the correction.
+    """
+
+    sigma_m: float | None = None
     crs: str | None = None
-    options: VectorOptions = field(default_factory=VectorOptions)
+    options: CorrectionOptions = field(default_factory=CorrectionOptions)
 
 
-def _check(connection: Connection, caller: Token, inputs: CorrectVectors) -> None:
+@dataclass(frozen=True)
+class ProjectVectors(VectorInputs):
+    """The inputs of a projection of vectors.
+
+    Attributes:
+        vectors: name of the file uploaded beside the image, GeoJSON in longitude and latitude, or in the
+            reference system that it names.
+        options: of the projection.
+    """
+
+    options: ProjectionOptions = field(default_factory=ProjectionOptions)
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The files of a job on this machine.
+
+    Attributes:
+        vectors, scene, terrain: that it reads.
+        made: by the names of the outputs, the paths of the vectors and of their vertices.
+    """
+
+    vectors: VectorFile
+    scene: SceneModel
+    terrain: TerrainFile
+    made: dict[str, Path]
+
+
+def _check(connection: Connection, caller: Token, inputs: VectorInputs, options: VectorOptions) -> None:
+    """Refuse what both processes cannot use."""
     check_scene(connection, caller, inputs.scene)
     check_file_names(inputs, "vectors", "dem", "model", "geoid")
     if not inputs.vectors.lower().endswith(SUFFIXES):
         raise InputError(f"vectors: {inputs.vectors} found, one of {', '.join(SUFFIXES)} expected")
-    if inputs.sigma_m is not None and not inputs.sigma_m > 0.0:
-        raise InputError(f"sigma_m: {inputs.sigma_m:g} found, a length above 0 m expected")
-    check_options(inputs.options)
-    if inputs.crs is not None:
-        with naming("crs"):
-            check_map_code(inputs.crs)
+    check_options(options)
     if inputs.vertical is not None:
         with naming("vertical"):
             vertical_crs(inputs.vertical)
     if inputs.registration is not None:
         _registration_keys(connection, inputs.scene, inputs.registration)
+
+
+def _check_correction(connection: Connection, caller: Token, inputs: CorrectVectors) -> None:
+    _check(connection, caller, inputs, inputs.options)
+    if inputs.sigma_m is not None and not inputs.sigma_m > 0.0:
+        raise InputError(f"sigma_m: {inputs.sigma_m:g} found, a length above 0 m expected")
+    if inputs.crs is not None:
+        with naming("crs"):
+            check_map_code(inputs.crs)
+
+
+def _check_projection(connection: Connection, caller: Token, inputs: ProjectVectors) -> None:
+    _check(connection, caller, inputs, inputs.options)
 
 
 def _registration_keys(connection: Connection, scene_id: UUID, job_id: UUID) -> list[str]:
@@ -97,43 +155,49 @@ def _registration_keys(connection: Connection, scene_id: UUID, job_id: UUID) -> 
     return keys
 
 
-def _run(work: Work) -> Commit:
-    """Correct uploaded vectors and put them into the storage, with a file of their vertices."""
-    inputs: CorrectVectors = work.inputs
+@contextmanager
+def _files(work: Work, sigma_m: float | None = None) -> Iterator[_Files]:
+    """The files of a job, until the context closes; damage of stored ones is looked for on an error."""
+    inputs: VectorInputs = work.inputs
     with work.database.snapshot() as connection:
         scene = present_scene(connection, inputs.scene)
         keys = []
         if inputs.registration is not None:
             keys = _registration_keys(connection, inputs.scene, inputs.registration)
-    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as made:
+    with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
-        folder = Path(made)
         registration = None
         for key in keys:
             with named_by_row(key):
-                registration = work.storage.fetch(key, folder).parent
-        work.progress(0.1, "correcting the vectors")
+                registration = work.storage.fetch(key, Path(folder)).parent
+        model = image.with_name(inputs.model) if inputs.model else None
+        geoid = image.with_name(inputs.geoid) if inputs.geoid else None
+        names = (f"{kind}.{inputs.format}" for kind in ("vectors", "vertices"))
         with suspecting_damage(work.database, work.storage, [*stored_keys(scene), *keys]):
-            corrected = correct_file(
+            yield _Files(
                 VectorFile(image.with_name(inputs.vectors)),
-                SceneModel(
-                    image,
-                    image.with_name(inputs.model) if inputs.model else None,
-                    registration,
-                    inputs.sigma_m,
-                ),
-                TerrainFile(
-                    image.with_name(inputs.dem),
-                    inputs.vertical,
-                    image.with_name(inputs.geoid) if inputs.geoid else None,
-                    inputs.fill_px,
-                ),
-                folder / VECTORS_NAME,
-                crs=inputs.crs,
-                vertices=folder / VERTICES_NAME,
-                options=inputs.options,
+                SceneModel(image, model, registration, sigma_m),
+                TerrainFile(image.with_name(inputs.dem), inputs.vertical, geoid, inputs.fill_px),
+                {name: Path(folder) / name for name in names},
             )
-        stored = store_results(work, {name: folder / name for name in (VECTORS_NAME, VERTICES_NAME)})
+
+
+def _correct(work: Work) -> Commit:
+    """Correct uploaded vectors and put them into the storage, with a file of their vertices."""
+    inputs: CorrectVectors = work.inputs
+    with _files(work, inputs.sigma_m) as files:
+        work.progress(0.1, "correcting the vectors")
+        output, vertices = files.made.values()
+        corrected = correct_file(
+            files.vectors,
+            files.scene,
+            files.terrain,
+            output,
+            crs=inputs.crs,
+            vertices=vertices,
+            options=inputs.options,
+        )
+        stored = store_results(work, files.made)
     statement = AccuracyStatement(corrected.relative_to_control_points, corrected.on_the_earth)
 
     def commit(connection: Connection) -> dict[str, Any]:
@@ -149,6 +213,53 @@ def _run(work: Work) -> Commit:
     return commit
 
 
+def _project(work: Work) -> Commit:
+    """Project uploaded vectors and put them into the storage, with a file of their vertices."""
+    inputs: ProjectVectors = work.inputs
+    with _files(work) as files:
+        work.progress(0.1, "projecting the vectors")
+        output, vertices = files.made.values()
+        projected = project_file(
+            files.vectors,
+            files.scene,
+            files.terrain,
+            output,
+            vertices=vertices,
+            options=inputs.options,
+        )
+        stored = store_results(work, files.made)
+
+    def commit(connection: Connection) -> dict[str, Any]:
+        return {
+            "features": projected.features,
+            "vertices": projected.vertices,
+            "added_vertices": projected.added_vertices,
+            "hidden_vertices": projected.hidden_vertices,
+            "outside": projected.outside,
+            "left_out": list(projected.left_out),
+            "files": stored,
+        }
+
+    return commit
+
+
+def _outputs(vectors: str, vertices: str) -> dict[str, str]:
+    """Descriptions of the outputs, in either format."""
+    described = {"vectors": vectors, "vertices": vertices}
+    return {f"{kind}.{suffix}": text for suffix in get_args(Format) for kind, text in described.items()}
+
+
+_COUNTS: dict[str, dict[str, Any]] = {
+    "features": {"type": "integer", "title": "Features that were written"},
+    "vertices": {"type": "integer", "title": "Their vertices"},
+    "added_vertices": {"type": "integer", "title": "Vertices added where edges are bent"},
+    "left_out": {
+        "type": "array",
+        "items": {"type": "integer"},
+        "title": "Numbers of the features, from 1, that meet no ground",
+    },
+}
+
 CORRECT_VECTORS = Process(
     id="correct-vectors",
     title="Correct vectors",
@@ -156,25 +267,38 @@ CORRECT_VECTORS = Process(
     "terrain uploaded beside it, with the predicted accuracy of every vertex.",
     scope=Scope.REGISTER,
     inputs=CorrectVectors,
-    outputs={
-        VECTORS_NAME: "The vectors on the map, with the accuracy of the worst vertex of each feature.",
-        VERTICES_NAME: "Every vertex as a point, with its image position and its accuracy.",
-    },
-    check=_check,
-    run=_run,
+    outputs=_outputs(
+        "The vectors on the map, with the accuracy of the worst vertex of each feature.",
+        "Every vertex as a point, with its image position and its accuracy.",
+    ),
+    check=_check_correction,
+    run=_correct,
     values={
-        "features": {"type": "integer", "title": "Features on the map"},
-        "vertices": {"type": "integer", "title": "Their vertices"},
-        "added_vertices": {"type": "integer", "title": "Vertices added where the ground bends edges"},
-        "left_out": {
-            "type": "array",
-            "items": {"type": "integer"},
-            "title": "Numbers of the features, from 1, that meet no ground",
-        },
+        **_COUNTS,
         "relative_to_control_points": {
             "type": "object",
             "title": "Accuracy relative to the control points",
         },
         "on_the_earth": {"type": "object", "title": "Accuracy on the Earth"},
+    },
+)
+
+PROJECT_VECTORS = Process(
+    id="project-vectors",
+    title="Project vectors",
+    description="Bring vectors of the map into the pixel coordinates of an uploaded scene, by its model "
+    "and a terrain uploaded beside it, with the vertices that the ground hides.",
+    scope=Scope.REGISTER,
+    inputs=ProjectVectors,
+    outputs=_outputs(
+        "The vectors in pixel coordinates, with the share of the hidden vertices of each feature.",
+        "Every vertex as a point, with its ground position and whether it is hidden.",
+    ),
+    check=_check_projection,
+    run=_project,
+    values={
+        **_COUNTS,
+        "hidden_vertices": {"type": "integer", "title": "Vertices that other ground hides"},
+        "outside": {"type": "integer", "title": "Features that the scene does not show"},
     },
 )

@@ -10,8 +10,9 @@ from app.errors import InputError
 from app.usecases.registered_scene import SceneModel, read_registered_scene
 from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from app.usecases.vector_files import (
+    CorrectionOptions,
+    ProjectionOptions,
     VectorFile,
-    VectorOptions,
     check_options,
     default_crs,
     refuse_longitudes,
@@ -26,7 +27,7 @@ from services.formats.vector.pixel_coordinates import (
     line_sample_of_xy,
     xy_of_line_sample,
 )
-from services.map_grid import check_map_code
+from services.map_grid import check_map, check_map_code
 from services.quality.accuracy_statement import StatedAccuracy, vertices_accuracy
 from services.vectors.accuracy import ErrorSources
 from services.vectors.correct import correct_vectors, has_heights, missed_place
@@ -88,7 +89,8 @@ class ProjectedFile:
     left_out: tuple[int, ...]
 
 
-_DEFAULTS = VectorOptions()
+_CORRECTION = CorrectionOptions()
+_PROJECTION = ProjectionOptions()
 
 
 def correct_file(
@@ -99,7 +101,7 @@ def correct_file(
     *,
     crs: str | None = None,
     vertices: Path | None = None,
-    options: VectorOptions = _DEFAULTS,
+    options: CorrectionOptions = _CORRECTION,
 ) -> CorrectedFile:
     """Write vectors that were digitised on a raw scene, on the map.
 
@@ -180,8 +182,7 @@ def project_file(
     output: Path,
     *,
     vertices: Path | None = None,
-    options: VectorOptions = _DEFAULTS,
-    clip: bool = False,
+    options: ProjectionOptions = _PROJECTION,
 ) -> ProjectedFile:
     """Write vectors of the map in the pixel coordinates of a raw scene.
 
@@ -192,7 +193,6 @@ def project_file(
         output: file to write; an existing one is replaced.
         vertices: file to write with every vertex and its ground position; None for none.
         options: of the projection.
-        clip: cut features at the border of the image.
 
     Raises:
         InputError: a file cannot be used, or places have no height.
@@ -203,11 +203,17 @@ def project_file(
     ground = read_terrain(terrain)
     layer = read_layer(vectors.path, vectors.layer)
     if layer.crs is None:
-        raise InputError(f"{vectors.path}: no coordinate reference system found, one expected")
+        raise InputError(
+            f"{vectors.path}: no known coordinate reference system found, one of a map expected"
+        )
+    try:
+        check_map(layer.crs)
+    except InputError as error:
+        raise InputError(f"{vectors.path}: {error}") from None
     near = ground_outline(scene, ground, layer.crs)
     geometries = layer.geometries.copy()
     geometries[~shapely.intersects(geometries, near)] = None
-    if clip:
+    if options.clip:
         geometries = cut(geometries, near)
     projected = project_vectors(
         shapes_of(geometries), scene, ground, layer.crs, tolerance_px=options.tolerance_px
@@ -219,7 +225,7 @@ def project_file(
     shown = shapely.intersects(in_image, border)
     place = f"feature {int(np.argmax(missed)) + 1}" if missed.any() else ""
     refuse_missed(missed, place, options)
-    if clip:
+    if options.clip:
         in_image = cut(in_image, border)
     shapes = shapes_of(in_image)
     drawn = geometries_of(

@@ -54,6 +54,7 @@ def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any
         "register-scenes": {"scenes": [scene, other]},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
+        "project-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "ingest-block": {"path": "block"},
         "export-block": {"block": "flat"},
         "assess-block": {"block": "flat"},
@@ -185,6 +186,7 @@ def test_metadata_of_an_upload_is_text(client: TestClient, admin: dict[str, str]
         ("orthorectify", ("vertical",), "EPSG:4326"),
         ("correct-vectors", ("crs",), "EPSG:5773"),
         ("correct-vectors", ("vertical",), "EPSG:4326"),
+        ("project-vectors", ("vertical",), "EPSG:4326"),
         ("register-scene", ("check_heights",), "EPSG:4326"),
     ],
 )

@@ -54,7 +54,7 @@ class VectorLayer:
         name: of the layer.
         geometries: (n,) of shapely; None where a feature has none.
         attributes: n rows.
-        crs: code or WKT of the reference system; None when there is none.
+        crs: code or WKT of the reference system; None when there is none, or an unknown one.
         fid: (n,) numbers of the features where the format keeps them; None otherwise.
     """
 
@@ -114,7 +114,9 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
     driver = driver_of(path)
     _check_signature(path, driver)
     with _named(path, "read"), TemporaryDirectory(prefix="amers-") as folder:
-        source = plain_geojson(path, Path(folder)) if driver == "GeoJSON" else str(path)
+        source, is_known = str(path), True
+        if driver == "GeoJSON":
+            source, is_known = plain_geojson(path, Path(folder))
         layers = {str(layer): kind for layer, kind in pyogrio.list_layers(source)}
         with_geometries = [layer for layer, kind in layers.items() if kind is not None]
         names = ", ".join(with_geometries)[:300] or "none"
@@ -140,7 +142,7 @@ def read_layer(path: Path, name: str | None = None) -> VectorLayer:
         name or with_geometries[0],
         geometries,
         table.drop_columns([fid_name, geometry_name]),
-        meta["crs"],
+        meta["crs"] if is_known else None,
         table[fid_name].to_numpy() if driver == "GPKG" else None,
     )
 

@@ -9,12 +9,19 @@ import json
 from pathlib import Path
 from typing import Any
 
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
 from services.errors import FormatError
 from services.formats.text_files import load_json
 
 
-def plain_geojson(path: Path, folder: Path) -> str:
+def plain_geojson(path: Path, folder: Path) -> tuple[str, bool]:
     """What GDAL opens: a copy in a folder with features, name and named reference system of a file.
+
+    Returns:
+        Its name, and whether its reference system is known: where the file states one that PROJ does not
+        know, GDAL would take longitudes and latitudes.
 
     Raises:
         FormatError: the file is not GeoJSON.
@@ -31,7 +38,7 @@ def plain_geojson(path: Path, folder: Path) -> str:
     plain["features"] = [_feature(one, path) for one in _features(document, path)]
     copy = folder / path.name
     copy.write_text(json.dumps(plain), encoding="utf-8")
-    return f"GeoJSON:{copy}"
+    return f"GeoJSON:{copy}", crs is not None or "crs" not in document
 
 
 def _features(document: dict[str, Any], path: Path) -> list[Any]:
@@ -59,8 +66,14 @@ def _feature(feature: Any, path: Path) -> dict[str, Any]:
 
 
 def _named_crs(crs: Any) -> str | None:
-    """The name of a reference system; not its address, which would be fetched."""
+    """The name of a reference system that PROJ knows; not its address, which would be fetched."""
     properties = crs.get("properties") if isinstance(crs, dict) and crs.get("type") == "name" else None
     name = properties.get("name") if isinstance(properties, dict) else None
     is_code = isinstance(name, str) and name.upper().startswith(("URN:OGC:DEF:CRS:", "EPSG:", "OGC:"))
-    return name if is_code else None
+    if not is_code:
+        return None
+    try:
+        CRS.from_user_input(name)
+    except CRSError:
+        return None
+    return str(name)
