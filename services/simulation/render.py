@@ -1,7 +1,7 @@
 """Rendering of images of a simulated world, line by line."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,7 +158,7 @@ def ray_nodes(
     lines: range,
     nodes: range,
     *,
-    shift_px: tuple[float, float] = (0.0, 0.0),
+    seen: Callable[[Array], Array] = lambda line_sample: line_sample,
 ) -> RayNodes:
     """Lines of sight of some lines, and of a quarter line before and after them, at some nodes.
 
@@ -168,11 +168,11 @@ def ray_nodes(
         setup: both heights.
         lines: consecutive lines.
         nodes: consecutive nodes, one for every `NODE_SPACING`-th sample from sample -0.5 on.
-        shift_px: added to lines and samples.
+        seen: positions (n, 2) of the model that pixels (n, 2) show, smooth.
     """
-    line = lines.start + np.arange(-1.0, len(lines) + 1.0) + shift_px[0]
-    sample = -0.5 + NODE_SPACING * np.arange(nodes.start, nodes.stop) + shift_px[1]
-    image = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1).reshape(-1, 2)
+    line = lines.start + np.arange(-1.0, len(lines) + 1.0)
+    sample = -0.5 + NODE_SPACING * np.arange(nodes.start, nodes.stop)
+    image = seen(np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1).reshape(-1, 2))
 
     def at(height_m: float) -> Array:
         ground = model.locate(image, np.full(len(image), height_m))

@@ -19,6 +19,7 @@ from services.simulation.conditions import (
     under_clouds,
 )
 from services.simulation.detectors import PERFECT, Detectors
+from services.simulation.distortion import Distortion
 from services.simulation.land import NO_ROOF
 from services.simulation.light import Day, averaged, day_of, radiance, smoothing_margin
 from services.simulation.rays import RayNodes, intersect_surface
@@ -31,7 +32,7 @@ from services.simulation.render import (
 )
 from services.simulation.view import ViewGeometry
 from services.simulation.world import World
-from services.types import FloatImage
+from services.types import Array, FloatImage
 
 TILE_PX = NODE_SPACING
 _CELLS = 128
@@ -103,6 +104,8 @@ class TiledView:
         seed: int,
         conditions: Conditions = CLEAR,
         detectors: Detectors = PERFECT,
+        *,
+        distortion: Distortion | None = None,
     ) -> None:
         """Prepare an image.
 
@@ -112,6 +115,7 @@ class TiledView:
             seed: seed of clouds and noise.
             conditions: conditions of the acquisition.
             detectors: what the sensor model does not know of them.
+            distortion: what the sensor model does not know of the image.
 
         Raises:
             InputError: slopes are so steep that the terrain would occlude itself.
@@ -123,6 +127,8 @@ class TiledView:
         self._geometry = geometry
         self._conditions = conditions
         self._detectors = detectors
+        self._distortion = distortion or Distortion(geometry.plan.shape)
+        self._as_modelled = detectors.are_perfect and self._distortion.is_none
         self._seed = seed
         self._setup = ray_setup(world, plan.incidence_deg, *sun)
         self._light = LightOnDemand(world, day, plan.gsd_m / world.posting_m)
@@ -158,18 +164,18 @@ class TiledView:
     def _row_of_tiles(self, row: int, first: int, last: int) -> Iterator[tuple[int, Pixels]]:
         """Yield columns and pixels of neighbouring tiles, rendering those that are missing."""
         missing = [c for c in range(first, last + 1) if (row, c) not in self._tiles]
-        if missing and self._detectors.are_perfect:
+        if missing and self._as_modelled:
             rays = self._rays(row, range(missing[0], missing[-1] + 2))
         for column in range(first, last + 1):
             pixels = self._tiles.pop((row, column), None)
             if pixels is None:
-                if self._detectors.are_perfect:
+                if self._as_modelled:
                     at = column - missing[0]
                     of_tile = np.s_[:, :, at : at + 2]
                     tile_rays = rays._replace(low=rays.low[of_tile], high=rays.high[of_tile])
                     light = self._light_along(tile_rays, self._tile_shape(row, column))
                 else:
-                    light = self._light_of_detectors(row, column)
+                    light = self._light_as_seen(row, column)
                 pixels = self._render(row, column, light)
             self._tiles[row, column] = pixels
             yield column, pixels
@@ -185,26 +191,36 @@ class TiledView:
         lines, samples = self.shape
         return min(TILE_PX, lines - row * TILE_PX), min(TILE_PX, samples - column * TILE_PX)
 
-    def _light_of_detectors(self, row: int, column: int) -> FloatImage:
-        """Light of a tile as its detectors see it: out of place, and blurred."""
+    def _light_as_seen(self, row: int, column: int) -> FloatImage:
+        """Light of a tile as it is seen: out of place, distorted, and blurred."""
         lines, samples = self._tile_shape(row, column)
         margin = math.ceil(3.0 * max(self._detectors.blur_px))
-        step = self._detectors.step_of(column, self.shape[1]) - [0.0, float(margin)]
-        first = row * TILE_PX - margin
-        rays = ray_nodes(
-            self._world,
-            self._geometry.true_model,
-            self._setup,
-            range(first, first + lines + 2 * margin),
-            range(column, column + 2 + math.ceil(2 * margin / TILE_PX)),
-            shift_px=(float(step[0]), float(step[1])),
-        )
-        light = self._light_along(rays, (lines + 2 * margin, samples + 2 * margin))
+        first = np.array([row, column]) * TILE_PX - margin
+        shape = lines + 2 * margin, samples + 2 * margin
+        corner = first + self._detectors.step_of(column, self.shape[1])
+        pixels = np.indices(shape).reshape(2, -1).T + corner
+        jumps = self._distortion.jump(pixels)
+        light = np.empty(shape, dtype=np.float32)
+        for jump in np.unique(jumps, axis=0):
+            here = (jumps == jump).all(axis=1).reshape(shape)
+            light[here] = self._light_after(jump + corner, shape)[here]
         if margin == 0:
             return light
         along_lines, along_samples = self._detectors.blur_px
         blurred = cv2.GaussianBlur(light, (0, 0), sigmaX=along_samples, sigmaY=along_lines)
         return np.ascontiguousarray(blurred[margin : margin + lines, margin : margin + samples])
+
+    def _light_after(self, corner: Array, shape: tuple[int, int]) -> FloatImage:
+        """Light of a part of the image after a jump to its corner, smoothly distorted."""
+        rays = ray_nodes(
+            self._world,
+            self._geometry.true_model,
+            self._setup,
+            range(shape[0]),
+            range(2 + (shape[1] - 1) // TILE_PX),
+            seen=lambda line_sample: self._distortion.after_jump(line_sample + corner),
+        )
+        return self._light_along(rays, shape)
 
     def _render(self, row: int, column: int, light: FloatImage) -> Pixels:
         """Pixels of one tile."""
