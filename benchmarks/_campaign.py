@@ -6,19 +6,23 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
+from benchmarks._distortions import distortion_of
 from benchmarks._point_errors import BlockErrors, spoil
 from benchmarks._trials import Trial
 from benchmarks._worlds import Block, Place, world_of
 from services.errors import AmersError
+from services.geodesy import metres_per_degree
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource
-from services.quality.accuracy import accuracy, normalised_error
+from services.quality.accuracy import accuracy, normal_ce90, normalised_error
 from services.quality.frames import frame_in_image
 from services.registration.on_points import Registration, register_scene
 from services.registration.options import RegistrationOptions
+from services.sensors.rpc import RpcModel
 from services.simulation.conditions import Conditions
 from services.simulation.defects import Damage, DamagedImage
 from services.simulation.detectors import Detectors
+from services.simulation.distortion import Distortion
 from services.simulation.render import surface_seen
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
@@ -27,6 +31,8 @@ from services.types import Array, ChipSource, ControlPoints
 
 WRONG = 3.0
 """A result is wrong when its CE90 exceeds the predicted CE90 this many times."""
+WRONG_PART = 0.1
+"""A result is wrong in part when this share of the image is wrong by that."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,12 @@ class Outcome:
         cpu_s: of the registration, with the rendering of the pixels that it reads.
         ground_predicted_m: CE90 on the Earth as stated, with the frame of the blocks; median.
         ground_normalised: as `normalised`, on the Earth.
+        wrong_share: of the image that is off by more than `WRONG` times the CE90 predicted there.
+        judged_share: of the image: neither moved ground, nor shown twice. All else is left aside.
+        line_gap_px: median distance along lines from an active point to the next.
+        spacing_px: of the points that were searched, if they were evenly spread.
+        followable: whether a distortion is smooth enough for that spacing: its shortest period is at
+            least twice as long.
     """
 
     verdict: str
@@ -64,6 +76,11 @@ class Outcome:
     cpu_s: float
     ground_predicted_m: float = float("nan")
     ground_normalised: float = float("nan")
+    wrong_share: float = float("nan")
+    judged_share: float = 1.0
+    line_gap_px: float = float("nan")
+    spacing_px: float = float("nan")
+    followable: bool = False
 
     @property
     def delivered(self) -> bool:
@@ -80,6 +97,11 @@ class Outcome:
         """Whether the true error on the Earth is more than `WRONG` times the predicted one."""
         return not self.ground_ce90_m <= WRONG * self.ground_predicted_m
 
+    @property
+    def wrong_in_part(self) -> bool:
+        """Whether more than `WRONG_PART` of the image is wrong where its accuracy is predicted."""
+        return not self.wrong_share <= WRONG_PART
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -88,8 +110,9 @@ class Prepared:
     Attributes:
         scene, points: what a registration gets.
         world: what the scene shows.
-        geometry, detectors: the truth about its image.
+        geometry, detectors, distortion: the truth about its image.
         errors: of the blocks of the points.
+        shortest_px: period that points must resolve to follow the distortion, see `Drawn`.
     """
 
     scene: Scene
@@ -98,11 +121,22 @@ class Prepared:
     geometry: ViewGeometry
     detectors: Detectors
     errors: BlockErrors
+    distortion: Distortion
+    shortest_px: float = 0.0
 
     def shown(self, line_sample: Array) -> Array:
         """The ground (n, 3) that pixels (n, 2) show."""
         seen = self.detectors.seen(line_sample, self.scene.image.shape[1])
-        return surface_seen(self.world, self.geometry.true_model, seen)
+        return surface_seen(self.world, self.geometry.true_model, self.distortion.undistorted(seen))
+
+    def places(self) -> tuple[Array, float]:
+        """Pixels (n, 2) all over the image that show what belongs there, and their share of all."""
+        shape = self.distortion.shape
+        count = (12, 12) if self.distortion.is_none else (48, 12)
+        axes = [np.linspace(0.0, size - 1.0, n) for size, n in zip(shape, count, strict=True)]
+        pixels = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        unique = self.distortion.is_unique(pixels)
+        return pixels[unique], float(unique.mean())
 
 
 def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
@@ -130,14 +164,44 @@ def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
     conditions = Conditions(trial.haze, trial.cloud_cover, trial.inverted, trial.season, trial.noise)
     steps = more.uniform(-1.0, 1.0, (trial.parts, 2)) * trial.seam_px
     detectors = Detectors(steps - steps.mean(axis=0), (trial.smear_px, trial.blur_px))
-    image: ImageSource = TiledView(world, geometry, int(rng.integers(2**31)), conditions, detectors)
+    shape = place.lines, place.lines
+    distorting = np.random.default_rng([seed, trial.number, 6])
+    distortion = distortion_of(trial.distortion, shape, trial.gsd_m, distorting)
+    image: ImageSource = TiledView(
+        world, geometry, int(rng.integers(2**31)), conditions, detectors, distortion=distortion
+    )
     if trial.bits != 12 or trial.damaged > 0.0:
         damage = Damage(trial.bits, trial.damaged, trial.missing, trial.patch_px, trial.brightest)
         image = DamagedImage(image, damage, trial.number)
-    scene = Scene(image, geometry.delivered, geometry.acquisition, trial.sigma_m)
+    delivered = geometry.delivered
+    if trial.distortion.tilt_deg > 0.0:
+        delivered = _of_another_view(world, plan, trial, error_m, distorting)
+    scene = Scene(image, delivered, geometry.acquisition, trial.sigma_m)
     side_m = trial.gsd_m * place.lines
     points, errors = spoil(block.points, trial, world.centre_lon_lat, side_m, rng=rng, more=more)
-    return Prepared(scene, points, world, geometry, detectors, errors)
+    shortest_px = trial.distortion.shortest_px
+    return Prepared(scene, points, world, geometry, detectors, errors, distortion, shortest_px)
+
+
+def _of_another_view(
+    world: World, plan: ViewPlan, trial: Trial, error_m: tuple[float, float], rng: np.random.Generator
+) -> RpcModel:
+    """The model of a view from another direction, of the same place or of one beside it."""
+    incidence, azimuth = np.radians([trial.incidence_deg, trial.azimuth_deg])
+    towards = rng.uniform(0.0, 2.0 * np.pi, 2)
+    direction = np.tan(incidence) * np.array([np.sin(azimuth), np.cos(azimuth)])
+    tilt = np.tan(np.radians(trial.distortion.tilt_deg))
+    direction += tilt * np.array([np.sin(towards[0]), np.cos(towards[0])])
+    away_m = trial.distortion.away * plan.gsd_m * plan.shape[0]
+    per_degree = metres_per_degree(plan.lon_lat[1], 0.0)
+    east, north = away_m * np.sin(towards[1]), away_m * np.cos(towards[1])
+    other = replace(
+        plan,
+        lon_lat=(plan.lon_lat[0] + east / per_degree[0], plan.lon_lat[1] + north / per_degree[1]),
+        incidence_deg=float(np.degrees(np.arctan(np.hypot(*direction)))),
+        azimuth_deg=float(np.degrees(np.arctan2(*direction)) % 360.0),
+    )
+    return plan_geometry(world, other, rng, error_m).delivered
 
 
 def attempt(
@@ -157,15 +221,25 @@ def registered(
         registration = register_scene(prepared.scene, prepared.points, chips, options)
     except AmersError as error:
         cpu_s = time.process_time() - start_s
-        return Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s), None
-    return _judged(prepared, registration, time.process_time() - start_s), registration
+        refused = Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
+        return _with_spacing(refused, prepared, options), None
+    outcome = _judged(prepared, registration, time.process_time() - start_s)
+    return _with_spacing(outcome, prepared, options), registration
+
+
+def _with_spacing(outcome: Outcome, prepared: Prepared, options: RegistrationOptions) -> Outcome:
+    """The outcome with the spacing of the searched points: by the truth, also where it is refused."""
+    shape = np.array(prepared.scene.image.shape)
+    place = prepared.geometry.true_model.project(prepared.points.lon_lat_h)
+    shown = int(((place >= 0.0) & (place <= shape - 1.0)).all(axis=1).sum())
+    searched = min(shown, options.max_points or shown)
+    spacing_px = float(np.sqrt(np.prod(shape) / max(searched, 1)))
+    return replace(outcome, spacing_px=spacing_px, followable=prepared.shortest_px >= 2.0 * spacing_px)
 
 
 def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:
     """The errors of a registration against the true sensor, on a grid over the whole image."""
-    shape = prepared.scene.image.shape
-    axes = [np.linspace(0.0, size - 1.0, 12) for size in shape]
-    line_sample = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    line_sample, judged_share = prepared.places()
     shown = prepared.shown(line_sample)
     in_frame = prepared.errors.in_frame(shown)
 
@@ -175,12 +249,19 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
     derivative = registration.model.project_derivative(shown)
     inverse = np.linalg.inv(derivative[:, :, :2])
 
+    def on_ground_m(error: Array) -> Array:
+        return np.asarray((inverse @ error[:, :, None])[:, :, 0])
+
     def ce90_m(error: Array) -> float:
-        return accuracy((inverse @ error[:, :, None])[:, :, 0]).ce90_m.value
+        return accuracy(on_ground_m(error)).ce90_m.value
 
     error, on_earth = error_px(in_frame), error_px(shown)
     covariance = registration.adjustment.covariance_at(line_sample)
     both = covariance + frame_in_image(registration.frame, derivative, registration.adjustment.apart_px)
+    local_m = normal_ce90(inverse @ covariance @ inverse.transpose(0, 2, 1))
+    right = np.hypot(*on_ground_m(error).T) <= WRONG * local_m
+    measures = registration.measures
+    lines = np.sort(measures.line_sample[measures.active, 0])
     quality = registration.qualification
     moved_m = [place.median_m for place in quality.stability.displacements]
     return Outcome(
@@ -200,4 +281,7 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
         cpu_s=cpu_s,
         ground_predicted_m=quality.predicted.on_the_earth_median_m,
         ground_normalised=normalised_error(on_earth, both).mean_square,
+        wrong_share=float(1.0 - right.mean()),
+        judged_share=judged_share,
+        line_gap_px=float(np.median(np.diff(lines))),
     )

@@ -15,6 +15,7 @@ from services.registration.options import RegistrationOptions
 from services.simulation.archive import ArchiveView
 from services.simulation.conditions import clouds_over
 from services.simulation.detectors import PERFECT
+from services.simulation.distortion import Distortion
 from services.types import Array, BoolArray, ChipSource, ControlPoints
 
 CORRECT_M = 3.0
@@ -74,6 +75,7 @@ def register_later(
             continent.geometry(view),
             PERFECT,
             _only_frame(frame_error_m),
+            Distortion(scene.image.shape),
         )
         outcome, registration = registered(prepared, chips, OPTIONS)
         line_sample = prepared.geometry.true_model.project(true)

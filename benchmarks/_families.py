@@ -15,6 +15,8 @@ from queue import Empty, Queue
 import cv2
 
 from benchmarks._campaign import Outcome, attempt
+from benchmarks._distorted_trials import DISTORTED, distorted_trial
+from benchmarks._distortions import Drawn
 from benchmarks._trials import (
     Trial,
     damaged_trial,
@@ -58,8 +60,10 @@ DRAWS: dict[str, Callable[[int, int], Trial]] = {
     "intact": intact_trial,
     "points": points_trial,
     "sensor": sensor_trial,
+    **{family: partial(distorted_trial, family) for family in DISTORTED},
 }
 _POINTS = {"point_ce90_m": (0.5, 1.5, 3.0, 5.0), "incidence_deg": (0.0, 10.0, 20.0, 35.1)}
+_OTHERWISE = {"chip_ratio": (0.1, 0.5, 2.5, 10.0), "point_ce90_m": (0.5, 1.5, 3.0, 5.0)}
 FAMILIES = {
     "ordinary": Family(
         ("trial",),
@@ -117,6 +121,36 @@ FAMILIES = {
             "chip_ratio": (0.1, 0.5, 2.5, 10.0),
         },
     ),
+    "jitter": Family(
+        ("jitter",),
+        140,
+        {
+            "distortion.amplitude_px": (0.2, 0.5, 1.0, 2.0, 6.01),
+            "distortion.period_px": (100.0, 300.0, 1_000.0, 8_000.0),
+            **_OTHERWISE,
+        },
+    ),
+    "bow": Family(("bow",), 100, {"distortion.amplitude_px": (0.5, 1.0, 2.0, 4.0, 8.01), **_OTHERWISE}),
+    "steps": Family(
+        ("steps",),
+        80,
+        {"distortion.step_lines": (1, 3, 10, 30, 101), "distortion.steps": (1, 2, 4), **_OTHERWISE},
+    ),
+    "moved": Family(
+        ("moved",),
+        80,
+        {
+            "distortion.moved_share": (0.05, 0.15, 0.25, 0.4),
+            "distortion.moved_m": (2.0, 5.0, 15.0, 40.0, 101.0),
+            **_OTHERWISE,
+        },
+    ),
+    "wrong_model": Family(
+        ("wrong_model",), 60, {"distortion.tilt_deg": (0.0, 0.01, 8.0, 16.0, 25.1), **_OTHERWISE}
+    ),
+    "otherwise": Family(
+        ("otherwise",), 60, {"distortion.amplitude_px": (0.2, 1.0, 2.0, 8.01), **_OTHERWISE}
+    ),
 }
 
 
@@ -134,9 +168,8 @@ def place_of(scene: Scene) -> Place:
 def fingerprint() -> str:
     """A short hash of the sources that outcomes follow from."""
     digest = hashlib.sha256()
-    drawn = [
-        ROOT / "benchmarks" / f"_{name}.py" for name in ("campaign", "point_errors", "trials", "worlds")
-    ]
+    names = ("campaign", "distorted_trials", "distortions", "point_errors", "trials", "worlds")
+    drawn = [ROOT / "benchmarks" / f"_{name}.py" for name in names]
     for path in sorted((ROOT / "services").rglob("*.py")) + drawn:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -151,7 +184,9 @@ def read_outcomes(file: Path, code: str | None) -> dict[str, Result]:
         except json.JSONDecodeError:
             continue
         if code in (None, record["code"]):
-            outcomes[record["name"]] = Trial(**record["trial"]), Outcome(**record["outcome"])
+            drawn = Drawn(**record["trial"].pop("distortion", {}))
+            trial = Trial(**record["trial"], distortion=drawn)
+            outcomes[record["name"]] = trial, Outcome(**record["outcome"])
     return outcomes
 
 

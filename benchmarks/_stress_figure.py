@@ -1,6 +1,7 @@
 """The figure of a stress campaign."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 
 import matplotlib as mpl
@@ -45,7 +46,7 @@ def draw_figure(results: Sequence[Result], factors: Mapping[str, Sequence[float]
 
 def _verdicts(axis: Axes, results: Sequence[Result], factor: str, edges: Sequence[float]) -> None:
     """Shares of the verdicts in the classes of a factor, and how many results were right."""
-    value = np.array([float(getattr(trial, factor)) for trial, _ in results])
+    value = np.array([float(attrgetter(factor)(trial)) for trial, _ in results])
     row = np.clip(np.searchsorted(edges, value, side="right") - 1, 0, len(edges) - 2)
     classes = range(len(edges) - 1)
     count = np.array([max(1, int((row == k).sum())) for k in classes])

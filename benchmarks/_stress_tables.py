@@ -1,6 +1,7 @@
 """Figures of a stress campaign, its tables, and whether it shows what it must."""
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ def by_factor(results: Sequence[Result], factors: Factors) -> dict[str, list[dic
     """Figures of the scenes in each class of each factor."""
     table: dict[str, list[dict[str, Any]]] = {}
     for factor, edges in factors.items():
-        value = np.array([float(getattr(trial, factor)) for trial, _ in results])
+        value = np.array([float(attrgetter(factor)(trial)) for trial, _ in results])
         row = np.clip(np.searchsorted(edges, value, side="right") - 1, 0, len(edges) - 2)
         table[factor] = [
             {

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from benchmarks._distortions import NOT_DISTORTED, Drawn
 from benchmarks._worlds import (
     FINE_GSD_M,
     NOMINAL,
@@ -42,6 +43,7 @@ class Trial:
         blur_px, smear_px: sigma of the blur along samples and along lines.
         seam_px, parts: largest displacement of the parts of the detectors, and their number.
         terrain_m: spacing of the terrain that the scene is taken of; 0 for that of the chips.
+        distortion: what the sensor model of the scene does not describe.
     """
 
     number: int
@@ -81,6 +83,7 @@ class Trial:
     seam_px: float = 0.0
     parts: int = 1
     terrain_m: float = 0.0
+    distortion: Drawn = NOT_DISTORTED
 
 
 def draw_trial(seed: int, number: int, places: tuple[Place, ...] = PLACES) -> Trial:

@@ -5,8 +5,9 @@ that make registration difficult: a few factors over their whole range, the othe
 the conditions that SRP is described by. *Damaged* scenes have missing and saturated pixels, and each is
 registered without them too. *Points* have correlated errors, offsets between blocks, errors of the
 frame's height and distorted blocks. *Sensor* scenes have a blur, seams between detectors and a terrain
-that nothing knows. Each result is compared with the true sensor over the whole image, in the frame of
-the points and on the Earth.
+that nothing knows. Scenes of six more families, *jitter*, *bow*, *steps*, *moved*, *wrong_model* and
+*otherwise*, are distorted in ways that their models do not say. Each result is compared with the true
+sensor over the whole image, in the frame of the points and on the Earth.
 
 Every scene follows from the seed and its number. The outcome of each scene is appended to a file. A
 scene is not repeated as long as the sources are the same; blocks of points are reused until their files
@@ -14,10 +15,13 @@ are removed. Run: python -m benchmarks.stress [--family damaged] [--scenes 500] 
 """
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from benchmarks._distorted_tables import accused, by_kind, distorted_acceptance, show_distorted
+from benchmarks._distorted_trials import DISTORTED
 from benchmarks._families import (
     FAMILIES,
     Result,
@@ -39,7 +43,7 @@ def main() -> None:
     """Run the missing scenes, print the tables, write the results, draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--family", choices=[*FAMILIES, "all"], default="ordinary")
-    parser.add_argument("--scenes", type=int, help="of each family; by default 500, 200, 200 and 100")
+    parser.add_argument("--scenes", type=int, help="of each family; by default what `_families` says")
     parser.add_argument("--nominal", type=int, default=10, help="scenes in nominal conditions")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--jobs", type=int, default=1, help="processes; each has its own worlds")
@@ -100,6 +104,13 @@ def report(family: str, of_kind: dict[str, list[Result]]) -> None:
     rows = [("all", results), ("nominal", nominal), ("intact", intact)]
     show(family, [(name, part) for name, part in rows if part], results, factors)
     lines = acceptance(results, nominal, intact)
+    kinds_of = {}
+    if family in DISTORTED:
+        kinds_of = by_kind(family, [(trial.distortion, outcome) for trial, outcome in results])
+        show_distorted(f"distortions: {family}", kinds_of)
+        lines += distorted_acceptance(family, [outcome for _, outcome in results])
+    else:
+        lines.append(accused([outcome for _, outcome in results]))
     show_acceptance(lines)
     name = "stress" if family == "ordinary" else f"stress_{family}"
     keep(
@@ -113,6 +124,7 @@ def report(family: str, of_kind: dict[str, list[Result]]) -> None:
                 for requirement, holds, figures in lines
             ],
             "factors": by_factor(results, factors),
+            **({"distortions": {k: asdict(v) for k, v in kinds_of.items()}} if kinds_of else {}),
         },
     )
     draw_figure(results, factors, RESULTS / f"{name}.png")

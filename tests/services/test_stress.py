@@ -1,6 +1,7 @@
 """A small stress campaign: difficult scenes of a small world, and the conditions that describe SRP."""
 
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +172,7 @@ def test_every_factor_of_a_family_is_inside_its_classes(family: str) -> None:
     draw = DRAWS[FAMILIES[family].kinds[-1]]
     trials = [draw(SEED, number, (SMALL,)) for number in range(60)]
     for factor, edges in FAMILIES[family].factors.items():
-        values = [float(getattr(trial, factor)) for trial in trials]
+        values = [float(attrgetter(factor)(trial)) for trial in trials]
         assert edges[0] <= min(values), factor
         assert max(values) <= edges[-1], factor
 
