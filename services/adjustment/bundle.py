@@ -225,10 +225,10 @@ def _known(
     """The images of the first group with the covariance of all their parameters."""
     n, size = len(images), values.shape[1]
     rows = np.flatnonzero(group[:n] == 0)
-    k = {len(images[row].sigma) for row in rows.tolist()}
-    if values.size > DENSE_ROWS or len(k) != 1:
+    if values.size > DENSE_ROWS:
         return None
-    inside = (rows[:, None] * size + np.arange(own := k.pop())).ravel()
+    own = max(len(images[row].sigma) for row in rows.tolist())
+    inside = (rows[:, None] * size + np.arange(own)).ravel()
     relative = joint_relative(*of)[np.ix_(inside, inside)]
     members = [images[row] for row in rows.tolist()]
     return known_images(members, values[rows, :own], relative, frames[0])

@@ -22,14 +22,17 @@ class KnownImages:
 
     Attributes:
         names: of the n images.
-        values: (n, k) their parameters.
-        relative: (n k, n k) covariance of the parameters for an exact frame.
+        parameters: names of those of each; some images may have fewer than others.
+        values: (n, k) their parameters; 0 for those that an image lacks.
+        relative: (n k, n k) covariance of the parameters for an exact frame; that of those that an image
+            lacks is one.
         frame: of the block on the Earth, which its images share.
         ground, line_sample: (n, q, 3) and (n, q, 2), places and where the delivered models show them,
             of which the parameters are.
     """
 
     names: tuple[str, ...]
+    parameters: tuple[tuple[str, ...], ...]
     values: Array
     relative: Array
     frame: Frame
@@ -40,13 +43,15 @@ class KnownImages:
         return len(self.names)
 
     def take(self, rows: IntArray) -> "KnownImages":
-        """Some of the images."""
-        k = self.values.shape[1]
-        inside = (rows[:, None] * k + np.arange(k)).ravel()
+        """Some of the images, with as many parameters as that of them has that has most."""
+        parameters = tuple(self.parameters[row] for row in rows.tolist())
+        most = max(map(len, parameters), default=0)
+        inside = (rows[:, None] * self.values.shape[1] + np.arange(most)).ravel()
         return replace(
             self,
             names=tuple(self.names[row] for row in rows.tolist()),
-            values=self.values[rows],
+            parameters=parameters,
+            values=self.values[rows, :most],
             relative=self.relative[np.ix_(inside, inside)],
             ground=self.ground[rows],
             line_sample=self.line_sample[rows],
@@ -61,6 +66,7 @@ def known_images(
     ground = np.stack([place for place, _ in places])
     return KnownImages(
         tuple(image.name for image in images),
+        tuple(tuple(own.name for own in image.parameters) for image in images),
         values,
         relative,
         frame,
@@ -152,9 +158,15 @@ def tie(images: Sequence[AdjustableImage], known: KnownImages) -> Tie:
         image = images[row]
         there = common.line_sample[number]
         off_px = np.abs(image.model.project(common.ground[number]) - there)
-        if len(image.sigma) != common.values.shape[1] or not np.nanmax(off_px) < _SAME_PX:
+        if not np.nanmax(off_px) < _SAME_PX:
             raise InputError(
                 f"{image.name}: its model is not the one that the neighbour has adjusted; give both "
                 "blocks the image with the same model, as delivered"
+            )
+        here, before = [own.name for own in image.parameters], common.parameters[number]
+        if tuple(here) != before:
+            raise InputError(
+                f"{image.name}: the parameters {', '.join(here)} are free, and the neighbour has "
+                f"adjusted {', '.join(before)}; give both blocks the image with the same free parameters"
             )
     return Tie(np.array(rows, dtype=np.int64), common)

@@ -9,7 +9,8 @@ from services.adjustment.known_images import KnownImages
 from services.errors import FormatError
 from services.types import Frame
 
-FORMAT = "amers-images/1"
+FORMAT = "amers-images/2"
+_SEPARATOR = "\n"
 
 
 def write_adjusted_images(path: Path, block: str, known: KnownImages) -> None:
@@ -25,6 +26,7 @@ def write_adjusted_images(path: Path, block: str, known: KnownImages) -> None:
         format=FORMAT,
         block=block,
         names=np.array(known.names),
+        parameters=np.array([_SEPARATOR.join(own) for own in known.parameters]),
         values=known.values,
         relative=known.relative,
         frame_m2=known.frame.covariance_m2,
@@ -46,6 +48,7 @@ def read_adjusted_images(path: Path) -> tuple[str, KnownImages]:
             names = tuple(str(name) for name in file["names"])
             known = KnownImages(
                 names,
+                tuple(tuple(str(own).split(_SEPARATOR)) for own in file["parameters"]),
                 file["values"],
                 file["relative"],
                 Frame(file["frame_m2"]),
@@ -65,6 +68,7 @@ def read_adjusted_images(path: Path) -> tuple[str, KnownImages]:
         not n
         or known.values.shape[:1] != (n,)
         or known.values.ndim != 2
+        or [len(known.parameters), max(map(len, known.parameters))] != list(known.values.shape)
         or shapes != ((size, size), (3, 3), (*places, 2))
         or known.ground.shape != (n, places[-1], 3)
     ):

@@ -24,6 +24,7 @@ from tests.services.ties import difference_m
 NO_CONTROL = ControlFiles()
 KNOWN = KnownImages(
     ("a", "b é"),
+    (("line shift", "sample shift"), ("roll", "pitch", "yaw", "roll drift", "radial", "focal length")),
     np.arange(12.0).reshape(2, 6),
     np.eye(12) * 0.01,
     Frame.from_sigmas(0.5, 1.0),
@@ -35,7 +36,7 @@ KNOWN = KnownImages(
 def test_adjusted_images_come_back_as_they_were_written(tmp_path) -> None:
     write_adjusted_images(tmp_path / IMAGES_NPZ, "block", KNOWN)
     block, known = read_adjusted_images(tmp_path / IMAGES_NPZ)
-    assert (block, known.names) == ("block", KNOWN.names)
+    assert (block, known.names, known.parameters) == ("block", KNOWN.names, KNOWN.parameters)
     for name in ("values", "relative", "ground", "line_sample"):
         np.testing.assert_array_equal(getattr(known, name), getattr(KNOWN, name))
     np.testing.assert_array_equal(known.frame.covariance_m2, KNOWN.frame.covariance_m2)
@@ -45,6 +46,7 @@ def test_adjusted_images_come_back_as_they_were_written(tmp_path) -> None:
     ("change", "message"),
     [
         ({"relative": np.eye(11)}, "do not fit each other"),
+        ({"parameters": (("roll",), ("roll", "pitch"))}, "do not fit each other"),
         ({"relative": np.eye(12) * np.nan}, "finite ones expected"),
         ({"frame": Frame.from_sigmas(0.5, np.nan)}, "finite ones expected"),
         ({"values": np.array([[object()] * 6] * 2)}, "adjusted images of a block expected"),
