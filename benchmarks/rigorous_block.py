@@ -18,8 +18,9 @@ from benchmarks._measuring import keep
 from benchmarks._rigorous_block import Truth, drawn
 from services.adjustment.bundle import adjust_block
 from services.adjustment.parameters import AdjustableImage, image_parameters
-from services.adjustment.rigorous_parameters import SRP, rigorous_parameters
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.geodesy import lon_lat_h_from_east_north_up
+from services.sensors.parameter_sets import SRP
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.rpc_fit import fit_rpc
 from services.simulation.orbit import pushbroom_over

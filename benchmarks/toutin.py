@@ -26,8 +26,9 @@ from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import ControlGround
 from services.adjustment.intersection import intersect
 from services.adjustment.parameters import AdjustableImage
-from services.adjustment.rigorous_parameters import TOUTIN, rigorous_parameters
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.geodesy import metres_per_degree_at, move_metres
+from services.sensors.parameter_sets import TOUTIN
 from services.simulation.orbit import pushbroom_over
 from services.types import Array, IntArray, Observations
 

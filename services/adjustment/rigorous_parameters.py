@@ -1,6 +1,5 @@
 """The free parameters of rigorous models in a block adjustment: attitude, orbit and focal length."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,12 +7,10 @@ import numpy as np
 
 from services.adjustment.parameters import Computed, FreeParameter
 from services.errors import InputError
+from services.sensors.parameter_sets import UNITS, ParameterSet
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
 from services.types import Array, BoolArray, IntArray
-
-UNITS = ("μrad",) * 6 + ("m",) * 6 + ("ppm",) * 2
-"""In which people state the terms of a rigorous model."""
 
 _PER_SI = np.repeat([1e6, 1.0, 1e6], [6, 6, 2])
 _LOCATING = ("roll", "pitch", "along track", "across track", "radial")
@@ -22,73 +19,6 @@ _ORBIT_SHARE = 0.9
 _NODES = 5
 """Places a side of the image over which the largest displacement is looked for."""
 _CREDIBLE_SIGMAS = 6.0
-
-
-@dataclass(frozen=True)
-class ParameterSet:
-    """Terms that are free, with their a priori standard deviations.
-
-    Roll and pitch have none of their own: with the orbit they make up the accuracy on the ground that is
-    stated of a scene.
-
-    Attributes:
-        name: of the system that published the set.
-        sigmas: of the other terms, in `UNITS`.
-    """
-
-    name: str
-    sigmas: Mapping[str, float]
-
-
-SRP = ParameterSet(
-    "SRP",
-    {
-        "yaw": 20.0,
-        "roll drift": 2.0,
-        "pitch drift": 2.0,
-        "yaw drift": 20.0,
-        "focal length": 20.0,
-    },
-)
-"""Attitude biases and drifts on three axes and the focal length: 7 parameters.
-
-Source of the set: Chandelier and others (2020), SRP. Sigmas: a satellite with star trackers whose images
-of 30 km are off by about half a pixel of 1.5 m at the edge by each."""
-
-TOUTIN = ParameterSet(
-    "Toutin",
-    {
-        "yaw": 400.0,
-        "roll drift": 10.0,
-        "pitch drift": 10.0,
-        "along track": 200.0,
-        "across track": 200.0,
-        "focal length": 100.0,
-    },
-)
-"""The eight independent parameters of an image of Toutin and Carbonneau.
-
-Two translations and a rotation to map coordinates (pitch, roll, yaw), scales along and across (pitch
-drift, focal length), the effect of heights along and across (position), and the skew (roll drift).
-Sigmas for SPOT 1 to 3: ephemerides of some hundred metres, a yaw known as well as roll and pitch are
-where scenes lie within 350 m, and drifts that rates measured every 125 ms leave, below 10 m at the last
-line. Of drifts that of the pitch matters (Westin, 1990)."""
-
-SPOT_HRV = ParameterSet(
-    "SPOT-HRV in a GIS",
-    {
-        "yaw": 400.0,
-        "along track": 200.0,
-        "across track": 200.0,
-        "radial": 200.0,
-        "anisotropy": 100.0,
-    },
-)
-"""Position, constants of the attitude and anisotropy of the focal length: 7 parameters.
-
-Sigmas as in `TOUTIN`."""
-
-PARAMETER_SETS = {own.name: own for own in (SRP, TOUTIN, SPOT_HRV)}
 
 
 @dataclass(frozen=True)

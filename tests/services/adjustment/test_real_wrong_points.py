@@ -8,9 +8,10 @@ import pytest
 
 from services.adjustment.bundle import adjust_block
 from services.adjustment.control_ground import ControlGround
-from services.adjustment.rigorous_parameters import PARAMETER_SETS, rigorous_parameters
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.errors import InputError
 from services.formats.sensor_models.rigorous_model import read_rigorous_model
+from services.sensors.parameter_sets import PARAMETER_SETS
 from services.sensors.pushbroom import PushbroomModel
 from services.types import Frame, Observations
 

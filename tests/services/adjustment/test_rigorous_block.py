@@ -11,15 +11,10 @@ from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
 from services.adjustment.parameter_figures import held_parameters, parameter_figures
 from services.adjustment.parameters import AdjustableImage, image_parameters, sharing_covariance
-from services.adjustment.rigorous_parameters import (
-    PARAMETER_SETS,
-    SRP,
-    TOUTIN,
-    ParameterSet,
-    rigorous_parameters,
-)
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.errors import InputError
 from services.geodesy import lon_lat_h_from_east_north_up
+from services.sensors.parameter_sets import PARAMETER_SETS, SRP, TOUTIN, ParameterSet
 from services.sensors.pushbroom import PushbroomModel
 from services.sensors.refined import refined_rpc
 from services.sensors.rpc_fit import fit_rpc
@@ -163,9 +158,9 @@ def test_the_accuracy_on_the_ground_is_the_one_that_is_stated(free: ParameterSet
 
 def test_the_sets_have_the_parameters_that_were_published() -> None:
     assert {name: len(rigorous(free)[0].sigma) for name, free in PARAMETER_SETS.items()} == {
-        "SRP": 7,
-        "Toutin": 8,
-        "SPOT-HRV in a GIS": 7,
+        "srp": 7,
+        "toutin": 8,
+        "spot-hrv": 7,
     }
     with pytest.raises(InputError, match="own: heading given as free, some of roll, pitch"):
         rigorous(ParameterSet("own", {"heading": 1.0}))

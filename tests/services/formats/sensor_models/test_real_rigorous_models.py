@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks import _rigorous_oracles as oracles
-from services.adjustment.rigorous_parameters import TOUTIN, rigorous_parameters
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.formats.sensor_models.rigorous_model import read_rigorous_model
+from services.sensors.parameter_sets import TOUTIN
 
 pytestmark = pytest.mark.real_data
 
