@@ -14,7 +14,8 @@ from services.joint.measured import MeasuredScene
 from services.matching.control_points import PointMatches
 from services.registration.options import RegistrationOptions
 from services.registration.search import Search, adjust_search
-from services.sensors.correction import CorrectedModel, ImageCorrection
+from services.sensors.base import SensorModel
+from services.sensors.correction import ImageCorrection
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World
 from services.types import (
@@ -255,7 +256,7 @@ def places(
     return lon_lat_h
 
 
-def errors_px(truth: JointTruth, number: int, model: CorrectedModel, at: Array) -> tuple[Array, Array]:
+def errors_px(truth: JointTruth, number: int, model: SensorModel, at: Array) -> tuple[Array, Array]:
     """Errors (k, 2) of a registered model at image positions (k, 2): in the frame of the points, true.
 
     The first are of ground moved as the control points are together, the second of true ground.

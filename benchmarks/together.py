@@ -11,7 +11,7 @@ Run: python -m benchmarks.together [--blocks marrakech,wrong,nigeria]
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -37,6 +37,7 @@ from services.joint.results import ground_misfits_m
 from services.quality.stability import image_places
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
+from services.sensors.correction import CorrectedModel
 from services.simulation.world import make_world
 from services.types import Array, Frame
 
@@ -162,7 +163,7 @@ def _row(truth: JointTruth, number: int, block: JointBlock, k: int, registration
     relative, earth = errors_px(truth, number, registration.model, at)
     alone_m = float("nan")
     if measured.alone is not None:
-        own = replace(registration.model, correction=measured.alone.correction)
+        own = CorrectedModel(measured.scene.model, measured.alone.correction)
         alone_m = float(np.hypot(*errors_px(truth, number, own, at)[0].T).max() * gsd_m)
     return Row(
         name=measured.name,

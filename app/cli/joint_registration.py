@@ -63,7 +63,13 @@ class JointRequest:
     @property
     def command(self) -> str:
         """The command that registers the scenes again, without the accuracy of their models."""
-        named = {"--block": self.block, "--join": self.joined, "-o": self.output}
+        rigorous = self.files[0].rigorous
+        named = {
+            "--block": self.block,
+            "--join": self.joined,
+            "--rigorous": rigorous,
+            "-o": self.output,
+        }
         words = [str(one.image) for one in self.files]
         words += [str(word) for pair in named.items() if pair[1] is not None for word in pair]
         return shlex.join(["amers", "scene", "register-many", *words])

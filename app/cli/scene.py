@@ -28,6 +28,7 @@ from app.usecases.registration.register import SceneFiles
 from app.usecases.terrain_file import TerrainFile
 from services.orthorectification.rectify import OrthoOptions
 from services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
+from services.sensors.parameter_sets import parameter_set_named
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -171,6 +172,13 @@ def register_many(
     bands: Annotated[
         str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
     ] = None,
+    rigorous: Annotated[
+        str | None,
+        typer.Option(
+            help="Adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model: "
+            "srp, toutin or spot-hrv."
+        ),
+    ] = None,
     max_ce90_on_earth_m: Annotated[
         float | None,
         typer.Option(help="Largest CE90 on the Earth, metres: with the frame of the points.", min=0.001),
@@ -190,10 +198,12 @@ def register_many(
     out. The folder OUTPUT/block holds the report on all scenes. The points come from the store unless
     --block is given.
     """
+    if rigorous is not None:
+        parameter_set_named(rigorous)
     images = images_of(scenes)
     _refuse_shared_files(images, [])
     request = JointRequest(
-        files=[SceneFiles(image, None, sigma_m, bands) for image in images],
+        files=[SceneFiles(image, None, sigma_m, bands, rigorous=rigorous) for image in images],
         output=output,
         block=block,
         joined=join,

@@ -40,11 +40,11 @@ def warm_up() -> None:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     scene, points, chips = _small_registration()
-    registration = register_scene(scene, points, chips)
+    register_scene(scene, points, chips)
     mixed = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     frame = no_correction(scene.image.shape)
     refined_rpc(
-        CorrectedModel(registration.model.base, ImageCorrection(mixed, frame.centre, frame.half_size)),
+        CorrectedModel(scene.model, ImageCorrection(mixed, frame.centre, frame.half_size)),
         scene.image.shape,
     )
     page_template("registration.html")

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 from services.geodesy import ecef_from_east_north_up
 from services.imagery.source import ImageSource, image_gsd_m
 from services.sensors.base import SensorModel
+from services.sensors.parameter_sets import ParameterSet
 from services.types import Acquisition, Array
 
 FOOTPRINT_PER_SIDE = 8
@@ -24,12 +25,15 @@ class Scene:
         acquisition: how the image was taken.
         sigma_m: horizontal accuracy of the model before registration, one standard deviation a
             coordinate, metres.
+        parameter_set: what is free in its rigorous model where scenes are registered together; None for
+            a correction in the image.
     """
 
     image: ImageSource
     model: SensorModel
     acquisition: Acquisition
     sigma_m: float
+    parameter_set: ParameterSet | None = None
 
 
 def scene_centre(scene: Scene) -> Array:

@@ -9,12 +9,14 @@ from services.adjustment.block_problem import BlockOptions
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import ControlGround
 from services.adjustment.known_images import KnownImages
-from services.adjustment.parameters import ImageParameters, image_parameters
+from services.adjustment.parameters import AdjustableImage, ImageParameters, image_parameters
+from services.adjustment.rigorous_parameters import rigorous_parameters
 from services.imagery.scene import scene_gsd_m
 from services.joint.measured import MeasuredScene
 from services.quality.frames import why_unknown
 from services.registration.options import RegistrationOptions
-from services.sensors.correction import CorrectedModel
+from services.sensors.base import SensorModel
+from services.sensors.pushbroom import PushbroomModel
 from services.types import (
     Array,
     BoolArray,
@@ -37,6 +39,7 @@ class JointBlock:
     Attributes:
         scenes: the n scenes.
         images: what may move.
+        shared: (n,) variance of the control of every scene over what is stated; see `_shared_factor`.
         ties: m observations of tie points, with sigmas as the residuals show them.
         rows: for every scene, the points (k,) of its search that are observed.
         at: for every scene, rows (k,) of these among all observations.
@@ -47,7 +50,8 @@ class JointBlock:
     """
 
     scenes: tuple[MeasuredScene, ...]
-    images: tuple[ImageParameters, ...]
+    images: tuple[AdjustableImage, ...]
+    shared: Array
     ties: Observations
     rows: tuple[IntArray, ...]
     at: tuple[IntArray, ...]
@@ -56,10 +60,13 @@ class JointBlock:
     adjustment: BlockAdjustment
     tie_sigma: float = 1.0
 
-    def model(self, scene: int) -> CorrectedModel:
+    def values(self, scene: int) -> Array:
+        """The parameters (k,) of a scene."""
+        return self.adjustment.values[scene, : len(self.images[scene].sigma)]
+
+    def model(self, scene: int) -> SensorModel:
         """The adjusted model of a scene."""
-        image = self.images[scene]
-        return image.corrected(self.adjustment.values[scene, : len(image.sigma)])
+        return self.images[scene].corrected(self.values(scene))
 
     def active(self, scene: int) -> BoolArray:
         """Points (k,) of the search of a scene that the adjustment uses."""
@@ -103,12 +110,14 @@ def adjust_together(
     """
     images = tuple(_image(measured, options) for measured in scenes)
     rows = [np.flatnonzero(measured.usable) for measured in scenes]
-    block = _adjusted(scenes, images, ties, neighbour, rows)
+    shared = np.array([_shared_factor(one, _correction(one, options)) for one in scenes])
+    block = _adjusted(scenes, images, shared, ties, neighbour, rows=rows)
     if not len(ties):
         return block
     factor = block.adjustment.sigma_px
     shown = replace(ties, sigma_px=ties.sigma_px * factor)
-    return replace(_adjusted(scenes, images, shown, neighbour, rows), tie_sigma=factor)
+    again = _adjusted(scenes, images, shared, shown, neighbour, rows=rows)
+    return replace(again, tie_sigma=factor)
 
 
 def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages | None) -> JointBlock:
@@ -125,21 +134,24 @@ def repeated(block: JointBlock, held: Sequence[IntArray], neighbour: KnownImages
         np.flatnonzero(block.active(number) & ~np.isin(measured.search.rows, held[number]))
         for number, measured in enumerate(block.scenes)
     ]
-    return _adjusted(block.scenes, block.images, ties, neighbour, rows, like=block.adjustment)
+    return _adjusted(
+        block.scenes, block.images, block.shared, ties, neighbour, rows=rows, like=block.adjustment
+    )
 
 
 def _adjusted(
     scenes: Sequence[MeasuredScene],
-    images: tuple[ImageParameters, ...],
+    images: tuple[AdjustableImage, ...],
+    shared: Array,
     ties: Observations,
     neighbour: KnownImages | None,
-    rows: Sequence[IntArray],
     *,
+    rows: Sequence[IntArray],
     like: BlockAdjustment | None = None,
 ) -> JointBlock:
     """The block of some of the control points (`rows` of the search of every scene) and tie points."""
     first = int(ties.point.max(initial=-1)) + 1
-    found, control, place = _control(scenes, images, rows, first)
+    found, control, place = _control(scenes, shared, rows, first)
     common = neighbour and not set(neighbour.names).isdisjoint(image.name for image in images)
     adjustment = adjust_block(
         images,
@@ -154,12 +166,21 @@ def _adjusted(
     at = np.split(len(ties) + np.argsort(order, kind="stable"), ends)
     held_by = np.split(place, ends)
     return JointBlock(
-        tuple(scenes), images, ties, tuple(rows), tuple(at), control, tuple(held_by), adjustment
+        tuple(scenes), images, shared, ties, tuple(rows), tuple(at), control, tuple(held_by), adjustment
     )
 
 
-def _image(measured: MeasuredScene, options: RegistrationOptions) -> ImageParameters:
+def _image(measured: MeasuredScene, options: RegistrationOptions) -> AdjustableImage:
     """What may move in a scene: by what it is stated to be off, and by what its own points show."""
+    scene, correction = measured.scene, _correction(measured, options)
+    if scene.parameter_set is None or not isinstance(scene.model, PushbroomModel):
+        return correction
+    sigma_m = float(correction.prior_px[0, 0]) * scene_gsd_m(scene)
+    return rigorous_parameters(measured.name, scene.model, scene.parameter_set, sigma_m=sigma_m)
+
+
+def _correction(measured: MeasuredScene, options: RegistrationOptions) -> ImageParameters:
+    """What may move in a scene that has a correction in the image."""
     scene, alone = measured.scene, measured.alone
     shift_px, slope_px = scene.sigma_m / scene_gsd_m(scene), options.adjustment.prior_slope_sigma_px
     if alone is not None:
@@ -178,7 +199,7 @@ def _image(measured: MeasuredScene, options: RegistrationOptions) -> ImageParame
 
 def _control(
     scenes: Sequence[MeasuredScene],
-    images: Sequence[ImageParameters],
+    factor: Array,
     rows: Sequence[IntArray],
     first: int,
 ) -> tuple[Observations, ControlGround, IntArray]:
@@ -190,7 +211,6 @@ def _control(
     identity = np.concatenate([part.id for part in parts])
     _, index, place = np.unique(identity, return_index=True, return_inverse=True)
     image = np.repeat(np.arange(len(scenes)), [len(own) for own in rows])
-    factor = np.array([_shared_factor(*both) for both in zip(scenes, images, strict=True)])
     counts = np.bincount(place, minlength=len(index))
     of_point = np.bincount(place, factor[image], len(index)) / np.maximum(counts, 1)
     line_sample = np.concatenate(

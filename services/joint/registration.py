@@ -13,7 +13,14 @@ from services.imagery.source import CachedImage, image_gsds_m
 from services.joint.block import JointBlock, repeated
 from services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
 from services.joint.measured import MeasuredScene, nothing_found
-from services.joint.results import held_cells, held_draws, registered_scene, scene_measures
+from services.joint.results import (
+    RigorousScene,
+    held_cells,
+    held_draws,
+    registered_scene,
+    rigorous_scene,
+    scene_measures,
+)
 from services.matching.ground_features import FeatureOptions
 from services.production.image_passes import image_passes
 from services.production.point_views import check_image_names
@@ -24,7 +31,8 @@ from services.registration.on_points import Registration, search_near, search_sc
 from services.registration.options import RegistrationOptions
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
 from services.registration.search import adjust_search
-from services.sensors.correction import CorrectedModel
+from services.sensors.correction import CorrectedModel, no_correction
+from services.sensors.pushbroom import PushbroomModel
 from services.tasks import Work
 from services.types import (
     Array,
@@ -61,6 +69,7 @@ class JointRegistration:
         numbers: of the scenes of the block that were registered now.
         registrations: of these.
         fits: how they fit.
+        rigorous: what was found of those with a rigorous model; None for the others.
         left: scenes that did not fit.
     """
 
@@ -68,6 +77,7 @@ class JointRegistration:
     numbers: tuple[int, ...]
     registrations: tuple[Registration, ...]
     fits: tuple[SceneFit, ...]
+    rigorous: tuple[RigorousScene | None, ...]
     left: tuple[Left, ...]
 
 
@@ -101,6 +111,7 @@ def register_together(
         ComputationError: no scene shows control points that agree, or no scene fits.
     """
     before = joined.scenes if joined else ()
+    scenes = [_on_known_ground(scene, points) for scene in scenes]
     together = [*before, *scenes]
     check_image_names(together)
     work = work or Work()
@@ -124,7 +135,26 @@ def register_together(
         raise left[0].error if left else DoesNotFit("no scene fits")
     registrations = qualified(block, numbers, options, known, part_of(progress, 0.8, 0.2))
     fits = tuple(scene_fit(block, number) for number in numbers)
-    return JointRegistration(block, numbers, registrations, fits, tuple(left))
+    rigorous = tuple(rigorous_scene(block, number) for number in numbers)
+    return JointRegistration(block, numbers, registrations, fits, rigorous, tuple(left))
+
+
+def _on_known_ground(scene: Scene, points: ControlPoints) -> Scene:
+    """The scene, whose rigorous model holds for all ground on the Earth, kept to that of the points.
+
+    Rays are searched for along these heights, and other models do not hold beyond theirs.
+    """
+    if not isinstance(scene.model, PushbroomModel) or not len(points):
+        return scene
+    height_m = points.lon_lat_h[:, 2]
+    margin_m = max(_HEIGHT_MARGIN_M, float(np.ptp(height_m)))
+    low, high = scene.model.height_range_m
+    low, high = max(low, float(height_m.min()) - margin_m), min(high, float(height_m.max()) + margin_m)
+    return replace(scene, model=replace(scene.model, height_range_m=(low, high)))
+
+
+_HEIGHT_MARGIN_M = 500.0
+"""Least height of ground above and below the control points."""
 
 
 def _measure_all(
@@ -200,7 +230,8 @@ def _searched_again(
             image=CachedImage(scene.image),
             fine_gsd_m=fine_gsd_m(scene, shown, initial_prediction(scene, shown)),
         )
-        prediction = Prediction(model, _uncertainty_m(block, number, shown))
+        unmoved = CorrectedModel(model, no_correction(scene.image.shape))
+        prediction = Prediction(unmoved, _uncertainty_m(block, number, shown))
         rows = points_to_try(scene, shown, prediction, options.max_points)
         search, _ = search_near(context, prediction, rows)
         try:
@@ -214,7 +245,7 @@ def _searched_again(
 def _uncertainty_m(block: JointBlock, number: int, points: ControlPoints) -> Array:
     """Standard deviation (n,) of where a scene of a block shows points that it was not searched for."""
     image, model = block.images[number], block.model(number)
-    design = image.design(image.model.project(points.lon_lat_h))
+    design = image.computed(block.values(number), points.lon_lat_h).by_parameters
     of_scene = design @ block.covariance(number) @ design.transpose(0, 2, 1)
     derivative = model.project_derivative(points.lon_lat_h)
     of_points = derivative @ points.covariance_m2 @ derivative.transpose(0, 2, 1)

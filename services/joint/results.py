@@ -1,14 +1,20 @@
 """The result of each scene of a block: its correction with covariance, its measures, its quality."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment, deformation_covariance
+from services.adjustment.parameter_figures import (
+    ParameterFigure,
+    held_parameters,
+    parameter_figures,
+)
 from services.adjustment.shared_errors import SharedErrors
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock
+from services.joint.nearest import nearest_correction, scene_heights_m
 from services.quality.cell_stability import cell_stability_of, cells_of
 from services.quality.frames import shared_frame, weighted_frame
 from services.quality.qualification import QualificationOptions, qualify_repeated
@@ -16,6 +22,7 @@ from services.quality.stability import AdjustedScene, Repetition, stability_of
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
+from services.sensors.pushbroom import PushbroomModel
 from services.types import Array, BoolArray, IntArray, Measures
 
 _INDEPENDENT = SharedErrors(1.0, np.zeros(3), 0.0)
@@ -24,17 +31,17 @@ _INDEPENDENT = SharedErrors(1.0, np.zeros(3), 0.0)
 def scene_adjustment(block: JointBlock, number: int, options: RegistrationOptions) -> SceneAdjustment:
     """The correction of one scene of a block, as that of a scene alone is stated.
 
-    Residuals are those at the known ground. The covariance is that of the block, with the errors that
+    That of a rigorous model is the nearest to it; residuals are those of the adjusted model itself, at
+    the known ground. The covariance is that of the block, with the errors that
     the measures of the scene share, and with what the points are deformed by.
     """
-    measured, image = block.scenes[number], block.images[number]
+    measured, nearest = block.scenes[number], nearest_correction(block, number)
     corrected = block.model(number)
-    correction, alone = corrected.correction, measured.alone
+    correction, alone = nearest.correction, measured.alone
+    rigorous = isinstance(corrected, PushbroomModel)
     active = block.active(number)
     seen = measured.observations()
-    free = np.flatnonzero(image.free.ravel())
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = block.covariance(number)
+    covariance = nearest.covariance
     if active.any() and seen.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += seen.common_covariance_px2
     deformation = np.zeros((6, 6))
@@ -47,18 +54,53 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
     normalised = residual_px**2 / (seen.sigma_px[:, None] ** 2 + of_points)
     return SceneAdjustment(
         correction=correction,
-        order=options.adjustment.order or (alone.order if alone else "affine"),
-        validation_px=alone.validation_px if alone else (),
+        order=options.adjustment.order or (alone.order if alone and not rigorous else "affine"),
+        validation_px=alone.validation_px if alone and not rigorous else (),
         slope_px=alone.slope_px if alone else options.adjustment.prior_slope_sigma_px,
         covariance=covariance + deformation,
         deformation=deformation,
-        local_sigma_px=alone.local_sigma_px if alone else np.zeros(2),
+        local_sigma_px=np.hypot(alone.local_sigma_px if alone else 0.0, nearest.local_px),
         shared=alone.shared if alone else _INDEPENDENT,
         apart_px=alone.apart_px if alone else 0.0,
         residual_px=np.where(measured.usable[:, None], residual_px, np.nan),
         active=active,
         sigma0=float(np.sqrt(normalised[active].mean())) if active.any() else 1.0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)) if active.any() else np.zeros(2),
+    )
+
+
+@dataclass(frozen=True)
+class RigorousScene:
+    """What a block has found of a scene with a rigorous model.
+
+    Attributes:
+        parameter_set: name of the set of its parameters.
+        parameters: with their standard deviations, in their units.
+        held: a sentence that names those that the observations do not determine; "" where they do all.
+        heights_m: lowest and highest ground of the scene, which fitted models are compared over.
+        correction_error_px: largest distance of the nearest affine correction from the adjusted model.
+    """
+
+    parameter_set: str
+    parameters: tuple[ParameterFigure, ...]
+    held: str
+    heights_m: tuple[float, float]
+    correction_error_px: float
+
+
+def rigorous_scene(block: JointBlock, number: int) -> RigorousScene | None:
+    """What a block has found of a scene; None for a correction in the image."""
+    parameter_set = block.scenes[number].scene.parameter_set
+    if parameter_set is None or not isinstance(block.model(number), PushbroomModel):
+        return None
+    name = block.images[number].name
+    own = [each for each in parameter_figures(block.images, block.adjustment) if each.image == name]
+    return RigorousScene(
+        parameter_set.name,
+        tuple(own),
+        "".join(held_parameters(own)),
+        scene_heights_m(block, number),
+        nearest_correction(block, number).max_error_px,
     )
 
 

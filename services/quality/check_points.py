@@ -11,7 +11,7 @@ from services.quality.accuracy import Accuracy, NormalisedError, accuracy, norma
 from services.quality.criteria import at_most, verdict_of
 from services.quality.qualification import Qualification
 from services.quality.stability import ImageResiduals, residuals_in_image
-from services.sensors.correction import CorrectedModel
+from services.sensors.base import SensorModel
 from services.types import Array, Frame
 
 MARKING_SIGMA_PX = 0.5
@@ -54,7 +54,7 @@ class CheckResult:
 
 
 def check_model(
-    model: CorrectedModel, adjustment: SceneAdjustment, points: CheckPoints, frame: Frame
+    model: SensorModel, adjustment: SceneAdjustment, points: CheckPoints, frame: Frame
 ) -> CheckResult:
     """The errors of a registered model at check points.
 

@@ -29,6 +29,7 @@ from services.registration.search import (
     select_inliers,
     summarise,
 )
+from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import (
     BoolArray,
@@ -57,7 +58,7 @@ class Registration:
         qualification: quality figures and verdict.
     """
 
-    model: CorrectedModel
+    model: SensorModel
     adjustment: SceneAdjustment
     measures: Measures
     views: ViewMeasures

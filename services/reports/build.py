@@ -1,5 +1,7 @@
 """The report of a registration, made from the registration and the facts around it."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from services.adjustment.affine_fit import Order
@@ -31,6 +33,7 @@ def build_report(
     figure_data: FigureData,
     *,
     checks: tuple[Check, ...] = (),
+    nearest_px: float | None = None,
 ) -> RegistrationReport:
     """The report of a registration.
 
@@ -41,8 +44,16 @@ def build_report(
         refined_model: the files that carry the correction.
         figure_data: what the figures of the page draw.
         checks: accuracy at points that had no part in the registration.
+        nearest_px: largest distance of the correction from the adjusted rigorous model that it stands
+            for; None where the correction is what was adjusted.
     """
     qualification = registration.qualification
+    correction = _correction_record(registration.adjustment, run.options, scene.gsd_m)
+    if nearest_px is not None:
+        reason = (
+            f"affine: the nearest to the adjusted rigorous model, {nearest_px:.2g} px off it at most"
+        )
+        correction = replace(correction, order_reason=reason)
     return RegistrationReport(
         format=REPORT_FORMAT,
         run=run,
@@ -53,7 +64,7 @@ def build_report(
         on_the_earth=qualification.accuracy.on_the_earth,
         criteria=qualification.criteria,
         scene=scene,
-        correction=_correction_record(registration.adjustment, run.options, scene.gsd_m),
+        correction=correction,
         refined_model=refined_model,
         search_stages=registration.search_stages,
         point_counts=qualification.point_counts,
@@ -78,10 +89,16 @@ def scene_record(scene: Scene, name: str) -> SceneRecord:
         lines=lines,
         samples=samples,
         gsd_m=scene_gsd_m(scene),
-        model="map grid" if isinstance(scene.model, OrthoModel) else "RPC",
+        model=_kind_of_model(scene),
         sigma_m=scene.sigma_m,
         footprint_lon_lat=scene_footprint(scene),
     )
+
+
+def _kind_of_model(scene: Scene) -> str:
+    if isinstance(scene.model, OrthoModel):
+        return "map grid"
+    return f"rigorous, {scene.parameter_set.name}" if scene.parameter_set else "RPC"
 
 
 def _correction_record(

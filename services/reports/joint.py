@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from services.adjustment.parameter_figures import ParameterFigure
 from services.joint.registration import JointRegistration
-from services.joint.results import ground_misfits_m
+from services.joint.results import RigorousScene, ground_misfits_m
 from services.quality.accuracy import Statistics, statistics
 from services.quality.accuracy_statement import StatedAccuracy
 from services.quality.criteria import Verdict
@@ -46,6 +47,29 @@ class GroundMisfits:
 
 
 @dataclass(frozen=True)
+class RigorousRecord:
+    """The adjusted rigorous model of a scene.
+
+    Attributes:
+        parameter_set: name of the set of its free parameters.
+        parameters: with their standard deviations, in their units.
+        held: names those that the observations do not determine, as a sentence; "" where they do all.
+        heights_m: lowest and highest ground of the scene, over which its RPC is fitted.
+        rpc_error_px: largest distance of that RPC from the adjusted model.
+        rpc_words: the same as a sentence.
+        correction_error_px: largest distance of the nearest affine correction from the adjusted model.
+    """
+
+    parameter_set: str
+    parameters: tuple[ParameterFigure, ...]
+    held: str
+    heights_m: tuple[float, float]
+    rpc_error_px: float
+    rpc_words: str
+    correction_error_px: float
+
+
+@dataclass(frozen=True)
 class JointScene:
     """One scene of the block.
 
@@ -61,6 +85,7 @@ class JointScene:
         image_residuals_px: of the active control points, at their known ground.
         ground_misfits_m: of its control points, where the block moves them.
         stability: the block adjusted without a part of its control points.
+        rigorous: what was found of its rigorous model; null for a correction in the image.
     """
 
     name: str
@@ -76,6 +101,7 @@ class JointScene:
     image_residuals_px: ImageResiduals
     ground_misfits_m: GroundMisfits
     stability: Stability
+    rigorous: RigorousRecord | None
 
 
 @dataclass(frozen=True)
@@ -228,6 +254,21 @@ def _joint_scene(result: JointRegistration, number: int, report: RegistrationRep
         image_residuals_px=report.image_residuals_px,
         ground_misfits_m=GroundMisfits(*(statistics(axis) for axis in misfit_m.T)),
         stability=report.stability,
+        rigorous=_rigorous_record(result.rigorous[number], report),
+    )
+
+
+def _rigorous_record(found: RigorousScene | None, report: RegistrationReport) -> RigorousRecord | None:
+    if found is None:
+        return None
+    return RigorousRecord(
+        parameter_set=found.parameter_set,
+        parameters=found.parameters,
+        held=found.held,
+        heights_m=found.heights_m,
+        rpc_error_px=report.refined_model.max_error_px,
+        rpc_words=report.refined_model.note,
+        correction_error_px=found.correction_error_px,
     )
 
 

@@ -12,7 +12,7 @@ from rich.text import Text
 from services.geodesy import metres_per_degree
 from services.reports.drawing import ACTIVE, DEACTIVATED, crowding
 from services.reports.html import page_template
-from services.reports.joint import BlockTable, JointReport, block_tables
+from services.reports.joint import BlockTable, JointReport, JointScene, block_tables
 from services.reports.maps import equal_panel
 from services.reports.numbers import ABSENT, number
 from services.reports.plot import Figure
@@ -45,8 +45,13 @@ def joint_tables(report: JointReport) -> RenderableType:
     reasons = (one.reason for one in report.left)
     words = "\n".join([report.verdict_words, *report.accuracy_lines, *reasons])
     tables = [_published(one) for one in block_tables(report)]
+    rigorous = [part for scene in report.scenes if scene.rigorous for part in _rigorous(scene)]
     return Group(
-        Text(f"Verdict: {report.heading}", style="bold"), Text(words), scene_table(report), *tables
+        Text(f"Verdict: {report.heading}", style="bold"),
+        Text(words),
+        scene_table(report),
+        *tables,
+        *rigorous,
     )
 
 
@@ -78,6 +83,25 @@ def scene_table(report: JointReport) -> Table:
     for one in report.left:
         table.add_row(escape(one.name), "left the block", *[ABSENT] * 5)
     return table
+
+
+def _rigorous(scene: JointScene) -> tuple[RenderableType, ...]:
+    """The parameters of a rigorous model, what its points do not determine, and the RPC fitted to it."""
+    found = scene.rigorous
+    if found is None:
+        return ()
+    table = Table(title=f"{escape(scene.name)}: {found.parameter_set}", title_justify="left")
+    for k, head in enumerate(("Parameter", "Unit", "Found", "Sigma", "A priori", "Determined")):
+        table.add_column(head, justify="left" if k < 2 else "right")
+    for own in found.parameters:
+        table.add_row(
+            own.name,
+            own.unit,
+            *(number(value) for value in (own.value, own.sigma, own.a_priori_sigma)),
+            "held" if own.is_held else f"{own.determined:.0%}",
+        )
+    words = [words for words in (found.held, found.rpc_words) if words]
+    return table, Text("\n".join(words))
 
 
 def _published(one: BlockTable) -> Table:

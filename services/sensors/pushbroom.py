@@ -122,6 +122,17 @@ class PushbroomModel:
         object.__setattr__(near, "_first_guess", self._first_guess)
         return near
 
+    def cropped(self, origin: tuple[float, float], shape: tuple[int, int]) -> "PushbroomModel":
+        """The model of a part of the image.
+
+        Args:
+            origin: line and sample of the first pixel of the part.
+            shape: its lines and samples.
+        """
+        parts = zip((self.line_time, self.look), origin, strict=True)
+        line_time, look = (replace(part, breaks=part.breaks - first) for part, first in parts)
+        return replace(self, image_shape=shape, line_time=line_time, look=look)
+
     @cached_property
     def _first_guess(self) -> "_FirstGuess":
         """Where `project` begins."""

@@ -33,6 +33,7 @@ from services.imagery.scene import scene_gsd_m
 from services.quality.accuracy_statement import accuracy_document
 from services.registration.options import RegistrationOptions
 from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
+from services.sensors.parameter_sets import ParameterSetName
 
 MOST_SCENES = 100
 _REPORTS = ("report.json", "report.html", "report.txt")
@@ -46,12 +47,15 @@ class RegisterScenes:
         scenes: ids of uploaded scenes, 2 to 100.
         bands: bands to use of each, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the
             panchromatic band or the mean of the visible ones.
+        rigorous: adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model,
+            with the free parameters of this set: "srp", "toutin" or "spot-hrv"; by default RPCs.
         copy_image: whether GeoTIFFs are copied to the outputs with the refined model in their tags.
         options: of the registration.
     """
 
     scenes: tuple[UUID, ...]
     bands: str | None = None
+    rigorous: ParameterSetName | None = None
     copy_image: bool = False
     options: RegistrationOptions = field(default_factory=RegistrationOptions)
 
@@ -120,7 +124,8 @@ def _local_files(work: Work, row: SceneRow, stack: ExitStack) -> SceneFiles:
     """The files of a scene on this machine, until the stack closes."""
     scratch = stack.enter_context(TemporaryDirectory(prefix="amers-"))
     image = local_image(work.storage, work.settings, row, Path(scratch))
-    return SceneFiles(image=image, sigma_m=row.sigma_m, bands=work.inputs.bands)
+    inputs: RegisterScenes = work.inputs
+    return SceneFiles(image, sigma_m=row.sigma_m, bands=inputs.bands, rigorous=inputs.rigorous)
 
 
 def _packed(folder: Path, names: Iterable[str]) -> dict[str, Path]:

@@ -48,6 +48,8 @@ class SceneFiles:
         mask: image of the same ground; pixels are not used where it is not zero.
         check_points: file of points held out of the registration.
         check_heights: vertical datum of their heights, where their format cannot state it.
+        rigorous: name of the free parameters of its rigorous model, where it has one and is registered
+            together with others; None uses its RPC. See `PARAMETER_SETS`.
     """
 
     image: Path
@@ -57,6 +59,7 @@ class SceneFiles:
     mask: Path | None = None
     check_points: Path | None = None
     check_heights: str | None = None
+    rigorous: str | None = None
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ from services.errors import AmersError, FormatError, InputError
 from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
-from services.formats.sensor_models.refined_model import write_refined
+from services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
 from services.imagery.scene import Scene, scene_footprint
 from services.joint.registration import AdjustedScenes, JointRegistration, register_together
+from services.joint.results import RigorousScene
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.reports.build import build_report, scene_record
@@ -33,6 +34,9 @@ from services.reports.figure_data import figure_data
 from services.reports.joint import JointReport, joint_report
 from services.reports.joint_pages import format_joint_html, format_joint_tables
 from services.reports.report import RefinedModelRecord, RunRecord
+from services.sensors.base import SensorModel
+from services.sensors.parameter_sets import parameter_set_named
+from services.sensors.pushbroom import PushbroomModel
 from services.tasks import Work
 from services.types import Array, Progress, no_progress, part_of
 
@@ -129,6 +133,7 @@ def run_joint_registration(
                 raise InputError(
                     f"none of {len(files)} scenes can be used: {next(iter(failed.values()))}"
                 )
+            _check_rigorous(read)
             progress(0.0, "looking for points")
             control = find_points(_outline([one.scene for one in read]))
             for one in read:
@@ -160,7 +165,12 @@ def run_joint_registration(
             one = by_name[result.block.scenes[result.numbers[count]].name]
             name = one.folder
             registered[name] = _written(
-                one, registration, control, attempts[name], place.folder_of(name), copy_image=copy_image
+                one,
+                (registration, result.rigorous[count]),
+                control,
+                attempts[name],
+                place.folder_of(name),
+                copy_image=copy_image,
             )
         report = joint_report(
             result,
@@ -198,9 +208,27 @@ def _read_all(
     return read
 
 
+def _check_rigorous(read: Sequence[_Read]) -> None:
+    """Refuse a set of parameters of rigorous models where no scene has such a model."""
+    asked = [one for one in read if one.files.rigorous is not None]
+    if asked and all(one.scene.parameter_set is None for one in asked):
+        raise InputError(
+            f"rigorous: {asked[0].files.rigorous} given, and none of {len(asked)} scenes has metadata "
+            "with a rigorous model beside it (DIMAP with orbit and attitude, PHRDIMAP, WorldView XML): "
+            "leave the option out, or add the metadata of the products"
+        )
+
+
 def _read(files: SceneFiles, stack: ExitStack) -> Scene:
     bands = None if files.bands is None else parse_bands(files.bands)
-    scene = read_scene(files.image, files.model, sigma_m=files.sigma_m, bands=bands, mask=files.mask)
+    scene = read_scene(
+        files.image,
+        files.model,
+        sigma_m=files.sigma_m,
+        bands=bands,
+        mask=files.mask,
+        parameter_set=None if files.rigorous is None else parameter_set_named(files.rigorous),
+    )
     stack.callback(scene.image.close)  # type: ignore[attr-defined]
     return scene
 
@@ -208,6 +236,13 @@ def _read(files: SceneFiles, stack: ExitStack) -> Scene:
 def _named(scene: Scene, name: str) -> Scene:
     """The scene under the name that it has among others."""
     return replace(scene, acquisition=replace(scene.acquisition, image_id=name))
+
+
+def _for_heights(scene: Scene, heights_m: tuple[float, float]) -> Scene:
+    """The scene with the heights that its rigorous model was adjusted for."""
+    if not isinstance(scene.model, PushbroomModel):
+        return scene
+    return replace(scene, model=replace(scene.model, height_range_m=heights_m))
 
 
 def _outline(scenes: Sequence[Scene]) -> Array:
@@ -223,7 +258,7 @@ def _outline(scenes: Sequence[Scene]) -> Array:
 
 def _written(
     one: _Read,
-    registration: Registration,
+    result: tuple[Registration, RigorousScene | None],
     control: ControlSet,
     attempt: Attempt,
     folder: Path,
@@ -232,11 +267,15 @@ def _written(
 ) -> RegisteredScene:
     """The outputs of one scene, written as those of a scene alone are."""
     files, scene = one.files, one.scene
+    registration, found = result
+    model: SensorModel | AdjustedRigorous = registration.model
+    if found is not None:
+        model = AdjustedRigorous(registration.model, found.heights_m, found.correction_error_px)
     folder.mkdir(parents=True, exist_ok=True)
     refined = write_refined(
         files.image,
         files.model,
-        registration.model,
+        model,
         registration.adjustment,
         shape=scene.image.shape,
         folder=folder,
@@ -255,6 +294,7 @@ def _written(
         ),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),
+        nearest_px=None if found is None else found.correction_error_px,
     )
     paths = write_outputs(folder, report, files.image.name, control.points)
     outputs = {path.name: path for path in (*paths, *refined.files)}
@@ -283,7 +323,7 @@ def _write_block(
 
 def _scenes_text(result: JointRegistration, read: Sequence[_Read]) -> str:
     """The files of the scenes of a block, so that later scenes can be tied to them."""
-    names = {one.name for one in result.block.scenes}
+    adjusted = {one.name: one.scene for one in result.block.scenes}
     scenes = [
         {
             "name": one.name,
@@ -291,10 +331,12 @@ def _scenes_text(result: JointRegistration, read: Sequence[_Read]) -> str:
             "model": None if one.files.model is None else str(one.files.model.resolve()),
             "sigma_m": one.files.sigma_m,
             "bands": one.files.bands,
+            "rigorous": one.files.rigorous,
+            "heights_m": adjusted[one.name].model.height_range_m,
             "mask": None if one.files.mask is None else str(one.files.mask.resolve()),
         }
         for one in read
-        if one.name in names
+        if one.name in adjusted
     ]
     return json.dumps({"format": SCENES_FORMAT, "scenes": scenes}, indent=2) + "\n"
 
@@ -325,16 +367,18 @@ def _joined(folder: Path, stack: ExitStack) -> _Joined:
                 model=None if one["model"] is None else Path(one["model"]),
                 sigma_m=one["sigma_m"],
                 bands=one["bands"],
+                rigorous=one["rigorous"],
                 mask=None if one["mask"] is None else Path(one["mask"]),
             )
             for one in document["scenes"]
         }
+        heights_m = {str(one["name"]): tuple(one["heights_m"]) for one in document["scenes"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(
             f"{path}: the scenes of `amers scene register-many` expected: {error}"
         ) from None
     read = tuple(
-        _Read(one.image.stem, one, _named(_read(one, stack), name))
+        _Read(one.image.stem, one, _for_heights(_named(_read(one, stack), name), heights_m[name]))
         for name, one in files.items()
         if name in known.names
     )

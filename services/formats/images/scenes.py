@@ -18,12 +18,14 @@ from services.formats.sensor_models.dimap import (
     parse_imaging_time,
 )
 from services.formats.sensor_models.geom import parse_geom_acquisition
+from services.formats.sensor_models.rigorous_files import rigorous_model_of_image
 from services.formats.sensor_models.rpc_files import DeliveredModel, has_rpc, model_of_image
 from services.formats.sensor_models.rpc_text import rpb_satellite
 from services.formats.text_files import read_text
 from services.imagery.scene import Scene, view_direction
 from services.imagery.source import ImageSource
 from services.sensors.ortho import OrthoModel
+from services.sensors.parameter_sets import ParameterSet
 from services.sensors.rpc import RpcModel
 from services.types import Acquisition, Array
 
@@ -77,6 +79,7 @@ def read_scene(
     bands: BandMix | None = None,
     crop_origin: tuple[float, float] | None = None,
     mask: Path | None = None,
+    parameter_set: ParameterSet | None = None,
 ) -> Scene:
     """The scene of an image file with its sensor model; the image stays open and is read by windows.
 
@@ -91,19 +94,26 @@ def read_scene(
         bands: the bands to use; by default the panchromatic band or the mean of the visible bands.
         mask: image of the same ground, with the same or coarser pixels, nonzero where pixels are
             excluded.
+        parameter_set: keep the rigorous model of an image whose metadata have one, with these parameters
+            free; other images are read as without it. By default every model is an RPC or a map grid.
 
     Raises:
         FormatError: the image, its model or its mask cannot be used.
     """
     image = open_raster(path, bands)
     try:
-        grid = map_grid_of(image)
+        rigorous = None
+        if parameter_set is not None:
+            rigorous = rigorous_model_of_image(image, model_path, crop_origin)
+        grid = map_grid_of(image) if rigorous is None else None
         if grid is not None and model_path is None and crop_origin is None and not has_rpc(image):
             acquisition = _ortho_acquisition(image)
             if sigma_m is None:
                 sigma_m = _ortho_sigma_m(path, acquisition.sensor)
             return Scene(_masked(image, mask), OrthoModel(grid), acquisition, sigma_m)
-        delivered = model_of_image(image, model_path, crop_origin)
+        alone = rigorous is not None and model_path is None and not has_rpc(image)
+        file = rigorous.path if rigorous is not None and alone else model_path
+        delivered = model_of_image(image, file, crop_origin)
         acquisition = _acquisition(image, delivered)
         source = _masked(replace(image, codes=_pixel_codes(delivered)), mask)
     except FormatError:
@@ -111,7 +121,12 @@ def read_scene(
         raise
     if sigma_m is None:
         sigma_m = prior_sigma_m(delivered.model, acquisition.sensor)
-    return Scene(source, delivered.model, acquisition, sigma_m)
+    if rigorous is None:
+        return Scene(source, delivered.model, acquisition, sigma_m)
+    model = rigorous.model
+    if delivered.convention != "rigorous":
+        model = replace(model, height_range_m=delivered.model.height_range_m)
+    return Scene(source, model, acquisition, sigma_m, parameter_set)
 
 
 def model_files(path: Path, model_path: Path | None = None) -> list[Path]:

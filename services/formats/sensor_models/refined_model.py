@@ -7,8 +7,15 @@ from services.adjustment.image_correction import SceneAdjustment
 from services.formats.images.ortho import write_refined_ortho
 from services.formats.images.raster import open_raster
 from services.formats.sensor_models.correction_json import format_correction
-from services.formats.sensor_models.rpc_files import DeliveredModel, read_rpc, write_model
+from services.formats.sensor_models.rpc_files import (
+    DeliveredModel,
+    has_rpc,
+    model_of_image,
+    read_rpc,
+    write_model,
+)
 from services.map_grid import MapGrid
+from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel, fold_into_ortho
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
@@ -16,6 +23,23 @@ from services.sensors.rpc import RpcModel
 from services.types import UNKNOWN_FRAME, Frame
 
 CORRECTION_JSON = "correction.json"
+FIT_LIMIT_PX = 0.1
+"""An RPC that misses its adjusted rigorous model by more is written with a warning."""
+
+
+@dataclass(frozen=True)
+class AdjustedRigorous:
+    """An adjusted rigorous model, with what its files state of it.
+
+    Attributes:
+        model: adjusted.
+        heights_m: lowest and highest ground of the scene, over which an RPC is fitted.
+        correction_error_px: largest distance of the nearest correction from the adjusted model.
+    """
+
+    model: SensorModel
+    heights_m: tuple[float, float]
+    correction_error_px: float
 
 
 @dataclass(frozen=True)
@@ -38,7 +62,7 @@ class RefinedFiles:
 def write_refined(
     image_path: Path,
     model_path: Path | None,
-    model: CorrectedModel,
+    model: SensorModel | AdjustedRigorous,
     adjustment: SceneAdjustment,
     *,
     shape: tuple[int, int],
@@ -54,6 +78,7 @@ def write_refined(
     | RPC tags, NITF | `STEM_RPC.TXT`, which GDAL prefers to the tags of the image beside it |
     | `_RPC.TXT`, RPB, DIMAP, `.geom` | the file under its own name |
     | map grid | `IMAGE.aux.xml`, which GDAL prefers to the map grid of the image beside it |
+    | adjusted rigorous model | as for an RPC, the one fitted to it; the note states its error |
     | any of a GeoTIFF | a copy of the image with new tags, when `copy_image` |
 
     An RPC that differs from the corrected model by 0.01 px or more is not written: `correction.json`
@@ -61,8 +86,8 @@ def write_refined(
 
     Args:
         image_path, model_path: the files of the scene.
-        model: the delivered model with its correction.
-        adjustment: order and covariance of the correction.
+        model: the delivered model with its correction, or an adjusted rigorous model.
+        adjustment: order and covariance of the correction; for a rigorous model of the nearest one.
         shape: lines and samples of the image.
         folder: where to write; created when missing.
         copy_image: also write a copy of a GeoTIFF with the refined model in its tags.
@@ -75,16 +100,24 @@ def write_refined(
     copied = image_path if copy_image and _is_geotiff(image_path) else None
     if copied is not None and (folder / copied.name).resolve() != copied.resolve():
         (folder / copied.name).unlink(missing_ok=True)
-    if isinstance(model.base, OrthoModel):
-        grid = fold_into_ortho(model.base, model.correction).grid
+    base = model.base if isinstance(model, CorrectedModel) else None
+    if isinstance(model, AdjustedRigorous):
+        delivered = _delivered_rpc(image_path, model_path)
+        model_files = _write_fitted(delivered, model, shape, folder, copied)
+        applies_to = (
+            f"rigorous model of {image_path.name}: the nearest correction to the adjusted one, "
+            f"{model.correction_error_px:.2g} px off it at most"
+        )
+    elif isinstance(model, CorrectedModel) and isinstance(base, OrthoModel):
+        grid = fold_into_ortho(base, model.correction).grid
         model_files = _write_grid(image_path, grid, folder, copied is not None)
         applies_to = f"map grid of {image_path.name}"
     else:
-        delivered = read_rpc(image_path, model_path) if isinstance(model.base, RpcModel) else None
+        delivered = read_rpc(image_path, model_path) if isinstance(base, RpcModel) else None
         model_files = _write_rpc(delivered, model, shape, folder, copied)
         applies_to = delivered.note if delivered else f"model of {image_path.name}"
     text = format_correction(
-        model.correction,
+        adjustment.correction,
         adjustment.order,
         adjustment.covariance,
         adjustment.local_sigma_px,
@@ -101,7 +134,7 @@ def write_refined(
 
 def _write_rpc(
     delivered: DeliveredModel | None,
-    model: CorrectedModel,
+    model: SensorModel,
     shape: tuple[int, int],
     folder: Path,
     copied: Path | None,
@@ -118,6 +151,41 @@ def _write_rpc(
     exact = refined.max_error_px == 0.0
     how = "exactly" if exact else f"fitted within {refined.max_error_px:.2g} px"
     return RefinedFiles(tuple(files), refined.max_error_px, f"{names}: the corrected model, {how}")
+
+
+def _write_fitted(
+    delivered: DeliveredModel | None,
+    adjusted: AdjustedRigorous,
+    shape: tuple[int, int],
+    folder: Path,
+    copied: Path | None,
+) -> RefinedFiles:
+    """The RPC fitted to an adjusted rigorous model, also in the format of a delivered RPC."""
+    refined = refined_rpc(adjusted.model, shape, adjusted.heights_m)
+    low, high = adjusted.heights_m
+    if refined.model is None:
+        note = f"no RPC could be fitted to the adjusted rigorous model at {low:.0f} to {high:.0f} m"
+        return RefinedFiles((), refined.max_error_px, note)
+    files = write_model(delivered, refined.model, folder, copied)
+    names, off_px = ", ".join(file.name for file in files), refined.max_error_px
+    note = (
+        f"{names}: an RPC fitted to the adjusted rigorous model within {off_px:.2g} px, for ground at "
+        f"{low:.0f} to {high:.0f} m"
+    )
+    if off_px > FIT_LIMIT_PX:
+        note = f"WARNING: more than {FIT_LIMIT_PX:g} px off: {note}; no RPC follows this attitude closer"
+    return RefinedFiles(tuple(files), off_px, note)
+
+
+def _delivered_rpc(image_path: Path, model_path: Path | None) -> DeliveredModel | None:
+    """The RPC that was delivered beside a rigorous model; None without one."""
+    image = open_raster(image_path)
+    try:
+        if model_path is None and not has_rpc(image):
+            return None
+        return model_of_image(image, model_path, None)
+    finally:
+        image.close()
 
 
 def _write_grid(image_path: Path, grid: MapGrid, folder: Path, copied: bool) -> RefinedFiles:

@@ -55,12 +55,17 @@ def rpc_of_rigorous_model(text: str, source: str) -> RpcFit | None:
     Raises:
         FormatError: a value of the model is missing, impossible or not supported.
     """
+    model = rigorous_model_in(text, source)
+    return None if model is None else fit_rpc(model, model.image_shape, model.height_range_m)
+
+
+def rigorous_model_in(text: str, source: str) -> PushbroomModel | None:
+    """The rigorous model of an XML document; None without one, as `rpc_of_rigorous_model`."""
     root = parse_xml(text, source)
     kind = _kind(root)
     if kind not in _READERS or (kind[1] == "2" and root.find(".//Refined_Model") is None):
         return None
-    model = _READERS[kind](text, source)
-    return fit_rpc(model, model.image_shape, model.height_range_m)
+    return _READERS[kind](text, source)
 
 
 def _kind(root: ElementTree.Element) -> tuple[str, str]:

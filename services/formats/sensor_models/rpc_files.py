@@ -146,7 +146,7 @@ def _in_delivered_format(delivered: DeliveredModel, model: RpcModel) -> dict[str
 
 
 def model_of_image(
-    image: RasterImage, model_path: Path | None, crop_origin: tuple[float, float] | None
+    image: RasterImage, model_path: FilePlace | None, crop_origin: tuple[float, float] | None
 ) -> DeliveredModel:
     """The RPC of an open image; see `read_rpc`."""
     if model_path is not None:
@@ -154,7 +154,7 @@ def model_of_image(
     else:
         model, path, convention, mended = _find_model(image)
     check_rpc(model, path.name)
-    offset = _crop_offset(image)
+    offset = crop_offset(image)
     tile = re.search(r"_R(\d+)C(\d+)$", image.path.stem, re.IGNORECASE)
     if crop_origin is not None:
         origin, reason = crop_origin, "shifted as requested" if any(crop_origin) else "as requested"
@@ -202,10 +202,15 @@ def _files_beside(image: RasterImage) -> tuple[list[str], Sequence[FilePlace]]:
     if airbus is not None:
         names.append(f"RPC_{airbus[1]}.XML")
     names.append(f"{stem}.geom")
-    if isinstance(image.path, Address):
-        return names, [file for file in map(image.path.with_name, names) if file.is_file()]
-    beside = {file.name.upper(): file for file in image.path.resolve().parent.iterdir()}
-    return names, [beside[name.upper()] for name in names if name.upper() in beside]
+    return names, files_named(image.path, names)
+
+
+def files_named(path: FilePlace, names: Sequence[str]) -> list[FilePlace]:
+    """The files beside an image that have one of these names, in upper or lower case, in their order."""
+    if isinstance(path, Address):
+        return [file for file in map(path.with_name, names) if file.is_file()]
+    beside = {file.name.upper(): file for file in path.resolve().parent.iterdir()}
+    return [beside[name.upper()] for name in names if name.upper() in beside]
 
 
 def _read_model_file(path: FilePlace) -> _Found:
@@ -250,7 +255,7 @@ def _parse_tags(tags: dict[str, str], source: str) -> RpcModel:
     return rpc_from_numbers(number)
 
 
-def _crop_offset(image: RasterImage) -> tuple[float, float] | None:
+def crop_offset(image: RasterImage) -> tuple[float, float] | None:
     """Line and sample of the first pixel in the full scene, when the geotransform marks a crop."""
     t = image.dataset.transform
     unit = (t.a, t.b, t.d, t.e) == (1.0, 0.0, 0.0, 1.0)

@@ -112,7 +112,7 @@ def phr_dimap(model: PushbroomModel) -> str:
 
 def dimap_v2(model: PushbroomModel) -> str:
     """A DIMAP document of version 2 with quaternions at 32 Hz that end with the image."""
-    start_s, end_s = line_time_s(model, 0.0), line_time_s(model, SHAPE[0] - 1.0)
+    start_s, end_s = line_time_s(model, 0.0), line_time_s(model, model.image_shape[0] - 1.0)
     times = np.round(np.linspace(start_s - 1e-3, end_s + 1e-3, 16), 7)
     quaternions = "".join(
         f"<Quaternion><Q0>{row(q[3])}</Q0><Q1>{row(q[0])}</Q1><Q2>{row(q[1])}</Q2><Q3>{row(q[2])}</Q3>"
@@ -129,9 +129,9 @@ def dimap_v2(model: PushbroomModel) -> str:
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.12">DIMAP</METADATA_FORMAT>
 </Metadata_Identification>
-<Raster_Dimensions><NROWS>{SHAPE[0]}</NROWS><NCOLS>{SHAPE[1]}</NCOLS></Raster_Dimensions>
+<Raster_Dimensions><NROWS>{model.image_shape[0]}</NROWS><NCOLS>{model.image_shape[1]}</NCOLS></Raster_Dimensions>
 <Geometric_Data><Refined_Model><Time><Time_Range><START>{utc(start_s)}</START></Time_Range><Time_Stamp>
-<LINE_PERIOD unit="microsecond">{1e6 * (end_s - start_s) / (SHAPE[0] - 1.0)!r}</LINE_PERIOD>
+<LINE_PERIOD unit="microsecond">{1e6 * (end_s - start_s) / (model.image_shape[0] - 1.0)!r}</LINE_PERIOD>
 </Time_Stamp></Time><Ephemeris><Point_List>{points}</Point_List></Ephemeris>
 <Attitudes><Quaternion_List>{quaternions}</Quaternion_List></Attitudes>
 <Geometric_Calibration><Instrument_Calibration><Band_Calibration_List><Band_Calibration>
