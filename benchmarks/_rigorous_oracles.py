@@ -97,10 +97,16 @@ def pleiades_rpc(folder: Path, name: str) -> Comparison:
 
 def worldview(folder: Path, name: str, light_path: LightPath = ALL_EFFECTS) -> Comparison:
     """WorldView and the RPC of the vendor in the same document."""
+    model = parse_worldview_isd(read_text(folder / "worldview_isd" / name), name, light_path)
+    rpc = worldview_rpc(folder, name)
+    return Comparison(name, "RPC of the vendor", model, _from_rpc(model, rpc, 0.9))
+
+
+def worldview_rpc(folder: Path, name: str) -> RpcModel:
+    """The RPC of the vendor in a WorldView document."""
     text = read_text(folder / "worldview_isd" / name)
-    model = parse_worldview_isd(text, name, light_path)
     (image,) = ElementTree.fromstring(text).findall("RPB/IMAGE")
-    rpc = RpcModel(
+    return RpcModel(
         *(
             _numbers(image, f"{key}COEFList/{key}COEF")
             for key in ("LINENUM", "LINEDEN", "SAMPNUM", "SAMPDEN")
@@ -110,7 +116,6 @@ def worldview(folder: Path, name: str, light_path: LightPath = ALL_EFFECTS) -> C
         _numbers(image, "LONGOFFSET", "LATOFFSET", "HEIGHTOFFSET"),
         _numbers(image, "LONGSCALE", "LATSCALE", "HEIGHTSCALE"),
     )
-    return Comparison(name, "RPC of the vendor", model, _from_rpc(model, rpc, 0.9))
 
 
 def spot_corners(folder: Path, name: str) -> Comparison:

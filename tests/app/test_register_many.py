@@ -207,6 +207,8 @@ def test_a_job_registers_uploaded_scenes_together(
     for wrong in ([scenes[0]], [scenes[0], scenes[0]], [*scenes, "nothing"]):
         reply = client.post(execution, json={"inputs": {"scenes": wrong}}, headers=me)
         assert reply.status_code == 422, reply.text
+    best = client.post(execution, json={"inputs": {"scenes": scenes, "rigorous": "best"}}, headers=me)
+    assert best.status_code == 422, best.text
     body = {"inputs": {"scenes": scenes}}
     assert client.post(execution, json=body, headers=other).status_code == 404
     assert client.post(execution, json=body, headers=bearer("read")).status_code == 403
