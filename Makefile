@@ -11,7 +11,7 @@ PAGE := app/web/built/index.html
 # Tests of services wait for them: three processes for two cores, whose number nproc does not tell where
 # OMP_NUM_THREADS is set. More would collect all tests once more each, and wait for the cores.
 WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
-LONG := cape_verde continent faults image_selection load stress throughput block_adjustment toutin
+LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
 .PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
 

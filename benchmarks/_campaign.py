@@ -14,6 +14,7 @@ from services.errors import AmersError
 from services.geodesy import metres_per_degree
 from services.imagery.scene import Scene
 from services.imagery.source import ImageSource
+from services.matching.predict import in_image
 from services.quality.accuracy import accuracy, normal_ce90, normalised_error
 from services.quality.frames import frame_in_image
 from services.registration.on_points import Registration, register_scene
@@ -104,6 +105,26 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Truth:
+    """What the pixels of a scene show, and how well points can tell.
+
+    Attributes:
+        line_sample: (n, 2) pixels all over the image that show what belongs there.
+        in_frame, on_earth: (n, 3) their ground, as the points say and as it is.
+        judged_share: of the image that such pixels stand for.
+        shown_points: number of points that the image shows.
+        shortest_px: period that points must resolve to follow the distortion, see `Drawn`.
+    """
+
+    line_sample: Array
+    in_frame: Array
+    on_earth: Array
+    judged_share: float
+    shown_points: int
+    shortest_px: float = 0.0
+
+
+@dataclass(frozen=True)
 class Prepared:
     """A scene and points with errors, and the truth.
 
@@ -129,14 +150,28 @@ class Prepared:
         seen = self.detectors.seen(line_sample, self.scene.image.shape[1])
         return surface_seen(self.world, self.geometry.true_model, self.distortion.undistorted(seen))
 
-    def places(self) -> tuple[Array, float]:
-        """Pixels (n, 2) all over the image that show what belongs there, and their share of all."""
-        shape = self.distortion.shape
-        count = (12, 12) if self.distortion.is_none else (48, 12)
-        axes = [np.linspace(0.0, size - 1.0, n) for size, n in zip(shape, count, strict=True)]
+    def truth(self) -> Truth:
+        """The truth at pixels all over the image."""
+        shape = self.scene.image.shape
+        axes = [np.linspace(0.0, size - 1.0, n) for size, n in zip(shape, self._judged, strict=True)]
         pixels = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         unique = self.distortion.is_unique(pixels)
-        return pixels[unique], float(unique.mean())
+        pixels = pixels[unique]
+        on_earth = self.shown(pixels)
+        place = self.geometry.true_model.project(self.points.lon_lat_h)
+        return Truth(
+            line_sample=pixels,
+            in_frame=self.errors.in_frame(on_earth),
+            on_earth=on_earth,
+            judged_share=float(unique.mean()),
+            shown_points=int(in_image(place, shape, 0.0).sum()),
+            shortest_px=self.shortest_px,
+        )
+
+    @property
+    def _judged(self) -> tuple[int, int]:
+        """Numbers of pixels along lines and samples that are judged: jitter needs many lines."""
+        return (12, 12) if self.distortion.is_none else (48, 12)
 
 
 def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
@@ -216,32 +251,34 @@ def registered(
     prepared: Prepared, chips: ChipSource, options: RegistrationOptions
 ) -> tuple[Outcome, Registration | None]:
     """The outcome of registering a scene, and the registration; None when it is refused."""
+    return outcome_of(prepared.scene, prepared.points, chips, options, prepared.truth())
+
+
+def outcome_of(
+    scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions, truth: Truth
+) -> tuple[Outcome, Registration | None]:
+    """The outcome of registering a scene on points, and the registration; None when it is refused."""
     start_s = time.process_time()
     try:
-        registration = register_scene(prepared.scene, prepared.points, chips, options)
+        registration = register_scene(scene, points, chips, options)
     except AmersError as error:
         cpu_s = time.process_time() - start_s
         refused = Outcome("refused", str(error), 0, 0, 0, "", *[float("nan")] * 7, cpu_s)
-        return _with_spacing(refused, prepared, options), None
-    outcome = _judged(prepared, registration, time.process_time() - start_s)
-    return _with_spacing(outcome, prepared, options), registration
+        return _with_spacing(refused, truth, scene, options), None
+    outcome = _judged(scene, registration, truth, time.process_time() - start_s)
+    return _with_spacing(outcome, truth, scene, options), registration
 
 
-def _with_spacing(outcome: Outcome, prepared: Prepared, options: RegistrationOptions) -> Outcome:
+def _with_spacing(outcome: Outcome, truth: Truth, scene: Scene, options: RegistrationOptions) -> Outcome:
     """The outcome with the spacing of the searched points: by the truth, also where it is refused."""
-    shape = np.array(prepared.scene.image.shape)
-    place = prepared.geometry.true_model.project(prepared.points.lon_lat_h)
-    shown = int(((place >= 0.0) & (place <= shape - 1.0)).all(axis=1).sum())
-    searched = min(shown, options.max_points or shown)
-    spacing_px = float(np.sqrt(np.prod(shape) / max(searched, 1)))
-    return replace(outcome, spacing_px=spacing_px, followable=prepared.shortest_px >= 2.0 * spacing_px)
+    searched = min(truth.shown_points, options.max_points or truth.shown_points)
+    spacing_px = float(np.sqrt(np.prod(scene.image.shape) / max(searched, 1)))
+    return replace(outcome, spacing_px=spacing_px, followable=truth.shortest_px >= 2.0 * spacing_px)
 
 
-def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Outcome:
-    """The errors of a registration against the true sensor, on a grid over the whole image."""
-    line_sample, judged_share = prepared.places()
-    shown = prepared.shown(line_sample)
-    in_frame = prepared.errors.in_frame(shown)
+def _judged(scene: Scene, registration: Registration, truth: Truth, cpu_s: float) -> Outcome:
+    """The errors of a registration against the truth."""
+    line_sample, shown, in_frame = truth.line_sample, truth.on_earth, truth.in_frame
 
     def error_px(ground: Array) -> Array:
         return np.asarray(registration.model.project(ground) - line_sample)
@@ -271,7 +308,7 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
         matched=quality.point_counts.matched,
         active=quality.point_counts.active,
         order=registration.adjustment.order,
-        ce90_before_m=ce90_m(prepared.scene.model.project(shown) - line_sample),
+        ce90_before_m=ce90_m(scene.model.project(shown) - line_sample),
         ce90_m=ce90_m(error),
         ground_ce90_m=ce90_m(on_earth),
         predicted_m=quality.predicted.median_m,
@@ -282,6 +319,6 @@ def _judged(prepared: Prepared, registration: Registration, cpu_s: float) -> Out
         ground_predicted_m=quality.predicted.on_the_earth_median_m,
         ground_normalised=normalised_error(on_earth, both).mean_square,
         wrong_share=float(1.0 - right.mean()),
-        judged_share=judged_share,
+        judged_share=truth.judged_share,
         line_gap_px=float(np.median(np.diff(lines))),
     )

@@ -163,7 +163,7 @@ def show_distorted(title: str, rows: dict[str, Distorted]) -> None:
 
 
 def _is_named(family: str, outcome: Outcome) -> bool:
-    return any(part in outcome.reason for part in LACK_OF_FIT[family])
+    return any(part in outcome.reason for part in LACK_OF_FIT.get(family, ()))
 
 
 def _told(outcome: Outcome) -> list[str]:

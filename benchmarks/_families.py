@@ -165,11 +165,11 @@ def place_of(scene: Scene) -> Place:
     return NOMINAL if kind == "nominal" else PLACES[number % len(PLACES)]
 
 
-def fingerprint() -> str:
-    """A short hash of the sources that outcomes follow from."""
+def fingerprint(*more: str) -> str:
+    """A short hash of the sources that outcomes follow from, and of more modules of the benchmarks."""
     digest = hashlib.sha256()
     names = ("campaign", "distorted_trials", "distortions", "point_errors", "trials", "worlds")
-    drawn = [ROOT / "benchmarks" / f"_{name}.py" for name in names]
+    drawn = [ROOT / "benchmarks" / f"_{name}.py" for name in (*names, *more)]
     for path in sorted((ROOT / "services").rglob("*.py")) + drawn:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

@@ -111,9 +111,9 @@ def test_moved_ground_is_as_large_and_as_far_as_drawn() -> None:
 def test_the_truth_of_a_distorted_scene_is_that_of_its_pixels(block: Block) -> None:
     """What the undistorted scene shows at the undistorted place."""
     straight, bent = (prepared_with(block, d) for d in (Drawn(), Drawn("bow", 6.0)))
-    pixels, share = bent.places()
-    assert share == 1.0
-    shown = bent.shown(pixels)
+    truth = bent.truth()
+    pixels, shown = truth.line_sample, truth.on_earth
+    assert truth.judged_share == 1.0
     np.testing.assert_allclose(shown, straight.shown(bent.distortion.undistorted(pixels)), atol=1e-9)
     apart_px = straight.geometry.true_model.project(shown) - pixels
     assert np.linalg.norm(apart_px, axis=1).max() == pytest.approx(6.0, rel=0.02)

@@ -1,0 +1,205 @@
+"""Crops of real views, distorted by known maps, registered, and judged by ties."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._campaign import Outcome, Truth, outcome_of
+from benchmarks._distorted_trials import DISTORTED
+from benchmarks._distortions import NOT_DISTORTED, Drawn, distortion_of
+from benchmarks._real_views import VIEWS, RealView, real_view
+from services.imagery.scene import Scene, scene_centre, scene_gsd_m
+from services.matching.predict import in_image
+from services.registration.on_points import Registration
+from services.registration.options import RegistrationOptions
+from services.sensors.rpc import RpcModel
+from services.simulation.distortion import DistortedImage, Distortion
+from services.types import Array
+
+CLEAN = "clean"
+SCENES = {
+    "jitter": 54,
+    "bow": 36,
+    "steps": 36,
+    "moved": 36,
+    "wrong_model": 27,
+    "otherwise": 27,
+    CLEAN: 36,
+}
+"""Scenes of each family: 216 distorted ones, and some that are not."""
+LOCATION_M = (5.0, 30.0)
+OPTIONS = RegistrationOptions()
+_BESIDE_PX = 30.0
+"""How far crops reach beyond the points of their view."""
+_GRID = 40
+_KEY = 21
+
+
+@dataclass(frozen=True)
+class RealScene:
+    """What is done to one scene.
+
+    Attributes:
+        name: family and number.
+        view: of which it is a crop.
+        corner: (2,) line and sample of the view where the crop begins.
+        size_px: lines and samples of the crop.
+        shift_px: (2,) by which its model is off.
+        sigma_m: as stated.
+        drawn: its distortion.
+    """
+
+    name: str
+    view: str
+    corner: tuple[int, int]
+    size_px: int
+    shift_px: tuple[float, float]
+    sigma_m: float
+    drawn: Drawn
+
+
+@dataclass(frozen=True)
+class RealPrepared:
+    """A scene with its truth.
+
+    Attributes:
+        scene: what a registration gets, with the points of the view.
+        view: it is a crop of.
+        distortion: of the crop.
+        truth: at the ties that it shows.
+    """
+
+    scene: Scene
+    view: RealView
+    distortion: Distortion
+    truth: Truth
+
+
+Result = tuple[RealScene, Outcome]
+
+
+def name_of(family: str, number: int) -> str:
+    """The name of a scene."""
+    return f"{family}_{number:04d}"
+
+
+def view_of(number: int) -> str:
+    """The view of the scenes of a number."""
+    return VIEWS[number % len(VIEWS)]
+
+
+def real_scene(name: str, seed: int, view: RealView) -> RealScene:
+    """What is done to the scene of a name: everything follows from it and the seed."""
+    family, digits = name.rsplit("_", 1)
+    number = int(digits)
+    draw, key = DISTORTED.get(family, (None, 0))
+    rng = np.random.default_rng([seed, number, key, _KEY])
+    first = np.clip(view.placed.min(axis=0) - _BESIDE_PX, 0.0, None)
+    last = np.minimum(view.placed.max(axis=0) + _BESIDE_PX, view.scene.image.shape) - view.crop
+    corner = np.rint(rng.uniform(first, np.maximum(first, last))).astype(int).tolist()
+    error_m = rng.uniform(*LOCATION_M)
+    towards = rng.uniform(0.0, 2.0 * np.pi)
+    shift_px = error_m / scene_gsd_m(view.scene) * np.array([np.sin(towards), np.cos(towards)])
+    return RealScene(
+        name,
+        view_of(number),
+        (corner[0], corner[1]),
+        view.crop,
+        (float(shift_px[0]), float(shift_px[1])),
+        float(error_m / rng.uniform(1.2, 2.6)),
+        NOT_DISTORTED if draw is None else draw(rng, view.crop),
+    )
+
+
+def prepare_real(plan: RealScene, view: RealView, seed: int) -> RealPrepared:
+    """A distorted crop, its model as delivered, and the truth at the ties that it shows."""
+    shape, corner = (plan.size_px, plan.size_px), np.array(plan.corner, dtype=np.float64)
+    rng = np.random.default_rng([seed, int(plan.name.rsplit("_", 1)[1]), _KEY])
+    distortion = distortion_of(plan.drawn, shape, scene_gsd_m(view.scene), rng)
+    image = DistortedImage(view.scene.image, distortion, plan.corner)
+    model = view.scene.model
+    if plan.drawn.tilt_deg > 0.0:
+        model = _of_another_view(plan, view, rng)
+    if not isinstance(model, RpcModel):
+        raise TypeError(f"{plan.view}: an RPC expected, {type(model).__name__} given")
+    moved = replace(model, image_offset=model.image_offset - corner + plan.shift_px)
+    scene = Scene(image, moved, view.scene.acquisition, plan.sigma_m)
+    return RealPrepared(scene, view, distortion, _truth(plan, view, distortion))
+
+
+def register_real(
+    plan: RealScene, view: RealView, seed: int
+) -> tuple[RealPrepared, Outcome, Registration | None]:
+    """A scene, its outcome and its registration; None when it is refused."""
+    prepared = prepare_real(plan, view, seed)
+    outcome, registration = outcome_of(
+        prepared.scene, view.block.points, view.block, OPTIONS, prepared.truth
+    )
+    return prepared, outcome, registration
+
+
+def run_real(names: list[str], seed: int, real_data: Path) -> Iterator[tuple[str, Result]]:
+    """Yield names and results of scenes, view by view."""
+    for name in sorted(names, key=lambda name: (view_of(int(name.rsplit("_", 1)[1])), name)):
+        view = real_view(real_data, view_of(int(name.rsplit("_", 1)[1])))
+        plan = real_scene(name, seed, view)
+        yield name, (plan, register_real(plan, view, seed)[1])
+
+
+def read_real_outcomes(file: Path, code: str | None) -> dict[str, Result]:
+    """Outcomes by name, of the sources with a fingerprint, or of all when None; without broken lines."""
+    outcomes: dict[str, Result] = {}
+    for line in file.read_text().splitlines() if file.exists() else ():
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if code in (None, record["code"]):
+            plan = {**record["scene"], "drawn": Drawn(**record["scene"]["drawn"])}
+            for pair in ("corner", "shift_px"):
+                plan[pair] = tuple(plan[pair])
+            scene = RealScene(**plan)
+            outcomes[scene.name] = scene, Outcome(**record["outcome"])
+    return outcomes
+
+
+def real_outcome_line(code: str, result: Result) -> str:
+    """The line that keeps the outcome of a scene."""
+    scene, outcome = (asdict(part) for part in result)
+    return json.dumps({"code": code, "scene": scene, "outcome": outcome}) + "\n"
+
+
+def _of_another_view(plan: RealScene, view: RealView, rng: np.random.Generator) -> RpcModel:
+    """The model of another view, which agrees about the ground in the middle, or beside it."""
+    middle = scene_centre(view.scene)
+    middle[2] = float(np.median(view.ground[:, 2]))
+    apart_px = view.scene.model.project(middle[None, :]) - view.another.project(middle[None, :])
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    away_px = plan.drawn.away * plan.size_px * np.array([np.sin(angle), np.cos(angle)])
+    return replace(view.another, image_offset=view.another.image_offset + apart_px[0] + away_px)
+
+
+def _truth(plan: RealScene, view: RealView, distortion: Distortion) -> Truth:
+    """What the distorted crop shows of the ties, where it shows it once and in its place."""
+    corner, shape = np.array(plan.corner), distortion.shape
+    line_sample = distortion.distorted(view.line_sample - corner)
+    line_sample[~in_image(line_sample, shape, -2.0)] = np.nan
+    shown = np.isfinite(line_sample).all(axis=1)
+    shown[shown] = ~distortion.is_moved(line_sample[shown])
+    ground = view.ground[shown]
+    return Truth(
+        line_sample=line_sample[shown],
+        in_frame=ground,
+        on_earth=ground,
+        judged_share=float(distortion.is_unique(_grid(shape)).mean()),
+        shown_points=int(in_image(view.placed - corner, shape, 0.0).sum()),
+        shortest_px=plan.drawn.shortest_px,
+    )
+
+
+def _grid(shape: tuple[int, int]) -> Array:
+    axes = [np.linspace(0.0, size - 1.0, _GRID) for size in shape]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
