@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from services.errors import CoverageError
-from services.imagery.source import ArrayImage, Window
+from services.imagery.resampling import finite_bounds
+from services.imagery.source import ArrayImage
 from services.sensors.base import SensorModel
 from services.terrain import Terrain, bilinear_height
 from services.types import Array, FloatImage
@@ -16,8 +17,10 @@ from services.types import Array, FloatImage
 _TOLERANCE_M = 1e-5
 _BOX_NODES = 17
 _BOX_MARGIN = 0.01
-_BLOCK = 8
+_BLOCK = 4
 """Side, in nodes, of the blocks whose highest node decides whether a stretch of a line is skipped."""
+_BLOCKS = 8
+"""Side, in blocks, of the larger blocks for longer stretches."""
 _MAX_NODES = 20_000
 _GRID_LINE = 1e-9
 """A position nearer than this to a line of the grid is on it, nodes."""
@@ -62,31 +65,44 @@ def intersect_terrain(model: SensorModel, line_sample: Array, terrain: Terrain) 
     Raises:
         CoverageError: no line comes near the grid.
     """
-    box = _box_of(line_sample)
-    low_m, high_m = terrain.around(_ray_ends(model, box, model.height_range_m)).range_m()
-    ground = terrain.around(_ray_ends(model, box, (low_m, high_m)))
+    ground = ground_in_sight(model, line_sample, terrain)
     if not isinstance(ground.heights, ArrayImage) and len(line_sample) > 1:
         return _in_halves(model, line_sample, terrain)
     low_m, high_m = ground.range_m()
     low_m, high_m = low_m - _MARGIN_M, high_m + _MARGIN_M
-    heights = ground.heights.read(Window(0, 0, *ground.grid.shape))
+    heights = np.ascontiguousarray(ground.nodes())
     places = [
         model.locate(line_sample, np.full(len(line_sample), height_m))[:, :2]
         for height_m in (low_m, (low_m + high_m) / 2.0, high_m)
     ]
     low, middle, high = (ground.grid.line_sample(lon_lat) for lon_lat in places)
-    track = np.column_stack([middle, (high - low) / 2.0, (high + low) / 2.0 - middle])
-    undulation_m = np.zeros((len(track), 2))
+    undulation_m = np.zeros((len(middle), 2))
     if ground.geoid is not None:
         undulation_m = np.column_stack([_defined(ground.geoid, places[k]) for k in (0, 2)])
-    summits = _summits(heights)
-    height_m = _first_crossings(heights, summits, track, undulation_m, (low_m, high_m))
+    blocks = _highest(heights, _BLOCK)
+    summits = _with_neighbours(blocks), _with_neighbours(_highest(blocks, _BLOCKS))
+    height_m = _first_crossings(heights, summits, (low, middle, high), undulation_m, (low_m, high_m))
     met = model.locate(line_sample, height_m)
     if ground.geoid is not None:
         # Between the ends of a line, the geoid is not exactly linear.
         exact_m = _defined(ground.height_m, met)
         met = model.locate(line_sample, np.where(np.isfinite(exact_m), exact_m, height_m))
     return met
+
+
+def ground_in_sight(model: SensorModel, line_sample: Array, terrain: Terrain) -> Terrain:
+    """The part of a terrain that lines of sight of image positions (n, 2) can meet.
+
+    Raises:
+        CoverageError: no line comes near the grid.
+    """
+    box = _box_of(line_sample)
+    lowest_m, highest_m = model.height_range_m
+    ground = terrain.around(_ray_ends(model, box, (lowest_m, highest_m)))
+    low_m, high_m = ground.range_m()
+    if lowest_m <= low_m and high_m <= highest_m:
+        terrain = ground
+    return terrain.around(_ray_ends(model, box, (low_m, high_m)))
 
 
 def _in_halves(model: SensorModel, line_sample: Array, terrain: Terrain) -> Array:
@@ -104,10 +120,9 @@ def _in_halves(model: SensorModel, line_sample: Array, terrain: Terrain) -> Arra
 
 def _box_of(line_sample: Array) -> Array:
     """A grid of image positions around others (n, 2); models are smooth between its nodes."""
-    known = line_sample[np.isfinite(line_sample).all(axis=1)]
-    if not len(known):
+    low, high = finite_bounds(line_sample)
+    if not (low <= high).all():
         return line_sample
-    low, high = known.min(axis=0), known.max(axis=0)
     margin = _BOX_MARGIN * (high - low) + 1.0
     axes = [np.linspace(*ends, _BOX_NODES) for ends in zip(low - margin, high + margin, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -178,28 +193,37 @@ def _crossing(  # noqa: PLR0917 - numbers of one line of sight, in its innermost
 
 
 @njit(cache=True, error_model="numpy")
-def _summits(heights: FloatImage) -> FloatImage:
-    """Highest node of each block and of the blocks beside it; minus infinity where there is none."""
-    rows, cols = (heights.shape[0] - 1) // _BLOCK + 1, (heights.shape[1] - 1) // _BLOCK + 1
-    own = np.full((rows, cols), -np.inf, dtype=np.float32)
+def _highest(heights: FloatImage, side: int) -> FloatImage:
+    """Highest of each block of heights; minus infinity where there is none."""
+    shape = (heights.shape[0] - 1) // side + 1, (heights.shape[1] - 1) // side + 1
+    out = np.full(shape, -np.inf, dtype=np.float32)
     for i in range(heights.shape[0]):
         for j in range(heights.shape[1]):
-            if heights[i, j] > own[i // _BLOCK, j // _BLOCK]:
-                own[i // _BLOCK, j // _BLOCK] = heights[i, j]
-    out = np.full((rows, cols), -np.inf, dtype=np.float32)
+            if heights[i, j] > out[i // side, j // side]:
+                out[i // side, j // side] = heights[i, j]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _with_neighbours(highest: FloatImage) -> FloatImage:
+    """Highest of each block and of the blocks beside it."""
+    rows, cols = highest.shape
+    out = np.empty_like(highest)
     for i in range(rows):
         for j in range(cols):
+            summit = highest[i, j]
             for k in range(max(i - 1, 0), min(i + 2, rows)):
                 for m in range(max(j - 1, 0), min(j + 2, cols)):
-                    out[i, j] = max(out[i, j], own[k, m])
+                    summit = max(summit, highest[k, m])
+            out[i, j] = summit
     return out
 
 
 @njit(inline="always", error_model="numpy")
-def _summit_m(summits: FloatImage, line: _Line, u: float) -> float:
-    """Highest ground within a block's side of the position of a line."""
-    row = (line.row[0] + u * (line.row[1] + u * line.row[2])) / _BLOCK
-    col = (line.col[0] + u * (line.col[1] + u * line.col[2])) / _BLOCK
+def _summit_m(summits: FloatImage, side: int, line: _Line, u: float) -> float:
+    """Highest ground within a block's side, in nodes, of the position of a line."""
+    row = (line.row[0] + u * (line.row[1] + u * line.row[2])) / side
+    col = (line.col[0] + u * (line.col[1] + u * line.col[2])) / side
     i = min(max(int(row), 0), summits.shape[0] - 1)
     j = min(max(int(col), 0), summits.shape[1] - 1)
     return summits[i, j] + line.geoid_m[0] + abs(line.geoid_m[1])
@@ -250,15 +274,22 @@ def _crossing_in_cell(  # noqa: PLR0917 - numbers of one line of sight, in its i
 
 
 @njit(cache=True, error_model="numpy")
-def _first_crossing(heights: FloatImage, summits: FloatImage, line: _Line) -> float:
+def _first_crossing(heights: FloatImage, summits: tuple[FloatImage, FloatImage], line: _Line) -> float:
     """u where a line of sight first meets the ground; NaN where unknown."""
     nodes = 2.0 * (abs(line.row[1]) + abs(line.row[2]) + abs(line.col[1]) + abs(line.col[2]))
     if not nodes < _MAX_NODES:
         return np.nan
     stretches = math.ceil(nodes / (_BLOCK - 1)) + 1
-    for k in range(stretches):
+    k = 0
+    while k < stretches:
         u, end = 1.0 - 2.0 * k / stretches, 1.0 - 2.0 * (k + 1) / stretches
-        if _summit_m(summits, line, u) < line.middle_m + end * line.half_m:
+        if k % _BLOCKS == 0:
+            far = max(1.0 - 2.0 * (k + _BLOCKS) / stretches, -1.0)
+            if _summit_m(summits[1], _BLOCK * _BLOCKS, line, u) < line.middle_m + far * line.half_m:
+                k += _BLOCKS
+                continue
+        k += 1
+        if _summit_m(summits[0], _BLOCK, line, u) < line.middle_m + end * line.half_m:
             continue
         gap_m = _gap_m(heights, line, u)
         while u > end:
@@ -271,31 +302,39 @@ def _first_crossing(heights: FloatImage, summits: FloatImage, line: _Line) -> fl
     return np.nan
 
 
+@njit(inline="always", error_model="numpy")
+def _quadratic(low: float, middle: float, high: float) -> tuple[float, float, float]:
+    """Coefficients of 1, u and u^2 of the quadratic with these values at -1, 0 and 1."""
+    return middle, (high - low) / 2.0, (high + low) / 2.0 - middle
+
+
 @njit(cache=True, error_model="numpy")
 def _first_crossings(
     heights: FloatImage,
-    summits: FloatImage,
-    track: Array,
+    summits: tuple[FloatImage, FloatImage],
+    places: tuple[Array, Array, Array],
     undulation_m: Array,
     between_m: tuple[float, float],
 ) -> Array:
     """Heights (n,) where lines of sight first meet the ground; NaN where unknown.
 
-    With u from -1 at the lowest height to 1 at the highest, a line is at `a + b u + c u^2` in the grid.
+    With u from -1 at the lowest height to 1 at the highest, a line is at a quadratic of u in the grid.
 
     Args:
         heights: of the grid, above its vertical datum.
-        summits: of the same grid, see `_summits`.
-        track: (n, 6) a, b and c, line and sample.
+        summits: of the blocks of the same grid and of the larger blocks, each with its neighbours.
+        places: (n, 2) of the lines in the grid at the lowest height, the middle and the highest.
         undulation_m: (n, 2) of the geoid at both ends of the line.
         between_m: lowest and highest height, above the ellipsoid.
     """
     middle_m, half_m = (between_m[0] + between_m[1]) / 2.0, (between_m[1] - between_m[0]) / 2.0
-    out = np.full(len(track), np.nan)
-    for i in range(len(track)):
-        t = track[i]
+    low, middle, high = places
+    out = np.full(len(middle), np.nan)
+    for i in range(len(middle)):
         low_m, high_m = undulation_m[i]
         geoid_m = ((low_m + high_m) / 2.0, (high_m - low_m) / 2.0)
-        line = _Line((t[0], t[2], t[4]), (t[1], t[3], t[5]), geoid_m, middle_m, half_m)
+        row = _quadratic(low[i, 0], middle[i, 0], high[i, 0])
+        col = _quadratic(low[i, 1], middle[i, 1], high[i, 1])
+        line = _Line(row, col, geoid_m, middle_m, half_m)
         out[i] = middle_m + half_m * _first_crossing(heights, summits, line)
     return out

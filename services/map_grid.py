@@ -155,7 +155,7 @@ def utm_of(lon: float, lat: float) -> str:
 def _transformed(transformer: Transformer, points: Array) -> Array:
     x, y = transformer.transform(points[:, 0], points[:, 1])
     out = np.column_stack([x, y])
-    out[~np.isfinite(out).all(axis=1)] = np.nan
+    out[~(np.isfinite(x) & np.isfinite(y))] = np.nan
     return out
 
 

@@ -18,8 +18,8 @@ Geoid = Callable[[Array], Array]
 
 _TILE = 2048
 """Side of the windows in which a grid is read, cells."""
-_MAX_CELLS_IN_MEMORY = 32_000_000
-"""Largest part of a terrain that is kept in memory: 128 MB."""
+_MAX_CELLS_IN_MEMORY = 64_000_000
+"""Largest part of a terrain that is kept in memory: 256 MB."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,7 @@ class Terrain:
         outermost nodes the height is constant.
         """
         position = self.grid.line_sample(np.asarray(lon_lat, dtype=np.float64)[:, :2])
-        height_m = np.full(len(position), np.nan)
-        for window, rows in self._pieces(position):
-            pixels = self.heights.read(window)
-            first = np.array([window.line, window.sample], dtype=np.float64)
-            height_m[rows] = bilinear_heights(pixels, position[rows] - first)
+        height_m = self._heights_at(position)
         valid = np.flatnonzero(np.isfinite(height_m))
         if self.geoid is not None and len(valid):
             height_m[valid] += self.geoid(lon_lat[valid, :2])
@@ -95,7 +91,9 @@ class Terrain:
         lines, samples = (int(size) for size in high - low + 1)
         window = Window(int(low[0]), int(low[1]), lines, samples)
         heights: ImageSource = _CroppedImage(self.heights, window)
-        if lines * samples <= _MAX_CELLS_IN_MEMORY:
+        if isinstance(self.heights, ArrayImage):
+            heights = ArrayImage(self.heights.pixels[low[0] : high[0] + 1, low[1] : high[1] + 1])
+        elif lines * samples <= _MAX_CELLS_IN_MEMORY:
             heights = ArrayImage(self.heights.read(window))
         origin_xy = self.grid.xy(low[None, :].astype(np.float64))[0]
         grid = replace(self.grid, origin_xy=origin_xy, shape=(lines, samples))
@@ -108,11 +106,9 @@ class Terrain:
             CoverageError: the grid has voids only.
         """
         low, high = math.inf, -math.inf
-        for window in _tiles((0, 0), self.grid.shape):
-            pixels = self.heights.read(window)
-            finite = pixels[np.isfinite(pixels)]
-            if len(finite):
-                low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+        for pixels in self._parts():
+            lowest, highest = _finite_range(pixels)
+            low, high = min(low, lowest), max(high, highest)
         if low > high:
             raise CoverageError(
                 "the terrain has only voids here, heights expected; fill the voids or give another "
@@ -127,6 +123,30 @@ class Terrain:
         lowest, highest = float(np.nanmin(undulation)), float(np.nanmax(undulation))
         margin = (highest - lowest) / 8.0 + 0.1
         return low + lowest - margin, high + highest + margin
+
+    def nodes(self) -> FloatImage:
+        """Heights (lines, samples) of all nodes, in the vertical datum; not to be changed."""
+        if isinstance(self.heights, ArrayImage):
+            return self.heights.pixels
+        return self.heights.read(Window(0, 0, *self.grid.shape))
+
+    def _parts(self) -> Iterator[FloatImage]:
+        """Yield all heights, in one part when they are in memory."""
+        if isinstance(self.heights, ArrayImage):
+            yield self.nodes()
+            return
+        for window in _tiles((0, 0), self.grid.shape):
+            yield self.heights.read(window)
+
+    def _heights_at(self, position: Array) -> Array:
+        """Heights (n,) of the grid at positions (n, 2) in it; NaN outside."""
+        if isinstance(self.heights, ArrayImage):
+            return bilinear_heights(self.nodes(), position)
+        height_m = np.full(len(position), np.nan)
+        for window, rows in self._pieces(position):
+            first = np.array([window.line, window.sample], dtype=np.float64)
+            height_m[rows] = bilinear_heights(self.heights.read(window), position[rows] - first)
+        return height_m
 
     def _pieces(self, position: Array) -> Iterator[tuple[Window, IntArray]]:
         """Yield windows of the grid, each with the rows of the positions that it contains."""
@@ -158,6 +178,17 @@ class _CroppedImage:
     def read(self, window: Window) -> FloatImage:
         line, sample = window.line + self.window.line, window.sample + self.window.sample
         return self.whole.read(Window(line, sample, window.lines, window.samples))
+
+
+@njit(cache=True)
+def _finite_range(heights: FloatImage) -> tuple[float, float]:
+    """Lowest and highest finite height; infinity and minus infinity where there is none."""
+    low, high = np.inf, -np.inf
+    for i in range(heights.shape[0]):
+        for j in range(heights.shape[1]):
+            if np.isfinite(heights[i, j]):
+                low, high = min(low, heights[i, j]), max(high, heights[i, j])
+    return low, high
 
 
 @njit(inline="always")

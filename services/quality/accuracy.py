@@ -243,11 +243,12 @@ def normal_ce90(covariance: Array) -> Array:
     Returns:
         (n,) radius that holds 90 %, in the square root of the covariance's unit; NaN for a NaN.
     """
-    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    variance = np.linalg.eigvalsh(np.where(finite[:, None, None], covariance, 0.0))
-    small, large = np.sqrt(np.clip(variance, 0.0, None)).T
-    ratio = np.divide(small, large, out=np.zeros_like(small), where=large > 0.0)
-    return np.where(finite, large * np.interp(ratio, *_ce90_of_ratio()), np.nan)
+    (a, b), (c, d) = covariance.transpose(1, 2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # The larger eigenvalue, and the square of the ratio of both.
+        large = np.maximum((a + d) / 2.0 + np.hypot((a - d) / 2.0, (b + c) / 2.0), 0.0)
+        ratio = np.where(large > 0.0, np.clip((a * d - b * c) / large**2, 0.0, 1.0), 0.0)
+        return np.sqrt(large) * np.interp(np.sqrt(ratio), *_ce90_of_ratio())
 
 
 @lru_cache(maxsize=1)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from services.quality.accuracy import normal_ce90
 from services.quality.correction_accuracy import CorrectionAccuracy
@@ -73,7 +74,7 @@ def predict_vertices(
     derivative = model.project_derivative(lon_lat_h)
     horizontal, vertical = derivative[:, :, :2], derivative[:, :, 2:]
     slope = np.nan_to_num(terrain.slope(lon_lat_h))
-    to_ground = _inverse(horizontal + vertical * slope[:, None, :])
+    to_image = horizontal + vertical * slope[:, None, :]
     own_px2 = sources.vertex_sigma_px**2 * np.eye(2)
     own_px2 = own_px2 + sources.height_sigma_m**2 * _outer(vertical)
     if sources.registration is None:
@@ -82,24 +83,32 @@ def predict_vertices(
     else:
         relative_px2 = own_px2 + sources.registration.relative_px2(line_sample)
         earth_px2 = relative_px2 + sources.registration.frame_px2(derivative)
-    with np.errstate(invalid="ignore"):
-        on_ground = [_spread(to_ground, one) for one in (relative_px2, earth_px2)]
-    return VertexAccuracy(*(np.where(np.isfinite(one), one, np.nan) for one in on_ground))
+    return VertexAccuracy(_on_ground(to_image, relative_px2), _on_ground(to_image, earth_px2))
 
 
 def _outer(matrices: Array) -> Array:
     """Each matrix (n, i, j) times its transpose, (n, i, i)."""
-    return np.asarray(matrices @ matrices.transpose(0, 2, 1))
+    return np.asarray((matrices[:, :, None, :] * matrices[:, None, :, :]).sum(axis=3))
 
 
-def _spread(linear: Array, covariance: Array) -> Array:
-    """Covariances (n, 2, 2) after linear maps (n, 2, 2)."""
-    half = np.einsum("nij,njk->nik", linear, covariance)
-    return np.asarray(np.einsum("nij,nkj->nik", half, linear))
+@njit(cache=True, error_model="numpy")
+def _on_ground(to_image: Array, in_image: Array) -> Array:
+    """Covariances on the ground of others in the image, with the maps (n, 2, 2) from ground to image.
 
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses of matrices (n, 2, 2); not finite where a line of sight grazes the ground."""
-    (a, b), (c, d) = matrices.transpose(1, 2, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((np.array([[d, -b], [-c, a]]) / (a * d - b * c)).transpose(2, 0, 1))
+    NaN where a map has no inverse: a line of sight grazes the ground.
+    """
+    out = np.empty_like(in_image)
+    inverse = np.empty((2, 2))
+    for n in range(len(to_image)):
+        a, b, c, d = to_image[n, 0, 0], to_image[n, 0, 1], to_image[n, 1, 0], to_image[n, 1, 1]
+        determinant = a * d - b * c
+        inverse[0, 0], inverse[0, 1] = d / determinant, -b / determinant
+        inverse[1, 0], inverse[1, 1] = -c / determinant, a / determinant
+        for i in range(2):
+            for j in range(2):
+                value = 0.0
+                for k in range(2):
+                    for m in range(2):
+                        value += inverse[i, k] * in_image[n, k, m] * inverse[j, m]
+                out[n, i, j] = value if np.isfinite(value) else np.nan
+    return out

@@ -7,7 +7,7 @@ import numpy as np
 from pyproj import CRS
 
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
-from services.lines_of_sight import intersect_terrain
+from services.lines_of_sight import ground_in_sight, intersect_terrain
 from services.map_grid import MapGrid, xy_of_lon_lat
 from services.terrain import Terrain
 from services.types import Array, BoolArray
@@ -63,6 +63,8 @@ def correct_vectors(
         CoverageError: no vertex comes near the terrain.
     """
     gsd_m, posting_m = scene_gsd_m(scene), terrain.posting_m
+    if len(shapes.vertices):
+        terrain = ground_in_sight(scene.model, shapes.vertices, terrain)
 
     def ground(line_sample: Array) -> Array:
         """x, y, longitude, latitude and height."""

@@ -123,22 +123,23 @@ def _between(
             inner = pieces[batch] - 1
             owner = np.repeat(batch, inner)
             begin = np.cumsum(inner) - inner
-            number = np.arange(inner.sum()) - np.repeat(begin, inner) + 1
-            t = number / pieces[owner]
-            source = vertices[low[owner]] + t[:, None] * (vertices[high[owner]] - vertices[low[owner]])
-            # Of an edge with twice as many pieces, every second place is known.
-            is_new = np.full(len(number), not len(known)) | (number % 2 == 1)
-            moved = np.empty((len(source), len(tolerance)))
-            moved[is_new] = _applied(transformation, source[is_new])
-            moved[~is_new] = known[used : used + len(source) - int(is_new.sum())]
-            used += len(source) - int(is_new.sum())
+            source, number = _places(vertices, low[batch], high[batch], pieces[batch])
+            if len(known):
+                # Of an edge with twice as many pieces, every second place is known.
+                is_new = number % 2 == 1
+                moved = np.empty((len(source), len(tolerance)))
+                moved[is_new] = _applied(transformation, source[is_new])
+                moved[~is_new] = known[used : used + len(source) - int(is_new.sum())]
+                used += len(source) - int(is_new.sum())
+            else:
+                moved = _applied(transformation, source)
             ends = target[low[batch]] * scale, target[high[batch]] * scale
             kept, is_rough = _needed(begin, inner, moved * scale, *ends)
             is_rough &= 2 * pieces[batch] <= finest[batch]
             rougher.append(batch[is_rough])
             seen.append(moved[np.repeat(is_rough, inner)])
             kept &= ~np.repeat(is_rough, inner)
-            broken[owner[~np.isfinite(moved).all(axis=1)]] = True
+            broken[owner[_undefined(moved)]] = True
             size += np.bincount(owner[kept], minlength=len(low))
             parts.append((owner[kept], source[kept], moved[kept]))
         rows, known = np.concatenate(rougher), np.concatenate(seen)
@@ -148,6 +149,32 @@ def _between(
     owner, source, moved = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     order = np.argsort(owner, kind="stable")
     return _Between(size, source[order], moved[order], broken)
+
+
+@njit(cache=True)
+def _places(vertices: Array, low: IntArray, high: IntArray, pieces: IntArray) -> tuple[Array, IntArray]:
+    """Places (m, d) that cut edges (k,) into equal pieces, and their numbers along the edges, from 1."""
+    count = (pieces - 1).sum()
+    out, number = np.empty((count, vertices.shape[1])), np.empty(count, dtype=np.int64)
+    row = 0
+    for e in range(len(low)):
+        start, end = vertices[low[e]], vertices[high[e]]
+        for k in range(1, pieces[e]):
+            for d in range(vertices.shape[1]):
+                out[row, d] = start[d] + k / pieces[e] * (end[d] - start[d])
+            number[row] = k
+            row += 1
+    return out, number
+
+
+@njit(cache=True)
+def _undefined(at: Array) -> BoolArray:
+    """Positions (n,) of others (n, d) with a coordinate that is not finite."""
+    out = np.zeros(len(at), dtype=np.bool_)
+    for i in range(len(at)):
+        for d in range(at.shape[1]):
+            out[i] |= not np.isfinite(at[i, d])
+    return out
 
 
 def _applied(transformation: Transformation, positions: Array) -> Array:

@@ -31,6 +31,19 @@ def hills(amplitude_m: float = 150.0) -> FloatImage:
     return (500.0 + amplitude_m * smooth).astype(np.float32)
 
 
+class Stored:
+    """Heights that are not in memory, and the windows of them that were read."""
+
+    def __init__(self, pixels: FloatImage) -> None:
+        self.image = ArrayImage(pixels)
+        self.shape = self.image.shape
+        self.windows: list[Window] = []
+
+    def read(self, window: Window) -> FloatImage:
+        self.windows.append(window)
+        return self.image.read(window)
+
+
 def terrain(amplitude_m: float = 150.0) -> Terrain:
     return Terrain(GRID, ArrayImage(hills(amplitude_m)))
 
@@ -62,23 +75,26 @@ def test_a_grid_read_by_windows_gives_the_same_heights(monkeypatch: pytest.Monke
     whole, whole_range_m = terrain().height_m(lon_lat), terrain().range_m()
     monkeypatch.setattr(terrain_module, "_TILE", 64)
     monkeypatch.setattr(terrain_module, "_MAX_CELLS_IN_MEMORY", 1000)
-    np.testing.assert_array_equal(terrain().height_m(lon_lat), whole)
-    assert terrain().range_m() == whole_range_m
-    np.testing.assert_allclose(terrain().around(lon_lat[:9]).height_m(lon_lat[:9]), whole[:9])
+    stored = replace(terrain(), heights=Stored(hills()))
+    np.testing.assert_array_equal(stored.height_m(lon_lat), whole)
+    assert stored.range_m() == whole_range_m
+    np.testing.assert_allclose(stored.around(lon_lat[:9]).height_m(lon_lat[:9]), whole[:9])
+
+
+def test_a_part_of_a_terrain_has_the_same_heights() -> None:
+    lon_lat = GRID.lon_lat(places(9))
+    for heights in (ArrayImage(hills()), Stored(hills())):
+        part = replace(terrain(), heights=heights).around(lon_lat)
+        assert part.grid.shape < GRID.shape
+        np.testing.assert_allclose(part.height_m(lon_lat), terrain().height_m(lon_lat))
 
 
 def test_no_window_is_larger_than_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[Window] = []
-
-    class Watched(ArrayImage):
-        def read(self, window: Window) -> FloatImage:
-            read.append(window)
-            return super().read(window)
-
     monkeypatch.setattr(terrain_module, "_TILE", 64)
-    replace(terrain(), heights=Watched(hills())).height_m(GRID.lon_lat(places()))
-    assert len(read) == 25
-    assert max(max(window.lines, window.samples) for window in read) <= 65
+    stored = Stored(hills())
+    replace(terrain(), heights=stored).height_m(GRID.lon_lat(places()))
+    assert len(stored.windows) == 25
+    assert max(max(window.lines, window.samples) for window in stored.windows) <= 65
 
 
 def test_heights_outside_the_grid_and_next_to_a_void_are_nan() -> None:
@@ -159,7 +175,9 @@ def test_a_terrain_too_large_for_the_memory_is_read_in_parts(monkeypatch: pytest
     model, ground = view(35.0), terrain(60.0)
     whole = intersect_terrain(model, pixels_of(), ground)
     monkeypatch.setattr(terrain_module, "_MAX_CELLS_IN_MEMORY", 800)
-    parts = intersect_terrain(model, pixels_of(), ground)
+    stored = Stored(ground.heights.read(Window(0, 0, *SHAPE)))
+    parts = intersect_terrain(model, pixels_of(), replace(ground, heights=stored))
+    assert len(stored.windows) > 2
     np.testing.assert_allclose(parts[:, 2], whole[:, 2], atol=a_tenth_of_a_millimetre)
 
 

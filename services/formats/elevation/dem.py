@@ -120,13 +120,14 @@ class _Heights:
     def read(self, window: Window) -> FloatImage:
         band = self.image.band - 1
         dataset = self.image.dataset
-        stored = self.image.read(window)
-        scale = np.float32(dataset.scales[band] * self.unit_m)
-        heights = stored * scale + np.float32(dataset.offsets[band] * self.unit_m)
+        heights = self.image.read(window)
+        void = heights == UNDECLARED_VOID
+        heights *= np.float32(dataset.scales[band] * self.unit_m)
+        heights += np.float32(dataset.offsets[band] * self.unit_m)
         with np.errstate(invalid="ignore"):
-            void = (heights < HEIGHTS_M[0]) | (heights > HEIGHTS_M[1]) | (stored == UNDECLARED_VOID)
+            void |= (heights < HEIGHTS_M[0]) | (heights > HEIGHTS_M[1])
         heights[void] = np.nan
-        return np.asarray(heights)
+        return heights
 
 
 def _vertical_datum(
