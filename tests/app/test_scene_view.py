@@ -1,0 +1,47 @@
+"""A service draws the raw image of a scene as tiles, for its owner."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from fastapi.testclient import TestClient
+
+from app.config import Settings
+from app.db.engine import Database
+from tests.app.ledger import job_runner, make_token
+from tests.app.test_orthorectification import write_inputs
+
+
+def test_the_tiles_of_a_scene_are_read_by_ranges(
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    settings: Settings,
+    database: Database,
+    tmp_path: Path,
+) -> None:
+    image, _ = write_inputs(tmp_path)
+    me = bearer("register")
+    scene = client.post("/scenes?name=scene.tif", content=image.read_bytes(), headers=me).json()["id"]
+    ended = job_runner(client, database, settings, me)("view-scene", scene=scene)
+    assert ended["status"] == "successful", str(ended)
+    answer = client.get(f"/jobs/{ended['jobID']}/results", headers=me).json()
+    index = client.get(answer["tiles.json"]["href"], headers=me).json()
+    with rasterio.open(image) as raw:
+        pixels = raw.read(1).astype(float)
+    assert (index["lines"], index["samples"]) == pixels.shape == (answer["lines"], answer["samples"])
+    at, size = index["levels"][0]["tiles"][0]
+    part = client.get(
+        answer["tiles.bin"]["href"], headers={**me, "Range": f"bytes={at}-{at + size - 1}"}
+    )
+    assert part.status_code == 206
+    tile = cv2.imdecode(np.frombuffer(part.content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert np.corrcoef(tile.ravel(), pixels[: len(tile), : tile.shape[1]].ravel())[0, 1] > 0.9
+
+    stranger = make_token(client, bearer("admin"))
+    assert client.get(answer["tiles.bin"]["href"], headers=stranger).status_code == 404
+    body = {"inputs": {"scene": scene}}
+    for headers, status in ((stranger, 404), (bearer("read"), 403), ({}, 401)):
+        reply = client.post("/processes/view-scene/execution", json=body, headers=headers)
+        assert reply.status_code == status
