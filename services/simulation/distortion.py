@@ -1,5 +1,6 @@
 """What sensor models do not describe: jitter, bows, lost lines, moved ground, swapped axes."""
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Literal, Protocol
@@ -14,7 +15,7 @@ Turn = Literal["", "swapped", "mirrored", "upside down"]
 
 _STEPS = 400
 _CLOSE_PX = 1e-10
-_TILE_PX = 256
+_TILE_PX, _CACHED_TILES = 256, 256
 
 
 class Displacement(Protocol):
@@ -167,7 +168,7 @@ class Distortion:
                 break
         found = np.full(place.shape, np.nan)
         times = np.zeros(len(place), dtype=np.int64)
-        for jump in self._jumps():
+        for jump in self.jumps():
             pixel = place - jump
             shows = (self.jump(pixel) == jump).all(axis=1)
             found[shows] = pixel[shows]
@@ -193,6 +194,13 @@ class Distortion:
         if self.moved is not None:
             out[self.is_moved(line_sample)] += self.moved.shift_px
         return out
+
+    def jumps(self) -> list[Array]:
+        """All values (2,) that `jump` has."""
+        apart = [np.zeros(2)] if self.moved is None else [np.zeros(2), self.moved.shift_px]
+        lines = np.unique(self._lines_before())
+        jumps = np.array([np.array([line, 0.0]) + shift for line in lines for shift in apart])
+        return list(np.unique(jumps, axis=0))
 
     def after_jump(self, line_sample: Array) -> Array:
         """Positions (n, 2) in the undistorted image after the jump of their pixels: a smooth map."""
@@ -224,13 +232,6 @@ class Distortion:
         lost = np.array(list(accumulate((step.lines for step in self.steps), initial=0)), np.float64)
         return lost - lost[self._steps_passed(np.array([(self.shape[0] - 1.0) / 2.0]))]
 
-    def _jumps(self) -> list[Array]:
-        """All values (2,) that `jump` has."""
-        apart = [np.zeros(2)] if self.moved is None else [np.zeros(2), self.moved.shift_px]
-        lines = np.unique(self._lines_before())
-        jumps = np.array([np.array([line, 0.0]) + shift for line in lines for shift in apart])
-        return list(np.unique(jumps, axis=0))
-
 
 class DistortedImage:
     """A part of an image, resampled once by the spline of `sample_image` where it is read.
@@ -251,6 +252,7 @@ class DistortedImage:
         """
         self.distortion = distortion
         self._image, self._corner = image, np.array(corner, dtype=np.float64)
+        self._tiles: OrderedDict[tuple[int, int], FloatImage] = OrderedDict()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -260,29 +262,38 @@ class DistortedImage:
     def read(self, window: Window) -> FloatImage:
         """Pixels of a window, float32; NaN outside the part and where the image has none."""
         out = np.full((window.lines, window.samples), np.nan, dtype=np.float32)
-        first = np.maximum([window.line, window.sample], 0)
-        last = np.minimum(
-            [window.line + window.lines, window.sample + window.samples], self.distortion.shape
-        )
-        for line in range(int(first[0]), int(last[0]), _TILE_PX):
-            for sample in range(int(first[1]), int(last[1]), _TILE_PX):
-                end = np.minimum(np.array([line, sample]) + _TILE_PX, last)
-                tile = self._tile(range(line, int(end[0])), range(sample, int(end[1])))
-                i, j = line - window.line, sample - window.sample
-                out[i : i + tile.shape[0], j : j + tile.shape[1]] = tile
+        start = np.array([window.line, window.sample])
+        first, last = np.maximum(start, 0), np.minimum(start + out.shape, self.shape)
+        if not (last > first).all():
+            return out
+        low, high = first // _TILE_PX, (last - 1) // _TILE_PX
+        for row in range(low[0], high[0] + 1):
+            for column in range(low[1], high[1] + 1):
+                pixels = self._tile(row, column)
+                corner = np.array([row, column]) * _TILE_PX
+                a, b = np.maximum(first, corner), np.minimum(last, corner + pixels.shape)
+                (r0, c0), (r1, c1) = a - start, b - start
+                (i0, j0), (i1, j1) = a - corner, b - corner
+                out[r0:r1, c0:c1] = pixels[i0:i1, j0:j1]
         return out
 
-    def _tile(self, lines: range, samples: range) -> FloatImage:
-        grid = np.meshgrid(
-            np.arange(lines.start, lines.stop, dtype=np.float64),
-            np.arange(samples.start, samples.stop, dtype=np.float64),
-            indexing="ij",
-        )
-        pixels = np.stack(grid, axis=-1).reshape(-1, 2)
+    def _tile(self, row: int, column: int) -> FloatImage:
+        """A tile, kept until many others were read."""
+        if (row, column) not in self._tiles:
+            self._tiles[row, column] = self._resampled(np.array([row, column]) * _TILE_PX)
+            while len(self._tiles) > _CACHED_TILES:
+                self._tiles.popitem(last=False)
+        return self._tiles[row, column]
+
+    def _resampled(self, first: IntArray) -> FloatImage:
+        """Pixels of the tile that begins at a line and sample (2,)."""
+        lines, samples = (int(n) for n in np.minimum(first + _TILE_PX, self.shape) - first)
+        pixels = np.indices((lines, samples)).reshape(2, -1).T + first.astype(np.float64)
         jumps = self.distortion.jump(pixels)
         out = np.full(len(pixels), np.nan, dtype=np.float32)
-        for jump in np.unique(jumps, axis=0):
+        for jump in self.distortion.jumps():
             here = (jumps == jump).all(axis=1)
-            position = self.distortion.after_jump(pixels[here] + jump) + self._corner
-            out[here] = sample_image(self._image, position[None, :, :], 1.0)[0]
-        return out.reshape(len(lines), len(samples))
+            if here.any():
+                position = self.distortion.after_jump(pixels[here] + jump) + self._corner
+                out[here] = sample_image(self._image, position[None, :, :], 1.0)[0]
+        return out.reshape(lines, samples)

@@ -201,9 +201,10 @@ class TiledView:
         pixels = np.indices(shape).reshape(2, -1).T + corner
         jumps = self._distortion.jump(pixels)
         light = np.empty(shape, dtype=np.float32)
-        for jump in np.unique(jumps, axis=0):
+        for jump in self._distortion.jumps():
             here = (jumps == jump).all(axis=1).reshape(shape)
-            light[here] = self._light_after(jump + corner, shape)[here]
+            if here.any():
+                light[here] = self._light_after(jump + corner, shape)[here]
         if margin == 0:
             return light
         along_lines, along_samples = self._detectors.blur_px
