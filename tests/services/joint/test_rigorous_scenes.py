@@ -56,7 +56,9 @@ class RigorousTruth(SceneTruth):
     parameter_set: ParameterSet
 
     def position(self, lon_lat_h: Array) -> Array:
-        return self.delivered.corrected(self.values).project(lon_lat_h)
+        position = self.delivered.corrected(self.values).project(lon_lat_h)
+        wave = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
+        return np.asarray(position + wave * np.array(self.plan.bend_px))
 
     def scene(self) -> Scene:
         model = self.delivered.model
@@ -251,3 +253,15 @@ def test_every_scene_of_a_mixed_block_is_qualified_and_has_an_rpc() -> None:
     refined = refined_rpc(block.model(0), SHAPE, found.heights_m)
     assert refined.model is not None
     assert refined.max_error_px < 0.01
+
+
+def test_a_bent_rigorous_scene_is_named_and_does_not_spoil_the_others() -> None:
+    rng = np.random.default_rng(36)
+    truth = mixed(rng)
+    bent = rigorous_truth(plan_of(0, name="bent", bend_px=(8.0, 4.0)), SRP, rng)
+    truth = replace(truth, images=(bent, *truth.images[1:]))
+    block, left = adjust_fitting(*observed(truth, rng), OPTIONS)
+    assert [one.measured.name for one in left] == ["bent"]
+    without = replace(truth, images=truth.images[1:])
+    assert max(normalised(without, block, number) for number in range(3)) < 4.0
+    assert max(largest_m(without, block, number) for number in range(3)) < 1.2
