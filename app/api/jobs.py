@@ -151,9 +151,10 @@ def status_info(request: Request, job: Job) -> StatusInfo:
             Link(rel="related", href=f"{here}/results/{name}", type=media_type(name), title=name)
             for name in results.kept_files(job)
         ]
-    if "scene" in job.inputs:
-        scene = f"{request.base_url}scenes/{job.inputs['scene']}"
-        links.append(Link(rel="related", href=scene, type=JSON, title="scene"))
+    one = [job.inputs["scene"]] if "scene" in job.inputs else []
+    for scene in job.inputs.get("scenes", one):
+        href = f"{request.base_url}scenes/{scene}"
+        links.append(Link(rel="related", href=href, type=JSON, title="scene"))
     return StatusInfo(
         job_id=job.id,
         process_id=job.kind,

@@ -69,11 +69,11 @@ def show_results(
     return JSONResponse(jsonable_encoder({**values, **members}))
 
 
-@router.get("/jobs/{job_id}/results/{name}", response_class=Response)
+@router.get("/jobs/{job_id}/results/{name:path}", response_class=Response)
 def download_result(
     *, job_id: JobId, name: str, database: DatabaseDep, storage: StorageDep, caller: Reader
 ) -> Response:
-    """Return one file of the results."""
+    """Return one file of the results; of scenes registered together its name is `SCENE/NAME`."""
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
     return file_reply(storage, results.result_key(job, name), media_type(name))

@@ -25,7 +25,7 @@ def renew(
     reference: Annotated[str, typer.Argument(help="Number of the published block, ID, or ID@VERSION.")],
     *,
     job: Annotated[
-        list[UUID] | None, typer.Option(help="Job that registered a scene on the block; repeat.")
+        list[UUID] | None, typer.Option(help="Job that registered scenes on the block; repeat.")
     ] = None,
     image: Annotated[
         list[Path] | None,
@@ -55,7 +55,7 @@ def renew(
         progress(0.0, "reading points")
         with database.snapshot() as connection:
             base = read_base(connection, reference, version)
-            rows = [registered_job(connection, base.block, one) for one in job or ()]
+            rows = [row for one in job or () for row in registered_job(connection, base.block, one)]
             scenes = [scene_of_image(connection, base.block, one) for one in image or ()]
         scenes += [scene_of_job(database, storage, settings, row, Path(scratch)) for row in rows]
         document = renew_block(

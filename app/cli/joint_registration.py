@@ -19,6 +19,7 @@ from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
 from app.usecases.executors import ComputeOptions
 from app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
+from app.usecases.registration.joined_scenes import read_joined
 from app.usecases.registration.register import SceneFiles, image_key, record_registration
 from app.usecases.registration.result_folder import older_result, replacing
 from app.usecases.registration.together import (
@@ -155,7 +156,7 @@ def _run(request: JointRequest, find_points: FindPoints, folders: dict[str, Path
                 folders.__getitem__,
                 request.output.resolve().name,
                 ComputeOptions(jobs=request.jobs),
-                request.joined,
+                None if request.joined is None else read_joined(request.joined / BLOCK_FOLDER),
             ),
             options=request.options,
             copy_image=request.copy_image,

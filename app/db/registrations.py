@@ -8,7 +8,7 @@ from uuid import UUID, uuid4
 from sqlalchemy import exists, func, insert, select, update
 
 from app.db.engine import Connection
-from app.db.rows import columns_of, first
+from app.db.rows import columns_of, every, first
 from app.db.schema import registration
 
 
@@ -17,7 +17,7 @@ class RegistrationRow:
     """A registered scene.
 
     Attributes:
-        job_id: the job that made it; a job registers once.
+        job_id: the job that made it; a job registers one scene or several, each once.
         block_versions: id and version of every block whose points were used.
         report: the content of `report.json`.
         files: name to key in the storage.
@@ -78,10 +78,17 @@ def claim_scene(connection: Connection, registration_id: UUID, scene_key: str) -
     return claimed.rowcount == 1
 
 
-def find_by_job(connection: Connection, job_id: UUID) -> RegistrationRow | None:
-    """The registration that a job made."""
-    statement = select(*COLUMNS).where(registration.c.job_id == job_id)
-    return first(RegistrationRow, connection.execute(statement))
+def find_of_job(connection: Connection, job_id: UUID) -> list[RegistrationRow]:
+    """The registrations that a job made, one for each scene that it registered."""
+    of_job = registration.c.job_id == job_id
+    statement = select(*COLUMNS).where(of_job).order_by(registration.c.scene_id)
+    return every(RegistrationRow, connection.execute(statement))
+
+
+def find_of_scene(connection: Connection, job_id: UUID, scene_id: UUID) -> RegistrationRow | None:
+    """The registration that a job made of a scene."""
+    of_both = (registration.c.job_id == job_id, registration.c.scene_id == scene_id)
+    return first(RegistrationRow, connection.execute(select(*COLUMNS).where(*of_both)))
 
 
 def find_counted(connection: Connection, scene_key: str) -> RegistrationRow | None:

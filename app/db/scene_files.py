@@ -19,7 +19,7 @@ class SceneFiles:
         image: name of the file; None after its removal, or when it was not uploaded.
         models: names of the files beside it.
         job_id: the last job that registered the scene and whose files are still there.
-        results: names of the files of that job.
+        results: name to key in the storage of the files that it made of the scene.
         accuracy: what the report of the last registration states, by the names of its members, None in
             reports without them; None without a registration.
     """
@@ -28,7 +28,7 @@ class SceneFiles:
     image: str | None
     models: list[str]
     job_id: UUID | None
-    results: list[str]
+    results: dict[str, str]
     accuracy: dict[str, Any] | None
 
 

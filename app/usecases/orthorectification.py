@@ -11,7 +11,7 @@ from uuid import UUID
 import numpy as np
 
 from app.auth import Scope
-from app.db import registrations, scenes
+from app.db import scenes
 from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError, TooLarge
@@ -21,7 +21,13 @@ from app.usecases.processes import Commit, Process, Work
 from app.usecases.quotas import FREE_ROOM
 from app.usecases.registered_scene import REFINED_NAME
 from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
+from app.usecases.scene_inputs import (
+    check_file_names,
+    check_scene,
+    naming,
+    present_scene,
+    registration_files,
+)
 from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile, read_terrain
 from services.formats.elevation.geoid import vertical_crs
@@ -287,11 +293,9 @@ def _refined_key(connection: Connection, scene_id: UUID, job_id: UUID) -> str:
 
     Raises:
         InputError: the job did not register the scene, or made no RPC.
+        Conflict: its results were removed.
     """
-    registration = registrations.find_by_job(connection, job_id)
-    if registration is None or registration.scene_id != scene_id:
-        raise InputError(f"registration: job {job_id} did not register scene {scene_id}")
-    key = registration.files.get(REFINED_NAME)
+    key = registration_files(connection, scene_id, job_id).get(REFINED_NAME)
     if key is None:
         raise InputError(
             f"registration: job {job_id} made no {REFINED_NAME}, because no RPC fits its refined model"

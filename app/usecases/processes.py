@@ -66,6 +66,11 @@ def results_folder(job_id: UUID) -> str:
     return f"results/{job_id}"
 
 
+def result_name(key: str) -> str:
+    """The name of a file among the results of its job, by its key in the storage."""
+    return key.split("/", 3)[3]
+
+
 @dataclass(frozen=True)
 class Process:
     """A process.

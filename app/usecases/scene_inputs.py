@@ -1,11 +1,11 @@
-"""Checks of jobs on an uploaded scene: of the scene, and of the names of files beside its image."""
+"""Checks of jobs on an uploaded scene: of the scene, its registration, and names of files beside it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 from uuid import UUID
 
-from app.db import scenes
+from app.db import registrations, scenes
 from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
@@ -48,6 +48,23 @@ def naming(field: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{field}: {error}") from None
+
+
+def registration_files(connection: Connection, scene_id: UUID, job_id: UUID) -> dict[str, str]:
+    """Name to storage key of the outputs that a job made of a scene that it registered.
+
+    Raises:
+        InputError: the job did not register the scene.
+        Conflict: its results were removed.
+    """
+    registration = registrations.find_of_scene(connection, job_id, scene_id)
+    if registration is None:
+        raise InputError(f"registration: job {job_id} did not register scene {scene_id}")
+    if not registration.files:
+        raise Conflict(
+            f"registration: the results of job {job_id} were removed; register scene {scene_id} again"
+        )
+    return registration.files
 
 
 def present_scene(connection: Connection, scene_id: UUID) -> SceneRow:

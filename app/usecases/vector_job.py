@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 from uuid import UUID
 
 from app.auth import Scope
-from app.db import registrations
 from app.db.engine import Connection
 from app.db.tokens import Token
 from app.errors import InputError
@@ -17,7 +16,13 @@ from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
 from app.usecases.registered_scene import REFINED_NAME, SceneModel
 from app.usecases.results import store_results
-from app.usecases.scene_inputs import check_file_names, check_scene, naming, present_scene
+from app.usecases.scene_inputs import (
+    check_file_names,
+    check_scene,
+    naming,
+    present_scene,
+    registration_files,
+)
 from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile
 from app.usecases.vector_files import (
@@ -143,16 +148,13 @@ def _registration_keys(connection: Connection, scene_id: UUID, job_id: UUID) -> 
     """The storage keys of the correction and the refined model that a job made of a scene.
 
     Raises:
-        InputError: the job did not register the scene.
+        InputError: the job did not register the scene, or made no correction.
+        Conflict: its results were removed.
     """
-    registration = registrations.find_by_job(connection, job_id)
-    if registration is None or registration.scene_id != scene_id:
-        raise InputError(f"registration: job {job_id} did not register scene {scene_id}")
-    names = (CORRECTION_JSON, REFINED_NAME)
-    keys = [registration.files[name] for name in names if name in registration.files]
-    if CORRECTION_JSON not in registration.files:
+    files = registration_files(connection, scene_id, job_id)
+    if CORRECTION_JSON not in files:
         raise InputError(f"registration: job {job_id} made no {CORRECTION_JSON}")
-    return keys
+    return [files[name] for name in (CORRECTION_JSON, REFINED_NAME) if name in files]
 
 
 @contextmanager

@@ -53,7 +53,7 @@ def test_a_worker_back_from_the_dead_writes_nothing(database: Database):
             write(connection)
     assert state_of(database, job.id).state == "running"
     with database.transaction() as connection:
-        assert registrations.find_by_job(connection, job.id) is None, "the late result was rolled back"
+        assert registrations.find_of_job(connection, job.id) == [], "the late result was rolled back"
         finish(connection, job.id, heir.attempt, scene_id)
     assert state_of(database, job.id).state == "successful"
     with pytest.raises(UniqueViolation), database.transaction() as connection:

@@ -1,46 +1,34 @@
-"""Scenes registered together: by `amers scene register-many`, and by the process `register-scenes`."""
+"""Scenes registered together by `amers scene register-many`."""
 
-import io
 import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
-import rasterio
-from fastapi.testclient import TestClient
 from jsonschema import validate
 
 from app.config import Settings
 from app.db import engine
 from app.storage import Storage
-from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.reports.document import failure_schema, joint_schema, report_schema
-from services.sensors.rpc import RpcModel
-from services.types import FloatImage
-from tests.app.flat_world import (
-    SIGMA_M,
-    FlatWorld,
-    flat_texture,
-    make_flat_world,
-    publish_world,
+from tests.app.flat_world import SIGMA_M, FlatWorld, make_flat_world, publish_world
+from tests.app.joint_world import (
+    A_FIFTH_OF_A_PIXEL,
+    SCENES,
+    true_model,
+    write_scenes,
 )
 from tests.app.registration_outputs import largest_error_px
-from tests.app.worker_processes import ended, running_worker
 from tests.command_line import Done, amers_here
 from tests.statements import run_sql
 
 pytestmark = pytest.mark.long
 
 Amers = Callable[..., Done]
-A_FIFTH_OF_A_PIXEL = 0.2
-SCENES = {"east": (0.05, 0.3, (12.0, -7.0)), "south": (0.3, 0.02, (-9.0, 10.0))}
-"""How scenes look, in sizes of the image by the height, and by how much their models are off."""
 
 
 @pytest.fixture(scope="module")
@@ -51,34 +39,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
 @pytest.fixture(scope="module")
 def folder(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes of the ground of the block, and one of other ground."""
-    folder = tmp_path_factory.mktemp("scenes")
-    rng = np.random.default_rng(8)
-    for name, (_, _, shift_px) in SCENES.items():
-        write_scene(folder / f"{name}.tif", true_model(world, name), shift_px, world.ground, rng)
-    other = flat_texture(len(world.ground), rng)
-    write_scene(folder / "wrong.tif", true_model(world, "east"), (3.0, 3.0), other, rng)
-    return folder
-
-
-def true_model(world: FlatWorld, name: str) -> RpcModel:
-    """Flat ground looks the same from all sides."""
-    line_num, sample_num = world.true_model.line_num.copy(), world.true_model.sample_num.copy()
-    line_num[3], sample_num[3] = SCENES[name][:2]
-    return replace(world.true_model, line_num=line_num, sample_num=sample_num)
-
-
-def write_scene(
-    path: Path,
-    truth: RpcModel,
-    shift_px: tuple[float, float],
-    ground: FloatImage,
-    rng: np.random.Generator,
-) -> None:
-    pixels = np.clip(ground + rng.normal(0.0, 20.0, ground.shape), 1.0, 4095.0)
-    profile = {"driver": "GTiff", "width": len(ground), "height": len(ground), "count": 1}
-    with rasterio.open(path, "w", **profile, dtype="uint16") as file:
-        file.write(np.rint(pixels).astype(np.uint16), 1)
-        file.rpcs = gdal_rpc(replace(truth, image_offset=truth.image_offset - shift_px))
+    return write_scenes(world, tmp_path_factory.mktemp("scenes"))
 
 
 @pytest.fixture
@@ -183,59 +144,3 @@ def test_nothing_is_written_when_a_folder_holds_other_files(
     assert done.returncode == 2
     assert "block: holds files" in done.stderr
     assert [path.name for path in output.iterdir()] == ["block"]
-
-
-def test_a_job_registers_uploaded_scenes_together(
-    client: TestClient,
-    bearer: Callable[[str], dict[str, str]],
-    settings: Settings,
-    world: FlatWorld,
-    folder: Path,
-    tmp_path: Path,
-    dsn: str,
-    storage: Storage,
-):
-    publish_world(dsn, storage, world)
-    me, other = bearer("register"), bearer("register")
-    upload = f"/scenes?name=scene.tif&sigma_m={SIGMA_M}"
-    ids = {
-        name: client.post(upload, content=(folder / f"{name}.tif").read_bytes(), headers=me).json()["id"]
-        for name in (*SCENES, "wrong")
-    }
-    execution = "/processes/register-scenes/execution"
-    scenes = list(ids.values())
-    for wrong in ([scenes[0]], [scenes[0], scenes[0]], [*scenes, "nothing"]):
-        reply = client.post(execution, json={"inputs": {"scenes": wrong}}, headers=me)
-        assert reply.status_code == 422, reply.text
-    best = client.post(execution, json={"inputs": {"scenes": scenes, "rigorous": "best"}}, headers=me)
-    assert best.status_code == 422, best.text
-    body = {"inputs": {"scenes": scenes}}
-    assert client.post(execution, json=body, headers=other).status_code == 404
-    assert client.post(execution, json=body, headers=bearer("read")).status_code == 403
-    job = client.post(execution, json=body, headers=me).headers["location"]
-    with running_worker(settings, tmp_path / "log"):
-        done = ended(client, job, me)
-    assert done["status"] == "successful", done
-    results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
-    assert results["verdict"] == "not registered"
-    verdicts = {one["scene"]: one["verdict"] for one in results["scenes"]}
-    assert verdicts.pop(ids["wrong"]) == "not registered"
-    assert set(verdicts.values()) <= {"good", "usable"}
-    report = client.get(results["report.json"]["href"], headers=me).json()
-    validate(report, client.get("/schemas/joint.json").json())
-    packed = client.get(results[f"{ids['east']}.zip"]["href"], headers=me)
-    assert packed.headers["content-type"] == "application/zip"
-    with ZipFile(io.BytesIO(packed.content)) as file:
-        assert {"report.json", "report.html", "refined_RPC.TXT", "correction.json"} <= set(
-            file.namelist()
-        )
-        file.extract("refined_RPC.TXT", tmp_path)
-    refined = read_rpc(folder / "east.tif", tmp_path / "refined_RPC.TXT").model
-    assert largest_error_px(refined, true_model(world, "east")) < A_FIFTH_OF_A_PIXEL
-    with ZipFile(
-        io.BytesIO(client.get(results[f"{ids['wrong']}.zip"]["href"], headers=me).content)
-    ) as file:
-        validate(json.loads(file.read("report.json")), failure_schema())
-    with engine.connect(dsn) as connection:
-        counts = run_sql(connection, "select count(*) as n from registration where scene_id is not null")
-        assert counts.fetchone() == {"n": 2}

@@ -12,6 +12,7 @@ from sqlalchemy import (
     SmallInteger,
     Table,
     Text,
+    UniqueConstraint,
     Uuid,
     text,
 )
@@ -22,7 +23,7 @@ registration = Table(
     "registration",
     metadata,
     Column("id", Uuid, primary_key=True),
-    Column("job_id", ForeignKey("job.id", ondelete="SET NULL"), unique=True),
+    Column("job_id", ForeignKey("job.id", ondelete="SET NULL")),
     Column("scene_id", ForeignKey("scene.id")),
     # Id and version of each block whose points were used.
     Column("block_versions", Json, nullable=False),
@@ -36,6 +37,8 @@ registration = Table(
     # What identifies the scene; only one registration of a scene counts in the histories.
     Column("scene_key", Text),
     Column("counted", Boolean, nullable=False, server_default=text("false")),
+    # A job registers one scene or several, each once.
+    UniqueConstraint("job_id", "scene_id"),
     Index("registration_scene", "scene_id"),
     Index("registration_counted", "scene_key", unique=True, postgresql_where=text("counted")),
 )

@@ -6,7 +6,7 @@ select s.id as scene_id,
     case when s.state = 'removed' then '{}'::text[]
          else array(select jsonb_object_keys(s.models) order by 1) end as models,
     r.job_id,
-    array(select jsonb_object_keys(r.files) order by 1) as results,
+    coalesce(r.files, '{}'::jsonb) as results,
     (select jsonb_build_object(
             'verdict_scope', l.report->'verdict_scope',
             'relative_to_control_points', l.report->'relative_to_control_points',

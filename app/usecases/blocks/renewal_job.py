@@ -8,7 +8,9 @@ from typing import Any
 from uuid import UUID
 
 from app.auth import Scope
+from app.db.blocks import Block
 from app.db.engine import Connection
+from app.db.registrations import RegistrationRow
 from app.db.tokens import Token
 from app.errors import InputError
 from app.usecases.blocks import lifecycle
@@ -27,12 +29,15 @@ class RenewBlock:
 
     Attributes:
         block: number, ID or ID@VERSION of the published block.
-        jobs: successful jobs of register-scene on this block with the verdict "good".
+        jobs: successful jobs of register-scene on this block with the verdict "good", or of
+            register-scenes, whose scenes with this verdict are used.
+        scenes: the only scenes to use of jobs of register-scenes, all "good"; none named means all.
         version: of the renewed block; by default the next whole number.
     """
 
     block: str
     jobs: tuple[UUID, ...]
+    scenes: tuple[UUID, ...] = ()
     version: str = ""
 
 
@@ -43,8 +48,18 @@ def _check(connection: Connection, caller: Token, inputs: RenewBlock) -> None:
         raise InputError("jobs: one of them is given twice; name each once")
     block = lifecycle.find_published(connection, inputs.block)
     next_version(connection, block, inputs.version)
-    for job_id in inputs.jobs:
-        registered_job(connection, block, job_id)
+    _registrations(connection, block, inputs)
+
+
+def _registrations(connection: Connection, block: Block, inputs: RenewBlock) -> list[RegistrationRow]:
+    """The registrations of the jobs."""
+    rows = [
+        row for job_id in inputs.jobs for row in registered_job(connection, block, job_id, inputs.scenes)
+    ]
+    unused = set(inputs.scenes) - {row.scene_id for row in rows}
+    if unused:
+        raise InputError(f"scenes: {min(map(str, unused))}: none of the jobs registered this scene")
+    return rows
 
 
 def _run(work: Work) -> Commit:
@@ -53,7 +68,7 @@ def _run(work: Work) -> Commit:
     work.progress(0.0, "reading points")
     with work.database.snapshot() as connection:
         base = read_base(connection, inputs.block, inputs.version)
-        rows = [registered_job(connection, base.block, job_id) for job_id in inputs.jobs]
+        rows = _registrations(connection, base.block, inputs)
     # Lives as long as the transaction may need it; it ends with the attempt's process at the latest.
     scratch = tempfile.TemporaryDirectory(prefix="amers-renewal-")
     folder = Path(scratch.name) / "block"

@@ -1,6 +1,6 @@
 """The scenes that renew a block: found by their registrations, and registered on all its points."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -20,6 +20,7 @@ from app.errors import ComputationError, InputError, NotFound
 from app.storage import Storage
 from app.usecases.damage import suspecting_damage
 from app.usecases.registration.job import REGISTER_SCENE, scene_files
+from app.usecases.registration.joint_job import REGISTER_SCENES
 from app.usecases.registration.register import SceneFiles, image_key
 from app.usecases.scene_inputs import naming, present_scene
 from app.usecases.scenes import local_image, stored_keys
@@ -32,6 +33,9 @@ from services.quality.qualification import QualificationOptions
 from services.registration.on_points import register_scene
 from services.registration.options import RegistrationOptions
 from services.types import BoolArray, ChipSource, ControlPoints, IntArray, Progress, part_of
+
+PROCESSES = {process.id: process for process in (REGISTER_SCENE, REGISTER_SCENES)}
+"""Processes that register scenes."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,16 @@ class SceneOnBlock:
     found: BoolArray
 
 
-def registered_job(connection: Connection, block: Block, job_id: UUID) -> RegistrationRow:
-    """The registration of a job, good and on a version of a block.
+def registered_job(
+    connection: Connection, block: Block, job_id: UUID, scenes: Collection[UUID] = ()
+) -> list[RegistrationRow]:
+    """The registrations of a job, good and on a version of a block.
+
+    Args:
+        connection: for reading.
+        block: to be renewed.
+        job_id: of a job that registered one scene, or several together.
+        scenes: the only scenes that are used of several; by default those with the verdict "good".
 
     Raises:
         NotFound: there is no such job.
@@ -84,12 +96,22 @@ def registered_job(connection: Connection, block: Block, job_id: UUID) -> Regist
     if job is None:
         raise NotFound(f"no job {job_id}")
     name = f"job {job_id}"
-    if job.kind != REGISTER_SCENE.id or job.state != "successful":
+    if job.kind not in PROCESSES or job.state != "successful":
         raise InputError(
             f"{name}: is of the process {job.kind}, {job.state}; a successful one of "
-            f"{REGISTER_SCENE.id} is expected"
+            f"{' or '.join(PROCESSES)} is expected"
         )
-    return _usable(registrations.find_by_job(connection, job_id), block, name)
+    rows = registrations.find_of_job(connection, job_id)
+    if job.kind == REGISTER_SCENE.id:
+        return [_usable(rows[0] if rows else None, block, name)]
+    if scenes:
+        rows = [row for row in rows if row.scene_id in scenes]
+    else:
+        rows = [row for row in rows if row.verdict == "good"]
+    if not rows:
+        which = "of the scenes named" if scenes else "with the verdict 'good'"
+        raise InputError(f"{name}: registered no scene {which}; leave it out")
+    return [_usable(row, block, f"scene {row.scene_id} of {name}") for row in rows]
 
 
 def scene_of_job(
@@ -103,7 +125,7 @@ def scene_of_job(
 
     Args:
         database, storage, settings: of the installation.
-        registered: from `registered_job`.
+        registered: one from `registered_job`.
         scratch: existing folder of the caller's, for copies of files that lie in a bucket.
 
     Raises:
@@ -115,15 +137,19 @@ def scene_of_job(
         job = jobs.find(connection, registered.job_id)
         if job is None:
             raise NotFound(f"no job {registered.job_id}")
-        inputs = REGISTER_SCENE.parse_inputs(job.inputs)
-        scene = present_scene(connection, inputs.scene)
+        assert registered.scene_id is not None
+        scene = present_scene(connection, registered.scene_id)
     folder = scratch / str(registered.id)
     folder.mkdir()
     with suspecting_damage(database, storage, stored_keys(scene)):
         image = local_image(storage, settings, scene, folder)
+    inputs = PROCESSES[job.kind].parse_inputs(job.inputs)
+    files = SceneFiles(image, sigma_m=scene.sigma_m, bands=inputs.bands)
+    if job.kind == REGISTER_SCENE.id:
+        files = scene_files(inputs, image, scene.sigma_m)
     return GoodScene(
         f"scene {scene.name} of job {job.id}",
-        scene_files(inputs, image, scene.sigma_m),
+        files,
         registered.id,
         registered.created_at,
         inputs.options,

@@ -10,6 +10,7 @@ from uuid import UUID
 
 from app.db.engine import Connection
 from app.db.scene_files import SceneFiles, read_scene_files
+from app.usecases.processes import result_name
 from app.usecases.registration.deliverables import OUTPUTS, media_type
 
 VERSION = "1.1.0"
@@ -116,9 +117,9 @@ def _assets(files: SceneFiles, base: str) -> dict[str, dict[str, Any]]:
     for name in files.models:
         title = "A file delivered beside the image."
         assets[name] = _asset(f"{scene}/{name}", scene_media_type(name), title, "metadata")
-    for name in files.results:
+    for name, stored_key in sorted(files.results.items()):
         title = OUTPUTS.get(name, "The refined model in the format of the delivered one.")
-        href = f"{base}jobs/{files.job_id}/results/{name}"
+        href = f"{base}jobs/{files.job_id}/results/{result_name(stored_key)}"
         key = RESULTS.get(name, name)
         assets[key if key not in assets else f"refined-{key}"] = _asset(
             href, media_type(name), title, "metadata"

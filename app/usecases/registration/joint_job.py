@@ -1,13 +1,11 @@
 """The process `register-scenes`: register uploaded scenes together on the points of the store."""
 
-from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import UUID
-from zipfile import ZIP_DEFLATED, ZipFile
 
 from app.auth import Scope
 from app.db import scenes
@@ -15,12 +13,14 @@ from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.errors import AmersError, ComputationError, InputError, TooLarge, is_no_memory
+from app.usecases.control_files import IMAGES_NPZ
 from app.usecases.damage import suspecting_damage
 from app.usecases.processes import Commit, Process, Work, WorkFailed
 from app.usecases.registration.control_sources import points_of_store
+from app.usecases.registration.joined_job import fetch_joined, joinable_scenes
+from app.usecases.registration.joined_scenes import SCENES_JSON
 from app.usecases.registration.register import SceneFiles, record_registration
 from app.usecases.registration.together import (
-    BLOCK_FOLDER,
     JointOutcome,
     JointPlace,
     run_joint_registration,
@@ -36,7 +36,6 @@ from services.reports.failure import NO_ACCURACY, NOT_REGISTERED
 from services.sensors.parameter_sets import ParameterSetName
 
 MOST_SCENES = 100
-_REPORTS = ("report.json", "report.html", "report.txt")
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,8 @@ class RegisterScenes:
     """The inputs of a registration of scenes together.
 
     Attributes:
-        scenes: ids of uploaded scenes, 2 to 100.
+        scenes: ids of uploaded scenes, 2 to 100; with those that they join.
+        join: id of a job of this process whose scenes these join; the earlier ones stay as they are.
         bands: bands to use of each, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the
             panchromatic band or the mean of the visible ones.
         rigorous: adjust orbit, attitude and camera of the scenes whose metadata have a rigorous model,
@@ -54,6 +54,7 @@ class RegisterScenes:
     """
 
     scenes: tuple[UUID, ...]
+    join: UUID | None = None
     bands: str | None = None
     rigorous: ParameterSetName | None = None
     copy_image: bool = False
@@ -61,12 +62,18 @@ class RegisterScenes:
 
 
 def _check(connection: Connection, caller: Token, inputs: RegisterScenes) -> None:
-    count = len(inputs.scenes)
-    if not 2 <= count <= MOST_SCENES:
-        raise InputError(f"scenes: {count} given, 2 to {MOST_SCENES} expected")
-    if len(set(inputs.scenes)) < count:
+    if len(set(inputs.scenes)) < len(inputs.scenes):
         raise InputError("scenes: one is given twice, different ones expected")
-    for scene in inputs.scenes:
+    before = [] if inputs.join is None else joinable_scenes(connection, caller, inputs.join)
+    if set(before) & set(inputs.scenes):
+        raise InputError(f"scenes: job {inputs.join} has registered one of them; leave it out")
+    count = len(inputs.scenes) + len(before)
+    if not inputs.scenes or not 2 <= count <= MOST_SCENES:
+        raise InputError(
+            f"scenes: {len(inputs.scenes)} given, with {len(before)} that they join; at least one and "
+            f"2 to {MOST_SCENES} with these are expected"
+        )
+    for scene in (*inputs.scenes, *before):
         check_scene(connection, caller, scene)
     if inputs.bands is not None:
         parse_bands(inputs.bands)
@@ -79,6 +86,7 @@ def _run(work: Work) -> Commit:
         rows = {str(scene): present_scene(connection, scene) for scene in inputs.scenes}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="amers-")))
+        joined = None if inputs.join is None else fetch_joined(work, inputs.join, stack)
         files = {name: _local_files(work, row, stack) for name, row in rows.items()}
         try:
             with suspecting_damage(
@@ -87,7 +95,12 @@ def _run(work: Work) -> Commit:
                 outcome = run_joint_registration(
                     files,
                     points_of_store(work.database, work.storage),
-                    JointPlace(lambda name: folder / name, f"job {work.job.id}"),
+                    JointPlace(
+                        lambda name: folder / name,
+                        f"job {work.job.id}",
+                        joined=joined,
+                        address_of=lambda name, image: name,
+                    ),
                     options=inputs.options,
                     copy_image=inputs.copy_image,
                     progress=work.progress,
@@ -96,17 +109,21 @@ def _run(work: Work) -> Commit:
             if is_no_memory(error):
                 raise
             raise _with_reports(work, folder, error) from error
-        packed = _packed(folder, rows)
-        reports = {name: folder / BLOCK_FOLDER / name for name in _REPORTS}
-        keys = store_results(work, {**reports, **packed})
+        keys = store_results(work, {**outcome.files, **_of_scenes(folder, list(rows))})
         gsds_m = {name: scene_gsd_m(one.scene) for name, one in outcome.registered.items()}
 
     def commit(connection: Connection) -> dict[str, Any]:
         for name, registered in outcome.registered.items():
             row = rows[name]
             scene_key = row.sha256 or f"scene {row.id}"
-            # A job registers one scene at most: the registrations of many name their scenes only.
-            record_registration(connection, registered, scene_key, scene_id=row.id)
+            record_registration(
+                connection,
+                registered,
+                scene_key,
+                job_id=work.job.id,
+                scene_id=row.id,
+                keys={output: keys[f"{name}/{output}"] for output in registered.files},
+            )
             scenes.set_footprint(connection, row.id, registered.footprint)
             acquisition, shape = registered.scene.acquisition, registered.scene.image.shape
             scenes.describe(connection, row.id, acquisition, shape, gsds_m[name])
@@ -114,6 +131,7 @@ def _run(work: Work) -> Commit:
             "verdict": NOT_REGISTERED if outcome.failed else outcome.report.verdict,
             "verdict_words": outcome.report.verdict_words,
             "scenes": [_scene_values(name, outcome) for name in rows],
+            "joined": [one.address for one in joined.members] if joined else [],
             "files": keys,
         }
 
@@ -128,16 +146,9 @@ def _local_files(work: Work, row: SceneRow, stack: ExitStack) -> SceneFiles:
     return SceneFiles(image, sigma_m=row.sigma_m, bands=inputs.bands, rigorous=inputs.rigorous)
 
 
-def _packed(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The outputs of every scene in one file each, by its name."""
-    packed = {}
-    for name in names:
-        path = folder / f"{name}.zip"
-        with ZipFile(path, "w", ZIP_DEFLATED) as file:
-            for output in sorted((folder / name).iterdir()):
-                file.write(output, output.name)
-        packed[path.name] = path
-    return packed
+def _of_scenes(folder: Path, names: list[str]) -> dict[str, Path]:
+    """The outputs of every scene, by the name of the scene and their own."""
+    return {f"{name}/{path.name}": path for name in names for path in sorted((folder / name).iterdir())}
 
 
 def _scene_values(name: str, outcome: JointOutcome) -> dict[str, Any]:
@@ -162,7 +173,7 @@ def _scene_values(name: str, outcome: JointOutcome) -> dict[str, Any]:
 def _with_reports(work: Work, folder: Path, error: AmersError) -> WorkFailed | AmersError:
     """The error of a registration with the reports of its failure; without where there is no room."""
     try:
-        keys = store_results(work, _packed(folder, map(str, work.inputs.scenes)))
+        keys = store_results(work, _of_scenes(folder, [str(scene) for scene in work.inputs.scenes]))
     except (TooLarge, FileNotFoundError):
         return error
     return WorkFailed(error, {"verdict": NOT_REGISTERED, "files": keys})
@@ -172,13 +183,16 @@ REGISTER_SCENES = Process(
     id="register-scenes",
     title="Register scenes together",
     description="Refine the sensor models of uploaded scenes in one adjustment, on control points and "
-    "on tie points between the scenes. The outputs of each scene are in SCENE.zip.",
+    "on tie points between the scenes. The outputs of each scene are those of register-scene, as "
+    "SCENE/NAME.",
     scope=Scope.REGISTER,
     inputs=RegisterScenes,
     outputs={
         "report.json": "The report on all scenes as a document.",
         "report.html": "The report on all scenes as a page.",
         "report.txt": "The tables of the report as plain text.",
+        SCENES_JSON: "The scenes, for those that join them later.",
+        IMAGES_NPZ: "Their adjusted models with the joint covariance, for the same.",
     },
     check=_check,
     run=_run,
@@ -189,5 +203,10 @@ REGISTER_SCENES = Process(
         },
         "verdict_words": {"type": "string", "title": "How many scenes have which verdict"},
         "scenes": {"type": "array", "title": "Verdict, accuracy and reason of every scene"},
+        "joined": {
+            "type": "array",
+            "items": {"type": "string", "format": "uuid"},
+            "title": "Scenes that these joined",
+        },
     },
 )

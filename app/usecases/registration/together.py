@@ -1,6 +1,5 @@
 """Register scenes together: read their files, find control, adjust all at once, write each outcome."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -16,10 +15,16 @@ from app.usecases.executors import ComputeOptions, open_executor
 from app.usecases.registration.control_sources import ControlSet, FindPoints
 from app.usecases.registration.deliverables import write_outputs
 from app.usecases.registration.failure import Attempt, write_failure
+from app.usecases.registration.joined_scenes import (
+    SCENES_JSON,
+    JoinedScenes,
+    Member,
+    format_scenes,
+)
 from app.usecases.registration.register import RegisteredScene, SceneFiles, grown
 from services.conventions import MAX_ERROR_SIGMAS
-from services.errors import AmersError, FormatError, InputError
-from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
+from services.errors import AmersError, InputError
+from services.formats.adjusted_images import write_adjusted_images
 from services.formats.images.bands import parse_bands
 from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
@@ -42,8 +47,6 @@ from services.types import Array, Progress, no_progress, part_of
 
 BLOCK_FOLDER = "block"
 """Folder of the report on all scenes, beside those of the scenes."""
-SCENES_JSON = "scenes.json"
-SCENES_FORMAT = "amers-scenes/1"
 
 
 @dataclass(frozen=True)
@@ -54,13 +57,15 @@ class JointPlace:
         folder_of: the folder of the results of a scene, by its name, or of the block.
         name: of the results.
         compute: processes or a cluster.
-        joined: folder of the results of scenes that were registered together before.
+        joined: scenes that were registered together before.
+        address_of: what names an image to scenes that join later, by name of the folder and path.
     """
 
     folder_of: Callable[[str], Path]
     name: str
     compute: ComputeOptions = field(default_factory=ComputeOptions)
-    joined: Path | None = None
+    joined: JoinedScenes | None = None
+    address_of: Callable[[str, Path], str] = lambda name, image: str(image.resolve())
 
 
 @dataclass(frozen=True)
@@ -82,9 +87,10 @@ class JointOutcome:
 
 @dataclass(frozen=True)
 class _Read:
-    """A scene with its files, and the name of the folder of its results."""
+    """A scene with its files, the name of the folder of its results, and the address of its image."""
 
     folder: str
+    address: str
     files: SceneFiles
     scene: Scene
 
@@ -126,8 +132,8 @@ def run_joint_registration(
     }
     failed: dict[str, AmersError] = {}
     with ExitStack() as stack:
-        before = None if place.joined is None else _joined(place.joined, stack)
-        read = _read_all(files, attempts, failed, stack)
+        before = [] if place.joined is None else _joined(place.joined, stack)
+        read = _read_all(files, place, attempts, failed, stack)
         try:
             if not read:
                 raise InputError(
@@ -144,7 +150,7 @@ def run_joint_registration(
                 control.points,
                 control.chips,
                 options,
-                joined=None if before is None else before.adjusted,
+                joined=_adjusted(before, place.joined),
                 work=Work(executor, ahead=ahead),
                 progress=part_of(progress, 0.0, 0.85),
             )
@@ -179,13 +185,13 @@ def run_joint_registration(
             name=place.name,
             finished_at=datetime.now(UTC),
         )
-        known = [*(before.read if before else ()), *read]
-        written = _write_block(place.folder_of(BLOCK_FOLDER), report, result, known)
+        written = _write_block(place.folder_of(BLOCK_FOLDER), report, result, [*before, *read])
     return JointOutcome(report, registered, failed, written)
 
 
 def _read_all(
     files: Mapping[str, SceneFiles],
+    place: JointPlace,
     attempts: dict[str, Attempt],
     failed: dict[str, AmersError],
     stack: ExitStack,
@@ -195,16 +201,24 @@ def _read_all(
     A scene whose metadata name it like another one gets the name of its folder.
     """
     read: list[_Read] = []
+    taken = {one.name for one in place.joined.members} if place.joined else set()
     for name, one in files.items():
         try:
             scene = _read(one, stack)
         except InputError as error:
             failed[name] = error
             continue
-        if scene.acquisition.image_id in [other.name for other in read]:
+        if scene.acquisition.image_id in taken:
             scene = _named(scene, name)
+        if scene.acquisition.image_id in taken:
+            failed[name] = InputError(
+                f"{name}: the scenes that it joins have one of this name already; leave it out, or "
+                "rename the image if it is another one"
+            )
+            continue
         attempts[name].scene = scene
-        read.append(_Read(name, one, scene))
+        taken.add(scene.acquisition.image_id)
+        read.append(_Read(name, place.address_of(name, one.image), one, scene))
     return read
 
 
@@ -280,6 +294,7 @@ def _written(
         shape=scene.image.shape,
         folder=folder,
         copy_image=copy_image,
+        frame=registration.frame,
     )
     report = build_report(
         registration,
@@ -306,11 +321,17 @@ def _write_block(
 ) -> dict[str, Path]:
     """The report on all scenes, and what later scenes need to join them."""
     folder.mkdir(parents=True, exist_ok=True)
+    adjusted = {one.name: one.scene.model.height_range_m for one in result.block.scenes}
+    members = [
+        Member(one.name, one.address, one.files, adjusted[one.name])
+        for one in read
+        if one.name in adjusted
+    ]
     texts = {
         "report.json": format_report(report),
         "report.html": format_joint_html(report),
         "report.txt": format_joint_tables(report),
-        SCENES_JSON: _scenes_text(result, read),
+        SCENES_JSON: format_scenes(members),
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -321,65 +342,25 @@ def _write_block(
     return written
 
 
-def _scenes_text(result: JointRegistration, read: Sequence[_Read]) -> str:
-    """The files of the scenes of a block, so that later scenes can be tied to them."""
-    adjusted = {one.name: one.scene for one in result.block.scenes}
-    scenes = [
-        {
-            "name": one.name,
-            "image": str(one.files.image.resolve()),
-            "model": None if one.files.model is None else str(one.files.model.resolve()),
-            "sigma_m": one.files.sigma_m,
-            "bands": one.files.bands,
-            "rigorous": one.files.rigorous,
-            "heights_m": adjusted[one.name].model.height_range_m,
-            "mask": None if one.files.mask is None else str(one.files.mask.resolve()),
-        }
-        for one in read
-        if one.name in adjusted
-    ]
-    return json.dumps({"format": SCENES_FORMAT, "scenes": scenes}, indent=2) + "\n"
-
-
-@dataclass(frozen=True)
-class _Joined:
-    """Scenes that were registered together before, with their files."""
-
-    read: tuple[_Read, ...]
-    adjusted: AdjustedScenes
-
-
-def _joined(folder: Path, stack: ExitStack) -> _Joined:
-    """The scenes of an older result, open until the stack closes.
+def _joined(joined: JoinedScenes, stack: ExitStack) -> list[_Read]:
+    """Scenes that were registered together before, open until the stack closes.
 
     Raises:
-        InputError: the folder is not that of scenes registered together, or an image has moved.
+        InputError: an image has moved.
     """
-    _, known = read_adjusted_images(folder / BLOCK_FOLDER / IMAGES_NPZ)
-    path = folder / BLOCK_FOLDER / SCENES_JSON
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        if document["format"] != SCENES_FORMAT:
-            raise ValueError(f"format {document['format']!r:.60}, {SCENES_FORMAT!r} expected")
-        files = {
-            str(one["name"]): SceneFiles(
-                image=Path(one["image"]),
-                model=None if one["model"] is None else Path(one["model"]),
-                sigma_m=one["sigma_m"],
-                bands=one["bands"],
-                rigorous=one["rigorous"],
-                mask=None if one["mask"] is None else Path(one["mask"]),
-            )
-            for one in document["scenes"]
-        }
-        heights_m = {str(one["name"]): tuple(one["heights_m"]) for one in document["scenes"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(
-            f"{path}: the scenes of `amers scene register-many` expected: {error}"
-        ) from None
-    read = tuple(
-        _Read(one.image.stem, one, _for_heights(_named(_read(one, stack), name), heights_m[name]))
-        for name, one in files.items()
-        if name in known.names
-    )
-    return _Joined(read, AdjustedScenes(tuple(one.scene for one in read), known))
+    return [
+        _Read(
+            one.address,
+            one.address,
+            one.files,
+            _for_heights(_named(_read(one.files, stack), one.name), one.heights_m),
+        )
+        for one in joined.members
+    ]
+
+
+def _adjusted(before: Sequence[_Read], joined: JoinedScenes | None) -> AdjustedScenes | None:
+    """What the adjustment of scenes that were registered before has told of them."""
+    if joined is None:
+        return None
+    return AdjustedScenes(tuple(one.scene for one in before), joined.known)
