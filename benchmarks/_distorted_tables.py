@@ -17,14 +17,14 @@ FOLLOWED, NAMED = 0.8, 0.9
 
 LACK_OF_FIT = {
     "jitter": ("along_lines",),
-    "bow": ("along_lines", "along_samples", "over_image"),
-    "steps": ("steps", "along_lines"),
-    "moved": ("moved_ground", "second_consensus"),
-    "wrong_model": ("line_of_sight", "height", "consensus"),
-    "otherwise": ("along_lines", "along_samples", "over_image", "steps", "moved_ground"),
+    "bow": ("along_lines", "along_samples", "structure_in_image"),
+    "steps": ("along_lines", "points_elsewhere"),
+    "moved": ("points_elsewhere", "structure_in_image", "second_consensus"),
+    "wrong_model": ("against_height", "another view", "another scene", "swapped", "mirrored", "upside"),
+    "otherwise": ("structure_", "steps_along_lines", "points_elsewhere"),
 }
-"""Parts of the names of the criteria that tell what a family is: one of them must not be met."""
-_OF_ANY = (*LACK_OF_FIT["otherwise"], "line_of_sight", "height")
+"""Parts of the names of criteria, or of why a scene is refused, that tell what a family is."""
+_OF_ANY = LACK_OF_FIT["otherwise"]
 
 Pair = tuple[Drawn, Outcome]
 

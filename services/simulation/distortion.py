@@ -164,7 +164,7 @@ class Distortion:
         for _ in range(_STEPS):
             change = target - self._displaced(place)
             place += change
-            if not np.abs(change).max(initial=0.0) > _CLOSE_PX:
+            if not (np.abs(change) > _CLOSE_PX).any():
                 break
         found = np.full(place.shape, np.nan)
         times = np.zeros(len(place), dtype=np.int64)
@@ -173,7 +173,7 @@ class Distortion:
             shows = (self.jump(pixel) == jump).all(axis=1)
             found[shows] = pixel[shows]
             times += shows
-        found[times != 1] = np.nan
+        found[(times != 1) | ~np.isfinite(place).all(axis=1)] = np.nan
         return found
 
     def is_moved(self, line_sample: Array) -> BoolArray:

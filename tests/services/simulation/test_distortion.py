@@ -74,6 +74,9 @@ def test_the_inverse_gives_back_every_pixel_that_is_shown_once(name: str) -> Non
     back = distortion.distorted(distortion.undistorted(pixels))
     unique = np.isfinite(back).all(axis=1)
     np.testing.assert_allclose(back[unique], pixels[unique], atol=1e-8)
+    unknown = distortion.distorted(np.vstack([[np.nan, 5.0], distortion.undistorted(pixels[unique])]))
+    assert np.isnan(unknown[0]).all()
+    np.testing.assert_allclose(unknown[1:], pixels[unique], atol=1e-8)
     jumps = distortion.steps or distortion.moved
     assert unique.all() if not jumps else 0.5 < unique.mean() < 1.0
 
