@@ -149,7 +149,7 @@ def show_distorted(title: str, rows: dict[str, Distorted]) -> None:
     """Print the figures of each kind of distortion."""
     headings = (
         "kind  scenes  good  usable  failed  refused  right  good, wrong  wrong  in part  "
-        "true/predicted  largest  normalised  followable  followed  named  of  not met"
+        "true/predicted  largest  normalised  followable  followed  named  of"
     )
     table = Table(*headings.split("  "), title=title)
     for kind, row in rows.items():
@@ -157,9 +157,12 @@ def show_distorted(title: str, rows: dict[str, Distorted]) -> None:
         wrong = row.good_but_wrong, row.wrong, row.wrong_in_part
         figures = [f"{value:.2f}" for value in (*row.of_predicted, row.normalised)]
         told = row.followable, row.followed, row.named, row.not_right
-        cells = [*map(str, counts), *map(str, wrong), *figures, *map(str, told), _listed(row.told_by)]
+        cells = [*map(str, counts), *map(str, wrong), *figures, *map(str, told)]
         table.add_row(kind, *cells)
-    Console(width=200).print(table)
+    console = Console(width=200)
+    console.print(table)
+    for kind, row in rows.items():
+        console.print(f"{kind}, not met where not right: {_listed(row.told_by)}", highlight=False)
 
 
 def _is_named(family: str, outcome: Outcome) -> bool:
