@@ -11,6 +11,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+import rasterio
+import shapely
 from matplotlib.image import imread
 from playwright.sync_api import (
     Browser,
@@ -22,7 +24,8 @@ from playwright.sync_api import (
     sync_playwright,
 )
 
-from tests.app.flat_world import FlatWorld, make_flat_world
+from services.geodesy import metres_per_degree
+from tests.app.flat_world import CENTRE, GROUND_H, GSD_M, FlatWorld, make_flat_world
 from tests.factories import make_block
 from tests.service_process import Service, until
 
@@ -41,6 +44,8 @@ piece_bytes = 8 * 1024 * 1024
 points_of_the_block = 40
 vector_colour = np.array([0xB3, 0x26, 0x1E])
 enough_px = 50
+a_third_of_a_pixel_m = GSD_M / 3.0
+a_hundredth_px = 0.01
 most_stops = 80
 poll_ms = 100
 
@@ -191,6 +196,100 @@ def assert_accuracy_shown(page: Page, document: dict) -> None:
     shown = page.locator("dl.facts").first
     assert shown.locator("dt").all_inner_texts() == [one["label"] for one in stated]
     assert shown.locator("dd").all_inner_texts() == [one["words"] for one in stated]
+
+
+def test_what_is_drawn_on_the_raw_image_appears_on_the_map_and_returns(
+    visit, world, secret, service, ground, tmp_path
+):
+    """Registration, drawing with keys and pointer, the accuracy of each shape, and the way back."""
+    page = visit(f"#/job/{registered(service, secret, world)}", secret)
+    page.get_by_role("link", name="Draw on the image").click()
+    image = page.get_by_role("application")
+    expect(image).to_have_attribute("aria-busy", "false")
+    page.screenshot(path=ARTEFACTS / "draw-empty.png")
+
+    image.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Space")
+    page.get_by_role("button", name="Polygon").click()
+    box = image.bounding_box()
+    corners = [(0.45, 0.3), (0.55, 0.35), (0.52, 0.6)]
+    for x, y in corners:
+        image.click(position={"x": x * box["width"], "y": y * box["height"]})
+    page.screenshot(path=ARTEFACTS / "draw-begun.png")
+    page.keyboard.press("Enter")
+    drawn = page.get_by_role("list", name="Drawn").get_by_role("listitem")
+    expect(drawn).to_have_count(2)
+    page.get_by_label("Another terrain").set_input_files(ground)
+    page.get_by_label("Vertical datum").fill("ellipsoid")
+    page.get_by_role("button", name="Show on the map").click()
+    expect(drawn.first).to_contain_text("CE90")
+    assert until(lambda: vectors_drawn_px(page) >= enough_px)
+    until_drawn(page)
+    page.screenshot(path=ARTEFACTS / "draw-on-the-map.png")
+
+    pixels, on_map = (read_download(page, name) for name in ("drawn.geojson", "on_the_map.geojson"))
+    for in_image, there in zip(pixels["features"], on_map["features"], strict=True):
+        corner = coordinates(in_image)
+        truth = world.true_model.locate(corner[:, ::-1] - 0.5, np.full(len(corner), GROUND_H))
+        east, north = metres_per_degree(CENTRE[1], GROUND_H)
+        off_m = (coordinates(there)[:, :2] - truth[:, :2]) * [east, north]
+        assert np.hypot(*off_m.T).max() < 2.0 * there["properties"]["ce90_m"]
+        assert np.hypot(*off_m.T).max() < a_third_of_a_pixel_m
+
+    map_file = tmp_path / "on_the_map.geojson"
+    map_file.write_text(json.dumps(on_map), encoding="utf-8")
+    page.get_by_label("GeoJSON").set_input_files(map_file)
+    page.get_by_role("button", name="Show in the image").click()
+    expect(page.get_by_text("2 features in the image; 0 outside, 0 with hidden")).to_be_visible()
+    page.screenshot(path=ARTEFACTS / "draw-in-the-image.png")
+    back = read_download(page, "in_the_image.geojson")
+    for in_image, there in zip(pixels["features"], back["features"], strict=True):
+        np.testing.assert_allclose(coordinates(there)[:, :2], coordinates(in_image), atol=a_hundredth_px)
+
+    page.reload()
+    expect(drawn).to_have_count(2)
+    page.evaluate(AXE.read_text(encoding="utf-8"))
+    findings = page.evaluate("axe.run().then((found) => found.violations)")
+    assert [(found["id"], found["nodes"][0]["html"]) for found in findings] == []
+    page.set_viewport_size(PHONE)
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    page.screenshot(path=ARTEFACTS / "draw-phone.png")
+
+
+def registered(service: Service, secret: str, world: FlatWorld) -> str:
+    """The job that registered the scene of the world."""
+    headers = {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
+        sent = client.post("/scenes?name=drawn-on.tif", content=world.tagged.read_bytes())
+        inputs = {"inputs": {"scene": sent.raise_for_status().json()["id"]}}
+        asked = client.post("/processes/register-scene/execution", json=inputs)
+        job: str = asked.raise_for_status().json()["jobID"]
+        assert until(lambda: client.get(f"/jobs/{job}").json()["status"] == "successful")
+    return job
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Flat ground below the scene."""
+    path = tmp_path_factory.mktemp("ground") / "ground.tif"
+    west, north = CENTRE + [-0.01, 0.01]
+    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float32"}
+    grid = rasterio.transform.from_origin(west, north, 0.0005, 0.0005)
+    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=grid) as file:
+        file.write(np.full((40, 40), GROUND_H, dtype=np.float32), 1)
+    return path
+
+
+def read_download(page: Page, name: str) -> dict:
+    """The content of a file that the page offers."""
+    with page.expect_download() as download:
+        page.locator(f'a[download="{name}"]').click()
+    return dict(json.loads(download.value.path().read_text(encoding="utf-8")))
+
+
+def coordinates(feature: dict) -> np.ndarray:
+    return shapely.get_coordinates(shapely.geometry.shape(feature["geometry"]))
 
 
 def test_an_upload_resumes_where_it_stopped_when_the_page_is_opened_again(

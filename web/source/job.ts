@@ -37,11 +37,12 @@ export const showJob: ShowView = async (place, id) => {
   else fill(body, outcome(job), await failureReport(job, signal));
 };
 
-function find(id: string, signal: AbortSignal): Promise<StatusInfo> {
+/** The state of a job. */
+export function find(id: string, signal: AbortSignal): Promise<StatusInfo> {
   return get<StatusInfo>(`jobs/${encodeURIComponent(id)}`, signal);
 }
 
-function ended(job: StatusInfo): boolean {
+export function ended(job: StatusInfo): boolean {
   return !["accepted", "running"].includes(job.status);
 }
 
@@ -68,7 +69,7 @@ function progressOf(first: StatusInfo): { element: HTMLElement; update(job: Stat
 }
 
 /** The state of a job that has not ended, in words. */
-function stateText(job: StatusInfo): string {
+export function stateText(job: StatusInfo): string {
   const { "amers:queuePosition": position, "amers:estimatedEnd": end } = job;
   const waiting = position == null ? "Waiting for a worker" : `Waiting for a worker: number ${position} in the queue`;
   const state = job.status === "accepted" ? waiting : `${job.progress} % · ${job.message ?? "running"}`;
@@ -108,7 +109,7 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
   const { features, exaggeration } = residualVectors(points);
   heading.textContent = report.scene.name;
-  fill(body, ...summary(report, exaggeration), await downloads(results, signal));
+  fill(body, ...summary(report, exaggeration), drawingLink(job), await downloads(results, signal));
   await atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]);
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
@@ -119,6 +120,12 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
 function assessment({ specification, words }: Record<string, unknown>): HTMLElement | null {
   if (typeof specification !== "string") return null;
   return h("p", {}, h("b", {}, `Specification: ${specification}. `), String(words));
+}
+
+/** A link to the image of a scene that is registered, to draw on it. */
+function drawingLink({ jobID, processID }: StatusInfo): HTMLElement | null {
+  if (processID !== "register-scene") return null;
+  return h("p", {}, h("a", { class: "button", href: `#/draw/${jobID}` }, "Draw on the image"));
 }
 
 /** A link to the block that a job has ingested. */

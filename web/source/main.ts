@@ -4,6 +4,7 @@ import { type Caller, showAccess, whoCalls } from "./access";
 import { Refused } from "./api";
 import { Atlas } from "./atlas";
 import { blocks, showBlock, showBlocks } from "./blocks";
+import { showDrawing } from "./draw";
 import { h, problem } from "./elements";
 import { showJob } from "./job";
 import { go, type ShowView } from "./place";
@@ -15,6 +16,7 @@ const VIEWS: Record<string, { show: ShowView; section: string }> = {
   point: { show: showPoint, section: "points" },
   scenes: { show: showScenes, section: "scenes" },
   scene: { show: showScene, section: "scenes" },
+  draw: { show: showDrawing, section: "scenes" },
   job: { show: showJob, section: "scenes" },
   blocks: { show: showBlocks, section: "blocks" },
   block: { show: showBlock, section: "blocks" },

@@ -5,7 +5,7 @@ import { get, post } from "./api";
 import type { Jobs, Scene, Scenes, StatusInfo } from "./api_types";
 import { badge, bytes, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { go, type Place, type ShowView } from "./place";
-import { send, uploadModel } from "./upload";
+import { send, uploadBeside } from "./upload";
 
 const IMAGES = ".tif,.tiff,.jp2,.j2k,.ntf,.nitf,.zip,.tar";
 const MODELS = ".txt,.xml,.rpb,.rpc,.geom";
@@ -104,7 +104,7 @@ function uploadForm({ signal }: Place): HTMLElement {
     button.disabled = true;
     try {
       const { scene } = await send(file, sigma.value ? { sigma_m: sigma.value } : {}, state, signal);
-      for (const model of models.files ?? []) await uploadModel(scene, model);
+      for (const model of models.files ?? []) await uploadBeside(scene, model);
       go(`#/job/${await register(scene)}`);
     } catch (error) {
       state.replaceChildren(problem(error));

@@ -120,10 +120,17 @@ function layers(dark: boolean): LayerSpecification[] {
       paint: { "circle-radius": 11, "circle-color": "transparent", "circle-stroke-color": c.active, "circle-stroke-width": 2.5 },
     },
     {
+      id: "vector-areas",
+      type: "fill",
+      source: "vectors",
+      filter: ["in", ["geometry-type"], ["literal", ["Polygon", "MultiPolygon"]]],
+      paint: { "fill-color": c.active, "fill-opacity": 0.12 },
+    },
+    {
       id: "vectors",
       type: "line",
       source: "vectors",
-      filter: ["==", ["geometry-type"], "LineString"],
+      filter: ["!", ["in", ["geometry-type"], ["literal", ["Point", "MultiPoint"]]]],
       layout: { "line-cap": "round" },
       paint: { "line-color": ["case", ["==", ["get", "status"], "active"], c.active, c.quiet], "line-width": 1.8 },
     },
@@ -131,7 +138,7 @@ function layers(dark: boolean): LayerSpecification[] {
       id: "vector-points",
       type: "circle",
       source: "vectors",
-      filter: ["==", ["geometry-type"], "Point"],
+      filter: ["in", ["geometry-type"], ["literal", ["Point", "MultiPoint"]]],
       paint: {
         "circle-radius": ["case", ["==", ["get", "status"], "active"], 3.5, 2.5],
         "circle-color": ["case", ["==", ["get", "status"], "active"], c.active, c.quiet],

@@ -2,6 +2,7 @@
 
 import { type HttpResponse, type PreviousUpload, Upload } from "tus-js-client";
 import { address, authorization, call, Refused } from "./api";
+import type { StoredFile } from "./api_types";
 import { bytes, h } from "./elements";
 
 const PIECE_BYTES = 8 * 1024 * 1024;
@@ -42,9 +43,10 @@ export async function send(file: File, metadata: Record<string, string>, state: 
   }
 }
 
-/** Upload a file with the model of a scene beside its image. */
-export async function uploadModel(scene: string, model: File): Promise<void> {
-  await call(`scenes/${scene}/files/${encodeURIComponent(model.name)}`, { method: "PUT", body: model });
+/** Upload a file beside the image of a scene; returns the name that it has there. */
+export async function uploadBeside(scene: string, file: File): Promise<string> {
+  const reply = await call(`scenes/${scene}/files/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+  return ((await reply.json()) as StoredFile).name;
 }
 
 function begin(file: File, metadata: Record<string, string>, progress: (sent: number) => void): Sending {

@@ -194,12 +194,13 @@ def _of_one_type(geometries: Geometries, path: Path) -> tuple[Geometries, str]:
             geometries[rows], indices=np.arange(len(rows))
         )
         return out, f"Multi{kind}{height}"
-    if len(kinds) > 1 and path.suffix.lower() == ".shp":
+    one_type = {".shp": "a shapefile", ".fgb": "a FlatGeobuf with heights"}.get(path.suffix.lower())
+    if len(kinds) > 1 and one_type and (height or path.suffix.lower() == ".shp"):
         raise InputError(
-            f"{path}: a shapefile has one type of geometry, {', '.join(sorted(kinds))} found; write a "
-            ".gpkg"
+            f"{path}: {one_type} has one type of geometry, {', '.join(sorted(kinds))} found; write "
+            "a .gpkg"
         )
-    return geometries, (kinds.pop() if len(kinds) == 1 else "Unknown") + height
+    return geometries, kinds.pop() + height if len(kinds) == 1 else "Unknown"
 
 
 def _check_signature(path: Path, driver: str) -> None:

@@ -90,6 +90,17 @@ def test_single_and_multiple_geometries_become_multiple_ones(tmp_path: Path) -> 
         write_layer(tmp_path / "b.shp", VectorLayer("b", mixed, layer().attributes, None))
 
 
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson"])
+def test_geometries_of_several_types_keep_their_heights(suffix: str, tmp_path: Path) -> None:
+    shapes = shapely.from_wkt(["POINT Z (1 2 3)", "POLYGON Z ((0 0 1, 1 0 2, 1 1 3, 0 0 1))"])
+    mixed = VectorLayer("b", shapes, layer().attributes, "EPSG:4326")
+    write_layer(tmp_path / f"b.{suffix}", mixed)
+    again = read_layer(tmp_path / f"b.{suffix}").geometries
+    assert [shape.wkt for shape in again] == [shape.wkt for shape in shapes]
+    with pytest.raises(InputError, match=r"a FlatGeobuf with heights has one type of geometry"):
+        write_layer(tmp_path / "b.fgb", mixed)
+
+
 def test_a_layer_among_several_must_be_named(tmp_path: Path) -> None:
     path = tmp_path / "two.gpkg"
     for name in ("roads", "rivers"):
