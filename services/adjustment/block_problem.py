@@ -169,16 +169,20 @@ class BlockProblem:
         return values
 
     def start(self) -> Array:
-        """Points (p, 3) on the first ray of each, at the middle height of its model, or where known."""
+        """Points (p, 3) on the first ray of each, or where known.
+
+        They lie at the middle height of its model, or the nearest that the models of all rays hold for.
+        """
         lon_lat_h = np.full((self.n_points, 3), np.nan)
         known_m = self.known_heights[0]
         first = np.unique(self.observations.point, return_index=True)[1]
+        low, high = self._common_heights
         for i, image in enumerate(self.images):
             rows = first[self.observations.image[first] == i]
             known_of = known_m[self.observations.point[rows]]
-            height_m = np.where(
-                np.isfinite(known_of), known_of, float(np.mean(image.model.height_range_m))
-            )
+            point = self.observations.point[rows]
+            middle_m = np.clip(np.mean(image.model.height_range_m), low[point], high[point])
+            height_m = np.where(np.isfinite(known_of), known_of, middle_m)
             lon_lat_h[self.observations.point[rows]] = image.model.locate(
                 self.observations.line_sample[rows], height_m
             )
@@ -188,6 +192,15 @@ class BlockProblem:
         started = lon_lat_h[self.control.point]
         lon_lat_h[self.control.point] = np.where(known, self.control.lon_lat_h, started)
         return lon_lat_h
+
+    @property
+    def _common_heights(self) -> tuple[Array, Array]:
+        """Lowest and highest ground (p,) of each point that the models of all its rays hold for."""
+        ranges = np.array([image.model.height_range_m for image in self.images], dtype=np.float64)
+        low, high = np.full(self.n_points, -np.inf), np.full(self.n_points, np.inf)
+        np.maximum.at(low, self.observations.point, ranges[self.observations.image, 0])
+        np.minimum.at(high, self.observations.point, ranges[self.observations.image, 1])
+        return low, np.maximum(low, high)
 
     def equations(self, values: Array, lon_lat_h: Array, weight: Array | None = None) -> Equations:
         """The rows at parameters (n, k) and points (p, 3); weights (m + 2 c,) of the list, 1 by default.

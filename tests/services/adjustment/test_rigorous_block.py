@@ -145,6 +145,25 @@ def test_parameters_are_recovered_within_their_sigmas() -> None:
     assert 0.75 < np.mean(square) < 1.25
 
 
+@pytest.mark.parametrize("controlled", [False, True], ids=["tie points", "control"])
+def test_models_for_other_heights_meet_where_all_hold(controlled: bool) -> None:
+    """Rigorous models of products hold for all ground, RPCs for that of their image."""
+    wide = replace(MODELS[0], height_range_m=(-500.0, 9000.0))
+    images: list[AdjustableImage] = [rigorous_parameters("image 1", wide, SRP, sigma_m=SIGMA_M)]
+    for number in (1, 2):
+        rpc = fit_rpc(MODELS[number], SHAPE, HEIGHTS_M).model
+        name, shift_px = f"image {number + 1}", SIGMA_M / GSD_M
+        images.append(image_parameters(name, rpc, SHAPE, shift_px=shift_px, slope_px=0.3))
+    rng = np.random.default_rng(4)
+    truth = Truth(images, drawn(images, rng), ground(rng))
+    control = NO_CONTROL
+    if controlled:
+        control = truth.control(rng, np.arange(8), (0.5, 0.5), Frame.from_sigmas(1.0, 1.0))
+    block = adjust_block(images, truth.observed(rng, NOISE_PX), control=control)
+    assert block.active.mean() > 0.98
+    assert errors_of(block, truth.lon_lat_h)[0] < 2.0
+
+
 @pytest.mark.parametrize("free", PARAMETER_SETS.values(), ids=PARAMETER_SETS)
 def test_the_accuracy_on_the_ground_is_the_one_that_is_stated(free: ParameterSet) -> None:
     image = rigorous(free)[0]
