@@ -2,15 +2,19 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
+from fastapi.testclient import TestClient
 from jsonschema import validate
 from rasterio.transform import Affine
 
+from app.config import Settings
+from app.storage import Storage
 from services.formats.images.raster import gdal_rpc
 from services.formats.sensor_models.correction_json import parse_correction
 from services.formats.sensor_models.rpc_files import read_rpc
@@ -20,7 +24,16 @@ from services.sensors.pushbroom import PushbroomModel
 from services.sensors.pushbroom_errors import TERMS, PushbroomErrors
 from services.simulation.orbit import pushbroom_over
 from services.types import Array
-from tests.app.flat_world import CENTRE, GROUND_H, GSD_M, SIGMA_M, FlatWorld, make_flat_world
+from tests.app.flat_world import (
+    CENTRE,
+    GROUND_H,
+    GSD_M,
+    SIGMA_M,
+    FlatWorld,
+    make_flat_world,
+    publish_world,
+)
+from tests.app.worker_processes import ended, running_worker
 from tests.command_line import Done, amers_here
 from tests.services.formats.sensor_models.simulated_metadata import dimap_v2
 
@@ -169,3 +182,35 @@ def test_what_cannot_be_done_is_said(world: FlatWorld, folder: Path, tmp_path: P
     none = register(world, tmp_path / "out", folder / "rpc.tif", "--rigorous", "srp")
     assert none.returncode == 2
     assert "none of 1 scenes has metadata with a rigorous model" in none.stderr
+
+
+def test_a_job_adjusts_the_orbits_of_uploaded_scenes(
+    client: TestClient,
+    bearer: Callable[[str], dict[str, str]],
+    settings: Settings,
+    world: FlatWorld,
+    folder: Path,
+    tmp_path: Path,
+    dsn: str,
+    storage: Storage,
+) -> None:
+    publish_world(dsn, storage, world)
+    me, ids = bearer("register"), {}
+    for name in ("IMG_orbit_a.tif", "IMG_orbit_b.tif", "rpc.tif"):
+        upload = f"/scenes?name={name}&sigma_m={SIGMA_M}"
+        sent = client.post(upload, content=(folder / name).read_bytes(), headers=me)
+        ids[name] = sent.json()["id"]
+    for name in ("orbit_a", "orbit_b"):
+        metadata = folder / f"DIM_{name}.XML"
+        beside = f"/scenes/{ids[f'IMG_{name}.tif']}/files/{metadata.name}"
+        assert client.put(beside, content=metadata.read_bytes(), headers=me).status_code == 200
+    inputs = {"scenes": list(ids.values()), "rigorous": "srp"}
+    execution = "/processes/register-scenes/execution"
+    job = client.post(execution, json={"inputs": inputs}, headers=me).headers["location"]
+    with running_worker(settings, tmp_path / "log"):
+        done = ended(client, job, me)
+    assert done["status"] == "successful", done
+    results = client.get(f"/jobs/{done['jobID']}/results", headers=me).json()
+    report = client.get(results["report.json"]["href"], headers=me).json()
+    found = [one["rigorous"] and one["rigorous"]["parameter_set"] for one in report["scenes"]]
+    assert sorted(found, key=str) == [None, "SRP", "SRP"]
