@@ -288,7 +288,7 @@ class DistortedImage:
     def _resampled(self, first: IntArray) -> FloatImage:
         """Pixels of the tile that begins at a line and sample (2,)."""
         lines, samples = (int(n) for n in np.minimum(first + _TILE_PX, self.shape) - first)
-        pixels = np.indices((lines, samples)).reshape(2, -1).T + first.astype(np.float64)
+        pixels = np.indices((lines, samples)).reshape(2, -1).T.astype(np.float64) + first
         jumps = self.distortion.jump(pixels)
         out = np.full(len(pixels), np.nan, dtype=np.float32)
         for jump in self.distortion.jumps():
