@@ -44,7 +44,10 @@ def register(image: Path, block_folder: Path, folder: Path) -> None:
     print(f"the model moved by {np.nanmedian(np.hypot(*moved_px.T)):.1f} px (median over the points)")
 
     model, adjustment = registration.model, registration.adjustment
-    refined = write_refined(image, None, model, adjustment, shape=scene.image.shape, folder=folder)
+    # All points of one block share its frame; the errors of the model on the Earth include it.
+    refined = write_refined(
+        image, None, model, adjustment, shape=scene.image.shape, folder=folder, frame=points.frames[0]
+    )
     print(f"{refined.note}: {', '.join(path.name for path in refined.files)}")
 
 

@@ -4,9 +4,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import rasterio
+from rasterio.transform import from_origin
 
 from services.formats.images.raster import write_raster
-from services.simulation.view import SimulatedView, ViewPlan, simulate_block, simulate_view
+from services.sensors.base import SensorModel
+from services.simulation.view import (
+    SimulatedView,
+    ViewPlan,
+    plan_geometry,
+    simulate_block,
+    simulate_view,
+)
 from services.simulation.world import World, make_world
 
 SHAPE = (700, 700)
@@ -24,14 +33,41 @@ def write_block_images(folder: Path) -> list[Path]:
 
 def write_scene(folder: Path) -> Path:
     """Write another image of the same ground, with a model that is 50 m wrong, and return its path."""
+    world, rng = _world(), np.random.default_rng(3)
+    return _write(simulate_view(world, _plan(world), rng, ground_error_m=(40.0, -30.0)), folder)
+
+
+def true_model_of_scene() -> SensorModel:
+    """The true model of that image, which nobody knows of a real one."""
+    world, rng = _world(), np.random.default_rng(3)
+    return plan_geometry(world, _plan(world), rng, ground_error_m=(40.0, -30.0)).true_model
+
+
+def write_terrain(path: Path) -> Path:
+    """Write the heights of the ground above the ellipsoid, without buildings, and return the path."""
     world = _world()
+    west, north = world.origin_lon_lat + world.step_deg / 2.0 * [-1.0, 1.0]
+    lines, samples = world.terrain_m.shape
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=lines,
+        width=samples,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
+        transform=from_origin(west, north, *world.step_deg),
+    ) as file:
+        file.write(world.terrain_m, 1)
+    return path
+
+
+def _plan(world: World) -> ViewPlan:
     lon, lat = (float(degrees) for degrees in world.centre_lon_lat)
     day = datetime(2024, 7, 3, 10, 30, tzinfo=UTC)
-    plan = ViewPlan(
+    return ViewPlan(
         "scene", (lon, lat), SHAPE, GSD_M, incidence_deg=11.0, azimuth_deg=200.0, acquired_at=day
-    )
-    return _write(
-        simulate_view(world, plan, np.random.default_rng(3), ground_error_m=(40.0, -30.0)), folder
     )
 
 

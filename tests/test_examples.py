@@ -1,6 +1,7 @@
 """The examples, run as their readers run them."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -44,14 +45,30 @@ def test_a_block_is_made_from_images(made):
     assert (made / "chips.png").stat().st_size > 10_000
 
 
-def test_a_scene_is_registered_on_the_block(made, tmp_path):
-    printed = run(EXAMPLES / "register_scene.py", made / "block", tmp_path)
+@pytest.fixture(scope="module")
+def registered(made: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder that the example of a registration has filled, and what it printed."""
+    folder = tmp_path_factory.mktemp("registered")
+    return folder, run(EXAMPLES / "register_scene.py", made / "block", folder)
+
+
+def test_a_scene_is_registered_on_the_block(made, registered):
+    tmp_path, printed = registered
     assert "verdict: good" in printed
     image = tmp_path / "images" / "scene.tif"
     delivered, refined = read_rpc(image), read_rpc(image, tmp_path / "refined_RPC.TXT")
     ground = read_block(made / "block").points.lon_lat_h
     moved_px = refined.model.project(ground) - delivered.model.project(ground)
     assert 45.0 < float(np.median(np.hypot(*moved_px.T))) < 55.0
+
+
+def test_what_is_drawn_on_a_scene_is_where_the_truth_is(registered):
+    printed = run(EXAMPLES / "draw_on_scene.py", registered[0])
+    off_m, stated_m = (
+        float(re.search(text, printed)[1]) for text in (r"([\d.]+) m at most", r"CE90 ([\d.]+) m")
+    )
+    assert "2 features" in printed
+    assert off_m < stated_m < 10.0
 
 
 def test_points_are_queried_from_a_service_and_drawn(made, open_folder, tmp_path):
