@@ -81,6 +81,12 @@ class AffineFit:
         variance[active] = likeliest_variance(self.residual(parameters)[active], own, of_points[active])
         return replace(self, variance=variance)
 
+    def clipped(self, parameters: Array, most: float) -> "AffineFit":
+        """The same fit whose residuals from a solution are at most some standard deviations."""
+        computed = self.design @ parameters.T
+        residual = np.clip(self.misfit - computed, -most * self.sigma, most * self.sigma)
+        return replace(self, misfit=computed + residual)
+
     def scaled(self, factor: float) -> "AffineFit":
         """The same fit with its variances multiplied by a factor."""
         return replace(self, variance=self.variance * factor)

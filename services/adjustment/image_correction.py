@@ -6,21 +6,27 @@ import numpy as np
 from scipy.special import ndtr
 
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
+from services.adjustment.line_profile import Component, unit_variance, with_components
 from services.adjustment.order_selection import choose_order
+from services.adjustment.placed_measures import PlacedMeasures
+from services.adjustment.profile_solution import joined, solve_profile
 from services.adjustment.robust import deactivate
 from services.adjustment.shared_errors import (
     SharedErrors,
     likeliest_shared_errors,
     offset_sigma_px,
-    overlap_correlation,
 )
+from services.adjustment.structure import Structure
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection, no_correction
+from services.sensors.correction import ImageCorrection, LineProfile, no_correction
 from services.types import Array, BoolArray, IntArray
 
 _LOOSE_PX = 1000.0
 """A priori standard deviation of the offset of a block before anything is known of it."""
+
+_LEFT_OUT = 5
+"""Measures that disagree with an affine correction, from which on a profile is looked for in all."""
 
 _THIN = 1e-3
 """Smallest width of the area of the points that determines drift and skew, half sizes of the image."""
@@ -50,6 +56,8 @@ class AdjustmentOptions:
         folds: of the cross-validation.
         prior_slope_sigma_px: a priori standard deviation of drift and skew at the edge of the image,
             pixels; the measures may raise it, never lower it.
+        profile: whether motion along the lines that the measures show is followed, where no order is
+            given; what is not followed is tested in any case.
     """
 
     order: Order | None = None
@@ -60,6 +68,7 @@ class AdjustmentOptions:
     min_gain: float = 0.03
     folds: int = 5
     prior_slope_sigma_px: float = 1.0
+    profile: bool = True
 
 
 @dataclass(frozen=True)
@@ -115,6 +124,9 @@ class SceneAdjustment:
         sigma0: a posteriori standard deviation of unit weight.
         point_sigma_px: (2,) contribution of the points' own accuracy to the active residuals, one
             standard deviation of line and sample.
+        components: of the profile along the lines; none for an affine correction.
+        structures: what the residuals of the correction still depend on, by family; none where it was
+            not tested.
     """
 
     correction: ImageCorrection
@@ -130,6 +142,8 @@ class SceneAdjustment:
     active: BoolArray
     sigma0: float
     point_sigma_px: Array
+    components: tuple[Component, ...] = ()
+    structures: tuple[Structure, ...] = ()
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
@@ -174,7 +188,8 @@ def adjust_scene(
         UndeterminedCorrection: the points lie on a line, which does not determine the order given.
     """
     min_points = options.min_points if min_points is None else min_points
-    declared, usable, of_points = _declared_fit(model, shape, observations)
+    declared, seen, of_points = _declared_fit(model, shape, observations)
+    usable = seen if observations.usable is None else seen & observations.usable
     if usable.sum() < min_points:
         raise NotEnoughPoints(int(usable.sum()), min_points, "measures with a position and a sigma")
     order, validation = _order(declared, usable, options, like)
@@ -206,34 +221,75 @@ def adjust_scene(
         return np.asarray(fit.magnitude(parameters) / scale)
 
     active = deactivate(magnitude, agreeing, options.tolerance, min_points)
-    size = float(np.sqrt(shape[0] * shape[1]))
-    position_px = no_correction(shape).centre + fit.t * no_correction(shape).half_size
-    own_share = (1.0 - of_points / declared.variance).mean(axis=1)
-    overlapping = overlap_correlation(position_px, observations.chip_side_px, own_share)
+    measured = PlacedMeasures.of(
+        model,
+        shape,
+        observations.lon_lat_h,
+        observations.covariance_m2,
+        fit=declared,
+        of_points=of_points,
+        chip_side_px=observations.chip_side_px,
+    )
+    expected, limit = fit.expected(slope_px), options.tolerance
+    along_lines: tuple[Structure, ...] = ()
+    if like is None:
+        clipped = fit.clipped(start, 2.0 * limit * scale)
+        components, along_lines = _components(
+            measured, fit, clipped, seen=seen, active=active, options=options
+        )
+    else:
+        components = like.components
+    shared_fit, of_shared = declared, agreeing
+    if components:
+        active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
+        followed = solve_profile(measured.residuals(fit, active), components, expected, shape[0] - 1.0)
+        shared_fit, of_shared = measured.without(followed.profile, declared), active
     shared = (
         like.shared
         if like
         else likeliest_shared_errors(
-            declared,
-            agreeing,
+            shared_fit,
+            of_shared,
             free,
             slope_px,
-            position=position_px / size,
-            overlapping=overlapping,
+            position=measured.position,
+            overlapping=measured.overlapping,
         )
     )
-    parameters, _ = fit.scaled(shared.factor).solution(active, free, slope_px)
-    of_errors = shared.covariance(position_px[active] / size, overlapping[np.ix_(active, active)])
-    covariance = _covariance(
-        declared.scaled(shared.factor), active, free, slope_px, of_errors / shared.factor
-    )
+    profile: LineProfile | None = None
+    if components:
+        # As much noise and motion as the sigmas state, in the proportion that the residuals show.
+        stated = float(np.mean((declared.variance / fit.variance)[active]))
+        told = measured.residuals(declared, active, shared)
+        moving = tuple(component.scaled(stated * shared.factor) for component in components)
+        solution = solve_profile(told, moving, expected, shape[0] - 1.0)
+        parameters, covariance, profile = (
+            solution.parameters,
+            joined(solution.covariance),
+            solution.profile,
+        )
+        moving = tuple(component.scaled(stated) for component in components)
+        chi2 = unit_variance(with_components(measured.residuals(declared, active), moving))
+        sigma0 = float(np.sqrt(chi2 / _kept_variance(limit)))
+    else:
+        parameters, _ = fit.scaled(shared.factor).solution(active, free, slope_px)
+        of_errors = shared.covariance(
+            measured.position[active], measured.overlapping[np.ix_(active, active)]
+        )
+        covariance = _covariance(
+            declared.scaled(shared.factor), active, free, slope_px, of_errors / shared.factor
+        )
+        sigma0 = _sigma0(declared, active, free, slope_px, _kept_variance(limit))
+    correction = replace(no_correction(shape), parameters=parameters[:, :3], profile=profile)
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
-    correction = replace(no_correction(shape), parameters=parameters[:, :3])
     deformation = np.zeros((6, 6))
     if observations.deformation_px2 is not None:
         deformation[:] = deformation_covariance(observations.deformation_px2, correction)
-    misfit_px = fit.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
+    explained = measured.without(profile, fit) if profile else fit
+    misfit_px = (
+        explained.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
+    )
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
     return SceneAdjustment(
@@ -246,22 +302,56 @@ def adjust_scene(
         local_sigma_px=np.sqrt(local_px2),
         shared=shared,
         apart_px=apart_px,
-        residual_px=np.where(usable[:, None], misfit_px, np.nan),
+        residual_px=np.where((usable | active)[:, None], misfit_px, np.nan),
         active=active,
-        sigma0=_sigma0(declared, active, free, slope_px, _kept_variance(options.tolerance)),
+        sigma0=sigma0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
+        components=components,
+        structures=() if like else measured.structures(fit, active, components, shared, along_lines),
     )
+
+
+def _components(
+    measured: PlacedMeasures,
+    fit: AffineFit,
+    clipped: AffineFit,
+    *,
+    seen: BoolArray,
+    active: BoolArray,
+    options: AdjustmentOptions,
+) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
+    """What the measures show that no affine correction follows, and what is left along the lines.
+
+    Args:
+        measured: the measures.
+        fit: of them.
+        clipped: the same, whose residuals are limited.
+        seen: (n,) measures that there are.
+        active: (n,) those that agree with an affine correction.
+        options: whether it may be followed.
+    """
+    wanted = options.profile and options.order is None
+    components, along_lines = measured.components(fit, active, wanted=wanted)
+    if components or not wanted or (seen & ~active).sum() < _LEFT_OUT:
+        return components, along_lines
+    # What lies beside a step agrees with itself, and was left out.
+    components, _ = measured.components(clipped, seen)
+    if not components:
+        return (), along_lines
+    expected = fit.expected(np.inf)
+    agreeing = measured.agreeing(fit, seen, components, expected, options.tolerance)
+    again, along_lines = measured.components(fit, agreeing)
+    return again or components, along_lines
 
 
 def _declared_fit(
     model: SensorModel, shape: tuple[int, int], observations: ControlObservations
 ) -> tuple[AffineFit, BoolArray, Array]:
-    """The misfits with their declared variances, which of them are usable, and their points' part."""
+    """The misfits with their declared variances, which of them there are, and their points' part."""
     line_sample, sigma_px = observations.line_sample, observations.sigma_px
     misfit = line_sample - model.project(observations.lon_lat_h)
-    usable = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
-    if observations.usable is not None:
-        usable &= observations.usable
+    seen = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
+    usable = seen if observations.usable is None else seen & observations.usable
     derivative = np.nan_to_num(model.project_derivative(observations.lon_lat_h))
     covariance_px2 = derivative @ observations.covariance_m2 @ derivative.transpose(0, 2, 1)
     own = np.nan_to_num(sigma_px, nan=1.0)[:, None] ** 2
@@ -274,8 +364,8 @@ def _declared_fit(
         if len(blocks) > 1:
             member = observations.block[:, None] == blocks
     offset_px = np.full((2, member.shape[1]), _LOOSE_PX)
-    misfit = np.where(usable[:, None], misfit, 0.0)
-    return AffineFit(t, misfit, own + of_points, member, offset_px), usable, of_points
+    misfit = np.where(seen[:, None], misfit, 0.0)
+    return AffineFit(t, misfit, own + of_points, member, offset_px), seen, of_points
 
 
 def _frame_sigma_px(model: SensorModel, observations: ControlObservations, member: BoolArray) -> Array:

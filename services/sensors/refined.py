@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 from services.errors import CoverageError
 from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, fold_into_rpc
+from services.sensors.correction import CorrectedModel, fold_into_rpc, folds_into_rpc
 from services.sensors.rpc import RpcModel
 from services.sensors.rpc_fit import fit_rpc
 
 REFIT_LIMIT_PX = 0.01
 """Largest difference, anywhere in the image, of a refitted RPC from the corrected model."""
+
+LOUD_PX = 0.1
+"""An RPC that differs by more than this from the refined model is delivered with a warning."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ def refined_rpc(
 
     A correction of each coordinate separately folds into a delivered RPC exactly. For a correction that
     mixes the coordinates, a new RPC is fitted and accepted within `REFIT_LIMIT_PX`. For a rigorous model
-    the closest RPC is delivered, whatever its error is: no RPC follows every attitude.
+    and for a correction with a profile the closest RPC is delivered, whatever its error is: no RPC
+    follows every attitude.
 
     Args:
         model: refined: a delivered model with its correction, or a rigorous model.
@@ -43,13 +47,16 @@ def refined_rpc(
             model. Those of the ground in the image give a closer RPC: rigorous models of products hold
             for all ground on the Earth.
     """
-    if isinstance(model, CorrectedModel) and isinstance(model.base, RpcModel):
-        mixed = bool(model.correction.parameters[[0, 1], [2, 1]].any())
-        if not mixed:
-            return RefinedRpc(fold_into_rpc(model.base, model.correction), 0.0)
+    affine = isinstance(model, CorrectedModel) and model.correction.profile is None
+    if (
+        isinstance(model, CorrectedModel)
+        and isinstance(model.base, RpcModel)
+        and folds_into_rpc(model.correction)
+    ):
+        return RefinedRpc(fold_into_rpc(model.base, model.correction), 0.0)
     try:
         fitted = fit_rpc(model, shape, height_range_m or model.height_range_m)
     except CoverageError:
         return RefinedRpc(None, math.inf)
-    close = fitted.max_error_px < REFIT_LIMIT_PX or not isinstance(model, CorrectedModel)
+    close = fitted.max_error_px < REFIT_LIMIT_PX or not affine
     return RefinedRpc(fitted.model if close else None, fitted.max_error_px)

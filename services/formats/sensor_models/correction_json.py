@@ -1,7 +1,8 @@
 """The correction of a sensor model as a JSON document, which every registration writes.
 
 With `t = ((line, sample) - centre) / half_size`, a position of the delivered model moves by
-`parameters (1, t_line, t_sample)`. The centre of the first pixel is (0, 0).
+`parameters (1, t_line, t_sample)`, and by the profile of its line where there is one: linear between
+nodes, constant beyond them. The centre of the first pixel is (0, 0).
 """
 
 import json
@@ -13,10 +14,20 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.text_files import load_json
 from services.quality.correction_accuracy import CorrectionAccuracy
-from services.sensors.correction import ImageCorrection
+from services.sensors.correction import ImageCorrection, LineProfile
 from services.types import UNKNOWN_FRAME, Array, Frame
 
 CORRECTION_FORMAT = "amers-image-correction/1"
+PROFILE_FORMAT = "amers-image-correction/2"
+"""Of a correction with a profile: a reader that does not know it must not take the affine part alone."""
+
+_PROFILE = {
+    "line": (),
+    "displacement_px": (2,),
+    "variance_px2": (2,),
+    "with_parameters_px2": (2, 3),
+}
+"""Attributes of a profile, and the shape of each for a node."""
 
 
 def format_correction(
@@ -42,13 +53,15 @@ def format_correction(
         frame: of the control points on the Earth.
         apart_px: standard deviation of the offsets of the blocks of the points.
     """
+    profile = correction.profile
     document = {
-        "format": CORRECTION_FORMAT,
+        "format": PROFILE_FORMAT if profile else CORRECTION_FORMAT,
         "applies_to": applies_to,
         "carried": carried,
         "pixel_origin": "the centre of the first pixel is line 0, sample 0",
-        "formula": "(line, sample) + parameters_px (1, t_line, t_sample), "
-        "t = ((line, sample) - centre_px) / half_size_px",
+        "formula": "(line, sample) + parameters_px (1, t_line, t_sample)"
+        + (" + profile.displacement_px(line)" if profile else "")
+        + ", t = ((line, sample) - centre_px) / half_size_px",
         "order": order,
         "parameters_px": correction.parameters.tolist(),
         "centre_px": correction.centre.tolist(),
@@ -58,6 +71,8 @@ def format_correction(
         "frame_covariance_m2": _rows(frame.covariance_m2),
         "apart_px": apart_px,
     }
+    if profile is not None:
+        document["profile"] = {name: getattr(profile, name).tolist() for name in _PROFILE}
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -72,12 +87,18 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
         FormatError: the document has another form, or its correction folds or mirrors the image.
     """
     document = load_json(text, source)
-    if not isinstance(document, dict) or document.get("format") != CORRECTION_FORMAT:
-        raise FormatError(f"{source}: expected a document of the format {CORRECTION_FORMAT}")
+    if not isinstance(document, dict) or document.get("format") not in (
+        CORRECTION_FORMAT,
+        PROFILE_FORMAT,
+    ):
+        raise FormatError(
+            f"{source}: expected a document of the format {CORRECTION_FORMAT} or {PROFILE_FORMAT}"
+        )
     correction = ImageCorrection(
         parameters=_numbers(document, "parameters_px", (2, 3), source),
         centre=_numbers(document, "centre_px", (2,), source),
         half_size=_numbers(document, "half_size_px", (2,), source),
+        profile=_profile(document, source) if document["format"] == PROFILE_FORMAT else None,
     )
     if not (correction.half_size > 0.0).all():
         raise FormatError(f"{source}: half_size_px: expected positive numbers")
@@ -112,6 +133,23 @@ def parse_correction_accuracy(text: str, source: str = "correction") -> Correcti
         Frame(_covariance(document, "frame_covariance_m2", 3, source)),
         float(apart_px),
     )
+
+
+def _profile(document: dict[str, Any], source: str) -> LineProfile:
+    """The profile of a document."""
+    nodes = document.get("profile")
+    if not isinstance(nodes, dict) or not isinstance(nodes.get("line"), list):
+        raise FormatError(f"{source}: profile: expected an object with the lists {', '.join(_PROFILE)}")
+    count = len(nodes["line"])
+    values = {
+        name: _numbers(nodes, name, (count, *shape), f"{source}: profile")
+        for name, shape in _PROFILE.items()
+    }
+    if count < 2 or not (np.diff(values["line"]) > 0.0).all():
+        raise FormatError(f"{source}: profile: line: expected two ascending numbers or more")
+    if (values["variance_px2"] < 0.0).any():
+        raise FormatError(f"{source}: profile: variance_px2: expected numbers that are not negative")
+    return LineProfile(**values)
 
 
 def _rows(covariance: Array) -> list[list[float | None]]:

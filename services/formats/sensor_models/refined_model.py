@@ -18,7 +18,7 @@ from services.map_grid import MapGrid
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.sensors.ortho import OrthoModel, fold_into_ortho
-from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
+from services.sensors.refined import LOUD_PX, REFIT_LIMIT_PX, refined_rpc
 from services.sensors.rpc import RpcModel
 from services.types import UNKNOWN_FRAME, Frame
 
@@ -150,6 +150,11 @@ def _write_rpc(
     names = ", ".join(file.name for file in files)
     exact = refined.max_error_px == 0.0
     how = "exactly" if exact else f"fitted within {refined.max_error_px:.2g} px"
+    if refined.max_error_px > LOUD_PX:
+        how = (
+            f"up to {refined.max_error_px:.2g} px OFF: no RPC follows its profile along the lines. Use "
+            f"{CORRECTION_JSON} with the delivered model, or an orthorectified image"
+        )
     return RefinedFiles(tuple(files), refined.max_error_px, f"{names}: the corrected model, {how}")
 
 

@@ -21,7 +21,7 @@ from services.formats.sensor_models.correction_json import (
 from services.formats.sensor_models.refined_model import write_refined
 from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from services.geodesy import metres_per_degree_at
-from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.sensors.correction import CorrectedModel, ImageCorrection, LineProfile, no_correction
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
 from services.simulation.orbit import pushbroom_over
 
@@ -45,6 +45,40 @@ def test_a_correction_survives_a_round_trip() -> None:
     for name in ("parameters", "centre", "half_size"):
         np.testing.assert_array_equal(getattr(again, name), getattr(CORRECTION, name))
     assert json.loads(written())["covariance_px2"][0][0] is None
+
+
+def profiled() -> ImageCorrection:
+    line = np.array([0.0, 400.0, 999.0])
+    displacement_px = np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.0]])
+    profile = LineProfile(line, displacement_px, np.full((3, 2), 0.04), np.full((3, 2, 3), -0.01))
+    return replace(CORRECTION, profile=profile)
+
+
+def test_a_correction_with_a_profile_survives_a_round_trip_in_its_own_format() -> None:
+    document = json.loads(written(profiled()))
+    assert document["format"] == "amers-image-correction/2"
+    again, before = parse_correction(json.dumps(document)).profile, profiled().profile
+    assert again is not None
+    assert before is not None
+    for name in ("line", "displacement_px", "variance_px2", "with_parameters_px2"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
+    assert json.loads(written())["format"] == "amers-image-correction/1"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("line", [0.0, 400.0, 400.0], "profile: line: expected two ascending numbers"),
+        ("line", None, "profile: expected an object with the lists"),
+        ("displacement_px", [[0.0, 1.0]], "profile: displacement_px: expected 3 x 2 finite numbers"),
+        ("variance_px2", [[0.0, -1.0]] * 3, "variance_px2: expected numbers that are not negative"),
+    ],
+)
+def test_profiles_that_make_no_sense_are_refused(name: str, value: object, says: str) -> None:
+    document = json.loads(written(profiled()))
+    document["profile"][name] = value
+    with pytest.raises(FormatError, match=says):
+        parse_correction(json.dumps(document))
 
 
 def test_a_correction_without_a_frame_has_an_unknown_one() -> None:

@@ -1,0 +1,282 @@
+"""A displacement along the lines of an image: what a scanner does that no affine correction follows.
+
+The displacement of each coordinate is a Gaussian process of the line, a sum of components: smooth ones
+(bow, slow attitude), narrow bands (jitter) and steps (lost or repeated lines). A component is added as
+long as the residuals show one that chance does not explain and that predicts blocks of lines which were
+held out. Kernels and variances are those of the largest restricted likelihood (Patterson and Thompson,
+1971); estimate and covariance are those of universal kriging.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import null_space, solve_triangular
+
+from services.adjustment.structure import ALONG_LINES, Residuals, Structure, structures
+from services.types import Array, IntArray
+
+MAX_CHANCE = 0.002
+"""Structure that chance explains with a larger probability is not looked into."""
+_MOST_COMPONENTS = 3
+_MOST_POINTS = 200
+"""Measures that choose a kernel; more cost more and tell little more."""
+_LEAST_EVIDENCE = 4.0
+"""Logarithm of how many times more likely a component makes the residuals, at least."""
+_BLOCKS = 40
+"""Blocks of lines of the cross-validation."""
+_LEAST_GAIN = 0.97
+"""Residuals of held-out blocks with a component over those without, at most."""
+_LOOSE = 100.0
+"""Variance of components, over the likeliest one, for tests of what they leave."""
+_RATIOS = np.concatenate([[0.0], np.geomspace(0.03, 3000.0, 21)])
+"""Variances of a component that are tried, over the median variance of the measures."""
+_LENGTHS = (0.04, 0.08, 0.15, 0.3, 0.6, 1.2)
+"""Correlation lengths of smooth components, extents of the points along the lines."""
+_COHERENCE = (0.15, 0.4, 2.0)
+"""Lengths over which a narrow band keeps its phase, the same."""
+_LEAST_SEEN = 0.4
+"""Share of its amplitude that chips show of a jitter that can be followed."""
+_FINE = 8
+"""Periods tried around a peak, for each that independent residuals tell apart."""
+_ISOTROPIC = (0.05, 0.1, 0.2)
+"""Lengths of errors that neighbours share in all directions, sides of the image: what else may be."""
+
+
+@dataclass(frozen=True)
+class Component:
+    """One component of a profile.
+
+    Attributes:
+        kind: "smooth", "period" or "step".
+        length_px: over which it is correlated; of a step, the width of the gap that holds it.
+        at_px: period; first line of the gap that holds a step.
+        variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
+            are true: what these are off by, it is off by, too.
+        seen: share of the amplitude that chips show, which average over their lines.
+    """
+
+    kind: Literal["smooth", "period", "step"]
+    length_px: float
+    at_px: float
+    variance_px2: Array
+    seen: float = 1.0
+
+    def correlation(self, first: Array, second: Array) -> Array:
+        """Correlation (m, n) of the displacements at lines (m,) and (n,)."""
+        if self.kind == "step":
+            before = np.minimum(first[:, None], second[None, :])
+            return np.clip((before - self.at_px) / self.length_px, 0.0, 1.0)
+        apart = first[:, None] - second[None, :]
+        smooth = np.exp(-0.5 * (apart / self.length_px) ** 2)
+        if self.kind == "smooth":
+            return np.asarray(smooth)
+        return np.asarray(smooth * np.cos(2.0 * np.pi * apart / self.at_px))
+
+    def covariance(self, first: Array, second: Array) -> Array:
+        """Covariance (2, m, n) of what chips show, of line and sample."""
+        return np.asarray(self.variance_px2[:, None, None] * self.correlation(first, second))
+
+    def scaled(self, factor: float) -> "Component":
+        """The same component with its variance multiplied by a factor."""
+        return replace(self, variance_px2=self.variance_px2 * factor)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A component and how likely it makes the residuals.
+
+    Attributes:
+        component: with its likeliest variances.
+        log_evidence: over that of no component.
+    """
+
+    component: Component | None
+    log_evidence: float
+
+
+def likeliest_components(
+    residuals: Residuals, extent_px: float
+) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
+    """The components that residuals of an affine correction show, and what they leave along lines.
+
+    Args:
+        residuals: of the active measures.
+        extent_px: side of the image, to which errors that neighbours share are compared.
+    """
+    line = residuals.line_sample[:, 0]
+    blocks = line_blocks(line, max(residuals.chip_side_px, float(np.ptp(line)) / _BLOCKS))
+    components: list[Component] = []
+    while True:
+        found = structures(beyond(residuals, components), ALONG_LINES)
+        clearest = min(found, key=lambda one: one.chance)
+        if clearest.chance > MAX_CHANCE or len(components) == _MOST_COMPONENTS:
+            break
+        followed = with_components(residuals, components)
+        component = _likeliest(followed, found, extent_px, alone=not components)
+        if component is None:
+            break
+        richer = with_components(followed, [component])
+        if held_out_rms(richer, blocks) > _LEAST_GAIN * held_out_rms(followed, blocks):
+            break
+        components.append(component)
+    return tuple(components), found
+
+
+def with_components(residuals: Residuals, components: Sequence[Component]) -> Residuals:
+    """The same residuals, of which the covariance holds what the components displace."""
+    line = residuals.line_sample[:, 0]
+    covariance = residuals.covariance.copy()
+    for component in components:
+        covariance += component.covariance(line, line)
+    return replace(residuals, covariance=covariance)
+
+
+def beyond(residuals: Residuals, components: Sequence[Component]) -> Residuals:
+    """The residuals for tests of what the components leave: what they can follow counts as followed."""
+    return with_components(residuals, [component.scaled(_LOOSE) for component in components])
+
+
+def unit_variance(residuals: Residuals) -> float:
+    """Variance of unit weight of whitened residuals."""
+    _, bases, left = residuals.whitened
+    return float((left**2).sum() / max(left.size - 2 * bases.shape[2], 1))
+
+
+def line_blocks(line: Array, length: float) -> IntArray:
+    """Number (n,) of the block of `length` lines that each line lies in."""
+    return np.unique(np.floor((line - line.min()) / length), return_inverse=True)[1].astype(np.int64)
+
+
+def held_out_rms(residuals: Residuals, blocks: IntArray) -> float:
+    """Residuals of blocks (n,) of measures predicted from all others: robust rms, pixels."""
+    held = np.empty_like(residuals.misfit)
+    for k in range(2):
+        inverse = np.linalg.inv(residuals.covariance[k])
+        weighted = inverse @ residuals.design
+        projection = inverse - weighted @ np.linalg.pinv(residuals.design.T @ weighted) @ weighted.T
+        pulled = projection @ residuals.misfit[:, k]
+        for block in range(blocks.max() + 1):
+            rows = np.flatnonzero(blocks == block)
+            held[rows, k] = np.linalg.lstsq(projection[np.ix_(rows, rows)], pulled[rows], rcond=1e-9)[0]
+    square = (held**2).sum(axis=1)
+    return float(np.sqrt(np.mean(np.minimum(square, 9.0 * np.median(square)))))
+
+
+def _likeliest(
+    residuals: Residuals, found: Sequence[Structure], extent_px: float, *, alone: bool
+) -> Component | None:
+    """The component that makes the residuals most likely; None where shared errors do better."""
+    thinned = _thinned(residuals)
+    system = _System.of(thinned)
+    line = thinned.line_sample[:, 0]
+    candidates = [
+        system.judge(component, component.correlation(line, line))
+        for component in _candidates(thinned, found)
+    ]
+    best = max(candidates, key=lambda one: one.log_evidence)
+    least = _LEAST_EVIDENCE
+    if alone:
+        distance = np.linalg.norm(thinned.line_sample[:, None] - thinned.line_sample[None], axis=2)
+        shared = [system.judge(None, np.exp(-distance / (one * extent_px))) for one in _ISOTROPIC]
+        least += max(0.0, max(one.log_evidence for one in shared))
+    return best.component if best.log_evidence > least else None
+
+
+def _thinned(residuals: Residuals) -> Residuals:
+    """At most `_MOST_POINTS` of the measures, evenly along the lines."""
+    step = -(-len(residuals.misfit) // _MOST_POINTS)
+    rows = np.argsort(residuals.line_sample[:, 0])[::step]
+    return Residuals(
+        residuals.line_sample[rows],
+        residuals.height_m[rows],
+        residuals.height_pull,
+        residuals.misfit[rows],
+        residuals.covariance[:, rows[:, None], rows[None, :]],
+        residuals.design[rows],
+        residuals.chip_side_px,
+    )
+
+
+def _candidates(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
+    """Components of unit variance that may explain a structure."""
+    line = residuals.line_sample[:, 0]
+    extent = max(float(np.ptp(line)), 1e-9)
+    one = np.ones(2)
+    side = residuals.chip_side_px
+    lengths = [length * extent for length in _LENGTHS if length * extent >= 0.5 * side]
+    candidates = [
+        Component("smooth", length, np.nan, one, (1.0 + (side / length) ** 2 / 12.0) ** -0.5)
+        for length in lengths
+    ]
+    for structure in found:
+        if structure.shape == "period":
+            frequency = 1.0 / structure.at + np.arange(-_FINE // 2, _FINE // 2 + 1) / (_FINE * extent)
+            periods = 1.0 / frequency[frequency > 0.25 / extent]
+            phase = 2.0 * np.pi * line / periods[:, None]
+            gain, _ = residuals.gains(np.stack([np.cos(phase), np.sin(phase)], axis=-1))
+            period = float(periods[np.argmax(gain)])
+            seen = float(np.sinc(side / period))
+            if seen < _LEAST_SEEN:
+                continue
+            candidates += [Component("period", one_ * extent, period, one, seen) for one_ in _COHERENCE]
+        elif structure.shape == "step":
+            ordered = np.unique(line)
+            after = int(np.searchsorted(ordered, structure.at))
+            start = float(ordered[after - 1])
+            candidates.append(Component("step", float(ordered[after]) - start, start, one))
+    return candidates
+
+
+@dataclass(frozen=True)
+class _System:
+    """Whitened measures of each coordinate, without what the design explains.
+
+    Attributes:
+        lower: (2, n, n) Cholesky factors of the covariance.
+        rest: (2, n, n - k) bases of what the design leaves.
+        left: (2, n - k) measures in them.
+        unit_px2: (2,) median variance of a measure.
+    """
+
+    lower: Array
+    rest: Array
+    left: Array
+    unit_px2: Array
+
+    @classmethod
+    def of(cls, residuals: Residuals) -> "_System":
+        lower, _, _ = residuals.whitened
+        rest, left = [], []
+        for k in range(2):
+            columns = np.column_stack([residuals.design, residuals.misfit[:, k]])
+            white = solve_triangular(lower[k], columns, lower=True, check_finite=False)
+            basis = null_space(white[:, :-1].T, rcond=1e-9)
+            rest.append(basis)
+            left.append(basis.T @ white[:, -1])
+        diagonal = np.diagonal(residuals.covariance, 0, 1, 2)
+        return cls(lower, np.array(rest), np.array(left), np.median(diagonal, axis=1))
+
+    def judge(self, component: Component | None, correlation: Array) -> _Judged:
+        """The likeliest variances of a component with this correlation (n, n), and its evidence."""
+        ratio = _RATIOS[:, None]
+        quadratic, determinant = [], []
+        for k in range(2):
+            half = solve_triangular(self.lower[k], correlation, lower=True, check_finite=False)
+            white = solve_triangular(self.lower[k], half.T, lower=True, check_finite=False)
+            values, vectors = np.linalg.eigh(self.rest[k].T @ white @ self.rest[k] * self.unit_px2[k])
+            spread = 1.0 + ratio * np.maximum(values, 0.0)
+            quadratic.append(((vectors.T @ self.left[k]) ** 2 / spread).sum(axis=1))
+            determinant.append(np.log(spread).sum(axis=1))
+        freedom = self.left.size
+        total = quadratic[0][:, None] + quadratic[1][None, :]
+        logarithm = -0.5 * (determinant[0][:, None] + determinant[1][None, :])
+        logarithm = logarithm - 0.5 * freedom * np.log(np.maximum(total, 1e-300))
+        first, second = np.unravel_index(int(np.argmax(logarithm)), logarithm.shape)
+        weight = np.exp(logarithm - logarithm[0, 0] - (peak := float(logarithm.max() - logarithm[0, 0])))
+        evidence = peak + float(np.log(weight.mean()))
+        if component is None:
+            return _Judged(None, evidence)
+        variance = np.array([_RATIOS[first], _RATIOS[second]]) * self.unit_px2
+        return _Judged(replace(component, variance_px2=variance), evidence)

@@ -1,0 +1,145 @@
+"""The measures of a scene at their places: what the tests of their residuals and its profile work on."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from services.adjustment.affine_fit import AffineFit
+from services.adjustment.line_profile import Component, beyond, likeliest_components
+from services.adjustment.profile_solution import agreeing_with
+from services.adjustment.shared_errors import SharedErrors, overlap_correlation
+from services.adjustment.structure import ALONG_LINES, OTHERWISE, Residuals, Structure, structures
+from services.sensors.base import SensorModel
+from services.sensors.correction import LineProfile, no_correction
+from services.sensors.ortho import OrthoModel
+from services.types import Array, BoolArray
+
+
+@dataclass(frozen=True)
+class PlacedMeasures:
+    """The n measures of a scene.
+
+    Attributes:
+        position_px: (n, 2) by the model.
+        height_m: (n,) of the points.
+        height_pull: (2,) see `Residuals`.
+        overlapping: (n, n) correlation by overlapping chips.
+        chip_side_px: of a chip in the scene.
+        size_px: side of the image.
+        scanned: whether the image was scanned line by line.
+    """
+
+    position_px: Array
+    height_m: Array
+    height_pull: Array
+    overlapping: Array
+    chip_side_px: float
+    size_px: float
+    scanned: bool
+
+    @classmethod
+    def of(
+        cls,
+        model: SensorModel,
+        shape: tuple[int, int],
+        lon_lat_h: Array,
+        covariance_m2: Array,
+        *,
+        fit: AffineFit,
+        of_points: Array,
+        chip_side_px: float,
+    ) -> Self:
+        """The measures of points (n, 3); `of_points` (n, 2) is their part of the variances of a fit."""
+        frame = no_correction(shape)
+        position_px = frame.centre + fit.t * frame.half_size
+        own_share = (1.0 - of_points / fit.variance).mean(axis=1)
+        derivative = model.project_derivative(lon_lat_h)
+        return cls(
+            position_px,
+            lon_lat_h[:, 2],
+            np.nanmean(derivative @ covariance_m2[:, :, 2:], axis=0)[:, 0],
+            overlap_correlation(position_px, chip_side_px, own_share),
+            chip_side_px,
+            float(np.sqrt(shape[0] * shape[1])),
+            not isinstance(model, OrthoModel),
+        )
+
+    @property
+    def position(self) -> Array:
+        """(n, 2) sides of the image."""
+        return self.position_px / self.size_px
+
+    def residuals(
+        self, fit: AffineFit, rows: BoolArray, shared: SharedErrors | None = None
+    ) -> Residuals:
+        """The measures of a mask (n,), with the errors that they share."""
+        correlation = self.overlapping[np.ix_(rows, rows)]
+        if shared is not None:
+            correlation = shared.covariance(self.position[rows], correlation)
+        sigma = fit.sigma[rows].T
+        return Residuals(
+            self.position_px[rows],
+            self.height_m[rows],
+            self.height_pull,
+            fit.misfit[rows],
+            sigma[:, :, None] * correlation * sigma[:, None, :],
+            fit.design[rows],
+            self.chip_side_px,
+        )
+
+    def components(
+        self, fit: AffineFit, rows: BoolArray, *, wanted: bool = True
+    ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
+        """What a scanner did that no affine correction follows, and what is left along the lines.
+
+        Args:
+            fit: of the measures.
+            rows: (n,) those that are used.
+            wanted: whether it may be followed; else all is left.
+        """
+        residuals = self.residuals(fit, rows)
+        if not (wanted and self.scanned):
+            return (), structures(residuals, ALONG_LINES)
+        return likeliest_components(residuals, self.size_px)
+
+    def agreeing(
+        self,
+        fit: AffineFit,
+        rows: BoolArray,
+        components: tuple[Component, ...],
+        expected: Array,
+        tolerance: float,
+    ) -> BoolArray:
+        """Measures (n,) of a mask that agree with a profile, see `agreeing_with`."""
+        out = np.zeros_like(rows)
+        out[rows] = agreeing_with(self.residuals(fit, rows), components, expected, tolerance)
+        return out
+
+    def without(self, profile: LineProfile, fit: AffineFit) -> AffineFit:
+        """A fit of what a profile leaves, as chips show it."""
+        shown = profile.averaged(self.position_px[:, 0], self.chip_side_px)
+        return replace(fit, misfit=fit.misfit - shown)
+
+    def structures(
+        self,
+        fit: AffineFit,
+        active: BoolArray,
+        components: tuple[Component, ...],
+        shared: SharedErrors,
+        along_lines: tuple[Structure, ...],
+    ) -> tuple[Structure, ...]:
+        """What the residuals still depend on, beside errors that neighbours clearly share.
+
+        Args:
+            fit: of the measures.
+            active: (n,) those that are used.
+            components: of the profile.
+            shared: errors that neighbours share.
+            along_lines: what the components leave, where neighbours share nothing.
+        """
+        clear = shared.clear_share > 0.0
+        residuals = beyond(self.residuals(fit, active, shared if clear else None), components)
+        if clear or components:
+            along_lines = structures(residuals, ALONG_LINES)
+        return along_lines + structures(residuals, OTHERWISE)

@@ -1,0 +1,248 @@
+"""What a scanner does along its lines is followed as far as points show it, the rest is named."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from services.adjustment.image_correction import (
+    AdjustmentOptions,
+    ControlObservations,
+    SceneAdjustment,
+    adjust_scene,
+)
+from services.adjustment.line_profile import MAX_CHANCE
+from services.adjustment.structure import Family
+from services.quality.accuracy import normal_ce90, normalised_error
+from services.sensors.correction import CorrectedModel, ImageCorrection, LineProfile, no_correction
+from services.sensors.refined import LOUD_PX, refined_rpc
+from services.types import Array
+from tests.services.conftest import FlatModel
+
+SHAPE = (4000, 3000)
+CHIP_PX = 64.0
+WRONG = 3.0
+"""True over predicted CE90 from which on a result is wrong."""
+
+Motion = Callable[[Array], Array]
+"""Displacement (n, 2) of lines (n,)."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A scene whose lines move, adjusted, and how far off the result is."""
+
+    adjustment: SceneAdjustment
+    ratio: float
+    normalised: float
+
+    def chance(self, family: Family) -> float:
+        return next(one.chance for one in self.adjustment.structures if one.family == family)
+
+    @property
+    def named(self) -> bool:
+        return min(one.chance for one in self.adjustment.structures) < MAX_CHANCE
+
+
+def still(line: Array) -> Array:
+    return np.zeros((len(line), 2))
+
+
+def draw(
+    motion: Motion,
+    rng: np.random.Generator,
+    *,
+    count: int = 100,
+    sigma_px: float = 0.5,
+    wrong: float = 0.06,
+    averaged: bool = False,
+    by_height_px: float = 0.0,
+) -> tuple[ControlObservations, ImageCorrection]:
+    """Points of a scene that is shifted, skewed and moved line by line, with noise and some blunders."""
+    frame = no_correction(SHAPE)
+    truth = replace(
+        frame, parameters=np.column_stack([rng.normal(0.0, 10.0, 2), rng.normal(0.0, 1.0, (2, 2))])
+    )
+    predicted = rng.random((count, 2)) * (np.array(SHAPE) - 1.0)
+    height_m = rng.normal(0.0, 80.0, count)
+    offsets = np.linspace(-0.5, 0.5, 65) * CHIP_PX if averaged else np.zeros(1)
+    moved = np.mean([motion(predicted[:, 0] + offset) for offset in offsets], axis=0)
+    line_sample = truth.apply(predicted) + moved + sigma_px * rng.normal(size=(count, 2))
+    line_sample[:, 1] += by_height_px * height_m / 100.0
+    blunder = rng.random(count) < wrong
+    line_sample[blunder] += rng.choice([-1.0, 1.0], (blunder.sum(), 2)) * rng.uniform(5.0, 25.0)
+    lon_lat_h = FlatModel().locate(predicted, np.zeros(count))
+    lon_lat_h[:, 2] = height_m
+    return ControlObservations(
+        lon_lat_h, line_sample, np.full(count, sigma_px), np.zeros((count, 3, 3)), chip_side_px=CHIP_PX
+    ), truth
+
+
+def trial(motion: Motion, seed: int, **how: float) -> Trial:
+    """A drawn scene, adjusted, against its truth at places all over the image."""
+    observations, truth = draw(motion, np.random.default_rng(seed), **how)  # type: ignore[arg-type]
+    adjustment = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
+    places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
+    error = adjustment.correction.apply(places) - truth.apply(places) - motion(places[:, 0])
+    covariance = adjustment.covariance_at(adjustment.correction.apply(places))
+    true_px = float(np.quantile(np.hypot(*error.T), 0.9))
+    predicted_px = float(np.median(normal_ce90(covariance)))
+    return Trial(adjustment, true_px / predicted_px, normalised_error(error, covariance).mean_square)
+
+
+def jitter(period: float, size_px: tuple[float, float], chirp: float = 0.0) -> Motion:
+    def motion(line: Array) -> Array:
+        turns = line / period * (1.0 + chirp * line / SHAPE[0])
+        return np.column_stack(
+            [size_px[0] * np.sin(2.0 * np.pi * turns), size_px[1] * np.cos(2.0 * np.pi * turns + 1.0)]
+        )
+
+    return motion
+
+
+def bow(size_px: float) -> Motion:
+    return lambda line: (
+        np.column_stack([0.3 * line, line]) * 0.0
+        + size_px * ((2.0 * line / SHAPE[0] - 1.0) ** 2)[:, None] * [0.5, 1.0]
+    )
+
+
+def step(at: float, size_px: float) -> Motion:
+    return lambda line: (line > at)[:, None] * [size_px, 0.0]
+
+
+MOTIONS = {
+    "slow jitter": jitter(2500.0, (0.5, 2.0)),
+    "jitter": jitter(600.0, (1.0, 2.0)),
+    "jitter in lines alone": jitter(350.0, (2.0, 0.0)),
+    "jitter that changes": jitter(900.0, (0.5, 2.0), chirp=0.4),
+    "bow": bow(4.0),
+    "lines lost": step(2900.0, 6.0),
+}
+
+
+@pytest.mark.parametrize("name", list(MOTIONS))
+def test_what_points_show_along_the_lines_is_followed_with_the_stated_accuracy(name: str) -> None:
+    trials = [trial(MOTIONS[name], seed) for seed in range(8)]
+    assert all(one.adjustment.components for one in trials)
+    assert max(one.ratio for one in trials) < WRONG
+    assert 0.6 < np.mean([one.normalised for one in trials]) < 1.7
+
+
+@pytest.mark.parametrize("name", list(MOTIONS))
+def test_an_affine_correction_alone_would_be_wrong_and_say_nothing(name: str) -> None:
+    """Without the profile the same scenes are off by more than three times what is stated."""
+    observations, truth = draw(MOTIONS[name], np.random.default_rng(0))
+    places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
+    full = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
+    affine = replace(full.correction, profile=None)
+    error = affine.apply(places) - truth.apply(places) - MOTIONS[name](places[:, 0])
+    off_px = float(np.quantile(np.hypot(*error.T), 0.9))
+    assert off_px > 0.7 * np.abs(MOTIONS[name](places[:, 0])).max()
+
+
+def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
+    trials = [trial(still, seed, count=60) for seed in range(150)]
+    assert sum(one.named for one in trials) <= 3
+    assert sum(bool(one.adjustment.components) for one in trials) <= 2
+    assert 0.7 < np.mean([one.normalised for one in trials]) < 1.3
+
+
+def test_the_chance_of_each_family_is_what_it_says() -> None:
+    """Of independent errors, at most 5 % have a chance below 5 %, and not far fewer."""
+    trials = [trial(still, seed, count=60, wrong=0.0) for seed in range(300, 450)]
+    for family in ("lines", "steps", "samples", "image", "height"):
+        below = float(np.mean([one.chance(family) < 0.05 for one in trials]))
+        assert below < 0.09
+    assert np.mean([one.chance("height") < 0.5 for one in trials]) > 0.3
+
+
+def test_chips_show_less_of_a_fast_jitter_which_is_taken_into_account() -> None:
+    fast = jitter(130.0, (0.0, 4.0))
+    trials = [trial(fast, seed, count=160, averaged=True) for seed in range(6)]
+    assert max(one.ratio for one in trials) < WRONG
+    assert 0.5 < np.mean([one.normalised for one in trials]) < 2.0
+
+
+def test_residuals_that_grow_with_height_are_named_so() -> None:
+    trials = [trial(still, seed, by_height_px=1.5) for seed in range(8)]
+    assert all(one.chance("height") < MAX_CHANCE for one in trials)
+
+
+def test_heights_with_errors_on_level_ground_are_not_taken_for_another_view() -> None:
+    """A point that is too high by its error is displaced by it, in every model."""
+    rng = np.random.default_rng(3)
+    accused = 0
+    for _ in range(60):
+        observations, _ = draw(still, rng, wrong=0.0)
+        sigma_m, per_metre = 3.0, 0.4
+        error_m = sigma_m * rng.normal(size=len(observations.lon_lat_h))
+        line_sample = observations.line_sample - np.outer(error_m, [0.0, per_metre])
+        covariance_m2 = np.zeros((len(error_m), 3, 3))
+        covariance_m2[:, 2, 2] = sigma_m**2
+        lon_lat_h = observations.lon_lat_h.copy()
+        lon_lat_h[:, 2] = rng.normal(0.0, 3.0, len(error_m)) + error_m
+        tilted = replace(
+            observations, lon_lat_h=lon_lat_h, line_sample=line_sample, covariance_m2=covariance_m2
+        )
+        adjustment = adjust_scene(_Tilted(per_metre=per_metre), SHAPE, tilted, AdjustmentOptions())
+        chance = next(one.chance for one in adjustment.structures if one.family == "height")
+        accused += chance < MAX_CHANCE
+    assert accused <= 2
+
+
+@dataclass(frozen=True)
+class _Tilted(FlatModel):
+    """The plane whose model moves points by their heights; heights here are errors alone."""
+
+    per_metre: float = 0.0
+
+    def project_derivative(self, lon_lat_h: Array) -> Array:
+        derivative = np.array(super().project_derivative(lon_lat_h))
+        derivative[:, 1, 2] = self.per_metre
+        return derivative
+
+
+def test_a_repetition_keeps_the_components_and_follows_its_own_points() -> None:
+    observations, _ = draw(MOTIONS["jitter"], np.random.default_rng(5))
+    first = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
+    fewer = replace(observations, usable=first.active & (np.arange(len(first.active)) % 5 > 0))
+    again = adjust_scene(FlatModel(), SHAPE, fewer, AdjustmentOptions(), like=first)
+    assert again.components == first.components
+    places = np.random.default_rng(1).random((100, 2)) * (np.array(SHAPE) - 1.0)
+    moved = again.correction.apply(places) - first.correction.apply(places)
+    assert 0.0 < np.abs(moved).mean() < 0.5
+
+
+def profile_of(motion: Motion, nodes: int = 400) -> LineProfile:
+    line = np.linspace(0.0, SHAPE[0] - 1.0, nodes)
+    return LineProfile(line, motion(line), np.full((nodes, 2), 0.04), np.zeros((nodes, 2, 3)))
+
+
+def test_a_corrected_model_with_a_profile_is_consistent_with_itself() -> None:
+    parameters = np.array([[30.0, 2.0, -1.0], [-12.0, 0.5, 3.0]])
+    correction = replace(
+        no_correction(SHAPE), parameters=parameters, profile=profile_of(MOTIONS["jitter"])
+    )
+    model = CorrectedModel(FlatModel(), correction)
+    places = np.random.default_rng(2).random((200, 2)) * (np.array(SHAPE) - 1.0)
+    ground = model.locate(places, np.zeros(200))
+    np.testing.assert_allclose(model.project(ground), places, atol=1e-6)
+    step_m = 0.01
+    metre = FlatModel().locate(np.array([[0.0, 2.0 * step_m]]), np.zeros(1))[0, 0]
+    east = np.array([metre, 0.0, 0.0])
+    by_difference = (model.project(ground + east) - model.project(ground - east)) / (2.0 * step_m)
+    inside = np.abs(by_difference - model.project_derivative(ground)[:, :, 0]).max(axis=1) < 1e-3
+    assert inside.mean() > 0.97, "apart from nodes, where the slope changes"
+
+
+def test_an_rpc_that_cannot_follow_a_profile_is_loud() -> None:
+    correction = replace(no_correction(SHAPE), profile=profile_of(MOTIONS["jitter"]))
+    bent = replace(no_correction(SHAPE), profile=profile_of(bow(2.0)))
+    followed, shaken = (
+        refined_rpc(CorrectedModel(FlatModel(), one), SHAPE, (-50.0, 50.0)) for one in (bent, correction)
+    )
+    assert followed.model is not None
+    assert followed.max_error_px < LOUD_PX
+    assert shaken.max_error_px > LOUD_PX
