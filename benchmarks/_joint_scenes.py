@@ -209,7 +209,8 @@ def measured_scene(
     )
     search = Search(points, np.arange(n), matches, found, 0.0)
     enough = found.sum() >= options.adjustment.min_points
-    alone = adjust_search(scene, search, options.adjustment) if enough else None
+    affine = replace(options.adjustment, profile=False)
+    alone = adjust_search(scene, search, affine) if enough else None
     return MeasuredScene(scene, points, search, alone)
 
 

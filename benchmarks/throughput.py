@@ -28,7 +28,7 @@ import numpy as np
 from app.usecases.image_production import ProductionImages, run_production
 from app.usecases.production import BlockIdentity
 from app.usecases.registration import deliverables, register
-from app.usecases.registration.control_sources import points_of_blocks
+from app.usecases.registration.control_sources import points_of_block
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from benchmarks._measuring import keep
 from services.formats.block.reader import FolderChips, read_block
@@ -126,7 +126,7 @@ def in_process(folder: Path, images: list[Path], repeats: int) -> tuple[float, d
             if turn > 0:
                 alone.append(time.process_time() - started)
     stages: dict[str, float] = defaultdict(float)
-    sources = ControlSources(points_of_blocks([folder / "block"]))
+    sources = ControlSources(points_of_block(folder / "block"))
     with _timed(stages):
         for turn in range(repeats + 1):
             if turn == 1:

@@ -239,20 +239,6 @@ def health(expected: Array | IntArray, succeeded: Array | IntArray) -> Array:
     return np.asarray(np.minimum(ratio, 1.0))
 
 
-def all_surfaces(parts: Sequence[ControlPoints]) -> SurfaceHeights | None:
-    """The surface at the points of all parts; unknown where a part states none."""
-    if all(one.surface is None for one in parts):
-        return None
-    stated = [
-        one.surface or SurfaceHeights(np.full(len(one), np.nan), np.full(len(one), np.nan))
-        for one in parts
-    ]
-    return SurfaceHeights(
-        np.concatenate([one.height_m for one in stated]),
-        np.concatenate([one.sigma_m for one in stated]),
-    )
-
-
 class ChipSource(Protocol):
     """A source of chips: a block folder or the storage of the service."""
 

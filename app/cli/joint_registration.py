@@ -18,7 +18,7 @@ from app.db.engine import Database
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
 from app.usecases.executors import ComputeOptions
-from app.usecases.registration.control_sources import FindPoints, points_of_blocks, points_of_store
+from app.usecases.registration.control_sources import FindPoints, points_of_block, points_of_store
 from app.usecases.registration.joined_scenes import read_joined
 from app.usecases.registration.register import SceneFiles, image_key, record_registration
 from app.usecases.registration.result_folder import older_result, replacing
@@ -40,9 +40,8 @@ class JointRequest:
     Attributes:
         files: of the scenes.
         output: folder of the folders of the results.
-        blocks: folders of blocks of control points; none for the store.
+        block: folder of a block of control points; None for the store.
         joined: folder of results that these scenes join.
-        mask: that was given, see `masks_of`.
         copy_image: also copy GeoTIFFs, with the refined models in their tags.
         max_ce90_on_earth_m: see `QualificationOptions`.
         jobs: processes at once.
@@ -50,9 +49,8 @@ class JointRequest:
 
     files: Sequence[SceneFiles]
     output: Path
-    blocks: tuple[Path, ...]
+    block: Path | None
     joined: Path | None
-    mask: Path | None
     copy_image: bool
     max_ce90_on_earth_m: float | None
     jobs: int
@@ -66,19 +64,15 @@ class JointRequest:
     @property
     def command(self) -> str:
         """The command that registers the scenes again, without the accuracy of their models."""
-        one = self.files[0]
-        named: list[tuple[str, object]] = [
-            *(("--block", block) for block in self.blocks),
-            ("--join", self.joined),
-            ("--bands", one.bands),
-            ("--mask", self.mask),
-            ("--check-points", one.check_points),
-            ("--check-heights", one.check_heights),
-            ("--rigorous", one.rigorous),
-            ("-o", self.output),
-        ]
+        rigorous = self.files[0].rigorous
+        named = {
+            "--block": self.block,
+            "--join": self.joined,
+            "--rigorous": rigorous,
+            "-o": self.output,
+        }
         words = [str(one.image) for one in self.files]
-        words += [str(word) for pair in named if pair[1] is not None for word in pair]
+        words += [str(word) for pair in named.items() if pair[1] is not None for word in pair]
         return shlex.join(["amers", "scene", "register-many", *words])
 
     def scene(self, files: SceneFiles) -> SceneRequest:
@@ -145,8 +139,8 @@ def _failed(request: JointRequest, files: SceneFiles, error: AmersError) -> Outc
 @contextmanager
 def _control(request: JointRequest) -> Iterator[tuple[FindPoints, Database | None]]:
     """What finds control points, and the store that records registrations on its points."""
-    if request.blocks:
-        yield points_of_blocks(request.blocks), None
+    if request.block is not None:
+        yield points_of_block(request.block), None
         return
     settings = read_settings()
     with engine.opened(settings) as database:

@@ -11,19 +11,6 @@ from app.cli.exit_status import SUCCESS
 from app.cli.joint_registration import JointRequest, register_together
 from app.cli.output import AsJson, print_json, show, show_one
 from app.cli.progress import shown_progress
-from app.cli.scene_options import (
-    Bands,
-    Blocks,
-    CheckHeights,
-    CheckPoints,
-    CopyImage,
-    GeoidGrid,
-    MaxCe90OnEarthM,
-    Output,
-    Scenes,
-    SigmaM,
-    Vertical,
-)
 from app.cli.scene_registration import (
     Control,
     Outcome,
@@ -31,7 +18,6 @@ from app.cli.scene_registration import (
     SceneRequest,
     failure_text,
     images_of,
-    masks_of,
     register_scenes,
     worst_status,
 )
@@ -54,9 +40,13 @@ _STATED = ("relative_to_control_points", "on_the_earth")
 
 @app.command()
 def register(
-    scenes: Scenes,
+    scenes: Annotated[
+        list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
+    ],
     *,
-    block: Blocks = None,
+    block: Annotated[
+        Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
+    ] = None,
     reference: Annotated[
         Path | None,
         typer.Option(help="Ortho-image to register on; with --block only where it has no points."),
@@ -64,8 +54,10 @@ def register(
     dem: Annotated[
         Path | None, typer.Option(help="GeoTIFF with the heights of the reference's ground.")
     ] = None,
-    vertical: Vertical = None,
-    geoid: GeoidGrid = None,
+    vertical: Annotated[
+        str | None, typer.Option(help="Vertical datum of these heights: ellipsoid, EGM96, EPSG:…")
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     reference_sigma_m: Annotated[
         float | None,
         typer.Option(help="Accuracy of the reference on the Earth, one sigma, metres.", min=0.001),
@@ -74,19 +66,35 @@ def register(
         float | None,
         typer.Option(help="Accuracy of its heights on the Earth, one sigma, metres.", min=0.001),
     ] = None,
-    sigma_m: SigmaM = None,
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
+    ] = None,
     model: Annotated[
         Path | None, typer.Option(help="File of the model; by default it is found by its name.")
     ] = None,
-    bands: Bands = None,
+    bands: Annotated[
+        str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
+    ] = None,
     mask: Annotated[
         Path | None, typer.Option(help="Image of the same ground; pixels that are not 0 are not used.")
     ] = None,
-    check_points: CheckPoints = None,
-    check_heights: CheckHeights = None,
-    max_ce90_on_earth_m: MaxCe90OnEarthM = None,
-    copy_image: CopyImage = False,
-    output: Output = Path("registered"),
+    check_points: Annotated[
+        Path | None, typer.Option(help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.")
+    ] = None,
+    check_heights: Annotated[
+        str | None,
+        typer.Option(help="Vertical datum of the check points, if not in the file: ellipsoid, EPSG:…"),
+    ] = None,
+    max_ce90_on_earth_m: Annotated[
+        float | None,
+        typer.Option(help="Largest CE90 on the Earth, metres: with the frame of the points.", min=0.001),
+    ] = None,
+    copy_image: Annotated[
+        bool, typer.Option("--copy-image", help="Copy a GeoTIFF with the refined model in its tags.")
+    ] = False,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder; each of several scenes gets one inside it.")
+    ] = Path("registered"),
     jobs: Annotated[
         int, typer.Option(help="Number of scenes registered at once, each in a process.", min=1)
     ] = 1,
@@ -120,7 +128,7 @@ def register(
         reference_files = ReferenceFiles(reference, terrain, reference_sigma_m, reference_sigma_up_m)
     elif reference_sigma_m is not None or reference_sigma_up_m is not None:
         raise InputError("--reference-sigma-m, --reference-sigma-up-m: of a reference; add --reference")
-    control = Control(tuple(block or ()), reference_files)
+    control = Control(block, reference_files)
     requests = []
     for image in images:
         files = SceneFiles(image, model, sigma_m, bands, mask, check_points, check_heights)
@@ -147,23 +155,23 @@ def register(
 
 @app.command("register-many")
 def register_many(
-    scenes: Scenes,
+    scenes: Annotated[
+        list[Path], typer.Argument(help="GeoTIFF, JPEG 2000 or NITF, or folders of such images.")
+    ],
     *,
-    block: Blocks = None,
+    block: Annotated[
+        Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
+    ] = None,
     join: Annotated[
         Path | None,
         typer.Option(help="Output folder of scenes registered together before; they stay as they are."),
     ] = None,
-    sigma_m: SigmaM = None,
-    bands: Bands = None,
-    mask: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of masks that are named as the images; pixels that are not 0 are not used."
-        ),
+    sigma_m: Annotated[
+        float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)
     ] = None,
-    check_points: CheckPoints = None,
-    check_heights: CheckHeights = None,
+    bands: Annotated[
+        str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
+    ] = None,
     rigorous: Annotated[
         str | None,
         typer.Option(
@@ -171,9 +179,16 @@ def register_many(
             "srp, toutin or spot-hrv."
         ),
     ] = None,
-    max_ce90_on_earth_m: MaxCe90OnEarthM = None,
-    copy_image: CopyImage = False,
-    output: Output = Path("registered"),
+    max_ce90_on_earth_m: Annotated[
+        float | None,
+        typer.Option(help="Largest CE90 on the Earth, metres: with the frame of the points.", min=0.001),
+    ] = None,
+    copy_image: Annotated[
+        bool, typer.Option("--copy-image", help="Copy GeoTIFFs with the refined model in their tags.")
+    ] = False,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder; each scene gets one inside it.")
+    ] = Path("registered"),
     jobs: Annotated[int, typer.Option(help="Number of processes that search images.", min=1)] = 1,
     as_json: AsJson = False,
 ) -> None:
@@ -181,29 +196,17 @@ def register_many(
 
     Scenes with few control points are held by their neighbours. One that does not fit is named and left
     out. The folder OUTPUT/block holds the report on all scenes. The points come from the store unless
-    --block is given. A file of check points names the image of every mark.
+    --block is given.
     """
     if rigorous is not None:
         parameter_set_named(rigorous)
     images = images_of(scenes)
     _refuse_shared_files(images, [])
     request = JointRequest(
-        files=[
-            SceneFiles(
-                image,
-                sigma_m=sigma_m,
-                bands=bands,
-                rigorous=rigorous,
-                mask=of_image,
-                check_points=check_points,
-                check_heights=check_heights,
-            )
-            for image, of_image in zip(images, masks_of(mask, images), strict=True)
-        ],
+        files=[SceneFiles(image, None, sigma_m, bands, rigorous=rigorous) for image in images],
         output=output,
-        blocks=tuple(block or ()),
+        block=block,
         joined=join,
-        mask=mask,
         copy_image=copy_image,
         max_ce90_on_earth_m=max_ce90_on_earth_m,
         jobs=jobs,
@@ -231,8 +234,11 @@ def ortho(
         Path | None,
         typer.Option(help="File of the model, such as a refined one; by default found by its name."),
     ] = None,
-    vertical: Vertical = None,
-    geoid: GeoidGrid = None,
+    vertical: Annotated[
+        str | None,
+        typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…"),
+    ] = None,
+    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
     fill_px: Annotated[
         int, typer.Option(help="Fill voids of the terrain from this many nodes away.", min=0, max=50)
     ] = 0,
@@ -279,6 +285,7 @@ def _command_for(files: SceneFiles, control: Control, folder: Path, server: str 
         "--mask": files.mask,
         "--check-points": files.check_points,
         "--check-heights": files.check_heights,
+        "--block": control.block,
         "--reference": None if reference is None else reference.image,
         "--dem": None if terrain is None else terrain.dem,
         "--vertical": None if terrain is None else terrain.vertical,
@@ -289,14 +296,13 @@ def _command_for(files: SceneFiles, control: Control, folder: Path, server: str 
         "-o": folder,
     }
     words = [str(word) for name, value in options.items() if value is not None for word in (name, value)]
-    words += [str(word) for block in control.blocks for word in ("--block", block)]
     return shlex.join(["amers", "scene", "register", str(files.image), *words])
 
 
 def _refuse_contradictions(
-    block: list[Path] | None, reference: Path | None, dem: Path | None, server: str | None
+    block: Path | None, reference: Path | None, dem: Path | None, server: str | None
 ) -> None:
-    if server is not None and (reference is not None or block):
+    if server is not None and (reference is not None or block is not None):
         raise InputError(
             "--server: the service uses its own points and references; leave out --block and --reference"
         )

@@ -23,7 +23,7 @@ from app.db.engine import Database
 from app.errors import AmersError, ComputationError, InputError
 from app.storage import open_storage
 from app.usecases.references import references_of_store
-from app.usecases.registration.control_sources import points_of_blocks, points_of_store
+from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.failure import FAILURE_OUTPUTS, Attempt, write_failure
 from app.usecases.registration.reference_source import ReferenceFiles, given_reference
 from app.usecases.registration.register import (
@@ -59,11 +59,11 @@ class Control:
     """The control that a command names; without any, that of the store is used.
 
     Attributes:
-        blocks: folders of blocks.
+        block: folder of a block.
         reference: ortho-image and its terrain.
     """
 
-    blocks: tuple[Path, ...]
+    block: Path | None
     reference: ReferenceFiles | None
 
 
@@ -115,32 +115,6 @@ def images_of(paths: Sequence[Path]) -> list[Path]:
             raise InputError(f"{path}: no image ({', '.join(IMAGE_SUFFIXES)}) in this folder")
         images.extend(inside)
     return images
-
-
-def masks_of(mask: Path | None, images: Sequence[Path]) -> list[Path | None]:
-    """The mask of every image; None for those without.
-
-    Args:
-        mask: a folder with masks that are named as the images, or the mask of one image; None for none.
-        images: of the scenes.
-
-    Raises:
-        InputError: one mask is given for several scenes, or the folder has none for any of them.
-    """
-    if mask is None or not mask.is_dir():
-        if mask is not None and len(images) > 1:
-            raise InputError(
-                f"--mask {mask}: belongs to one scene, but {len(images)} scenes are given; name a "
-                "folder of masks that are named as the images"
-            )
-        return [mask] * len(images)
-    by_name = {
-        file.stem: file for file in sorted(mask.iterdir()) if file.suffix.lower() in IMAGE_SUFFIXES
-    }
-    masks = [by_name.get(image.stem) for image in images]
-    if not any(masks):
-        raise InputError(f"--mask {mask}: no file in this folder is named as one of the images")
-    return masks
 
 
 def register_scenes(
@@ -299,7 +273,7 @@ def _check_figures(checks: list[dict[str, Any]]) -> dict[str, Any]:
 @contextmanager
 def registrar(control: Control) -> Iterator[Register]:
     """The function that registers scenes on the control of a command."""
-    if control.blocks or control.reference is not None:
+    if control.block is not None or control.reference is not None:
         yield _on_files(control)
         return
     settings = read_settings()
@@ -310,7 +284,7 @@ def registrar(control: Control) -> Iterator[Register]:
 def _on_files(control: Control) -> Register:
     """A function that registers scenes on a block folder, a reference, or both."""
     sources = ControlSources(
-        find_points=points_of_blocks(control.blocks) if control.blocks else None,
+        find_points=None if control.block is None else points_of_block(control.block),
         find_reference=None if control.reference is None else given_reference(control.reference),
     )
 
@@ -396,7 +370,7 @@ def register_many(requests: Sequence[SceneRequest], control: Control, jobs: int)
 
 def _environment(stack: ExitStack, control: Control) -> dict[str, str]:
     """Variables with the place of the store, which stays open until the stack is closed."""
-    if control.blocks or control.reference is not None:
+    if control.block is not None or control.reference is not None:
         return {}
     settings = read_settings()
     database = stack.enter_context(engine.opened(settings))

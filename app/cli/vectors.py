@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import typer
 
 from app.cli.output import AsJson, print_json, show_one
-from app.cli.scene_options import GeoidGrid, Vertical
 from app.errors import InputError
 from app.usecases.registered_scene import SceneModel
 from app.usecases.terrain_file import TerrainFile
@@ -29,6 +28,10 @@ Registration = Annotated[
 Model = Annotated[
     Path | None, typer.Option(help="File of the delivered model; by default found by its name.")
 ]
+Vertical = Annotated[
+    str | None, typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…")
+]
+GeoidGrid = Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")]
 FillPx = Annotated[
     int, typer.Option(help="Fill voids of the terrain from this many nodes away.", min=0, max=50)
 ]

@@ -111,6 +111,8 @@ def register_together(
         ComputationError: no scene shows control points that agree, or no scene fits.
     """
     before = joined.scenes if joined else ()
+    # The corrections of a block are affine: what a scene does beyond shows as its lack of fit.
+    options = replace(options, adjustment=replace(options.adjustment, profile=False))
     scenes = [_on_known_ground(scene, points) for scene in scenes]
     together = [*before, *scenes]
     check_image_names(together)

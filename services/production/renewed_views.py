@@ -19,8 +19,8 @@ from services.types import (
     ControlPoints,
     IntArray,
     Observations,
+    SurfaceHeights,
     Views,
-    all_surfaces,
     point_chips,
 )
 
@@ -111,7 +111,7 @@ def with_new_points(renewed: RenewedViews, new: NewPoints) -> RenewedViews:
         views=_one_after_the_other(first.views, second_views),
         frames=(replace(frame, shared_m2=covering_m2),),
         chip_files=(),
-        surface=all_surfaces([first, second]),
+        surface=_all_surfaces(first, second),
         **{
             name: np.concatenate([getattr(first, name), getattr(second, name)])
             for name in (
@@ -140,6 +140,19 @@ def _one_after_the_other(first: Views, second: Views) -> Views:
     }
     start = np.concatenate([first.start, first.start[-1] + second.start[1:]])
     return Views(start=start, images=first.images, **columns)
+
+
+def _all_surfaces(first: ControlPoints, second: ControlPoints) -> SurfaceHeights | None:
+    """The surface at all points; unknown where one part states none."""
+    if first.surface is None and second.surface is None:
+        return None
+    parts = [
+        one.surface or SurfaceHeights(np.full(len(one), np.nan), np.full(len(one), np.nan))
+        for one in (first, second)
+    ]
+    return SurfaceHeights(
+        np.concatenate([one.height_m for one in parts]), np.concatenate([one.sigma_m for one in parts])
+    )
 
 
 def _shown(scenes: Sequence[SeeingScene], lon_lat_h: Array, gsd_m: float) -> Observations:

@@ -30,7 +30,7 @@ class Criterion:
         needed_for: "good" or "usable": the best verdict that is impossible without this criterion.
         met: whether the value meets the limit; a value that could not be computed never does.
         calculation: how the value is calculated, for people.
-        note: why there is no value, for people; "" where there is one.
+        note: why there is no value, or what an unmet criterion looks like, for people; "" otherwise.
     """
 
     name: str
@@ -112,6 +112,46 @@ _DESCRIPTIONS = {
         2,
         "Largest group of deactivated points that agree on another displacement, divided by the active "
         "points.",
+    ),
+    "structure_along_lines": _Description(
+        "Residuals along the lines",
+        "",
+        4,
+        "Probability, at most, that independent errors swing or bend along the lines as clearly as the "
+        "residuals do: F test of the best of all shapes tried, times their number.",
+    ),
+    "steps_along_lines": _Description(
+        "Steps along the lines",
+        "",
+        4,
+        "Probability, at most, that independent errors show a step at some line as clearly as the "
+        "residuals do.",
+    ),
+    "structure_along_samples": _Description(
+        "Residuals along the samples",
+        "",
+        4,
+        "As along the lines: seams between detectors and distortions of the optics show here.",
+    ),
+    "structure_in_image": _Description(
+        "Residuals over the image",
+        "",
+        4,
+        "The same for waves in two dimensions.",
+    ),
+    "structure_against_height": _Description(
+        "Residuals against height",
+        "",
+        4,
+        "Probability, at most, that independent errors grow with the height of the points as clearly as "
+        "the residuals do: the lines of sight of the model are not those of the image.",
+    ),
+    "points_elsewhere": _Description(
+        "Points that agree elsewhere",
+        "",
+        0,
+        "Points that were not found where they are expected are searched again in a wide window. Number "
+        "of those that agree on another displacement, beyond chance.",
     ),
     "check_points": _Description(
         "Normalised error at check points",

@@ -11,6 +11,7 @@ from services.quality.accuracy_statement import AccuracyStatement, scene_accurac
 from services.quality.cell_stability import CellStability, measure_cell_stability
 from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
 from services.quality.frames import why_unknown
+from services.quality.lack_of_fit import elsewhere_criterion, structure_criteria
 from services.quality.predicted import PredictedAccuracy, predict_accuracy
 from services.quality.stability import (
     AdjustedScene,
@@ -212,7 +213,7 @@ def qualify_repeated(
         unit_weight=adjustment.sigma0,
         second_consensus_share=second_consensus_share(measures),
     )
-    criteria = _criteria(figures, options, scene.gsd_m)
+    criteria = (*_criteria(figures, options, scene.gsd_m), *_of_fit(scene, predicted.median_px))
     if options.max_ce90_on_earth_m is not None:
         criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)
     return Qualification(
@@ -309,6 +310,19 @@ class _Figures:
     predicted_ce90_px: float
     unit_weight: float
     second_consensus_share: float
+
+
+def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
+    """The criteria on what the residuals depend on, and on points that agree elsewhere."""
+    measures = scene.measures
+    sight = np.zeros(2)
+    if len(measures.lon_lat_h):
+        sight = scene.model.project_derivative(measures.lon_lat_h)[:, :, 2].mean(axis=0)
+    expected = scene.model.project(measures.lon_lat_h)
+    return [
+        *structure_criteria(scene.adjustment.structures, sight, scene.shape, predicted_px),
+        elsewhere_criterion(scene.elsewhere, expected, measures.active),
+    ]
 
 
 def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Criterion:

@@ -8,6 +8,7 @@ import numpy as np
 from services.adjustment.image_correction import SceneAdjustment
 from services.errors import ComputationError
 from services.quality.accuracy import Statistics, statistics
+from services.quality.lack_of_fit import Elsewhere
 from services.sensors.base import SensorModel
 from services.types import Array, BoolArray, Frame, IntArray, Measures
 
@@ -27,6 +28,7 @@ class AdjustedScene:
         frame: of the control on the Earth.
         refit: repeats the adjustment on the measures of a mask (n,); None for a scene whose repetitions
             are those of a block.
+        elsewhere: points that agree on another displacement than the rest; None when there are none.
     """
 
     model: SensorModel
@@ -36,6 +38,7 @@ class AdjustedScene:
     gsd_m: float
     frame: Frame
     refit: Callable[[BoolArray], SceneAdjustment] | None = None
+    elsewhere: Elsewhere | None = None
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]

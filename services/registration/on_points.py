@@ -11,11 +11,13 @@ from services.imagery.source import CachedImage
 from services.matching.consensus import Voters
 from services.matching.control_points import ChipSearch, match_points
 from services.quality.frames import shared_frame
+from services.quality.lack_of_fit import Elsewhere
 from services.quality.qualification import Qualification, qualify
 from services.quality.stability import AdjustedScene
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
+from services.registration.elsewhere import search_elsewhere
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
@@ -94,7 +96,9 @@ def register_scene(
     context, search, adjustment = search_scene(
         scene, points, chips, options, progress=progress, stages=stages
     )
-    return build_registration(context, context.points, search, adjustment)
+    prediction = predict(scene, context.points, adjustment)
+    elsewhere = search_elsewhere(context, prediction, search, adjustment)
+    return build_registration(context, context.points, search, adjustment, elsewhere)
 
 
 def search_scene(
@@ -168,7 +172,8 @@ def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -
         lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
-    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m), tolerance_px
+    profile = prediction.model.correction.profile
+    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m, profile), tolerance_px
 
 
 def build_registration(
@@ -176,6 +181,7 @@ def build_registration(
     points: ControlPoints,
     search: Search,
     adjustment: SceneAdjustment,
+    elsewhere: Elsewhere | None = None,
 ) -> Registration:
     """The registration that the last search and its adjustment give, with its quality.
 
@@ -184,6 +190,7 @@ def build_registration(
         points: all points that the scene may show.
         search: the last search of a part of them.
         adjustment: on this search.
+        elsewhere: points that agree on another displacement; None when there are none.
     """
     context.progress(0.95, "qualifying the result")
     scene, options = context.scene, context.options
@@ -195,7 +202,9 @@ def build_registration(
 
     frame = shared_frame(points, measures.active)
     model = CorrectedModel(scene.model, adjustment.correction)
-    adjusted = AdjustedScene(model, measures, adjustment, scene.image.shape, context.gsd_m, frame, refit)
+    adjusted = AdjustedScene(
+        model, measures, adjustment, scene.image.shape, context.gsd_m, frame, refit, elsewhere
+    )
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)
     view_measures = search.matches.view_measures

@@ -28,7 +28,7 @@ from services.matching.control_points import PointMatches
 from services.quality.frames import shared_frame
 from services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel
+from services.sensors.correction import CorrectedModel, LineProfile
 from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
@@ -49,6 +49,7 @@ class Search:
         matches: of the points tried.
         inliers: (k,) points that agree on one displacement of the image.
         chip_side_m: side on the ground of the chips that were searched.
+        profile: of the model of the search, along the lines; None where it has none.
     """
 
     points: ControlPoints
@@ -56,6 +57,7 @@ class Search:
     matches: PointMatches
     inliers: BoolArray
     chip_side_m: float
+    profile: LineProfile | None = None
 
 
 def largest_error_m(uncertainty_m: Array) -> float:
@@ -99,9 +101,16 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
     derivative = scene.model.project_derivative(scene_centre(scene)[None, :])[0]
     ground_to_px = derivative[:, :2]
     shared_m2 = shared_frame(search.points, usable).shared_m2
+    chip_side_px = search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5)
+    line_sample = matches.line_sample
+    if search.profile is not None:
+        # Chips average over their lines: what they were compared through, they did not.
+        line = scene.model.project(search.points.lon_lat_h)[:, 0]
+        followed = search.profile.at(line) - search.profile.averaged(line, chip_side_px)
+        line_sample = line_sample - followed
     return ControlObservations(
         lon_lat_h=search.points.lon_lat_h,
-        line_sample=matches.line_sample,
+        line_sample=line_sample,
         sigma_px=matches.sigma_px,
         covariance_m2=search.points.covariance_m2,
         usable=usable,
@@ -109,7 +118,7 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
         deformation_px2=derivative @ shared_m2 @ derivative.T,
         block=search.points.block,
         frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
-        chip_side_px=search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5),
+        chip_side_px=chip_side_px,
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from services.adjustment.affine_fit import Order
 from services.adjustment.image_correction import SceneAdjustment
+from services.adjustment.line_profile import Component
 from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
 from services.registration.on_points import Registration
@@ -152,8 +153,26 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
             ("drift along the lines, at the last line", *parameters[:, 1]),
             ("drift along the samples, at the last sample", *parameters[:, 2]),
         )
-    return tuple(
+    sentences = [
         f"{name}: {line:+.2f} px in line, {sample:+.2f} px in sample"
         f" ({np.hypot(line, sample) * gsd_m:.2f} m)"
         for name, line, sample in parts
-    )
+    ]
+    profile = adjustment.correction.profile
+    if profile is not None:
+        line, sample = np.ptp(profile.displacement_px, axis=0)
+        kinds = ", ".join(map(_component_in_words, adjustment.components))
+        sentences.append(
+            f"profile along the lines ({kinds}): within {line:.2f} px in line, {sample:.2f} px in sample"
+        )
+    return tuple(sentences)
+
+
+def _component_in_words(component: Component) -> str:
+    """What a component of the profile is."""
+    if component.kind == "step":
+        last = component.at_px + component.length_px
+        return f"a step between the lines {component.at_px:.0f} and {last:.0f}"
+    if component.kind == "period":
+        return f"jitter with a period of {component.at_px:.0f} lines"
+    return f"a bend that changes over {component.length_px:.0f} lines"

@@ -122,6 +122,35 @@ def residuals_along(report: RegistrationReport) -> Figure:
     return figure
 
 
+def line_profile(report: RegistrationReport) -> Figure:
+    """The profile of the correction along the lines with twice its sigma, and what points show of it."""
+    figure = Figure(274.0)
+    profile = report.figure_data.profile
+    if profile is None:
+        return figure
+    measures = report.figure_data.measures
+    line = measures.predicted[measures.active, 0]
+    shown = measures.residual_px[measures.active] + profile.at(line)
+    sigma = np.sqrt(profile.variance_px2)
+    last = float(report.scene.lines)
+    for k, name in enumerate(("y (line)", "x (sample)")):
+        y_range = data_range(shown[:, k])
+        left = left_margin(y_range)
+        panel = Panel(figure, left, 6.0 + k * 118.0, WIDTH - left - 8.0, 108.0, (0.0, last), y_range)
+        panel.x_axis("line" if k == 1 else "", numbers=k == 1)
+        panel.y_axis(f"{name}, px")
+        value = profile.displacement_px[:, k]
+        low, high = value - 2.0 * sigma[:, k], value + 2.0 * sigma[:, k]
+        around = np.concatenate(
+            [panel.places(profile.line, high), panel.places(profile.line, low)[::-1]]
+        )
+        with panel.clipped():
+            figure.area(around, DEACTIVATED, 0.25)
+            figure.discs(panel.places(line, shown[:, k]), 3.0, ACTIVE, 0.7)
+            figure.line(panel.places(profile.line, value), DEACTIVATED, 1.4)
+    return figure
+
+
 def residuals_by_height(report: RegistrationReport) -> Figure:
     """Residuals of the active points on the ground against their height, along and across the view."""
     figure = Figure(188.0)

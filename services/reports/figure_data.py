@@ -8,6 +8,7 @@ import numpy as np
 from services.imagery.scene import Scene
 from services.imagery.source import reduce_image, render_chip
 from services.registration.on_points import Registration
+from services.sensors.correction import LineProfile
 from services.types import Array, ChipArray, ChipSource, ControlPoints, FloatImage, Measures, point_chips
 
 QUICKLOOK_PX = 1200
@@ -59,11 +60,13 @@ class FigureData:
         measures: one row for every point that the scene could show.
         quicklook: the scene reduced; None when there is none.
         gallery: chips beside the scene; the page shows the best, middle and worst scores.
+        profile: of the correction, along the lines; None where it is affine.
     """
 
     measures: Measures
     quicklook: Quicklook | None
     gallery: tuple[ChipPair, ...]
+    profile: LineProfile | None = None
 
 
 def figure_data(
@@ -78,7 +81,8 @@ def figure_data(
         registration: of the scene.
     """
     gallery = _gallery(scene, points, chips, registration)
-    return FigureData(registration.measures, _quicklook(scene), gallery)
+    profile = registration.adjustment.correction.profile
+    return FigureData(registration.measures, _quicklook(scene), gallery, profile)
 
 
 def _quicklook(scene: Scene) -> Quicklook:

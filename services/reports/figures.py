@@ -2,7 +2,13 @@
 
 from collections.abc import Callable
 
-from services.reports.charts import funnel, residual_histograms, residuals_along, residuals_by_height
+from services.reports.charts import (
+    funnel,
+    line_profile,
+    residual_histograms,
+    residuals_along,
+    residuals_by_height,
+)
 from services.reports.maps import coverage_map, ground_overview, predicted_map, residual_map
 from services.reports.plot import Figure
 from services.reports.report import RegistrationReport
@@ -14,6 +20,7 @@ FIGURES: tuple[Callable[[RegistrationReport], Figure], ...] = (
     residual_histograms,
     funnel,
     residuals_along,
+    line_profile,
     residuals_by_height,
     predicted_map,
 )

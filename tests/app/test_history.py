@@ -21,7 +21,7 @@ from app.db.jobs.attempts import LostJob
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
 from app.usecases.history import record_measures
-from app.usecases.registration.control_sources import points_of_blocks, points_of_store
+from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import (
     ControlSources,
     RegisteredScene,
@@ -62,7 +62,7 @@ def registered(world: FlatWorld, tmp_path_factory: pytest.TempPathFactory) -> Re
     files = SceneFiles(world.tagged, sigma_m=SIGMA_M)
     return run_registration(
         files,
-        ControlSources(points_of_blocks([world.block])),
+        ControlSources(points_of_block(world.block)),
         tmp_path_factory.mktemp("out"),
         options=OPTIONS,
     )

@@ -16,7 +16,7 @@ from app.db import engine
 from app.db.engine import Database
 from app.db.usage import read_usage
 from app.storage import Storage
-from app.usecases.registration.control_sources import points_of_blocks, points_of_store
+from app.usecases.registration.control_sources import points_of_block, points_of_store
 from app.usecases.registration.register import ControlSources, SceneFiles, run_registration
 from app.usecases.results import reconcile_results
 from app.usecases.retention import remove_old_results
@@ -265,7 +265,7 @@ def test_block_folder_and_store_give_the_same_registration(
     with engine.pooled(settings.database_url.get_secret_value(), settings) as database:
         of_store = ControlSources(points_of_store(database, storage))
         stored = run_registration(files, of_store, tmp_path / "a")
-    of_block = ControlSources(points_of_blocks([world.block]))
+    of_block = ControlSources(points_of_block(world.block))
     folder = run_registration(files, of_block, tmp_path / "b")
     assert np.array_equal(stored.registration.measures.active, folder.registration.measures.active)
     difference_px = np.abs(

@@ -41,37 +41,6 @@ def read_check_points(path: Path, heights: str | None, image: Path, scene: Scene
     return CheckPoints(lon_lat_h, marks.line_sample, marks.sigma_m, marks.sigma_px)
 
 
-def read_shared_check_points(
-    path: Path, heights: str | None, image: Path, scene: Scene
-) -> CheckPoints | None:
-    """The check points of one of several scenes, in a file for all; None where it has none for this one.
-
-    Args:
-        path, heights, image, scene: as of `read_check_points`.
-
-    Raises:
-        InputError: the file cannot be used, a mark in it names no image, or the model of the scene is
-            valid for none of its points.
-    """
-    marks = read_control_points(path, heights)
-    names = np.char.lower(marks.image)
-    unnamed = int((names == "").sum())
-    if unnamed:
-        raise InputError(
-            f"{path.name}: {unnamed} of {len(marks)} marks name no image; for scenes registered "
-            "together every mark names the image that it is in"
-        )
-    if not np.isin(names, [image.name.lower(), image.stem.lower()]).any():
-        return None
-    points = read_check_points(path, heights, image, scene)
-    if not np.isfinite(scene.model.project(points.lon_lat_h)).any():
-        raise InputError(
-            f"{path.name}: none of {len(points.lon_lat_h)} points in {image.name} lies where its model "
-            "is valid; longitude, latitude and height are expected"
-        )
-    return points
-
-
 def _ground_positions(marks: MarkedPoints, path: Path, scene: Scene) -> Array:
     """Ground positions (n, 3) of the points; missing heights are 0 where an ortho-image needs none."""
     missing = np.isnan(marks.lon_lat_h[:, 2])

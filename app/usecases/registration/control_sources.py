@@ -1,17 +1,15 @@
-"""Sources of control points for a scene: block folders, or the published blocks of the store."""
+"""Sources of control points for a scene: a block folder, or the published blocks of the store."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from app.db.engine import Database
 from app.db.points import control_points
-from app.errors import InputError
 from app.storage import Storage
 from app.usecases.damage import open_chips
 from services.formats.block.check import check_block
 from services.formats.block.reader import FolderChips
-from services.formats.block.several import SeveralChips, points_of_several
 from services.reports.report import BlockUsed
 from services.types import Array, ChipSource, ControlPoints
 
@@ -35,24 +33,14 @@ FindPoints = Callable[[Array], ControlSet]
 """Finds the control points inside an outline (n, 2) of lon, lat."""
 
 
-def points_of_blocks(folders: Sequence[Path]) -> FindPoints:
-    """A source of the points of block folders, which are checked completely first.
-
-    Raises:
-        InputError: a folder is given twice, or is no complete block.
-    """
-    if len({folder.resolve() for folder in folders}) < len(folders):
-        raise InputError("--block: a folder is given twice; name each once")
-    contents = [check_block(folder) for folder in folders]
-    metadata = [one.document.metadata for one in contents]
-    blocks = tuple(BlockUsed(one.id, one.version) for one in metadata)
-    points = contents[0].points
-    if len(contents) > 1:
-        points = points_of_several([one.points for one in contents])
+def points_of_block(folder: Path) -> FindPoints:
+    """A source of the points of a block folder, which is checked completely first."""
+    contents = check_block(folder)
+    metadata = contents.document.metadata
 
     def find(outline: Array) -> ControlSet:
-        sources = tuple(FolderChips(folder) for folder in folders)
-        return ControlSet(points, sources[0] if len(sources) == 1 else SeveralChips(sources), blocks)
+        block = BlockUsed(metadata.id, metadata.version)
+        return ControlSet(contents.points, FolderChips(folder), (block,))
 
     return find
 

@@ -152,7 +152,7 @@ def _register_and_write(
 
     checks: tuple[Check, ...] = ()
     if check_points is not None and files.check_points is not None:
-        registration, check = checked(registration, check_points, options, files.check_points.name)
+        registration, check = _check(registration, check_points, options, files.check_points.name)
         checks = (check,)
 
     progress(0.9, "writing the report")
@@ -258,21 +258,21 @@ def _register(
     return (*register_on(reference, scene, attempt.options, progress, attempt.stages), reference)
 
 
-def checked(
+def _check(
     registration: Registration,
     points: CheckPoints,
     options: RegistrationOptions,
     name: str,
 ) -> tuple[Registration, Check]:
     """The registration, qualified with check points too, and its accuracy at these points."""
-    result = check_model(registration.model, registration.adjustment, points, registration.frame)
+    checked = check_model(registration.model, registration.adjustment, points, registration.frame)
     limit = options.qualification.good_unit_weight
-    qualification = with_check_points(registration.qualification, result, limit)
+    qualification = with_check_points(registration.qualification, checked, limit)
     check = Check(
         f"independent check points of {name}",
-        result.accuracy,
-        result.residual_px,
-        result.normalised,
+        checked.accuracy,
+        checked.residual_px,
+        checked.normalised,
     )
     return replace(registration, qualification=qualification), check
 

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+
+import numpy as np
+import shapely
 
 from app.usecases.control_files import IMAGES_NPZ
 from app.usecases.executors import ComputeOptions, open_executor
@@ -18,18 +21,14 @@ from app.usecases.registration.joined_scenes import (
     Member,
     format_scenes,
 )
-from app.usecases.registration.open_scenes import (
-    OpenScene,
-    ground_outline,
-    open_joined,
-    open_scenes,
-    refuse_unused,
-)
-from app.usecases.registration.register import RegisteredScene, SceneFiles, checked
+from app.usecases.registration.register import RegisteredScene, SceneFiles, grown
+from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import AmersError, InputError
 from services.formats.adjusted_images import write_adjusted_images
+from services.formats.images.bands import parse_bands
+from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.refined_model import AdjustedRigorous, write_refined
-from services.imagery.scene import scene_footprint
+from services.imagery.scene import Scene, scene_footprint
 from services.joint.registration import AdjustedScenes, JointRegistration, register_together
 from services.joint.results import RigorousScene
 from services.registration.on_points import Registration
@@ -39,10 +38,12 @@ from services.reports.document import format_report
 from services.reports.figure_data import figure_data
 from services.reports.joint import JointReport, joint_report
 from services.reports.joint_pages import format_joint_html, format_joint_tables
-from services.reports.report import Check, RefinedModelRecord, RunRecord
+from services.reports.report import RefinedModelRecord, RunRecord
 from services.sensors.base import SensorModel
+from services.sensors.parameter_sets import parameter_set_named
+from services.sensors.pushbroom import PushbroomModel
 from services.tasks import Work
-from services.types import Progress, no_progress, part_of
+from services.types import Array, Progress, no_progress, part_of
 
 BLOCK_FOLDER = "block"
 """Folder of the report on all scenes, beside those of the scenes."""
@@ -84,6 +85,20 @@ class JointOutcome:
     files: dict[str, Path]
 
 
+@dataclass(frozen=True)
+class _Read:
+    """A scene with its files, the name of the folder of its results, and the address of its image."""
+
+    folder: str
+    address: str
+    files: SceneFiles
+    scene: Scene
+
+    @property
+    def name(self) -> str:
+        return self.scene.acquisition.image_id
+
+
 def run_joint_registration(
     files: Mapping[str, SceneFiles],
     find_points: FindPoints,
@@ -115,19 +130,18 @@ def run_joint_registration(
         name: Attempt(one.image, command or f"amers scene register-many {one.image.name}", options)
         for name, one in files.items()
     }
+    failed: dict[str, AmersError] = {}
     with ExitStack() as stack:
-        before = [] if place.joined is None else open_joined(place.joined, stack)
-        read, failed = open_scenes(files, place.joined, place.address_of, stack)
-        for one in read:
-            attempts[one.folder].scene = one.scene
+        before = [] if place.joined is None else _joined(place.joined, stack)
+        read = _read_all(files, place, attempts, failed, stack)
         try:
             if not read:
                 raise InputError(
                     f"none of {len(files)} scenes can be used: {next(iter(failed.values()))}"
                 )
-            refuse_unused(read)
+            _check_rigorous(read)
             progress(0.0, "looking for points")
-            control = find_points(ground_outline([one.scene for one in read]))
+            control = find_points(_outline([one.scene for one in read]))
             for one in read:
                 attempts[one.folder].control = control
             executor, ahead = stack.enter_context(open_executor(place.compute))
@@ -175,8 +189,89 @@ def run_joint_registration(
     return JointOutcome(report, registered, failed, written)
 
 
+def _read_all(
+    files: Mapping[str, SceneFiles],
+    place: JointPlace,
+    attempts: dict[str, Attempt],
+    failed: dict[str, AmersError],
+    stack: ExitStack,
+) -> list[_Read]:
+    """The scenes that can be read, open until the stack closes; the others are noted.
+
+    A scene whose metadata name it like another one gets the name of its folder.
+    """
+    read: list[_Read] = []
+    taken = {one.name for one in place.joined.members} if place.joined else set()
+    for name, one in files.items():
+        try:
+            scene = _read(one, stack)
+        except InputError as error:
+            failed[name] = error
+            continue
+        if scene.acquisition.image_id in taken:
+            scene = _named(scene, name)
+        if scene.acquisition.image_id in taken:
+            failed[name] = InputError(
+                f"{name}: the scenes that it joins have one of this name already; leave it out, or "
+                "rename the image if it is another one"
+            )
+            continue
+        attempts[name].scene = scene
+        taken.add(scene.acquisition.image_id)
+        read.append(_Read(name, place.address_of(name, one.image), one, scene))
+    return read
+
+
+def _check_rigorous(read: Sequence[_Read]) -> None:
+    """Refuse a set of parameters of rigorous models where no scene has such a model."""
+    asked = [one for one in read if one.files.rigorous is not None]
+    if asked and all(one.scene.parameter_set is None for one in asked):
+        raise InputError(
+            f"rigorous: {asked[0].files.rigorous} given, and none of {len(asked)} scenes has metadata "
+            "with a rigorous model beside it (DIMAP with orbit and attitude, PHRDIMAP, WorldView XML): "
+            "leave the option out, or add the metadata of the products"
+        )
+
+
+def _read(files: SceneFiles, stack: ExitStack) -> Scene:
+    bands = None if files.bands is None else parse_bands(files.bands)
+    scene = read_scene(
+        files.image,
+        files.model,
+        sigma_m=files.sigma_m,
+        bands=bands,
+        mask=files.mask,
+        parameter_set=None if files.rigorous is None else parameter_set_named(files.rigorous),
+    )
+    stack.callback(scene.image.close)  # type: ignore[attr-defined]
+    return scene
+
+
+def _named(scene: Scene, name: str) -> Scene:
+    """The scene under the name that it has among others."""
+    return replace(scene, acquisition=replace(scene.acquisition, image_id=name))
+
+
+def _for_heights(scene: Scene, heights_m: tuple[float, float]) -> Scene:
+    """The scene with the heights that its rigorous model was adjusted for."""
+    if not isinstance(scene.model, PushbroomModel):
+        return scene
+    return replace(scene, model=replace(scene.model, height_range_m=heights_m))
+
+
+def _outline(scenes: Sequence[Scene]) -> Array:
+    """The outline (n, 2) of the ground of all scenes, lon and lat, as far as their models may be off."""
+    outlines = [grown(scene_footprint(one), MAX_ERROR_SIGMAS * one.sigma_m) for one in scenes]
+    for outline in outlines[1:]:
+        outline[:, 0] -= 360.0 * np.round((outline[:, 0].mean() - outlines[0][:, 0].mean()) / 360.0)
+    together = shapely.union_all([shapely.Polygon(outline) for outline in outlines])
+    if not isinstance(together, shapely.Polygon):
+        together = together.convex_hull
+    return np.array(together.exterior.coords)[:-1]
+
+
 def _written(
-    one: OpenScene,
+    one: _Read,
     result: tuple[Registration, RigorousScene | None],
     control: ControlSet,
     attempt: Attempt,
@@ -187,12 +282,6 @@ def _written(
     """The outputs of one scene, written as those of a scene alone are."""
     files, scene = one.files, one.scene
     registration, found = result
-    checks: tuple[Check, ...] = ()
-    if one.check_points is not None and files.check_points is not None:
-        registration, check = checked(
-            registration, one.check_points, attempt.options, files.check_points.name
-        )
-        checks = (check,)
     model: SensorModel | AdjustedRigorous = registration.model
     if found is not None:
         model = AdjustedRigorous(registration.model, found.heights_m, found.correction_error_px)
@@ -220,7 +309,6 @@ def _written(
         ),
         RefinedModelRecord(refined.max_error_px, refined.note),
         figure_data(scene, control.points, control.chips, registration),
-        checks=checks,
         nearest_px=None if found is None else found.correction_error_px,
     )
     paths = write_outputs(folder, report, files.image.name, control.points)
@@ -229,7 +317,7 @@ def _written(
 
 
 def _write_block(
-    folder: Path, report: JointReport, result: JointRegistration, read: Sequence[OpenScene]
+    folder: Path, report: JointReport, result: JointRegistration, read: Sequence[_Read]
 ) -> dict[str, Path]:
     """The report on all scenes, and what later scenes need to join them."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -254,7 +342,24 @@ def _write_block(
     return written
 
 
-def _adjusted(before: Sequence[OpenScene], joined: JoinedScenes | None) -> AdjustedScenes | None:
+def _joined(joined: JoinedScenes, stack: ExitStack) -> list[_Read]:
+    """Scenes that were registered together before, open until the stack closes.
+
+    Raises:
+        InputError: an image has moved.
+    """
+    return [
+        _Read(
+            one.address,
+            one.address,
+            one.files,
+            _for_heights(_named(_read(one.files, stack), one.name), one.heights_m),
+        )
+        for one in joined.members
+    ]
+
+
+def _adjusted(before: Sequence[_Read], joined: JoinedScenes | None) -> AdjustedScenes | None:
     """What the adjustment of scenes that were registered before has told of them."""
     if joined is None:
         return None

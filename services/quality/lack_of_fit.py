@@ -1,0 +1,149 @@
+"""Lack of fit: what the residuals of a registration still depend on, tested and named."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.adjustment.line_profile import MAX_CHANCE
+from services.adjustment.structure import Family, Structure
+from services.quality.accuracy import CIRCULAR_CE90
+from services.quality.criteria import Criterion, Grade, at_least, at_most
+from services.types import Array, BoolArray, IntArray
+
+_CRITERIA: dict[Family, str] = {
+    "lines": "structure_along_lines",
+    "steps": "steps_along_lines",
+    "samples": "structure_along_samples",
+    "image": "structure_in_image",
+    "height": "structure_against_height",
+}
+_OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
+"""A model of the whole image follows these, or is wrong."""
+_WITHIN = 0.15
+"""Share of the active points between the lines of points that lie elsewhere, up to which these are lines
+that were lost or repeated rather than ground that moved."""
+
+
+_AS_MANY = 0.75
+"""Points that agree elsewhere, over the active points, beyond which neither place is the scene's."""
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Points that agree on another displacement than the rest of the scene.
+
+    Attributes:
+        rows: (k,) of the points, among all that the scene may show.
+        displacement_px: (2,) line and sample, from where the registered model expects them.
+        displacement_m: its length on the ground.
+        false_alarms: number of such groups that chance makes.
+        missed: number of points that do not agree with the scene.
+        share_of_missed: share of them, of those that were searched again, that agree on this place.
+    """
+
+    rows: IntArray
+    displacement_px: Array
+    displacement_m: float
+    false_alarms: float
+    missed: int
+    share_of_missed: float
+
+
+def structure_criteria(
+    structures: Sequence[Structure], sight: Array, shape: tuple[int, int], predicted_px: float
+) -> list[Criterion]:
+    """A criterion for each family of structures: chance has to explain it.
+
+    What the model of the whole image should follow and does not, and what is larger than the stated
+    accuracy, make this wrong: no usable registration has it.
+
+    Args:
+        structures: of the residuals of the final adjustment.
+        sight: (2,) pixels by which a metre of height moves a point in the image, line and sample.
+        shape: lines and samples of the image.
+        predicted_px: CE90 that is stated, median over the image.
+    """
+    criteria = []
+    for structure in structures:
+        larger = CIRCULAR_CE90 * float(np.sqrt(np.mean(structure.size_px**2))) > predicted_px
+        grade: Grade = "usable" if larger or structure.family in _OF_THE_MODEL else "good"
+        criterion = at_least(_CRITERIA[structure.family], structure.chance, MAX_CHANCE, grade)
+        if not criterion.met:
+            criterion = replace(criterion, note=_looks_like(structure, sight, shape))
+        criteria.append(criterion)
+    return criteria
+
+
+def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active: BoolArray) -> Criterion:
+    """The criterion on points that agree on another displacement.
+
+    Args:
+        elsewhere: these points; None when there are none.
+        line_sample: (n, 2) where all points are expected.
+        active: (n,) those that the adjustment uses.
+    """
+    if elsewhere is None:
+        return at_most("points_elsewhere", 0, 0, "good")
+    line = line_sample[elsewhere.rows, 0]
+    first, last = float(line.min()), float(line.max())
+    whole_lines = are_whole_lines(line, line_sample[active, 0])
+    moved = (
+        f"{len(line)} points of lines {first:.0f} to {last:.0f} agree on a place "
+        f"{np.hypot(*elsewhere.displacement_px):.0f} px ({elsewhere.displacement_m:.1f} m) away "
+        f"({elsewhere.displacement_px[0]:+.1f} lines, {elsewhere.displacement_px[1]:+.1f} samples), "
+        f"of which chance makes {elsewhere.false_alarms:.1g}"
+    )
+    looks = (
+        "hardly any others lie between these lines: lines of the image were lost or repeated, or belong "
+        "to another image"
+        if whole_lines
+        else "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of "
+        "another image"
+    )
+    as_many = elsewhere.share_of_missed * elsewhere.missed > _AS_MANY * active.sum()
+    criterion = at_most("points_elsewhere", len(line), 0, "usable" if whole_lines or as_many else "good")
+    return replace(criterion, note=f"{moved}; {looks}")
+
+
+def are_whole_lines(line: Array, others: Array) -> bool:
+    """Whether hardly any of the other points (m,) lie between the lines (n,) of points."""
+    between = (others >= line.min()) & (others <= line.max())
+    return bool(between.mean() <= _WITHIN) if len(others) else False
+
+
+def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> str:
+    """A sentence on what a structure looks like."""
+    line_px, sample_px = (structure.size_px * np.sqrt(2.0)).tolist()
+    size = f"{line_px:.2f} px in line and {sample_px:.2f} px in sample"
+    if structure.family == "height":
+        return _wrong_sight(structure, sight)
+    if structure.shape == "step":
+        return f"a step of {size} at line {structure.at:.0f}: lines that were lost or repeated"
+    if structure.family == "image":
+        return (
+            f"neighbours are displaced together by {size}: relief that is not in the model, or terrain"
+        )
+    along = "lines" if structure.family == "lines" else "samples"
+    if structure.shape != "period":
+        cause = "a bow of the attitude" if along == "lines" else "a bent detector line"
+        return f"residuals bend along the {along} by {size}: {cause} that no correction follows"
+    length = shape[0] if along == "lines" else shape[1]
+    cause = "seams between detectors, or a distortion of the optics"
+    if along == "lines":
+        cause = "a bow of the attitude" if structure.at > length else "attitude jitter"
+    return (
+        f"residuals swing along the {along} by {size} over {structure.at:.0f} {along}: {cause} that no "
+        "correction follows"
+    )
+
+
+def _wrong_sight(structure: Structure, sight: Array) -> str:
+    """A sentence on residuals that grow with height."""
+    slope = float(np.hypot(*structure.slope_px))
+    share = slope / max(float(np.hypot(*sight)), 1e-9)
+    return (
+        f"residuals grow by {100.0 * slope:.2f} px for 100 m of height, {share:.0%} of what the relief "
+        "moves in this model: the model is that of another view, or the heights of the points have "
+        "another datum or scale"
+    )

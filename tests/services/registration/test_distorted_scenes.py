@@ -1,0 +1,103 @@
+"""Scenes that no affine correction describes are followed with the stated accuracy, or named."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from services.quality.accuracy import normal_ce90
+from services.registration.on_points import Registration, register_scene
+from services.simulation.distortion import (
+    Bend,
+    DistortedImage,
+    Distortion,
+    MovedGround,
+    Step,
+    Waves,
+)
+from services.types import Array
+from tests.services.registration.test_on_points import FIRST, SIGMA_M, frame_m, per_degree, view_of
+from tests.services.simulated import block, world
+
+pytestmark = pytest.mark.long
+
+WRONG = 3.0
+"""True over predicted CE90 from which on a result is wrong."""
+
+
+def shape() -> tuple[int, int]:
+    return view_of(FIRST).image.shape
+
+
+def distortion(name: str) -> Distortion:
+    lines, samples = shape()
+    smooth: tuple[Waves | Bend, ...] = ()
+    steps: tuple[Step, ...] = ()
+    moved = None
+    if name == "jitter":
+        smooth = (Waves(np.array([[0.5, 2.5]]), np.array([0.8 * lines]), np.array([[0.3, 1.9]])),)
+    elif name == "bow":
+        smooth = (Bend(np.array([[0.0, 0.0], [0.0, 0.0], [2.0, 5.0]]), 0, lines),)
+    elif name == "repeated lines":
+        steps = (Step(int(0.65 * lines), -40),)
+    elif name == "moved ground":
+        centre = np.array([0.3 * lines, 0.35 * samples])
+        moved = MovedGround(centre, np.array([0.27, 0.3]) * shape(), 0.4, np.array([18.0, -14.0]))
+    return Distortion(shape(), smooth, steps, moved)
+
+
+@cache
+def registered(name: str) -> Registration:
+    view = view_of(FIRST)
+    image = DistortedImage(view.image, distortion(name))
+    return register_scene(replace(view.as_scene(SIGMA_M), image=image), *block())
+
+
+def errors(name: str) -> tuple[Array, Array]:
+    """True errors (n, 2) in pixels of the registered model, and its stated covariances (n, 2, 2)."""
+    view, how, result = view_of(FIRST), distortion(name), registered(name)
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform(0.05, 0.95, (300, 2)) * shape()
+    pixel = pixel[how.is_unique(pixel)]
+    height_m = rng.uniform(*world().height_range_m, len(pixel))
+    ground = view.geometry.true_model.locate(how.undistorted(pixel), height_m) + frame_m() / per_degree()
+    return result.model.project(ground) - pixel, result.adjustment.covariance_at(pixel)
+
+
+def unmet(name: str) -> set[str]:
+    return {one.name for one in registered(name).qualification.criteria if not one.met}
+
+
+def ratio(name: str) -> float:
+    error, covariance = errors(name)
+    return float(np.quantile(np.hypot(*error.T), 0.9) / np.median(normal_ce90(covariance)))
+
+
+@pytest.mark.parametrize("name", ["jitter", "bow"])
+def test_jitter_and_bow_are_followed_with_the_stated_accuracy(name: str) -> None:
+    result = registered(name)
+    assert result.qualification.verdict in ("good", "usable")
+    assert result.adjustment.components
+    assert ratio(name) < WRONG
+    error, _ = errors(name)
+    assert np.quantile(np.hypot(*error.T), 0.9) < 1.2
+
+
+def test_lines_that_were_repeated_are_followed_or_named() -> None:
+    result = registered("repeated lines")
+    named = unmet("repeated lines") & {"points_elsewhere", "steps_along_lines", "structure_along_lines"}
+    assert named or (result.adjustment.components and ratio("repeated lines") < WRONG)
+    if named:
+        assert result.qualification.verdict == "failed"
+        note = next(one.note for one in result.qualification.criteria if one.name in named)
+        assert "lines" in note
+
+
+def test_ground_that_moved_is_named_and_the_rest_stays_right() -> None:
+    result = registered("moved ground")
+    assert "points_elsewhere" in unmet("moved ground")
+    note = next(c.note for c in result.qualification.criteria if c.name == "points_elsewhere")
+    assert "ground that moved" in note
+    assert result.qualification.verdict == "usable"
+    assert ratio("moved ground") < WRONG
