@@ -35,7 +35,7 @@ export const showDrawing: ShowView = async (place, id) => {
   const state = h("p", { class: "quiet" }, "Opening the image …");
   fill(panel, h("p", {}, h("a", { href: `#/job/${id}` }, "← Registration")), h("h1", { tabindex: -1 }, `Draw on ${scene.name}`), state);
   const tiles = await tilesOf(scene.id, signal, (view) => (state.textContent = `Drawing the tiles: ${stateText(view)}`));
-  const section = h("section", { id: "image", "aria-label": "Raw image" });
+  const section = h("section", { id: "raw-image", "aria-label": "Raw image" });
   document.body.append(section);
   document.body.classList.add("drawing");
   await atlas.show("vectors", []);
