@@ -6,6 +6,7 @@ import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
+from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
 from services.matching.consensus import Voters
@@ -31,6 +32,7 @@ from services.registration.search import (
     select_inliers,
     summarise,
 )
+from services.registration.turned import turned_scenes
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel
 from services.types import (
@@ -44,6 +46,10 @@ from services.types import (
     ViewMeasures,
     no_progress,
 )
+
+_FEW_POINTS = 60
+_AGREEING = 12
+"""Points that agree on an image that is turned, at least, and half of those found."""
 
 
 @dataclass(frozen=True)
@@ -91,14 +97,37 @@ def register_scene(
     Raises:
         CoverageError: no point lies in the scene.
         NotEnoughPoints: too few points were found.
-        NoConsensus: the points found do not agree on one correction.
+        NoConsensus: the points found do not agree on one correction, or they agree on an image that is
+            turned.
     """
-    context, search, adjustment = search_scene(
-        scene, points, chips, options, progress=progress, stages=stages
-    )
+    try:
+        context, search, adjustment = search_scene(
+            scene, points, chips, options, progress=progress, stages=stages
+        )
+    except (NoConsensus, NotEnoughPoints) as error:
+        turned = _how_it_is_turned(scene, points, chips, options)
+        if not turned:
+            raise
+        raise NoConsensus(f"the image is {turned} ({error})") from error
     prediction = predict(scene, context.points, adjustment)
     elsewhere = search_elsewhere(context, prediction, search, adjustment)
     return build_registration(context, context.points, search, adjustment, elsewhere)
+
+
+def _how_it_is_turned(
+    scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions
+) -> str:
+    """How a scene that was not found is turned against its model; "" when it is not, as far as seen."""
+    few = replace(options, max_points=_FEW_POINTS, fine_stages=1)
+    for words, turned in turned_scenes(scene):
+        try:
+            _, search, adjustment = search_scene(turned, points, chips, few)
+        except (CoverageError, ComputationError):
+            continue
+        found, active = int((search.matches.reason == "").sum()), int(adjustment.active.sum())
+        if active >= max(_AGREEING, found / 2):
+            return f"{words}, by {active} points that agree then; turn the image or its model"
+    return ""
 
 
 def search_scene(

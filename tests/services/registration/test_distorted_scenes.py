@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from services.errors import NoConsensus
 from services.quality.accuracy import normal_ce90
 from services.registration.on_points import Registration, register_scene
 from services.simulation.distortion import (
@@ -14,6 +15,7 @@ from services.simulation.distortion import (
     Distortion,
     MovedGround,
     Step,
+    Turn,
     Waves,
 )
 from services.types import Array
@@ -44,7 +46,8 @@ def distortion(name: str) -> Distortion:
     elif name == "moved ground":
         centre = np.array([0.3 * lines, 0.35 * samples])
         moved = MovedGround(centre, np.array([0.27, 0.3]) * shape(), 0.4, np.array([18.0, -14.0]))
-    return Distortion(shape(), smooth, steps, moved)
+    turns: dict[str, Turn] = {"swapped": "swapped", "mirrored": "mirrored", "upside down": "upside down"}
+    return Distortion(shape(), smooth, steps, moved, turns.get(name, ""))
 
 
 @cache
@@ -92,6 +95,12 @@ def test_lines_that_were_repeated_are_followed_or_named() -> None:
         assert result.qualification.verdict == "failed"
         note = next(one.note for one in result.qualification.criteria if one.name in named)
         assert "lines" in note
+
+
+@pytest.mark.parametrize("name", ["swapped", "mirrored", "upside down"])
+def test_an_image_that_is_turned_is_refused_with_this_reason(name: str) -> None:
+    with pytest.raises(NoConsensus, match=f"the image is {name}"):
+        registered(name)
 
 
 def test_ground_that_moved_is_named_and_the_rest_stays_right() -> None:
