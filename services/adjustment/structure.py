@@ -55,6 +55,7 @@ class Structure:
         shape: "quadratic", "cubic", "period", "step", "wave" or "slope"; "" where nothing was tried.
         at: period in pixels, or line of a step; NaN for other shapes.
         size_px: (2,) of the shape at the points, line and sample, root mean square.
+        largest_px: longest displacement of a point by the shape, from their mean.
         slope_px: (2,) pixels per metre of height, of a slope; NaN for other shapes.
     """
 
@@ -63,6 +64,7 @@ class Structure:
     shape: str
     at: float
     size_px: Array
+    largest_px: float
     slope_px: Array
 
 
@@ -175,7 +177,7 @@ def _structure(residuals: Residuals, family: Family) -> Structure:
             )
     none = np.full(2, np.nan)
     if not tried:
-        return Structure(family, 1.0, "", float("nan"), none, none)
+        return Structure(family, 1.0, "", float("nan"), none, 0.0, none)
     smallest, _, name, at_best, coefficient, shape = min(tried, key=lambda one: one[0])
     count = sum(one[1] for one in tried)
     displacement = shape @ coefficient.T
@@ -185,6 +187,7 @@ def _structure(residuals: Residuals, family: Family) -> Structure:
         shape=name,
         at=float(at_best),
         size_px=displacement.std(axis=0),
+        largest_px=float(np.linalg.norm(displacement - displacement.mean(axis=0), axis=1).max()),
         slope_px=coefficient[:, 0] if family == "height" else none,
     )
 

@@ -115,36 +115,37 @@ _DESCRIPTIONS = {
     ),
     "structure_along_lines": _Description(
         "Residuals along the lines",
-        "",
-        4,
-        "Probability, at most, that independent errors swing or bend along the lines as clearly as the "
-        "residuals do: F test of the best of all shapes tried, times their number.",
+        "px",
+        2,
+        "Largest displacement by a swing or bend along the lines that residuals show; 0 where chance "
+        "shows one as clearly (F test of the best shape, times the number tried, 0.002). The limit is a "
+        "tenth of the predicted CE90.",
     ),
     "steps_along_lines": _Description(
         "Steps along the lines",
-        "",
-        4,
-        "Probability, at most, that independent errors show a step at some line as clearly as the "
-        "residuals do.",
+        "px",
+        2,
+        "The same for a step at some line.",
     ),
     "structure_along_samples": _Description(
         "Residuals along the samples",
-        "",
-        4,
-        "As along the lines: seams between detectors and distortions of the optics show here.",
+        "px",
+        2,
+        "As along the lines: seams between detectors and distortions of the optics show here. The limit "
+        "is half of the predicted CE90 for good, all of it for usable.",
     ),
     "structure_in_image": _Description(
         "Residuals over the image",
-        "",
-        4,
+        "px",
+        2,
         "The same for waves in two dimensions.",
     ),
     "structure_against_height": _Description(
         "Residuals against height",
-        "",
-        4,
-        "Probability, at most, that independent errors grow with the height of the points as clearly as "
-        "the residuals do: the lines of sight of the model are not those of the image.",
+        "px",
+        2,
+        "The same for what grows with the height of the points: the lines of sight of the model are "
+        "not those of the image.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",

@@ -7,8 +7,7 @@ import numpy as np
 
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family, Structure
-from services.quality.accuracy import CIRCULAR_CE90
-from services.quality.criteria import Criterion, Grade, at_least, at_most
+from services.quality.criteria import Criterion, Grade, at_most
 from services.types import Array, BoolArray, IntArray
 
 _CRITERIA: dict[Family, str] = {
@@ -18,6 +17,8 @@ _CRITERIA: dict[Family, str] = {
     "image": "structure_in_image",
     "height": "structure_against_height",
 }
+_GOOD, _FOLLOWED = 0.5, 0.1
+"""Largest displacement by a structure over the predicted CE90: of a good scene, and along the lines."""
 _OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
 """A model of the whole image follows these, or is wrong."""
 _WITHIN = 0.15
@@ -53,10 +54,11 @@ class Elsewhere:
 def structure_criteria(
     structures: Sequence[Structure], sight: Array, shape: tuple[int, int], predicted_px: float
 ) -> list[Criterion]:
-    """A criterion for each family of structures: chance has to explain it.
+    """A criterion for each family of structures: what chance does not explain has to be small.
 
-    What the model of the whole image should follow and does not, and what is larger than the stated
-    accuracy, make this wrong: no usable registration has it.
+    A structure that is as large as the stated accuracy makes this wrong: no usable registration has it.
+    What the profile should follow and does not is held to a tenth of it: points on the other side of a
+    step, or at the crest of a wave, were left out of what is seen.
 
     Args:
         structures: of the residuals of the final adjustment.
@@ -66,11 +68,17 @@ def structure_criteria(
     """
     criteria = []
     for structure in structures:
-        larger = CIRCULAR_CE90 * float(np.sqrt(np.mean(structure.size_px**2))) > predicted_px
-        grade: Grade = "usable" if larger or structure.family in _OF_THE_MODEL else "good"
-        criterion = at_least(_CRITERIA[structure.family], structure.chance, MAX_CHANCE, grade)
+        size_px = structure.largest_px if structure.chance < MAX_CHANCE else 0.0
+        grade: Grade = "good"
+        limit_px = _GOOD * predicted_px
+        if structure.family in _OF_THE_MODEL:
+            grade, limit_px = "usable", _FOLLOWED * predicted_px
+        elif size_px > predicted_px:
+            grade, limit_px = "usable", predicted_px
+        criterion = at_most(_CRITERIA[structure.family], size_px, limit_px, grade)
         if not criterion.met:
-            criterion = replace(criterion, note=_looks_like(structure, sight, shape))
+            seen = f"chance shows it with a probability of {structure.chance:.1g}"
+            criterion = replace(criterion, note=f"{_looks_like(structure, sight, shape)}; {seen}")
         criteria.append(criterion)
     return criteria
 

@@ -28,6 +28,7 @@ export interface AdjustmentOptions {
   min_gain: number | null;
   folds: number;
   prior_slope_sigma_px: number | null;
+  profile: boolean;
 }
 
 export interface BlockUsed {
