@@ -132,7 +132,7 @@ _DESCRIPTIONS = {
         "px",
         2,
         "As along the lines: seams between detectors and distortions of the optics show here. The limit "
-        "is half of the predicted CE90 for good, all of it for usable.",
+        "is half of the predicted CE90 for good, twice it for usable.",
     ),
     "structure_in_image": _Description(
         "Residuals over the image",

@@ -17,8 +17,9 @@ _CRITERIA: dict[Family, str] = {
     "image": "structure_in_image",
     "height": "structure_against_height",
 }
-_GOOD, _FOLLOWED = 0.5, 0.1
-"""Largest displacement by a structure over the predicted CE90: of a good scene, and along the lines."""
+_GOOD, _USABLE, _FOLLOWED = 0.5, 2.0, 0.1
+"""Largest displacement by a structure over the predicted CE90: of a good scene, a usable one, and along
+the lines of a usable one."""
 _OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
 """A model of the whole image follows these, or is wrong."""
 _WITHIN = 0.15
@@ -56,7 +57,7 @@ def structure_criteria(
 ) -> list[Criterion]:
     """A criterion for each family of structures: what chance does not explain has to be small.
 
-    A structure that is as large as the stated accuracy makes this wrong: no usable registration has it.
+    A structure that is larger than the stated accuracy makes this wrong: no usable registration has it.
     What the profile should follow and does not is held to a tenth of it: points on the other side of a
     step, or at the crest of a wave, were left out of what is seen.
 
@@ -73,9 +74,9 @@ def structure_criteria(
         limit_px = _GOOD * predicted_px
         if structure.family in _OF_THE_MODEL:
             grade, limit_px = "usable", _FOLLOWED * predicted_px
-        elif size_px > predicted_px:
-            grade, limit_px = "usable", predicted_px
-        criterion = at_most(_CRITERIA[structure.family], size_px, limit_px, grade)
+        elif size_px > _USABLE * predicted_px:
+            grade, limit_px = "usable", _USABLE * predicted_px
+        criterion = at_most(_CRITERIA[structure.family], size_px, float(np.nan_to_num(limit_px)), grade)
         if not criterion.met:
             seen = f"chance shows it with a probability of {structure.chance:.1g}"
             criterion = replace(criterion, note=f"{_looks_like(structure, sight, shape)}; {seen}")
