@@ -133,9 +133,10 @@ def line_profile(report: RegistrationReport) -> Figure:
     shown = measures.residual_px[measures.active] + profile.at(line)
     sigma = np.sqrt(profile.variance_px2)
     last = float(report.scene.lines)
+    y_ranges = [data_range(shown[:, k]) for k in range(2)]
+    left = max(map(left_margin, y_ranges))
     for k, name in enumerate(("y (line)", "x (sample)")):
-        y_range = data_range(shown[:, k])
-        left = left_margin(y_range)
+        y_range = y_ranges[k]
         panel = Panel(figure, left, 6.0 + k * 118.0, WIDTH - left - 8.0, 108.0, (0.0, last), y_range)
         panel.x_axis("line" if k == 1 else "", numbers=k == 1)
         panel.y_axis(f"{name}, px")
