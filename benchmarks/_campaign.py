@@ -25,7 +25,7 @@ from services.simulation.defects import Damage, DamagedImage
 from services.simulation.detectors import Detectors
 from services.simulation.distortion import Distortion
 from services.simulation.render import surface_seen
-from services.simulation.tiles import TiledView
+from services.simulation.tiles import TiledView, Tiles
 from services.simulation.view import ViewGeometry, ViewPlan, plan_geometry
 from services.simulation.world import World, with_smoother_terrain
 from services.types import Array, ChipSource, ControlPoints
@@ -50,7 +50,7 @@ class Outcome:
         predicted_m, predicted_worst_m: CE90 as stated, median and worst over the image.
         normalised: mean square of true errors over stated deviations, over the image.
         displacement_m: stability test, largest of the medians of the corners and the centre.
-        cpu_s: of the registration, with the rendering of the pixels that it reads.
+        cpu_s: of the registration, with the rendering of the pixels that it reads and no run kept.
         ground_predicted_m: CE90 on the Earth as stated, with the frame of the blocks; median.
         ground_normalised: as `normalised`, on the Earth.
         wrong_share: of the image that is off by more than `WRONG` times the CE90 predicted there.
@@ -174,8 +174,16 @@ class Prepared:
         return (12, 12) if self.distortion.is_none else (48, 12)
 
 
-def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
-    """The scene of a trial, with errors in its model, in its pixels and in the points."""
+def prepare(place: Place, trial: Trial, block: Block, seed: int, tiles: Tiles | None = None) -> Prepared:
+    """The scene of a trial, with errors in its model, in its pixels and in the points.
+
+    Args:
+        place: its world.
+        trial: what is drawn.
+        block: the points without errors.
+        seed: of the campaign.
+        tiles: of the scene, rendered before; those that are rendered are added.
+    """
     world = world_of(place)
     if trial.terrain_m > 0.0:
         world = with_smoother_terrain(world, trial.terrain_m)
@@ -203,7 +211,13 @@ def prepare(place: Place, trial: Trial, block: Block, seed: int) -> Prepared:
     distorting = np.random.default_rng([seed, trial.number, 6])
     distortion = distortion_of(trial.distortion, shape, trial.gsd_m, distorting)
     image: ImageSource = TiledView(
-        world, geometry, int(rng.integers(2**31)), conditions, detectors, distortion=distortion
+        world,
+        geometry,
+        int(rng.integers(2**31)),
+        conditions,
+        detectors,
+        distortion=distortion,
+        tiles=tiles,
     )
     if trial.bits != 12 or trial.damaged > 0.0:
         damage = Damage(trial.bits, trial.damaged, trial.missing, trial.patch_px, trial.brightest)
@@ -240,10 +254,16 @@ def _of_another_view(
 
 
 def attempt(
-    place: Place, trial: Trial, block: Block, seed: int, options: RegistrationOptions
+    place: Place,
+    trial: Trial,
+    block: Block,
+    seed: int,
+    options: RegistrationOptions,
+    *,
+    tiles: Tiles | None = None,
 ) -> Outcome:
-    """The outcome of registering the scene of a trial."""
-    prepared = prepare(place, trial, block, seed)
+    """The outcome of registering the scene of a trial; tiles as for `prepare`."""
+    prepared = prepare(place, trial, block, seed, tiles)
     return registered(prepared, replace(block, points=prepared.points), options)[0]
 
 

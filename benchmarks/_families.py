@@ -17,6 +17,7 @@ import cv2
 from benchmarks._campaign import Outcome, attempt
 from benchmarks._distorted_trials import DISTORTED, distorted_trial
 from benchmarks._distortions import Drawn
+from benchmarks._kept_pixels import keep_tiles, pixels_file, read_tiles
 from benchmarks._trials import (
     Trial,
     damaged_trial,
@@ -201,7 +202,13 @@ def run(scene: Scene, seed: int, folder: Path) -> Result:
     kind, number = scene
     place, trial = place_of(scene), DRAWS[kind](seed, number)
     options = NOMINAL_OPTIONS if kind == "nominal" else OPTIONS
-    return trial, attempt(place, trial, block_of(place, folder), seed, options)
+    file = pixels_file(folder, f"{name_of(scene)}_{seed}")
+    tiles = read_tiles(file)
+    kept = len(tiles)
+    outcome = attempt(place, trial, block_of(place, folder), seed, options, tiles=tiles)
+    if len(tiles) > kept:
+        keep_tiles(tiles, (place.lines, place.lines), file)
+    return trial, outcome
 
 
 def run_all(scenes: list[Scene], seed: int, folder: Path, jobs: int) -> Iterator[tuple[str, Result]]:

@@ -39,6 +39,8 @@ _CELLS = 128
 _CACHED_TILES = 16_384
 
 Pixels = npt.NDArray[np.uint16]
+Tiles = OrderedDict[tuple[int, int], Pixels]
+"""Pixels of tiles by row and column, the least recently read first."""
 
 
 class LightOnDemand:
@@ -106,6 +108,7 @@ class TiledView:
         detectors: Detectors = PERFECT,
         *,
         distortion: Distortion | None = None,
+        tiles: Tiles | None = None,
     ) -> None:
         """Prepare an image.
 
@@ -116,6 +119,7 @@ class TiledView:
             conditions: conditions of the acquisition.
             detectors: what the sensor model does not know of them.
             distortion: what the sensor model does not know of the image.
+            tiles: of the same image, rendered before; those that are rendered are added.
 
         Raises:
             InputError: slopes are so steep that the terrain would occlude itself.
@@ -136,7 +140,7 @@ class TiledView:
             plan.shape, conditions.cloud_cover, np.random.default_rng([seed, 0])
         )
         self._radiometry = seen_through(conditions, plan.radiometry)
-        self._tiles: OrderedDict[tuple[int, int], Pixels] = OrderedDict()
+        self._tiles: Tiles = OrderedDict() if tiles is None else tiles
 
     @property
     def shape(self) -> tuple[int, int]:
