@@ -1,43 +1,95 @@
-"""The store of the abstract tests: a published and a staged block."""
+"""The stores of the abstract tests: a published and a staged block."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
+from pydantic import SecretStr
 
+from app.config import Settings
+from app.db import engine
+from app.db.cluster.embedded import Cluster
+from app.main import create_app
+from app.storage import Storage
 from app.usecases.blocks import lifecycle
-from tests.factories import make_block
+from app.usecases.tokens import create_token
+from tests.app.conftest import TEMPLATE, fresh_database
+from tests.factories import MadeBlock, make_block
 from tests.statements import run_sql
 
 
-@pytest.fixture
-def made(connection, storage, tmp_path):
-    """A published block of 60 points, 3 of them with history; a staged one of 10 in the same place."""
-    made = make_block(tmp_path / "block", count=60)
-    lifecycle.ingest_block(connection, storage, made.folder)
-    lifecycle.publish_block(connection, "calanques")
-    run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
-    staged = make_block(tmp_path / "staged", count=10, seed=5, name="staged")
-    lifecycle.ingest_block(connection, storage, staged.folder)
-    connection.commit()
-    return made
+@dataclass(frozen=True)
+class Store:
+    """A service with a published block of 60 points, 3 of them with history; a staged one of 10 in the
+    same place.
 
+    Attributes:
+        made: the published block.
+        headers: of a caller with scope `read`.
+    """
 
-@pytest.fixture
-def get(made, client, bearer) -> Callable[..., Any]:
-    """GET with scope `read`; parameters by name."""
-    headers = bearer("read")
+    made: MadeBlock
+    client: TestClient
+    headers: dict[str, str]
+    dsn: str
 
-    def get(path: str, accept: str | None = None, **parameters: Any) -> Any:
-        all_headers = headers if accept is None else {**headers, "Accept": accept}
+    def get(self, path: str, accept: str | None = None, **parameters: Any) -> Any:
+        """The reply to GET; parameters by name."""
+        headers = self.headers if accept is None else {**self.headers, "Accept": accept}
         query = {name.replace("_", "-"): value for name, value in parameters.items()}
-        return client.get(path, params=query or None, headers=all_headers)
+        return self.client.get(path, params=query or None, headers=headers)
 
-    return get
+
+@contextmanager
+def filled_store(cluster: Cluster, folder: Path) -> Iterator[Store]:
+    """A store in a database and a folder of its own."""
+    made = make_block(folder / "block", count=60)
+    staged = make_block(folder / "staged", count=10, seed=5, name="staged")
+    with fresh_database(cluster, TEMPLATE) as dsn:
+        settings = Settings(database_url=SecretStr(dsn), data_folder=folder / "data")
+        with engine.connect(dsn) as connection:
+            storage = Storage(settings.data_folder / "storage")
+            lifecycle.ingest_block(connection, storage, made.folder)
+            lifecycle.publish_block(connection, "calanques")
+            run_sql(connection, "insert into point_history (point_id) select id from point limit 3")
+            lifecycle.ingest_block(connection, storage, staged.folder)
+            secret = create_token(connection, "a token to read", ["read"]).secret
+        with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+            yield Store(made, client, {"Authorization": f"Bearer {secret}"}, dsn)
+
+
+@pytest.fixture(scope="module")
+def store(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """One store for all tests of a module: they change nothing."""
+    with filled_store(cluster, tmp_path_factory.mktemp("store")) as store:
+        yield store
 
 
 @pytest.fixture
-def ids(get) -> Callable[..., list[int]]:
+def own_store(cluster: Cluster, tmp_path: Path) -> Iterator[Store]:
+    """A store that its test may change."""
+    with filled_store(cluster, tmp_path) as store:
+        yield store
+
+
+@pytest.fixture
+def made(store: Store) -> MadeBlock:
+    """The published block."""
+    return store.made
+
+
+@pytest.fixture
+def get(store: Store) -> Callable[..., Any]:
+    """GET with scope `read`; parameters by name."""
+    return store.get
+
+
+@pytest.fixture
+def ids(get: Callable[..., Any]) -> Callable[..., list[int]]:
     """The ids of the points that a query returns."""
 
     def ids(**parameters: Any) -> list[int]:

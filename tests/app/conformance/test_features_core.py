@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from app.db import engine
 from tests.statements import run_sql
 
 COLLECTIONS = ("points", "blocks", "density", "point-history")
@@ -190,13 +191,13 @@ def test_req_core_http_not_found(get):
         assert get(f"/collections/{path}").status_code == 404, path
 
 
-def test_req_core_fc_links_next_page_while_data_change(get, connection, made):
-    first = get("/collections/points/items", limit=25).json()
-    run_sql(connection, "update block set state = 'published' where id = 'staged'")
-    connection.commit()
+def test_req_core_fc_links_next_page_while_data_change(own_store):
+    first = own_store.get("/collections/points/items", limit=25).json()
+    with engine.connect(own_store.dsn) as connection:
+        run_sql(connection, "update block set state = 'published' where id = 'staged'")
     seen, page = [feature["id"] for feature in first["features"]], first
     while following := [item for item in page["links"] if item["rel"] == "next"]:
-        page = get(following[0]["href"]).json()
+        page = own_store.get(following[0]["href"]).json()
         seen += [feature["id"] for feature in page["features"]]
     assert seen[:60] == (2**26 + np.arange(60)).tolist()
     assert len(seen) == len(set(seen)) == 70

@@ -241,14 +241,14 @@ def test_req_sorting_pages_follow_each_other(get, made, sortby):
         assert saliency == sorted(saliency, reverse=sortby[0] == "-")
 
 
-def test_a_polygon_too_long_for_a_url_is_searched_by_post_page_after_page(made, client, bearer):
+def test_a_polygon_too_long_for_a_url_is_searched_by_post_page_after_page(made, store):
     angle = np.linspace(0.0, 2.0 * np.pi, 5_000)
     ring = np.column_stack([5.25 + 0.04 * np.cos(angle), 43.25 + 0.04 * np.sin(angle)])
     ring[-1] = ring[0]
     body = {"intersects": {"type": "Polygon", "coordinates": [ring.tolist()]}, "limit": 10}
-    seen, headers = [], bearer("read")
+    seen = []
     while body:
-        reply = client.post("/collections/points/search", json=body, headers=headers)
+        reply = store.client.post("/collections/points/search", json=body, headers=store.headers)
         assert reply.status_code == 200, reply.text
         seen += [feature["id"] for feature in reply.json()["features"]]
         following = [item for item in reply.json()["links"] if item["rel"] == "next"]
