@@ -12,6 +12,7 @@ from services.adjustment.parameter_figures import (
     parameter_figures,
 )
 from services.adjustment.shared_errors import SharedErrors
+from services.conventions import CHIP_SIZE
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock
 from services.joint.nearest import nearest_correction, scene_heights_m
@@ -163,7 +164,13 @@ def registered_scene(
         frame = weighted_frame(measured.points.frames, shares.astype(np.float64))
     model = block.model(number)
     scene = AdjustedScene(
-        model, measures, adjustment, measured.scene.image.shape, scene_gsd_m(measured.scene), frame
+        model,
+        measures,
+        adjustment,
+        measured.scene.image.shape,
+        scene_gsd_m(measured.scene),
+        frame,
+        control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
     )
 
     def of_scene(
@@ -196,7 +203,7 @@ def registered_scene(
 
 def _held_by_ties(options: QualificationOptions) -> QualificationOptions:
     """The thresholds for a scene that others hold as well: it may have few control points of its own."""
-    return replace(options, usable_active_points=0)
+    return replace(options, usable_active_points=0, usable_active_of_few=0.0)
 
 
 def tie_residual_px(block: JointBlock, number: int) -> float:

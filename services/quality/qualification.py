@@ -24,6 +24,10 @@ from services.types import Array, Frame, Measures
 
 _ENOUGH_RESIDUALS = 6
 """Active points whose residuals tell a standard deviation."""
+_MOST_WORSE = 4.0
+"""Errors of points are believed up to this many times their stated accuracy."""
+_CLEARLY_WORSE = 1.3
+"""Standard deviation of unit weight from which on points are called worse than stated."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,9 @@ class QualificationOptions:
     """Thresholds and sampling of a qualification.
 
     A registration is "good" when it meets every threshold, "usable" when it meets every `usable_*`
-    threshold, else "failed".
+    threshold, else "failed". Thresholds of "good" are pixels of the scene; those of "usable" are pixels
+    of the scene or of the chips, whichever are coarser: a scene is not worse for being finer than the
+    control. A limit in metres alone is set by a limit of 0 px.
 
     Attributes:
         good_active_points: smallest number of active points (SRP: one measure is never enough, at least
@@ -39,7 +45,8 @@ class QualificationOptions:
         good_coverage_percent: smallest coverage of the image by active points.
         good_active_of_matched: smallest ratio of active to matched points.
         good_residual_std_px, usable_residual_std_px: largest standard deviation of the active residuals,
-            of the worse coordinate, without the part that chance and the accuracy of the points explain.
+            of the worse coordinate, without the part that chance and the accuracy of the points explain:
+            for good as they state it, for usable as the scene shows it.
         good_displacement_px, usable_displacement_px: largest displacement of a corner or the centre when
             a part of the points is held out: the worst place, the median over the draws.
         good_displacement_m, usable_displacement_m: displacements up to this are good, usable where the
@@ -53,6 +60,8 @@ class QualificationOptions:
         good_second_consensus_share: largest group of deactivated points that agree on another
             displacement, as a share of the active points. A scene has one displacement, not two.
         usable_active_points: smallest number of active points.
+        usable_active_of_few: smallest ratio of active to matched points where fewer points are active
+            than a good registration has: part of a few points agree on a wrong correction too.
         coverage_cells: cells of the coverage along each side of the image.
         grid: nodes of the predicted accuracy along each side of the image.
         draws: number of repeated adjustments in the stability test.
@@ -71,6 +80,7 @@ class QualificationOptions:
     good_unit_weight: float = 3.0
     good_second_consensus_share: float = 0.3
     usable_active_points: int = 6
+    usable_active_of_few: float = 0.7
     usable_residual_std_px: float = 2.0
     usable_displacement_px: float = 2.0
     usable_displacement_m: float = 0.9
@@ -198,9 +208,12 @@ def qualify_repeated(
     measures, adjustment, shape = scene.measures, scene.adjustment, scene.shape
     point_counts = count_points(measures)
     residuals = residuals_in_image(measures.residual_px[measures.active])
-    residual_std_px = unexplained_px(measures, adjustment.point_sigma_px)
+    worse = _times_worse(adjustment.sigma0)
+    residual_std_px, shown_residual_std_px = (
+        unexplained_px(measures, times * adjustment.point_sigma_px) for times in (1.0, worse)
+    )
     if point_counts.active < _ENOUGH_RESIDUALS and np.isfinite(tie_residual_px):
-        residual_std_px = tie_residual_px
+        residual_std_px = shown_residual_std_px = tie_residual_px
     predicted = predict_accuracy(scene, options.grid)
     coverage = image_coverage(measures.line_sample[measures.active], shape, options.coverage_cells)
     figures = _Figures(
@@ -208,12 +221,17 @@ def qualify_repeated(
         active_of_matched=point_counts.active_of_matched,
         coverage_percent=coverage.percent,
         residual_std_px=residual_std_px,
+        shown_residual_std_px=shown_residual_std_px,
         displacement_px=max((place.median_px for place in stability.displacements), default=np.nan),
         predicted_ce90_px=predicted.worst_px,
         unit_weight=adjustment.sigma0,
         second_consensus_share=second_consensus_share(measures),
     )
-    criteria = (*_criteria(figures, options, scene.gsd_m), *_of_fit(scene, predicted.median_px))
+    control_px = max(scene.control_gsd_m / scene.gsd_m, 1.0)
+    criteria = (
+        *_criteria(figures, options, scene.gsd_m, control_px),
+        *_of_fit(scene, predicted.median_px),
+    )
     if options.max_ce90_on_earth_m is not None:
         criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)
     return Qualification(
@@ -306,6 +324,7 @@ class _Figures:
     active_of_matched: float
     coverage_percent: float
     residual_std_px: float
+    shown_residual_std_px: float
     displacement_px: float
     predicted_ce90_px: float
     unit_weight: float
@@ -332,29 +351,57 @@ def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Cri
     return replace(criterion, note=unknown)
 
 
-def _criteria(figures: _Figures, options: QualificationOptions, gsd_m: float) -> tuple[Criterion, ...]:
-    """The figures compared with the thresholds."""
+def _times_worse(unit_weight: float) -> float:
+    """How many times less accurate than stated a scene shows the points to be, at least 1."""
+    return float(np.clip(np.nan_to_num(unit_weight, nan=1.0), 1.0, _MOST_WORSE))
+
+
+def _criteria(
+    figures: _Figures, options: QualificationOptions, gsd_m: float, control_px: float
+) -> tuple[Criterion, ...]:
+    """The figures compared with the thresholds.
+
+    Args:
+        figures: of a registration.
+        options: thresholds.
+        gsd_m: of the scene.
+        control_px: pixels of the scene to one of the chips, at least 1.
+    """
     f, o = figures, options
     good_ce90_px = max(o.good_ce90_px, o.good_ce90_m / gsd_m)
-    usable_ce90_px = max(o.usable_ce90_px, o.usable_ce90_m / gsd_m)
-    usable_displacement_px = max(o.usable_displacement_px, o.usable_displacement_m / gsd_m)
+    usable_ce90_px = max(o.usable_ce90_px * control_px, o.usable_ce90_m / gsd_m)
+    usable_displacement_px = max(o.usable_displacement_px * control_px, o.usable_displacement_m / gsd_m)
     good_displacement_px = max(o.good_displacement_px, o.good_displacement_m / gsd_m)
+    usable_residual_px = o.usable_residual_std_px * control_px
+    few = o.usable_active_of_few > 0.0 and f.active_points < o.good_active_points
     return (
         at_least("active_points", f.active_points, o.good_active_points, "good"),
         at_least("coverage_percent", f.coverage_percent, o.good_coverage_percent, "good"),
         at_least("active_of_matched", f.active_of_matched, o.good_active_of_matched, "good"),
-        at_most("residual_std_px", f.residual_std_px, o.good_residual_std_px, "good"),
+        _noted(at_most("residual_std_px", f.residual_std_px, o.good_residual_std_px, "good"), f),
         at_most("displacement_px", f.displacement_px, good_displacement_px, "good"),
         at_most("predicted_ce90_px", f.predicted_ce90_px, good_ce90_px, "good"),
         at_least("active_points", f.active_points, o.usable_active_points, "usable"),
-        at_most("residual_std_px", f.residual_std_px, o.usable_residual_std_px, "usable"),
+        *([at_least("active_of_matched", f.active_of_matched, o.usable_active_of_few, "usable")] * few),
+        at_most("residual_std_px", f.shown_residual_std_px, usable_residual_px, "usable"),
         at_most("displacement_px", f.displacement_px, usable_displacement_px, "usable"),
         at_most("predicted_ce90_px", f.predicted_ce90_px, usable_ce90_px, "usable"),
-        at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"),
+        _noted(at_most("unit_weight", f.unit_weight, o.good_unit_weight, "good"), f),
         at_most(
             "second_consensus_share",
             f.second_consensus_share,
             o.good_second_consensus_share,
             "good",
         ),
+    )
+
+
+def _noted(criterion: Criterion, figures: _Figures) -> Criterion:
+    """The criterion, which says when it is not met because points are worse than they state."""
+    if criterion.met or not figures.unit_weight > _CLEARLY_WORSE:
+        return criterion
+    return replace(
+        criterion,
+        note=f"the scene shows points {figures.unit_weight:.1f} times less accurate than they state; "
+        "the accuracy stated here takes them as the scene shows them",
     )

@@ -29,6 +29,8 @@ class AdjustedScene:
         refit: repeats the adjustment on the measures of a mask (n,); None for a scene whose repetitions
             are those of a block.
         elsewhere: points that agree on another displacement than the rest; None when there are none.
+        control_gsd_m: ground sampling of the chips or of the reference that the scene was measured on;
+            0 where it was measured on none.
     """
 
     model: SensorModel
@@ -39,6 +41,7 @@ class AdjustedScene:
     frame: Frame
     refit: Callable[[BoolArray], SceneAdjustment] | None = None
     elsewhere: Elsewhere | None = None
+    control_gsd_m: float = 0.0
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]

@@ -232,7 +232,15 @@ def build_registration(
     frame = shared_frame(points, measures.active)
     model = CorrectedModel(scene.model, adjustment.correction)
     adjusted = AdjustedScene(
-        model, measures, adjustment, scene.image.shape, context.gsd_m, frame, refit, elsewhere
+        model,
+        measures,
+        adjustment,
+        scene.image.shape,
+        context.gsd_m,
+        frame,
+        refit,
+        elsewhere,
+        control_gsd_m=context.stages[-1].chip_gsd_m,
     )
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)

@@ -213,6 +213,7 @@ export interface QualificationOptions {
   good_unit_weight: number | null;
   good_second_consensus_share: number | null;
   usable_active_points: number;
+  usable_active_of_few: number | null;
   usable_residual_std_px: number | null;
   usable_displacement_px: number | null;
   usable_displacement_m: number | null;

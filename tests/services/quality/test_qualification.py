@@ -232,6 +232,59 @@ def test_points_that_state_large_sigmas_hide_no_error(registered, error, seed, s
     assert qualified(scene, replace(DEFAULT, good_coverage_percent=0.0)).verdict != "good"
 
 
+def test_a_scene_finer_than_its_chips_is_usable_by_the_limits_of_a_scene_as_coarse(registered):
+    scene = registered().adjusted()
+
+    def limits_m(control_gsd_m, needed_for):
+        on_chips = replace(scene, control_gsd_m=control_gsd_m)
+        criteria = qualify(on_chips, DEFAULT, np.random.default_rng(3)).criteria
+        names = ("residual_std_px", "displacement_px", "predicted_ce90_px")
+        limits = {c.name: c.limit * GSD_M for c in criteria if c.needed_for == needed_for}
+        return [pytest.approx(limits[name]) for name in names]
+
+    assert limits_m(2.0, "usable") == [4.0, 4.0, 6.0]
+    for finer_m in (0.0, 0.1, GSD_M):
+        assert limits_m(finer_m, "usable") == [1.0, 1.0, 1.5]
+    assert limits_m(2.0, "good") == limits_m(0.0, "good")
+
+
+def test_a_user_sets_a_limit_in_metres_alone(registered):
+    options = replace(DEFAULT, usable_ce90_px=0.0, usable_ce90_m=2.5)
+    scene = replace(registered().adjusted(), control_gsd_m=2.0)
+    criteria = qualify(scene, options, np.random.default_rng(3)).criteria
+    limit = next(c.limit for c in criteria if c.name == "predicted_ce90_px" and c.needed_for == "usable")
+    assert limit * GSD_M == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_worse_than_stated_make_a_scene_usable_that_says_so(registered, seed):
+    """60 points of 2.5 px that state 1 px: what the scene shows of them is in its accuracy."""
+    scene = registered(n=60, lost=0, wrong=0, seed=seed, stated_px=1.0, points_px=2.5)
+    result = qualified(scene)
+    assert result.verdict == "usable"
+    assert ("residual_std_px", "good") in failed(result)
+    note = next(c.note for c in result.criteria if c.name == "residual_std_px" and not c.met)
+    assert "times less accurate than they state" in note
+    place = np.array([[500.0, 500.0]])
+    error_px = scene.truth.apply(place) - scene.adjustment.correction.apply(place)
+    assert np.hypot(*error_px[0]) < 3.0 * result.predicted.median_px
+
+
+def test_worse_points_do_not_explain_a_bend_of_the_model(registered):
+    """What neighbours share is no error of theirs, however much worse than stated they look."""
+    measures = registered(n=300, lost=0, wrong=0).measures
+    wave_px = 4.0 * np.sin(measures.line_sample / 500.0)
+    bent = replace(measures, active=np.ones(300, dtype=bool), residual_px=wave_px)
+    assert unexplained_px(bent, np.full(2, 4.0 * 0.5)) > 2.0
+
+
+def test_few_points_of_which_many_disagree_are_not_usable(registered):
+    few = registered(n=18, lost=0, wrong=0)
+    disagreeing = replace(few.measures, active=np.arange(18) < 10)
+    assert ("active_of_matched", "usable") in failed(qualified(replace(few, measures=disagreeing)))
+    assert ("active_of_matched", "usable") not in failed(qualified(few))
+
+
 def test_stated_sigmas_of_the_points_move_no_limit(registered):
     scene = registered(n=100)
 
