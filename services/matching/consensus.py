@@ -13,13 +13,16 @@ from services.types import Array, BoolArray, IntArray
 MEDIAN_DISTANCE = float(np.sqrt(2.0 * np.log(2.0)))
 """Median distance from the centre of a circular normal distribution of unit sigma (1.177)."""
 
-MIN_FOR_SCATTER = 10
-"""Fewest inliers whose scatter is estimated well enough to replace the declared sigma."""
+MIN_FOR_SCATTER = 6
+"""Fewest inliers around whose affine field the scatter is estimated."""
 
 MIN_FOR_AFFINE = 6
 """Fewest measures from which an affine displacement field is estimated robustly."""
 
 MAX_SCALE_UPDATES = 4
+
+_AFFINE_FREEDOM = 3
+"""Measures that an affine field passes through."""
 
 _CELLS = 8
 """Cells along the side of a chip in which the area that chips cover is counted."""
@@ -253,7 +256,10 @@ def _scatter_px(
     """
     misfit = displacement - _affine_field(position, displacement, inliers)
     distance = np.hypot(*misfit[candidates].T)
-    return float(np.median(distance[distance <= reach_px]) / MEDIAN_DISTANCE)
+    near = distance[distance <= reach_px]
+    # An affine field of a few measures passes through them.
+    freedom = max(1.0 - _AFFINE_FREEDOM / len(near), 1.0 / len(near))
+    return float(np.median(near) / MEDIAN_DISTANCE / np.sqrt(freedom))
 
 
 def _affine_field(position: Array, displacement: Array, inliers: BoolArray) -> Array:

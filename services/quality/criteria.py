@@ -74,9 +74,9 @@ _DESCRIPTIONS = {
         "px",
         2,
         "Standard deviation of the active residuals (n - 1 in the denominator), the larger of x and y, "
-        "without the part that chance and the accuracy of the points explain: as stated for good, as the "
-        "scene shows it for usable, at most what separates neighbouring points. The limit of usable is in "
-        "pixels of the chips where these are coarser.",
+        "without the part that chance and the accuracy of the points explain: as stated for good, as "
+        "the scene shows it for usable, at most what separates neighbouring points. The limit of "
+        "usable is in pixels of the chips where these are coarser.",
     ),
     "displacement_px": _Description(
         "Displacement with fewer points",

@@ -162,6 +162,19 @@ def test_scattered_points_of_another_block_get_no_offset() -> None:
         assert inliers[60:].sum() <= 1
 
 
+@pytest.mark.parametrize("count", [16, 20])
+def test_few_points_worse_than_declared_are_kept(count: int) -> None:
+    """Three times worse: an affine field that passes through some of them does not cut the rest off."""
+    kept = []
+    for seed in range(30):
+        rng = np.random.default_rng([seed, count])
+        position = rng.uniform(0.0, 2000.0, (count, 2))
+        displacement = rng.normal(0.0, 3.0 * 2.0, (count, 2))
+        inliers, _ = robust_affine_inliers(position, displacement, np.ones(count, dtype=bool), 2.0)
+        kept.append(inliers.mean())
+    assert np.mean(kept) > 0.8
+
+
 def test_points_as_good_as_declared_have_a_scale_of_one() -> None:
     rng = np.random.default_rng(2)
     position = rng.uniform(0.0, 700.0, (80, 2))
