@@ -19,7 +19,8 @@ from services.adjustment.shared_errors import (
 from services.adjustment.structure import Structure
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection, LineProfile, no_correction
+from services.sensors.correction import ImageCorrection, no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray, IntArray
 
 _LOOSE_PX = 1000.0
@@ -56,8 +57,8 @@ class AdjustmentOptions:
         folds: of the cross-validation.
         prior_slope_sigma_px: a priori standard deviation of drift and skew at the edge of the image,
             pixels; the measures may raise it, never lower it.
-        profile: whether motion along the lines that the measures show is followed, where no order is
-            given; what is not followed is tested in any case.
+        profile: whether motion along lines and samples that the measures show is followed, where no
+            order is given; what is not followed is tested in any case.
     """
 
     order: Order | None = None
@@ -124,7 +125,7 @@ class SceneAdjustment:
         sigma0: a posteriori standard deviation of unit weight.
         point_sigma_px: (2,) contribution of the points' own accuracy to the active residuals, one
             standard deviation of line and sample.
-        components: of the profile along the lines; none for an affine correction.
+        components: of the displacement beyond the affine correction; none without one.
         structures: what the residuals of the correction still depend on, by family; none where it was
             not tested.
     """
@@ -231,10 +232,10 @@ def adjust_scene(
         chip_side_px=observations.chip_side_px,
     )
     expected, limit = fit.expected(slope_px), options.tolerance
-    along_lines: tuple[Structure, ...] = ()
+    along_axes: tuple[Structure, ...] = ()
     if like is None:
         clipped = fit.clipped(start, 2.0 * limit * scale)
-        components, along_lines = _components(
+        components, along_axes = _components(
             measured, fit, clipped, seen=seen, active=active, options=options
         )
     else:
@@ -242,8 +243,8 @@ def adjust_scene(
     shared_fit, of_shared = declared, agreeing
     if components:
         active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
-        followed = solve_profile(measured.residuals(fit, active), components, expected, shape[0] - 1.0)
-        shared_fit, of_shared = measured.without(followed.profile, declared), active
+        followed = solve_profile(measured.residuals(fit, active), components, expected, shape)
+        shared_fit, of_shared = measured.without(followed.displacement, declared), active
     shared = (
         like.shared
         if like
@@ -256,17 +257,17 @@ def adjust_scene(
             overlapping=measured.overlapping,
         )
     )
-    profile: LineProfile | None = None
+    displacement: DisplacementGrid | None = None
     if components:
         # As much noise and motion as the sigmas state, in the proportion that the residuals show.
         stated = float(np.mean((declared.variance / fit.variance)[active]))
         told = measured.residuals(declared, active, shared)
         moving = tuple(component.scaled(stated * shared.factor) for component in components)
-        solution = solve_profile(told, moving, expected, shape[0] - 1.0)
-        parameters, covariance, profile = (
+        solution = solve_profile(told, moving, expected, shape)
+        parameters, covariance, displacement = (
             solution.parameters,
             joined(solution.covariance),
-            solution.profile,
+            solution.displacement,
         )
         moving = tuple(component.scaled(stated) for component in components)
         chi2 = unit_variance(with_components(measured.residuals(declared, active), moving))
@@ -280,13 +281,13 @@ def adjust_scene(
             declared.scaled(shared.factor), active, free, slope_px, of_errors / shared.factor
         )
         sigma0 = _sigma0(declared, active, free, slope_px, _kept_variance(limit))
-    correction = replace(no_correction(shape), parameters=parameters[:, :3], profile=profile)
+    correction = replace(no_correction(shape), parameters=parameters[:, :3], displacement=displacement)
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
     deformation = np.zeros((6, 6))
     if observations.deformation_px2 is not None:
         deformation[:] = deformation_covariance(observations.deformation_px2, correction)
-    explained = measured.without(profile, fit) if profile else fit
+    explained = measured.without(displacement, fit) if displacement else fit
     misfit_px = (
         explained.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
     )
@@ -307,7 +308,7 @@ def adjust_scene(
         sigma0=sigma0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
         components=components,
-        structures=() if like else measured.structures(fit, active, components, shared, along_lines),
+        structures=() if like else measured.structures(fit, active, components, shared, along_axes),
     )
 
 
@@ -320,7 +321,7 @@ def _components(
     active: BoolArray,
     options: AdjustmentOptions,
 ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
-    """What the measures show that no affine correction follows, and what is left along the lines.
+    """What the measures show that no affine correction follows, and what is left along the axes.
 
     Args:
         measured: the measures.
@@ -331,17 +332,17 @@ def _components(
         options: whether it may be followed.
     """
     wanted = options.profile and options.order is None
-    components, along_lines = measured.components(fit, active, wanted=wanted)
+    components, along_axes = measured.components(fit, active, wanted=wanted)
     if components or not wanted or (seen & ~active).sum() < _LEFT_OUT:
-        return components, along_lines
+        return components, along_axes
     # What lies beside a step agrees with itself, and was left out.
     components, _ = measured.components(clipped, seen)
     if not components:
-        return (), along_lines
+        return (), along_axes
     expected = fit.expected(np.inf)
     agreeing = measured.agreeing(fit, seen, components, expected, options.tolerance)
-    again, along_lines = measured.components(fit, agreeing)
-    return again or components, along_lines
+    again, along_axes = measured.components(fit, agreeing)
+    return again or components, along_axes
 
 
 def _declared_fit(

@@ -1,10 +1,11 @@
-"""A displacement along the lines of an image: what a scanner does that no affine correction follows.
+"""A displacement along lines and samples: what scanners and optics do that no affine correction follows.
 
-The displacement of each coordinate is a Gaussian process of the line, a sum of components: smooth ones
-(bow, slow attitude), narrow bands (jitter) and steps (lost or repeated lines). A component is added as
-long as the residuals show one that chance does not explain and that predicts blocks of lines which were
-held out. Kernels and variances are those of the largest restricted likelihood (Patterson and Thompson,
-1971); estimate and covariance are those of universal kriging.
+The displacement of each coordinate is a sum of Gaussian processes of the line or the sample, the
+components: smooth ones (bow, slow attitude, distortion of the optics), narrow bands (jitter) and steps
+(lost or repeated lines). A component is added as long as the residuals show one
+that chance does not explain and that predicts blocks of lines or samples which were held out. Kernels
+and variances are those of the largest restricted likelihood (Patterson and Thompson, 1971); estimate and
+covariance are those of universal kriging.
 """
 
 from collections.abc import Sequence
@@ -14,26 +15,39 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import null_space, solve_triangular
 
-from services.adjustment.structure import ALONG_LINES, Residuals, Structure, structures
+from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
 from services.types import Array, IntArray
+
+Along = Literal["lines", "samples"]
+"""Of which a displacement is a function."""
+_AXIS: dict[Along, int] = {"lines": 0, "samples": 1}
+_FOLLOWED_BY: dict[Along, tuple[Family, ...]] = {"lines": ("lines", "steps"), "samples": ("samples",)}
+"""Structures that components along lines and samples may explain."""
 
 MAX_CHANCE = 0.002
 """Structure that chance explains with a larger probability is not looked into."""
 _MOST_COMPONENTS = 3
 _MOST_POINTS = 200
 """Measures that choose a kernel; more cost more and tell little more."""
+_ROUNDS = 2
+"""In which components that are found one after the other are estimated again beside each other."""
 _LEAST_EVIDENCE = 4.0
 """Logarithm of how many times more likely a component makes the residuals, at least."""
 _BLOCKS = 40
-"""Blocks of lines of the cross-validation."""
+"""Blocks of lines, or of samples, of the cross-validation."""
 _LEAST_GAIN = 0.97
 """Residuals of held-out blocks with a component over those without, at most."""
 _LOOSE = 100.0
 """Variance of components, over the likeliest one, for tests of what they leave."""
 _RATIOS = np.concatenate([[0.0], np.geomspace(0.03, 3000.0, 21)])
 """Variances of a component that are tried, over the median variance of the measures."""
-_LENGTHS = (0.04, 0.08, 0.15, 0.3, 0.6, 1.2)
-"""Correlation lengths of smooth components, extents of the points along the lines."""
+_LENGTHS: dict[Along, tuple[float, ...]] = {
+    "lines": (0.04, 0.08, 0.15, 0.3, 0.6, 1.2),
+    "samples": (0.6, 1.2),
+}
+"""Correlation lengths of smooth components, extents of the points along the axis.
+
+Seams between detectors are shorter than what optics do, and no smooth displacement."""
 _COHERENCE = (0.15, 0.4, 2.0)
 """Lengths over which a narrow band keeps its phase, the same."""
 _LEAST_SEEN = 0.4
@@ -46,15 +60,16 @@ _ISOTROPIC = (0.05, 0.1, 0.2)
 
 @dataclass(frozen=True)
 class Component:
-    """One component of a profile.
+    """One component of a displacement.
 
     Attributes:
         kind: "smooth", "period" or "step".
         length_px: over which it is correlated; of a step, the width of the gap that holds it.
-        at_px: period; first line of the gap that holds a step.
+        at_px: period; first line, or sample, of the gap that holds a step.
         variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
             are true: what these are off by, it is off by, too.
-        seen: share of the amplitude that chips show, which average over their lines.
+        seen: share of the amplitude that chips show, which average over their pixels.
+        along: lines or samples.
     """
 
     kind: Literal["smooth", "period", "step"]
@@ -62,20 +77,32 @@ class Component:
     at_px: float
     variance_px2: Array
     seen: float = 1.0
+    along: Along = "lines"
+
+    @property
+    def axis(self) -> int:
+        """Of the positions that it depends on: 0 along lines, 1 along samples."""
+        return _AXIS[self.along]
+
+    def share(self, line_sample: Array) -> Array:
+        """Share (...) of its variance at positions (..., 2): before a step there is none."""
+        position = line_sample[..., self.axis]
+        if self.kind == "step":
+            return np.clip((position - self.at_px) / self.length_px, 0.0, 1.0)
+        return np.ones_like(position)
 
     def correlation(self, first: Array, second: Array) -> Array:
-        """Correlation (m, n) of the displacements at lines (m,) and (n,)."""
+        """Correlation (m, n) of the displacements at positions (m, 2) and (n, 2)."""
         if self.kind == "step":
-            before = np.minimum(first[:, None], second[None, :])
-            return np.clip((before - self.at_px) / self.length_px, 0.0, 1.0)
-        apart = first[:, None] - second[None, :]
+            return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
+        apart = first[:, self.axis][:, None] - second[:, self.axis][None, :]
         smooth = np.exp(-0.5 * (apart / self.length_px) ** 2)
         if self.kind == "smooth":
             return np.asarray(smooth)
         return np.asarray(smooth * np.cos(2.0 * np.pi * apart / self.at_px))
 
     def covariance(self, first: Array, second: Array) -> Array:
-        """Covariance (2, m, n) of what chips show, of line and sample."""
+        """Covariance (2, m, n) of what chips show at positions (m, 2) and (n, 2), of line and sample."""
         return np.asarray(self.variance_px2[:, None, None] * self.correlation(first, second))
 
     def scaled(self, factor: float) -> "Component":
@@ -99,37 +126,58 @@ class _Judged:
 def likeliest_components(
     residuals: Residuals, extent_px: float
 ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
-    """The components that residuals of an affine correction show, and what they leave along lines.
+    """The components that residuals of an affine correction show, and what they leave along the axes.
 
     Args:
         residuals: of the active measures.
         extent_px: side of the image, to which errors that neighbours share are compared.
     """
-    line = residuals.line_sample[:, 0]
-    blocks = line_blocks(line, max(residuals.chip_side_px, float(np.ptp(line)) / _BLOCKS))
     components: list[Component] = []
+    told = 0.0
+    affine = found = structures(residuals, ALONG_AXES)
     while True:
-        found = structures(beyond(residuals, components), ALONG_LINES)
         clearest = min(found, key=lambda one: one.chance)
         if clearest.chance > MAX_CHANCE or len(components) == _MOST_COMPONENTS:
             break
         followed = with_components(residuals, components)
-        component = _likeliest(followed, found, extent_px, alone=not components)
-        if component is None:
+        thinned = _thinned(followed)
+        best = _System.of(thinned).best(_candidates(thinned, found))
+        if best.component is None or best.log_evidence <= _LEAST_EVIDENCE:
             break
-        richer = with_components(followed, [component])
+        richer = with_components(followed, [best.component])
+        blocks = _blocks(residuals, best.component)
         if held_out_rms(richer, blocks) > _LEAST_GAIN * held_out_rms(followed, blocks):
             break
-        components.append(component)
+        told += best.log_evidence
+        components = _again(residuals, [*components, best.component])
+        found = structures(beyond(residuals, components), ALONG_AXES)
+    if components and told <= _LEAST_EVIDENCE + _of_shared_errors(residuals, extent_px):
+        return (), affine
     return tuple(components), found
+
+
+def _again(residuals: Residuals, components: list[Component]) -> list[Component]:
+    """The same components, each as likely as it can be beside the others.
+
+    What was not yet followed when a component was found looked like noise, beside which it was small.
+    """
+    if len(components) == 1:
+        return components
+    thinned = _thinned(residuals)
+    for k in list(range(len(components))) * _ROUNDS:
+        one = components[k]
+        beside = with_components(thinned, components[:k] + components[k + 1 :])
+        variants = _smooth(thinned, one.along) if one.kind == "smooth" else [one]
+        components[k] = _System.of(beside).best(variants).component or one
+    return components
 
 
 def with_components(residuals: Residuals, components: Sequence[Component]) -> Residuals:
     """The same residuals, of which the covariance holds what the components displace."""
-    line = residuals.line_sample[:, 0]
+    place = residuals.line_sample
     covariance = residuals.covariance.copy()
     for component in components:
-        covariance += component.covariance(line, line)
+        covariance += component.covariance(place, place)
     return replace(residuals, covariance=covariance)
 
 
@@ -144,9 +192,13 @@ def unit_variance(residuals: Residuals) -> float:
     return float((left**2).sum() / max(left.size - 2 * bases.shape[2], 1))
 
 
-def line_blocks(line: Array, length: float) -> IntArray:
-    """Number (n,) of the block of `length` lines that each line lies in."""
-    return np.unique(np.floor((line - line.min()) / length), return_inverse=True)[1].astype(np.int64)
+def _blocks(residuals: Residuals, component: Component) -> IntArray:
+    """Number (n,) of the block of lines, or of samples, that each measure lies in."""
+    position = residuals.line_sample[:, component.axis]
+    length = max(residuals.chip_side_px, float(np.ptp(position)) / _BLOCKS)
+    return np.unique(np.floor((position - position.min()) / length), return_inverse=True)[1].astype(
+        np.int64
+    )
 
 
 def held_out_rms(residuals: Residuals, blocks: IntArray) -> float:
@@ -164,24 +216,13 @@ def held_out_rms(residuals: Residuals, blocks: IntArray) -> float:
     return float(np.sqrt(np.mean(np.minimum(square, 9.0 * np.median(square)))))
 
 
-def _likeliest(
-    residuals: Residuals, found: Sequence[Structure], extent_px: float, *, alone: bool
-) -> Component | None:
-    """The component that makes the residuals most likely; None where shared errors do better."""
+def _of_shared_errors(residuals: Residuals, extent_px: float) -> float:
+    """Logarithm of how much more likely errors that neighbours share make the residuals; 0 at least."""
     thinned = _thinned(residuals)
     system = _System.of(thinned)
-    line = thinned.line_sample[:, 0]
-    candidates = [
-        system.judge(component, component.correlation(line, line))
-        for component in _candidates(thinned, found)
-    ]
-    best = max(candidates, key=lambda one: one.log_evidence)
-    least = _LEAST_EVIDENCE
-    if alone:
-        distance = np.linalg.norm(thinned.line_sample[:, None] - thinned.line_sample[None], axis=2)
-        shared = [system.judge(None, np.exp(-distance / (one * extent_px))) for one in _ISOTROPIC]
-        least += max(0.0, max(one.log_evidence for one in shared))
-    return best.component if best.log_evidence > least else None
+    distance = np.linalg.norm(thinned.line_sample[:, None] - thinned.line_sample[None], axis=2)
+    shared = [system.judge(None, np.exp(-distance / (one * extent_px))) for one in _ISOTROPIC]
+    return max(0.0, max(one.log_evidence for one in shared))
 
 
 def _thinned(residuals: Residuals) -> Residuals:
@@ -201,20 +242,40 @@ def _thinned(residuals: Residuals) -> Residuals:
 
 def _candidates(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
     """Components of unit variance that may explain a structure."""
-    line = residuals.line_sample[:, 0]
-    extent = max(float(np.ptp(line)), 1e-9)
+    candidates = []
+    for along, families in _FOLLOWED_BY.items():
+        shown = [one for one in found if one.family in families]
+        if min(one.chance for one in shown) <= MAX_CHANCE:
+            candidates += _smooth(residuals, along)
+            if along == "lines":
+                candidates += _sharp(residuals, shown)
+    return candidates
+
+
+def _smooth(residuals: Residuals, along: Along) -> list[Component]:
+    """Smooth components of unit variance."""
+    side = residuals.chip_side_px
+    extent = max(float(np.ptp(residuals.line_sample[:, _AXIS[along]])), 1e-9)
+    lengths = [length * extent for length in _LENGTHS[along] if length * extent >= 0.5 * side]
+    seen = [(1.0 + (side / length) ** 2 / 12.0) ** -0.5 for length in lengths]
+    return [
+        Component("smooth", length, np.nan, np.ones(2), part, along)
+        for length, part in zip(lengths, seen, strict=True)
+    ]
+
+
+def _sharp(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
+    """Jitter and steps along the lines, of unit variance, that may explain a structure."""
+    position = residuals.line_sample[:, 0]
+    extent = max(float(np.ptp(position)), 1e-9)
     one = np.ones(2)
     side = residuals.chip_side_px
-    lengths = [length * extent for length in _LENGTHS if length * extent >= 0.5 * side]
-    candidates = [
-        Component("smooth", length, np.nan, one, (1.0 + (side / length) ** 2 / 12.0) ** -0.5)
-        for length in lengths
-    ]
+    candidates = []
     for structure in found:
         if structure.shape == "period":
             frequency = 1.0 / structure.at + np.arange(-_FINE // 2, _FINE // 2 + 1) / (_FINE * extent)
             periods = 1.0 / frequency[frequency > 0.25 / extent]
-            phase = 2.0 * np.pi * line / periods[:, None]
+            phase = 2.0 * np.pi * position / periods[:, None]
             gain, _ = residuals.gains(np.stack([np.cos(phase), np.sin(phase)], axis=-1))
             period = float(periods[np.argmax(gain)])
             seen = float(np.sinc(side / period))
@@ -222,10 +283,11 @@ def _candidates(residuals: Residuals, found: Sequence[Structure]) -> list[Compon
                 continue
             candidates += [Component("period", one_ * extent, period, one, seen) for one_ in _COHERENCE]
         elif structure.shape == "step":
-            ordered = np.unique(line)
+            ordered = np.unique(position)
             after = int(np.searchsorted(ordered, structure.at))
             start = float(ordered[after - 1])
-            candidates.append(Component("step", float(ordered[after]) - start, start, one))
+            width = float(ordered[after]) - start
+            candidates.append(Component("step", width, start, one))
     return candidates
 
 
@@ -234,12 +296,14 @@ class _System:
     """Whitened measures of each coordinate, without what the design explains.
 
     Attributes:
+        place: (n, 2) line and sample.
         lower: (2, n, n) Cholesky factors of the covariance.
         rest: (2, n, n - k) bases of what the design leaves.
         left: (2, n - k) measures in them.
         unit_px2: (2,) median variance of a measure.
     """
 
+    place: Array
     lower: Array
     rest: Array
     left: Array
@@ -256,7 +320,14 @@ class _System:
             rest.append(basis)
             left.append(basis.T @ white[:, -1])
         diagonal = np.diagonal(residuals.covariance, 0, 1, 2)
-        return cls(lower, np.array(rest), np.array(left), np.median(diagonal, axis=1))
+        return cls(
+            residuals.line_sample, lower, np.array(rest), np.array(left), np.median(diagonal, axis=1)
+        )
+
+    def best(self, candidates: Sequence[Component]) -> _Judged:
+        """The most likely of some components, with its likeliest variances."""
+        judged = [self.judge(one, one.correlation(self.place, self.place)) for one in candidates]
+        return max(judged, key=lambda one: one.log_evidence, default=_Judged(None, 0.0))
 
     def judge(self, component: Component | None, correlation: Array) -> _Judged:
         """The likeliest variances of a component with this correlation (n, n), and its evidence."""

@@ -9,9 +9,10 @@ from services.adjustment.affine_fit import AffineFit
 from services.adjustment.line_profile import Component, beyond, likeliest_components
 from services.adjustment.profile_solution import agreeing_with
 from services.adjustment.shared_errors import SharedErrors, overlap_correlation
-from services.adjustment.structure import ALONG_LINES, OTHERWISE, Residuals, Structure, structures
+from services.adjustment.structure import ALONG_AXES, OTHERWISE, Residuals, Structure, structures
 from services.sensors.base import SensorModel
-from services.sensors.correction import LineProfile, no_correction
+from services.sensors.correction import no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.sensors.ortho import OrthoModel
 from services.types import Array, BoolArray
 
@@ -91,7 +92,7 @@ class PlacedMeasures:
     def components(
         self, fit: AffineFit, rows: BoolArray, *, wanted: bool = True
     ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
-        """What a scanner did that no affine correction follows, and what is left along the lines.
+        """What no affine correction follows, and what is left along lines and samples.
 
         Args:
             fit: of the measures.
@@ -100,7 +101,7 @@ class PlacedMeasures:
         """
         residuals = self.residuals(fit, rows)
         if not (wanted and self.scanned):
-            return (), structures(residuals, ALONG_LINES)
+            return (), structures(residuals, ALONG_AXES)
         return likeliest_components(residuals, self.size_px)
 
     def agreeing(
@@ -116,9 +117,9 @@ class PlacedMeasures:
         out[rows] = agreeing_with(self.residuals(fit, rows), components, expected, tolerance)
         return out
 
-    def without(self, profile: LineProfile, fit: AffineFit) -> AffineFit:
-        """A fit of what a profile leaves, as chips show it."""
-        shown = profile.averaged(self.position_px[:, 0], self.chip_side_px)
+    def without(self, displacement: DisplacementGrid, fit: AffineFit) -> AffineFit:
+        """A fit of what a displacement leaves, as chips show it."""
+        shown = displacement.averaged(self.position_px, self.chip_side_px)
         return replace(fit, misfit=fit.misfit - shown)
 
     def structures(
@@ -127,7 +128,7 @@ class PlacedMeasures:
         active: BoolArray,
         components: tuple[Component, ...],
         shared: SharedErrors,
-        along_lines: tuple[Structure, ...],
+        along_axes: tuple[Structure, ...],
     ) -> tuple[Structure, ...]:
         """What the residuals still depend on, beside errors that neighbours clearly share.
 
@@ -136,10 +137,10 @@ class PlacedMeasures:
             active: (n,) those that are used.
             components: of the profile.
             shared: errors that neighbours share.
-            along_lines: what the components leave, where neighbours share nothing.
+            along_axes: what the components leave, where neighbours share nothing.
         """
         clear = shared.clear_share > 0.0
         residuals = beyond(self.residuals(fit, active, shared if clear else None), components)
         if clear or components:
-            along_lines = structures(residuals, ALONG_LINES)
-        return along_lines + structures(residuals, OTHERWISE)
+            along_axes = structures(residuals, ALONG_AXES)
+        return along_axes + structures(residuals, OTHERWISE)

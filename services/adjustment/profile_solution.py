@@ -1,13 +1,14 @@
-"""The correction with a profile along the lines: estimate and covariance by universal kriging."""
+"""A correction with a displacement beyond the affine one: universal kriging, with its covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.line_profile import Component, with_components
+from services.adjustment.line_profile import Along, Component, with_components
 from services.adjustment.structure import Residuals
-from services.sensors.correction import LineProfile
+from services.sensors.correction import no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray
 
 _MEDIAN_OF_LARGER = 1.0512
@@ -16,22 +17,30 @@ _AS_BAD = 0.8
 """Share of the worst residual from which on measures are dropped with it."""
 _NODES_A_PERIOD = 32
 _NODES_A_LENGTH = 8
-_FEWEST_NODES, _MOST_NODES = 65, 1025
+_NODES_A_GAP = 9
+_FEWEST_NODES = 33
+_MOST_NODES = 1025, 129
+"""Along the lines, which shake, and along the samples."""
+_WHERE: dict[Along, tuple[slice, slice]] = {
+    "lines": (slice(None), slice(1)),
+    "samples": (slice(1), slice(None)),
+}
+"""Nodes that differ for components along the lines and along the samples."""
 
 
 @dataclass(frozen=True)
 class ProfileSolution:
-    """A correction with a profile.
+    """A correction with a displacement beyond the affine one.
 
     Attributes:
         parameters: (2, k) of the design.
         covariance: (2, k, k) of them.
-        profile: along the lines.
+        displacement: on a grid.
     """
 
     parameters: Array
     covariance: Array
-    profile: LineProfile
+    displacement: DisplacementGrid
 
 
 def agreeing_with(
@@ -69,43 +78,56 @@ def agreeing_with(
 
 
 def solve_profile(
-    residuals: Residuals, components: Sequence[Component], expected: Array, last_line: float
+    residuals: Residuals, components: Sequence[Component], expected: Array, shape: tuple[int, int]
 ) -> ProfileSolution:
-    """Estimate and covariance of parameters and profile.
+    """Estimate and covariance of parameters and displacement.
 
     Args:
         residuals: of the active measures, whose covariance holds all their errors.
-        components: of the profile.
+        components: of the displacement.
         expected: (2, k) a priori weights of the parameters.
-        last_line: of the image; the profile reaches from line 0 to it.
+        shape: lines and samples of the image, which the nodes cover.
     """
-    line = residuals.line_sample[:, 0]
-    nodes = _nodes(components, line, last_line)
+    line, sample = _nodes(components, residuals.line_sample, shape)
+    nodes = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
+    frame = no_correction(shape)
+    t = np.concatenate([np.ones((*nodes.shape[:2], 1)), (nodes - frame.centre) / frame.half_size], -1)
+    # What moves whole lines is the same at all nodes of a line: one column is enough.
+    parts = [
+        (nodes[_WHERE[along]], [one for one in components if one.along == along])
+        for along in dict.fromkeys(one.along for one in components)
+    ]
     full = with_components(residuals, components)
-    parameters, covariance, displacement, variance, cross = [], [], [], [], []
+    parameters, covariance, displacement, variance = [], [], [], []
     for k in range(2):
         inverse = np.linalg.inv(full.covariance[k])
         weighted = inverse @ full.design
         own = np.linalg.pinv(full.design.T @ weighted + np.diag(expected[k]), hermitian=True)
         value = own @ (weighted.T @ full.misfit[:, k])
-        seen = np.zeros((len(nodes), len(line)))
-        unseen = np.zeros(len(nodes))
-        for component in components:
-            of_both = component.variance_px2[k] / component.seen
-            seen += of_both * component.correlation(nodes, line)
-            unseen += of_both / component.seen * np.diag(component.correlation(nodes, nodes))
-        gain = seen @ inverse
-        moved = gain @ full.design
+        rest = full.misfit[:, k] - full.design @ value
+        seen = [_seen(places, some, k, residuals.line_sample) for places, some in parts]
+        gain = [one @ inverse for one in seen]
+        moved = sum(one @ full.design for one in gain)
+        explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
+        unseen = sum(one.variance_px2[k] / one.seen**2 * one.share(nodes) for one in components)
+        of_parameters = moved @ own
+        spread = unseen - explained + (of_parameters * moved).sum(axis=-1)
+        cross = -(of_parameters[..., :3] * t).sum(axis=-1)
         parameters.append(value)
         covariance.append(own)
-        displacement.append(gain @ (full.misfit[:, k] - full.design @ value))
-        spread = unseen - (gain * seen).sum(axis=1) + ((moved @ own) * moved).sum(axis=1)
-        variance.append(np.maximum(spread, 0.0))
-        cross.append(-(moved @ own)[:, :3])
-    profile = LineProfile(
-        nodes, np.stack(displacement, axis=-1), np.stack(variance, axis=-1), np.stack(cross, axis=1)
+        displacement.append(np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2]))
+        variance.append(np.maximum(spread, 0.0) + 2.0 * cross)
+    grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1))
+    return ProfileSolution(np.array(parameters), np.array(covariance), grid)
+
+
+def _seen(places: Array, components: Sequence[Component], k: int, line_sample: Array) -> Array:
+    """Covariance (k, m, n) of a coordinate at places (k, m, 2) with what chips show at points (n, 2)."""
+    flat = places.reshape(-1, 2)
+    total = sum(
+        one.variance_px2[k] / one.seen * one.correlation(flat, line_sample) for one in components
     )
-    return ProfileSolution(np.array(parameters), np.array(covariance), profile)
+    return np.asarray(total).reshape(*places.shape[:2], -1)
 
 
 def joined(covariance: Array) -> Array:
@@ -115,20 +137,25 @@ def joined(covariance: Array) -> Array:
     return both
 
 
-def _nodes(components: Sequence[Component], line: Array, last_line: float) -> Array:
-    """Lines (k,) of the nodes: close enough for the shortest component, and at the points."""
-    low, high = min(0.0, float(line.min())), max(last_line, float(line.max()))
-    steps = [
-        one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH
-        for one in components
-        if one.kind != "step"
-    ]
-    count = (high - low) / min(steps, default=high - low)
-    even = np.linspace(low, high, int(np.clip(count, _FEWEST_NODES, _MOST_NODES)))
-    gaps = [
-        edge
-        for one in components
-        if one.kind == "step"
-        for edge in (one.at_px, one.at_px + one.length_px)
-    ]
-    return np.unique(np.concatenate([even, gaps]))
+def _nodes(
+    components: Sequence[Component], line_sample: Array, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Lines (k,) and samples (m,) of the nodes: close enough for short components, and at steps."""
+    both = []
+    for axis, most in enumerate(_MOST_NODES):
+        low = min(0.0, float(line_sample[:, axis].min()))
+        high = max(shape[axis] - 1.0, float(line_sample[:, axis].max()))
+        along = [one for one in components if one.axis == axis]
+        steps = [
+            one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH
+            for one in along
+            if one.kind != "step"
+        ]
+        gaps = [
+            np.linspace(one.at_px, one.at_px + one.length_px, _NODES_A_GAP)
+            for one in along
+            if one.kind == "step"
+        ]
+        count = int(np.clip((high - low) / min(steps), _FEWEST_NODES, most)) if steps else 2
+        both.append(np.unique(np.concatenate([np.linspace(low, high, count), *gaps])))
+    return both[0], both[1]

@@ -21,9 +21,9 @@ from scipy.special import fdtrc
 from services.types import Array
 
 Family = Literal["lines", "samples", "steps", "image", "height"]
-"""What residuals may depend on; steps are places along the lines."""
-ALONG_LINES: tuple[Family, ...] = ("lines", "steps")
-OTHERWISE: tuple[Family, ...] = ("samples", "image", "height")
+"""What residuals may depend on; "steps" are those along the lines."""
+ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples")
+OTHERWISE: tuple[Family, ...] = ("image", "height")
 
 _LEAST_POINTS = 12
 """Fewer residuals show no structure."""

@@ -201,8 +201,8 @@ def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -
         lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
-    profile = prediction.model.correction.profile
-    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m, profile), tolerance_px
+    displacement = prediction.model.correction.displacement
+    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m, displacement), tolerance_px
 
 
 def build_registration(

@@ -28,7 +28,8 @@ from services.matching.control_points import PointMatches
 from services.quality.frames import shared_frame
 from services.registration.context import Candidate, NotFound, Prediction, SearchStage
 from services.sensors.base import SensorModel
-from services.sensors.correction import CorrectedModel, LineProfile
+from services.sensors.correction import CorrectedModel
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray, ControlPoints, IntArray
 
 FIRST_TOLERANCE_PX = 3.0
@@ -49,7 +50,7 @@ class Search:
         matches: of the points tried.
         inliers: (k,) points that agree on one displacement of the image.
         chip_side_m: side on the ground of the chips that were searched.
-        profile: of the model of the search, along the lines; None where it has none.
+        displacement: of the model of the search, beyond an affine one; None where it has none.
     """
 
     points: ControlPoints
@@ -57,7 +58,7 @@ class Search:
     matches: PointMatches
     inliers: BoolArray
     chip_side_m: float
-    profile: LineProfile | None = None
+    displacement: DisplacementGrid | None = None
 
 
 def largest_error_m(uncertainty_m: Array) -> float:
@@ -103,10 +104,10 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
     shared_m2 = shared_frame(search.points, usable).shared_m2
     chip_side_px = search.chip_side_m * float(abs(np.linalg.det(ground_to_px)) ** 0.5)
     line_sample = matches.line_sample
-    if search.profile is not None:
-        # Chips average over their lines: what they were compared through, they did not.
-        line = scene.model.project(search.points.lon_lat_h)[:, 0]
-        followed = search.profile.at(line) - search.profile.averaged(line, chip_side_px)
+    if search.displacement is not None:
+        # Chips average over their pixels: what they were compared through, they did not.
+        place = scene.model.project(search.points.lon_lat_h)
+        followed = search.displacement.at(place) - search.displacement.averaged(place, chip_side_px)
         line_sample = line_sample - followed
     return ControlObservations(
         lon_lat_h=search.points.lon_lat_h,

@@ -158,21 +158,22 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
         f" ({np.hypot(line, sample) * gsd_m:.2f} m)"
         for name, line, sample in parts
     ]
-    profile = adjustment.correction.profile
-    if profile is not None:
-        line, sample = np.ptp(profile.displacement_px, axis=0)
+    displacement = adjustment.correction.displacement
+    if displacement is not None:
+        line, sample = np.ptp(displacement.displacement_px, axis=(0, 1))
         kinds = ", ".join(map(_component_in_words, adjustment.components))
         sentences.append(
-            f"profile along the lines ({kinds}): within {line:.2f} px in line, {sample:.2f} px in sample"
+            f"beyond the affine correction, {kinds}: within {line:.2f} px in line, {sample:.2f} px in "
+            "sample"
         )
     return tuple(sentences)
 
 
 def _component_in_words(component: Component) -> str:
-    """What a component of the profile is."""
+    """What a component of the displacement is."""
     if component.kind == "step":
         last = component.at_px + component.length_px
-        return f"a step between the lines {component.at_px:.0f} and {last:.0f}"
+        return f"a step between the {component.along} {component.at_px:.0f} and {last:.0f}"
     if component.kind == "period":
-        return f"jitter with a period of {component.at_px:.0f} lines"
-    return f"a bend that changes over {component.length_px:.0f} lines"
+        return f"jitter with a period of {component.at_px:.0f} {component.along}"
+    return f"a bend that changes over {component.length_px:.0f} {component.along}"

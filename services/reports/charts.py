@@ -122,33 +122,32 @@ def residuals_along(report: RegistrationReport) -> Figure:
     return figure
 
 
-def line_profile(report: RegistrationReport) -> Figure:
-    """The profile of the correction along the lines with twice its sigma, and what points show of it."""
+def displacement(report: RegistrationReport) -> Figure:
+    """What the correction follows beyond an affine one, and what points show of it."""
     figure = Figure(274.0)
-    profile = report.figure_data.profile
-    if profile is None:
+    sections, measures = report.figure_data.sections, report.figure_data.measures
+    if not sections:
         return figure
-    measures = report.figure_data.measures
-    line = measures.predicted[measures.active, 0]
-    shown = measures.residual_px[measures.active] + profile.at(line)
-    sigma = np.sqrt(profile.variance_px2)
-    last = float(report.scene.lines)
-    y_ranges = [data_range(shown[:, k]) for k in range(2)]
+    place = measures.predicted[measures.active]
+    residual = measures.residual_px[measures.active]
+    shown = [residual + one.at(place[:, one.axis]) for one in sections]
+    y_ranges = [data_range(np.concatenate([one[:, k] for one in shown])) for k in range(2)]
     left = max(map(left_margin, y_ranges))
-    for k, name in enumerate(("y (line)", "x (sample)")):
-        y_range = y_ranges[k]
-        panel = Panel(figure, left, 6.0 + k * 118.0, WIDTH - left - 8.0, 108.0, (0.0, last), y_range)
-        panel.x_axis("line" if k == 1 else "", numbers=k == 1)
-        panel.y_axis(f"{name}, px")
-        value = profile.displacement_px[:, k]
-        low, high = value - 2.0 * sigma[:, k], value + 2.0 * sigma[:, k]
-        around = np.concatenate(
-            [panel.places(profile.line, high), panel.places(profile.line, low)[::-1]]
-        )
-        with panel.clipped():
-            figure.area(around, DEACTIVATED, 0.25)
-            figure.discs(panel.places(line, shown[:, k]), 3.0, ACTIVE, 0.7)
-            figure.line(panel.places(profile.line, value), DEACTIVATED, 1.4)
+    width = (WIDTH - left - 8.0 + _GAP) / len(sections) - _GAP
+    for j, section in enumerate(sections):
+        x_range = (0.0, float(report.scene.shape[section.axis]))
+        for k, name in enumerate(("y (line)", "x (sample)")):
+            top = 6.0 + k * 118.0
+            panel = Panel(figure, left + j * (width + _GAP), top, width, 108.0, x_range, y_ranges[k])
+            panel.x_axis(("line", "sample")[section.axis] if k == 1 else "", numbers=k == 1)
+            panel.y_axis(f"{name}, px" if j == 0 else "", numbers=j == 0)
+            value, sigma = section.displacement_px[:, k], section.sigma_px[:, k]
+            above = panel.places(section.position, value + 2.0 * sigma)
+            below = panel.places(section.position, value - 2.0 * sigma)
+            with panel.clipped():
+                figure.area(np.concatenate([above, below[::-1]]), DEACTIVATED, 0.25)
+                figure.discs(panel.places(place[:, section.axis], shown[j][:, k]), 3.0, ACTIVE, 0.7)
+                figure.line(panel.places(section.position, value), DEACTIVATED, 1.4)
     return figure
 
 

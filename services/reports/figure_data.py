@@ -5,15 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene
 from services.imagery.source import reduce_image, render_chip
 from services.registration.on_points import Registration
-from services.sensors.correction import LineProfile
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, ChipArray, ChipSource, ControlPoints, FloatImage, Measures, point_chips
 
 QUICKLOOK_PX = 1200
 PAIRS_EACH = 6
 """Chip pairs of the best, of the middle and of the worst scores."""
+_NODES_OF_NO_CHANGE = 2
+"""Of a displacement along an axis that it does not change along."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,28 @@ class ChipPair:
 
 
 @dataclass(frozen=True)
+class Section:
+    """The displacement of a correction along a line or a column through the middle of the image.
+
+    Attributes:
+        axis: 0 along the lines, 1 along the samples.
+        position: (k,) lines or samples.
+        displacement_px: (k, 2) line and sample, beyond the affine correction.
+        sigma_px: (k, 2) of the corrected model there.
+    """
+
+    axis: int
+    position: Array
+    displacement_px: Array
+    sigma_px: Array
+
+    def at(self, position: Array) -> Array:
+        """Displacement (n, 2) at lines or samples (n,)."""
+        columns = self.displacement_px.T
+        return np.stack([np.interp(position, self.position, one) for one in columns], axis=-1)
+
+
+@dataclass(frozen=True)
 class FigureData:
     """What the figures of the page draw; it is not part of report.json.
 
@@ -60,13 +85,15 @@ class FigureData:
         measures: one row for every point that the scene could show.
         quicklook: the scene reduced; None when there is none.
         gallery: chips beside the scene; the page shows the best, middle and worst scores.
-        profile: of the correction, along the lines; None where it is affine.
+        displacement: of the correction; None where it is affine.
+        sections: of it, along the axes that it changes along.
     """
 
     measures: Measures
     quicklook: Quicklook | None
     gallery: tuple[ChipPair, ...]
-    profile: LineProfile | None = None
+    displacement: DisplacementGrid | None = None
+    sections: tuple[Section, ...] = ()
 
 
 def figure_data(
@@ -81,8 +108,28 @@ def figure_data(
         registration: of the scene.
     """
     gallery = _gallery(scene, points, chips, registration)
-    profile = registration.adjustment.correction.profile
-    return FigureData(registration.measures, _quicklook(scene), gallery, profile)
+    return FigureData(
+        registration.measures,
+        _quicklook(scene),
+        gallery,
+        registration.adjustment.correction.displacement,
+        displacement_sections(registration.adjustment),
+    )
+
+
+def displacement_sections(adjustment: SceneAdjustment) -> tuple[Section, ...]:
+    """The displacement of a correction along each axis that it changes along; none of an affine one."""
+    correction = adjustment.correction
+    grid = correction.displacement
+    sections = []
+    for axis, nodes in enumerate((grid.line, grid.sample) if grid else ()):
+        if len(nodes) > _NODES_OF_NO_CHANGE and grid is not None:
+            places = np.tile(correction.centre, (len(nodes), 1))
+            places[:, axis] = nodes
+            covariance = adjustment.covariance_at(correction.apply(places))
+            sigma_px = np.sqrt(np.diagonal(covariance, 0, 1, 2))
+            sections.append(Section(axis, nodes, grid.at(places), sigma_px))
+    return tuple(sections)
 
 
 def _quicklook(scene: Scene) -> Quicklook:

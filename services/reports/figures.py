@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from services.reports.charts import (
+    displacement,
     funnel,
-    line_profile,
     residual_histograms,
     residuals_along,
     residuals_by_height,
@@ -20,7 +20,7 @@ FIGURES: tuple[Callable[[RegistrationReport], Figure], ...] = (
     residual_histograms,
     funnel,
     residuals_along,
-    line_profile,
+    displacement,
     residuals_by_height,
     predicted_map,
 )

@@ -134,8 +134,10 @@ def _groups(report: RegistrationReport) -> list[tuple[str, Array, str, str]]:
     The places are the projections by the refined model.
     """
     measures, record = report.figure_data.measures, report.correction
-    profile = report.figure_data.profile
-    correction = ImageCorrection(record.parameters_px, record.centre_px, record.half_size_px, profile)
+    displacement = report.figure_data.displacement
+    correction = ImageCorrection(
+        record.parameters_px, record.centre_px, record.half_size_px, displacement
+    )
     place = correction.apply(measures.predicted)
     codes = np.where(measures.reason == "", NO_REASON, measures.reason)
     on_image = report.figure_data.quicklook is not None

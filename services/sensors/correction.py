@@ -5,106 +5,58 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from services.sensors.base import SensorModel
+from services.sensors.displacement import DisplacementGrid
 from services.sensors.rpc import RpcModel
 from services.types import Array
 
-_AVERAGED_LINES = 33
 _MOST_ITERATIONS = 40
 _INVERTED_PX = 1e-9
 """An iteration that moves no position by more is the last."""
 
 
 @dataclass(frozen=True)
-class LineProfile:
-    """A displacement that depends on the line alone: linear between nodes, constant beyond them.
-
-    A scanner takes all samples of a line at once, so that what shakes or bends it moves whole lines.
-
-    Attributes:
-        line: (k,) of the nodes, pixels of the uncorrected model, ascending.
-        displacement_px: (k, 2) line and sample.
-        variance_px2: (k, 2) of its errors.
-        with_parameters_px2: (k, 2, 3) covariance of its errors with those of the parameters of the same
-            coordinate.
-    """
-
-    line: Array
-    displacement_px: Array
-    variance_px2: Array
-    with_parameters_px2: Array
-
-    def at(self, line: Array) -> Array:
-        """Displacement (n, 2) of lines (n,) of the uncorrected model."""
-        return np.stack([np.interp(line, self.line, one) for one in self.displacement_px.T], axis=-1)
-
-    def averaged(self, line: Array, side: float) -> Array:
-        """Mean displacement (n, 2) over a side around lines (n,): what a chip of this side shows."""
-        offsets = np.linspace(-0.5, 0.5, _AVERAGED_LINES) * side
-        return np.asarray(np.mean([self.at(line + offset) for offset in offsets], axis=0))
-
-    def slope(self, line: Array) -> Array:
-        """Derivative (n, 2) of the displacement by the line (n,)."""
-        slopes = np.diff(self.displacement_px, axis=0) / np.diff(self.line)[:, None]
-        slopes = np.vstack([np.zeros((1, 2)), slopes, np.zeros((1, 2))])
-        return np.asarray(slopes[np.searchsorted(self.line, line)])
-
-    def covariance_px2(self, t: Array, line: Array) -> Array:
-        """What the errors of the profile add (n, 2, 2) to those of the parameters.
-
-        Args:
-            t: (n, 3) derivatives of a coordinate by its parameters.
-            line: (n,) of the uncorrected model.
-        """
-        columns = np.concatenate(
-            [self.variance_px2, self.with_parameters_px2.reshape(len(self.line), 6)], axis=1
-        )
-        own = np.stack([np.interp(line, self.line, column) for column in columns.T], axis=-1)
-        both = 2.0 * np.einsum("nck,nk->nc", own[:, 2:].reshape(-1, 2, 3), t)
-        return np.asarray((own[:, :2] + both)[:, :, None] * np.eye(2))
-
-
-@dataclass(frozen=True)
 class ImageCorrection:
-    """A displacement of image positions, from those of a model to the true ones: affine, and by line.
+    """A displacement of image positions, from those of a model to the true ones: affine, and on a grid.
 
     With `t = (line_sample - centre) / half_size`, a position moves by
     `parameters @ (1, t_line, t_sample)`. A shift has nonzero parameters in the first column only, a
     drift also on the diagonal (line by line, sample by sample), an affine everywhere. Where residuals
-    show that lines move against each other, a profile along the lines is added.
+    show that lines or samples move against each other, a displacement on a grid is added.
 
     Attributes:
         parameters: (2, 3) pixels; rows line and sample; columns constant, along lines, along samples.
             The last two are displacements at the edge of the image.
         centre, half_size: (2,) pixels.
-        profile: along the lines; None for an affine correction.
+        displacement: beyond it; None for an affine correction.
     """
 
     parameters: Array
     centre: Array
     half_size: Array
-    profile: LineProfile | None = None
+    displacement: DisplacementGrid | None = None
 
     def apply(self, line_sample: Array) -> Array:
         """Corrected positions (n, 2) of positions given by the model (n, 2)."""
         t = (line_sample - self.centre) / self.half_size
         moved = line_sample + self.parameters[:, 0] + t @ self.parameters[:, 1:].T
-        if self.profile is not None:
-            moved = moved + self.profile.at(line_sample[:, 0])
+        if self.displacement is not None:
+            moved = moved + self.displacement.at(line_sample)
         return np.asarray(moved)
 
     def invert(self, line_sample: Array) -> Array:
         """Positions (n, 2) of the uncorrected model for corrected positions (n, 2).
 
-        A profile is followed by iteration, which converges where lines keep their order.
+        A displacement on a grid is followed by iteration, which converges where lines and samples keep
+        their order.
         """
         affine = np.linalg.inv(self.jacobian).T
         moved = line_sample - self.centre - self.parameters[:, 0]
         before = self.centre + moved @ affine
-        if self.profile is None:
+        if self.displacement is None:
             return np.asarray(before)
         position = before
         for _ in range(_MOST_ITERATIONS):
-            last, position = position, before - self.profile.at(position[:, 0]) @ affine
+            last, position = position, before - self.displacement.at(position) @ affine
             if not len(position) or np.nanmax(np.abs(position - last), initial=0.0) < _INVERTED_PX:
                 break
         return np.asarray(position)
@@ -122,8 +74,8 @@ class ImageCorrection:
         design = np.zeros((len(t), 2, 6))
         design[:, 0, :3] = design[:, 1, 3:] = t
         covariance = design @ covariance_px2 @ design.transpose(0, 2, 1) + np.diag(local_sigma_px**2)
-        if self.profile is not None:
-            covariance = covariance + self.profile.covariance_px2(t, before[:, 0])
+        if self.displacement is not None:
+            covariance = covariance + self.displacement.variance_at(before)[:, :, None] * np.eye(2)
         return np.asarray(covariance)
 
     @property
@@ -133,11 +85,9 @@ class ImageCorrection:
 
     def derivative_at(self, line_sample: Array) -> Array:
         """Derivative of `apply` at positions (n, 2) of the model: (n, 2, 2), or (2, 2) for all."""
-        if self.profile is None:
+        if self.displacement is None:
             return self.jacobian
-        derivative = np.repeat(self.jacobian[None], len(line_sample), axis=0)
-        derivative[:, :, 0] += self.profile.slope(line_sample[:, 0])
-        return derivative
+        return np.asarray(self.jacobian + self.displacement.derivative(line_sample))
 
 
 def no_correction(shape: tuple[int, int]) -> ImageCorrection:
@@ -170,7 +120,7 @@ class CorrectedModel:
     def project_derivative(self, lon_lat_h: Array) -> Array:
         """Derivative of `project`: (n, 2, 3), pixels per metre east, north, up."""
         derivative = self.base.project_derivative(lon_lat_h)
-        if self.correction.profile is None:
+        if self.correction.displacement is None:
             return np.asarray(self.correction.jacobian @ derivative)
         return np.asarray(self.correction.derivative_at(self.base.project(lon_lat_h)) @ derivative)
 
@@ -186,7 +136,7 @@ class CorrectedModel:
 def folds_into_rpc(correction: ImageCorrection) -> bool:
     """Whether an RPC includes a correction exactly: each coordinate moves along itself, linearly."""
     mixed_px = correction.parameters[[0, 1], [2, 1]]
-    return correction.profile is None and not mixed_px.any()
+    return correction.displacement is None and not mixed_px.any()
 
 
 def fold_into_rpc(model: RpcModel, correction: ImageCorrection) -> RpcModel:
@@ -196,11 +146,12 @@ def fold_into_rpc(model: RpcModel, correction: ImageCorrection) -> RpcModel:
     `num' = m num + c den`.
 
     Raises:
-        ValueError: the correction mixes lines and samples or has a profile; `refined_rpc` fits an RPC.
+        ValueError: the correction mixes lines and samples or has a displacement beyond them;
+            `refined_rpc` fits an RPC.
     """
     if not folds_into_rpc(correction):
         raise ValueError(
-            "a correction by line, or one that mixes lines and samples does not fold into an RPC"
+            "a correction on a grid, or one that mixes lines and samples does not fold into an RPC"
         )
     gain = np.diag(correction.jacobian)
     constant = correction.apply(model.image_offset[None, :])[0] - model.image_offset

@@ -37,7 +37,7 @@ def refined_rpc(
 
     A correction of each coordinate separately folds into a delivered RPC exactly. For a correction that
     mixes the coordinates, a new RPC is fitted and accepted within `REFIT_LIMIT_PX`. For a rigorous model
-    and for a correction with a profile the closest RPC is delivered, whatever its error is: no RPC
+    and for a correction on a grid the closest RPC is delivered, whatever its error is: no RPC
     follows every attitude.
 
     Args:
@@ -47,7 +47,7 @@ def refined_rpc(
             model. Those of the ground in the image give a closer RPC: rigorous models of products hold
             for all ground on the Earth.
     """
-    affine = isinstance(model, CorrectedModel) and model.correction.profile is None
+    affine = isinstance(model, CorrectedModel) and model.correction.displacement is None
     if (
         isinstance(model, CorrectedModel)
         and isinstance(model.base, RpcModel)

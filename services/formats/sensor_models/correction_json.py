@@ -1,12 +1,13 @@
 """The correction of a sensor model as a JSON document, which every registration writes.
 
 With `t = ((line, sample) - centre) / half_size`, a position of the delivered model moves by
-`parameters (1, t_line, t_sample)`, and by the profile of its line where there is one: linear between
+`parameters (1, t_line, t_sample)`, and by a displacement on a grid where there is one: bilinear between
 nodes, constant beyond them. The centre of the first pixel is (0, 0).
 """
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,25 @@ import numpy as np
 from services.errors import FormatError
 from services.formats.text_files import load_json
 from services.quality.correction_accuracy import CorrectionAccuracy
-from services.sensors.correction import ImageCorrection, LineProfile
+from services.sensors.correction import ImageCorrection
+from services.sensors.displacement import DisplacementGrid
 from services.types import UNKNOWN_FRAME, Array, Frame
 
 CORRECTION_FORMAT = "amers-image-correction/1"
 PROFILE_FORMAT = "amers-image-correction/2"
-"""Of a correction with a profile: a reader that does not know it must not take the affine part alone."""
+"""Of a correction by line, as it was written before grids were; it is read only."""
+GRID_FORMAT = "amers-image-correction/3"
+"""Of a correction on a grid: a reader that does not know it must not take the affine part alone."""
 
 _PROFILE = {
-    "line": (),
     "displacement_px": (2,),
     "variance_px2": (2,),
     "with_parameters_px2": (2, 3),
 }
 """Attributes of a profile, and the shape of each for a node."""
+
+_DECIMALS = 6
+"""Of the values at the nodes of a grid."""
 
 
 def format_correction(
@@ -53,14 +59,14 @@ def format_correction(
         frame: of the control points on the Earth.
         apart_px: standard deviation of the offsets of the blocks of the points.
     """
-    profile = correction.profile
+    grid = correction.displacement
     document = {
-        "format": PROFILE_FORMAT if profile else CORRECTION_FORMAT,
+        "format": GRID_FORMAT if grid else CORRECTION_FORMAT,
         "applies_to": applies_to,
         "carried": carried,
         "pixel_origin": "the centre of the first pixel is line 0, sample 0",
         "formula": "(line, sample) + parameters_px (1, t_line, t_sample)"
-        + (" + profile.displacement_px(line)" if profile else "")
+        + (" + displacement.displacement_px at (line, sample), bilinear" if grid else "")
         + ", t = ((line, sample) - centre_px) / half_size_px",
         "order": order,
         "parameters_px": correction.parameters.tolist(),
@@ -71,8 +77,13 @@ def format_correction(
         "frame_covariance_m2": _rows(frame.covariance_m2),
         "apart_px": apart_px,
     }
-    if profile is not None:
-        document["profile"] = {name: getattr(profile, name).tolist() for name in _PROFILE}
+    if grid is not None:
+        document["displacement"] = {
+            "line": grid.line.tolist(),
+            "sample": grid.sample.tolist(),
+            "displacement_px": grid.displacement_px.round(_DECIMALS).tolist(),
+            "variance_px2": grid.variance_px2.round(_DECIMALS).tolist(),
+        }
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -87,18 +98,13 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
         FormatError: the document has another form, or its correction folds or mirrors the image.
     """
     document = load_json(text, source)
-    if not isinstance(document, dict) or document.get("format") not in (
-        CORRECTION_FORMAT,
-        PROFILE_FORMAT,
-    ):
-        raise FormatError(
-            f"{source}: expected a document of the format {CORRECTION_FORMAT} or {PROFILE_FORMAT}"
-        )
+    formats = (CORRECTION_FORMAT, PROFILE_FORMAT, GRID_FORMAT)
+    if not isinstance(document, dict) or document.get("format") not in formats:
+        raise FormatError(f"{source}: expected a document of the format {' or '.join(formats)}")
     correction = ImageCorrection(
         parameters=_numbers(document, "parameters_px", (2, 3), source),
         centre=_numbers(document, "centre_px", (2,), source),
         half_size=_numbers(document, "half_size_px", (2,), source),
-        profile=_profile(document, source) if document["format"] == PROFILE_FORMAT else None,
     )
     if not (correction.half_size > 0.0).all():
         raise FormatError(f"{source}: half_size_px: expected positive numbers")
@@ -106,6 +112,10 @@ def parse_correction(text: str, source: str = "correction") -> ImageCorrection:
         raise FormatError(
             f"{source}: parameters_px: expected a correction that neither folds nor mirrors the image"
         )
+    if document["format"] == GRID_FORMAT:
+        return replace(correction, displacement=_grid(document, source))
+    if document["format"] == PROFILE_FORMAT:
+        return replace(correction, displacement=_profile(document, correction, source))
     return correction
 
 
@@ -135,21 +145,47 @@ def parse_correction_accuracy(text: str, source: str = "correction") -> Correcti
     )
 
 
-def _profile(document: dict[str, Any], source: str) -> LineProfile:
-    """The profile of a document."""
+def _grid(document: dict[str, Any], source: str) -> DisplacementGrid:
+    """The displacement of a document."""
+    grid, place = document.get("displacement"), f"{source}: displacement"
+    if not isinstance(grid, dict):
+        raise FormatError(f"{place}: expected an object with nodes and their displacements")
+    nodes = [_ascending(grid, name, place) for name in ("line", "sample")]
+    shape = (len(nodes[0]), len(nodes[1]), 2)
+    values = [_numbers(grid, name, shape, place) for name in ("displacement_px", "variance_px2")]
+    return DisplacementGrid(*nodes, *values)
+
+
+def _ascending(nodes: dict[str, Any], name: str, source: str) -> Array:
+    """Two ascending numbers or more."""
+    values = nodes.get(name)
+    places = _numbers(nodes, name, (len(values) if isinstance(values, list) else 2,), source)
+    if len(places) < 2 or not (np.diff(places) > 0.0).all():
+        raise FormatError(f"{source}: {name}: expected two ascending numbers or more")
+    return places
+
+
+def _profile(document: dict[str, Any], correction: ImageCorrection, source: str) -> DisplacementGrid:
+    """The profile of a document: its variance is linear between the edges of the image."""
     nodes = document.get("profile")
     if not isinstance(nodes, dict) or not isinstance(nodes.get("line"), list):
-        raise FormatError(f"{source}: profile: expected an object with the lists {', '.join(_PROFILE)}")
-    count = len(nodes["line"])
+        raise FormatError(
+            f"{source}: profile: expected an object with the lists line, {', '.join(_PROFILE)}"
+        )
+    line = _ascending(nodes, "line", f"{source}: profile")
     values = {
-        name: _numbers(nodes, name, (count, *shape), f"{source}: profile")
+        name: _numbers(nodes, name, (len(line), *shape), f"{source}: profile")
         for name, shape in _PROFILE.items()
     }
-    if count < 2 or not (np.diff(values["line"]) > 0.0).all():
-        raise FormatError(f"{source}: profile: line: expected two ascending numbers or more")
     if (values["variance_px2"] < 0.0).any():
         raise FormatError(f"{source}: profile: variance_px2: expected numbers that are not negative")
-    return LineProfile(**values)
+    sample = correction.centre[1] + correction.half_size[1] * np.array([-1.0, 1.0])
+    t = np.ones((len(line), 2, 3))
+    t[:, :, 1] = (line[:, None] - correction.centre[0]) / correction.half_size[0]
+    t[:, :, 2] = [-1.0, 1.0]
+    shared = 2.0 * np.einsum("kcp,kmp->kmc", values["with_parameters_px2"], t)
+    displacement_px = np.repeat(values["displacement_px"][:, None], 2, axis=1)
+    return DisplacementGrid(line, sample, displacement_px, values["variance_px2"][:, None] + shared)
 
 
 def _rows(covariance: Array) -> list[list[float | None]]:

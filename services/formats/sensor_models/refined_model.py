@@ -152,7 +152,7 @@ def _write_rpc(
     how = "exactly" if exact else f"fitted within {refined.max_error_px:.2g} px"
     if refined.max_error_px > LOUD_PX:
         how = (
-            f"up to {refined.max_error_px:.2g} px OFF: no RPC follows its profile along the lines. Use "
+            f"up to {refined.max_error_px:.2g} px OFF: no RPC follows lines and samples so. Use "
             f"{CORRECTION_JSON} with the delivered model, or an orthorectified image"
         )
     return RefinedFiles(tuple(files), refined.max_error_px, f"{names}: the corrected model, {how}")

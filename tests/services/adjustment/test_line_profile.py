@@ -1,4 +1,4 @@
-"""What a scanner does along its lines is followed as far as points show it, the rest is named."""
+"""What moves lines and samples is followed as far as points show it, the rest is named."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,7 +15,8 @@ from services.adjustment.image_correction import (
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family
 from services.quality.accuracy import normal_ce90, normalised_error
-from services.sensors.correction import CorrectedModel, ImageCorrection, LineProfile, no_correction
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.sensors.refined import LOUD_PX, refined_rpc
 from services.types import Array
 from tests.services.conftest import FlatModel
@@ -26,12 +27,12 @@ WRONG = 3.0
 """True over predicted CE90 from which on a result is wrong."""
 
 Motion = Callable[[Array], Array]
-"""Displacement (n, 2) of lines (n,)."""
+"""Displacement (n, 2) of positions (n, 2)."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A scene whose lines move, adjusted, and how far off the result is."""
+    """A scene whose lines and samples move, adjusted, and how far off the result is."""
 
     adjustment: SceneAdjustment
     ratio: float
@@ -45,8 +46,8 @@ class Trial:
         return min(one.chance for one in self.adjustment.structures) < MAX_CHANCE
 
 
-def still(line: Array) -> Array:
-    return np.zeros((len(line), 2))
+def still(place: Array) -> Array:
+    return np.zeros((len(place), 2))
 
 
 def draw(
@@ -67,7 +68,7 @@ def draw(
     predicted = rng.random((count, 2)) * (np.array(SHAPE) - 1.0)
     height_m = rng.normal(0.0, 80.0, count)
     offsets = np.linspace(-0.5, 0.5, 65) * CHIP_PX if averaged else np.zeros(1)
-    moved = np.mean([motion(predicted[:, 0] + offset) for offset in offsets], axis=0)
+    moved = np.mean([motion(predicted + [offset, 0.0]) for offset in offsets], axis=0)
     line_sample = truth.apply(predicted) + moved + sigma_px * rng.normal(size=(count, 2))
     line_sample[:, 1] += by_height_px * height_m / 100.0
     blunder = rng.random(count) < wrong
@@ -84,7 +85,7 @@ def trial(motion: Motion, seed: int, **how: float) -> Trial:
     observations, truth = draw(motion, np.random.default_rng(seed), **how)  # type: ignore[arg-type]
     adjustment = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
     places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
-    error = adjustment.correction.apply(places) - truth.apply(places) - motion(places[:, 0])
+    error = adjustment.correction.apply(places) - truth.apply(places) - motion(places)
     covariance = adjustment.covariance_at(adjustment.correction.apply(places))
     true_px = float(np.quantile(np.hypot(*error.T), 0.9))
     predicted_px = float(np.median(normal_ce90(covariance)))
@@ -92,7 +93,8 @@ def trial(motion: Motion, seed: int, **how: float) -> Trial:
 
 
 def jitter(period: float, size_px: tuple[float, float], chirp: float = 0.0) -> Motion:
-    def motion(line: Array) -> Array:
+    def motion(place: Array) -> Array:
+        line = place[:, 0]
         turns = line / period * (1.0 + chirp * line / SHAPE[0])
         return np.column_stack(
             [size_px[0] * np.sin(2.0 * np.pi * turns), size_px[1] * np.cos(2.0 * np.pi * turns + 1.0)]
@@ -101,15 +103,18 @@ def jitter(period: float, size_px: tuple[float, float], chirp: float = 0.0) -> M
     return motion
 
 
-def bow(size_px: float) -> Motion:
-    return lambda line: (
-        np.column_stack([0.3 * line, line]) * 0.0
-        + size_px * ((2.0 * line / SHAPE[0] - 1.0) ** 2)[:, None] * [0.5, 1.0]
+def bow(size_px: float, axis: int = 0, degree: int = 2) -> Motion:
+    return lambda place: (
+        size_px * ((2.0 * place[:, axis] / SHAPE[axis] - 1.0) ** degree)[:, None] * [0.5, 1.0]
     )
 
 
 def step(at: float, size_px: float) -> Motion:
-    return lambda line: (line > at)[:, None] * [size_px, 0.0]
+    return lambda place: (place[:, 0] > at)[:, None] * [size_px, 0.0]
+
+
+def both(*motions: Motion) -> Motion:
+    return lambda place: np.sum([one(place) for one in motions], axis=0)
 
 
 MOTIONS = {
@@ -119,11 +124,18 @@ MOTIONS = {
     "jitter that changes": jitter(900.0, (0.5, 2.0), chirp=0.4),
     "bow": bow(4.0),
     "lines lost": step(2900.0, 6.0),
+    "bow over samples": bow(4.0, axis=1),
+    "large bow over samples": bow(8.0, axis=1),
+    "distortion of the optics": bow(3.0, axis=1, degree=3),
+    "bows over both": both(bow(6.0), bow(3.0, axis=1)),
+    "jitter and a bow over samples": both(jitter(600.0, (1.0, 2.0)), bow(4.0, axis=1)),
 }
 
 
 @pytest.mark.parametrize("name", list(MOTIONS))
-def test_what_points_show_along_the_lines_is_followed_with_the_stated_accuracy(name: str) -> None:
+def test_what_points_show_along_lines_and_samples_is_followed_with_the_stated_accuracy(
+    name: str,
+) -> None:
     trials = [trial(MOTIONS[name], seed) for seed in range(8)]
     assert all(one.adjustment.components for one in trials)
     assert max(one.ratio for one in trials) < WRONG
@@ -136,10 +148,10 @@ def test_an_affine_correction_alone_would_be_wrong_and_say_nothing(name: str) ->
     observations, truth = draw(MOTIONS[name], np.random.default_rng(0))
     places = np.random.default_rng(0).random((300, 2)) * (np.array(SHAPE) - 1.0)
     full = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
-    affine = replace(full.correction, profile=None)
-    error = affine.apply(places) - truth.apply(places) - MOTIONS[name](places[:, 0])
+    affine = replace(full.correction, displacement=None)
+    error = affine.apply(places) - truth.apply(places) - MOTIONS[name](places)
     off_px = float(np.quantile(np.hypot(*error.T), 0.9))
-    assert off_px > 0.7 * np.abs(MOTIONS[name](places[:, 0])).max()
+    assert off_px > 0.7 * np.abs(MOTIONS[name](places)).max()
 
 
 def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
@@ -215,15 +227,17 @@ def test_a_repetition_keeps_the_components_and_follows_its_own_points() -> None:
     assert 0.0 < np.abs(moved).mean() < 0.5
 
 
-def profile_of(motion: Motion, nodes: int = 400) -> LineProfile:
-    line = np.linspace(0.0, SHAPE[0] - 1.0, nodes)
-    return LineProfile(line, motion(line), np.full((nodes, 2), 0.04), np.zeros((nodes, 2, 3)))
+def grid_of(motion: Motion, nodes: tuple[int, int] = (400, 2)) -> DisplacementGrid:
+    line, sample = (np.linspace(0.0, size - 1.0, n) for size, n in zip(SHAPE, nodes, strict=True))
+    places = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
+    displacement_px = motion(places.reshape(-1, 2)).reshape(places.shape)
+    return DisplacementGrid(line, sample, displacement_px, np.full(places.shape, 0.04))
 
 
 def test_a_corrected_model_with_a_profile_is_consistent_with_itself() -> None:
     parameters = np.array([[30.0, 2.0, -1.0], [-12.0, 0.5, 3.0]])
     correction = replace(
-        no_correction(SHAPE), parameters=parameters, profile=profile_of(MOTIONS["jitter"])
+        no_correction(SHAPE), parameters=parameters, displacement=grid_of(MOTIONS["jitter"])
     )
     model = CorrectedModel(FlatModel(), correction)
     places = np.random.default_rng(2).random((200, 2)) * (np.array(SHAPE) - 1.0)
@@ -238,8 +252,8 @@ def test_a_corrected_model_with_a_profile_is_consistent_with_itself() -> None:
 
 
 def test_an_rpc_that_cannot_follow_a_profile_is_loud() -> None:
-    correction = replace(no_correction(SHAPE), profile=profile_of(MOTIONS["jitter"]))
-    bent = replace(no_correction(SHAPE), profile=profile_of(bow(2.0)))
+    correction = replace(no_correction(SHAPE), displacement=grid_of(MOTIONS["jitter"]))
+    bent = replace(no_correction(SHAPE), displacement=grid_of(bow(2.0)))
     followed, shaken = (
         refined_rpc(CorrectedModel(FlatModel(), one), SHAPE, (-50.0, 50.0)) for one in (bent, correction)
     )

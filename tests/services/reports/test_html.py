@@ -152,7 +152,7 @@ def test_a_page_is_made_of_any_registration(material, poor):
     parsed = Page(page(poor(material())))
     assert "Registration report" in parsed.texts
     assert [name for name, _ in parsed.attributes].count("aria-label") == len(FIGURES) - 1 + 3, (
-        "all figures but that of a profile, which an affine correction has not"
+        "all figures but that of a displacement, which an affine correction has not"
     )
 
 

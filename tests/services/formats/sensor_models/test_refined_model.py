@@ -1,8 +1,10 @@
 """Deliverables of a registration: correction, RPC where one fits, map grid and layers for a GIS."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyogrio
@@ -21,7 +23,8 @@ from services.formats.sensor_models.correction_json import (
 from services.formats.sensor_models.refined_model import write_refined
 from services.formats.vector.residual_layers import exaggeration_for, write_residual_layers
 from services.geodesy import metres_per_degree_at
-from services.sensors.correction import CorrectedModel, ImageCorrection, LineProfile, no_correction
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.sensors.refined import REFIT_LIMIT_PX, refined_rpc
 from services.simulation.orbit import pushbroom_over
 
@@ -47,36 +50,73 @@ def test_a_correction_survives_a_round_trip() -> None:
     assert json.loads(written())["covariance_px2"][0][0] is None
 
 
-def profiled() -> ImageCorrection:
-    line = np.array([0.0, 400.0, 999.0])
-    displacement_px = np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.0]])
-    profile = LineProfile(line, displacement_px, np.full((3, 2), 0.04), np.full((3, 2, 3), -0.01))
-    return replace(CORRECTION, profile=profile)
+def on_grid() -> ImageCorrection:
+    line, sample = np.array([0.0, 400.0, 999.0]), np.array([0.0, 1199.0])
+    displacement_px = np.array([[[0.0, 1.0]] * 2, [[2.0, -1.0]] * 2, [[0.5, 0.0], [0.25, 0.125]]])
+    grid = DisplacementGrid(line, sample, displacement_px, np.full((3, 2, 2), 0.04))
+    return replace(CORRECTION, displacement=grid)
 
 
-def test_a_correction_with_a_profile_survives_a_round_trip_in_its_own_format() -> None:
-    document = json.loads(written(profiled()))
-    assert document["format"] == "amers-image-correction/2"
-    again, before = parse_correction(json.dumps(document)).profile, profiled().profile
+def test_a_correction_on_a_grid_survives_a_round_trip_in_its_own_format() -> None:
+    document = json.loads(written(on_grid()))
+    assert document["format"] == "amers-image-correction/3"
+    again, before = parse_correction(json.dumps(document)).displacement, on_grid().displacement
     assert again is not None
     assert before is not None
-    for name in ("line", "displacement_px", "variance_px2", "with_parameters_px2"):
+    for name in ("line", "sample", "displacement_px", "variance_px2"):
         np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
     assert json.loads(written())["format"] == "amers-image-correction/1"
 
 
+def by_line() -> dict[str, Any]:
+    """A document of a correction by line, as it was written before grids were."""
+    document: dict[str, Any] = json.loads(written())
+    profile = {
+        "line": [0.0, 400.0, 999.0],
+        "displacement_px": [[0.0, 1.0], [2.0, -1.0], [0.5, 0.0]],
+        "variance_px2": [[0.04, 0.09]] * 3,
+        "with_parameters_px2": [[[-0.01, 0.002, 0.003], [-0.02, 0.004, -0.001]]] * 3,
+    }
+    return document | {"format": "amers-image-correction/2", "profile": profile}
+
+
+def test_a_correction_by_line_of_an_older_version_is_read() -> None:
+    correction = parse_correction(json.dumps(by_line()))
+    place = np.array([[400.0, 300.0], [700.0, 900.0]])
+    np.testing.assert_allclose(
+        correction.apply(place) - CORRECTION.apply(place),
+        [[2.0, -1.0], [2.0 - 1.5 * 300 / 599, -299 / 599]],
+    )
+    t = np.array([1.0, -99.5 / 500.0, -299.5 / 600.0])
+    expected = [0.04 + 2.0 * t @ [-0.01, 0.002, 0.003], 0.09 + 2.0 * t @ [-0.02, 0.004, -0.001]]
+    assert correction.displacement is not None
+    np.testing.assert_allclose(correction.displacement.variance_at(place[:1])[0], expected)
+
+
 @pytest.mark.parametrize(
-    ("name", "value", "says"),
+    ("made", "part", "name", "value", "says"),
     [
-        ("line", [0.0, 400.0, 400.0], "profile: line: expected two ascending numbers"),
-        ("line", None, "profile: expected an object with the lists"),
-        ("displacement_px", [[0.0, 1.0]], "profile: displacement_px: expected 3 x 2 finite numbers"),
-        ("variance_px2", [[0.0, -1.0]] * 3, "variance_px2: expected numbers that are not negative"),
+        (by_line, "profile", "line", [0.0, 400.0, 400.0], "line: expected two ascending numbers"),
+        (by_line, "profile", "line", None, "profile: expected an object with the lists"),
+        (by_line, "profile", "displacement_px", [[0.0, 1.0]], "expected 3 x 2 finite numbers"),
+        (
+            by_line,
+            "profile",
+            "variance_px2",
+            [[0.0, -1.0]] * 3,
+            "expected numbers that are not negative",
+        ),
+        (None, "displacement", "line", [0.0, 400.0, 400.0], "line: expected two ascending numbers"),
+        (None, "displacement", "sample", [7.0], "displacement: sample: expected two ascending numbers"),
+        (None, "displacement", "line", None, "displacement: line: expected 2 finite numbers"),
+        (None, "displacement", "variance_px2", [[0.0]], "variance_px2: expected 3 x 2 x 2 finite"),
     ],
 )
-def test_profiles_that_make_no_sense_are_refused(name: str, value: object, says: str) -> None:
-    document = json.loads(written(profiled()))
-    document["profile"][name] = value
+def test_displacements_that_make_no_sense_are_refused(
+    made: Callable[[], dict[str, Any]] | None, part: str, name: str, value: object, says: str
+) -> None:
+    document = made() if made else json.loads(written(on_grid()))
+    document[part][name] = value
     with pytest.raises(FormatError, match=says):
         parse_correction(json.dumps(document))
 

@@ -1,0 +1,93 @@
+"""A displacement of image positions that no affine correction follows, on a grid of nodes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.types import Array, IntArray
+
+_AVERAGED = 33
+"""Places along each axis over which a displacement is averaged."""
+
+
+@dataclass(frozen=True)
+class DisplacementGrid:
+    """A displacement of image positions: bilinear between nodes, constant beyond them.
+
+    A motion of whole lines, as of a scanner that shakes, is the same at all samples and has two nodes
+    along them; a bent detector has two nodes along the lines.
+
+    Attributes:
+        line: (k,) of the nodes, pixels of the uncorrected model, ascending; two at least.
+        sample: (m,) of the nodes, the same.
+        displacement_px: (k, m, 2) line and sample.
+        variance_px2: (k, m, 2) what the errors of the displacement add to the variance of a corrected
+            position by those of the affine parameters. It holds their covariance, too, so that it may be
+            negative.
+    """
+
+    line: Array
+    sample: Array
+    displacement_px: Array
+    variance_px2: Array
+
+    def at(self, line_sample: Array) -> Array:
+        """Displacement (n, 2) of positions (n, 2) of the uncorrected model."""
+        return self._between(self.displacement_px, line_sample)
+
+    def averaged(self, line_sample: Array, side: float) -> Array:
+        """Mean displacement (n, 2) over a side around positions (n, 2): what a chip of this side shows.
+
+        Exact where lines and samples move independently of each other.
+        """
+        offsets = np.linspace(-0.5, 0.5, _AVERAGED) * side
+        along_lines = [self.at(line_sample + [offset, 0.0]) for offset in offsets]
+        along_samples = [self.at(line_sample + [0.0, offset]) for offset in offsets]
+        return np.asarray(
+            np.mean(along_lines, axis=0) + np.mean(along_samples, axis=0) - self.at(line_sample)
+        )
+
+    def derivative(self, line_sample: Array) -> Array:
+        """Derivative (n, 2, 2) of `at` by the line and by the sample."""
+        (row, down), (column, right) = self._cells(line_sample)
+        first, second, third, fourth = self._corners(self.displacement_px, row, column)
+        height, width = np.diff(self.line)[row, None], np.diff(self.sample)[column, None]
+        by_line = ((1.0 - right) * (third - first) + right * (fourth - second)) / height
+        by_sample = ((1.0 - down) * (second - first) + down * (fourth - third)) / width
+        inside = [
+            (position >= nodes[0]) & (position <= nodes[-1])
+            for position, nodes in zip(line_sample.T, (self.line, self.sample), strict=True)
+        ]
+        return np.stack([by_line * inside[0][:, None], by_sample * inside[1][:, None]], axis=-1)
+
+    def variance_at(self, line_sample: Array) -> Array:
+        """Values (n, 2) of `variance_px2` at positions (n, 2) of the uncorrected model."""
+        return self._between(self.variance_px2, line_sample)
+
+    def _between(self, values: Array, line_sample: Array) -> Array:
+        """Values (k, m, 2) at the nodes, at positions (n, 2)."""
+        (row, down), (column, right) = self._cells(line_sample)
+        first, second, third, fourth = self._corners(values, row, column)
+        above = first + right * (second - first)
+        below = third + right * (fourth - third)
+        return np.asarray(above + down * (below - above))
+
+    def _cells(self, line_sample: Array) -> list[tuple[IntArray, Array]]:
+        """Along lines and samples: node (n,) before a position, and the share (n, 1) of the way on."""
+        cells = []
+        for position, nodes in zip(line_sample.T, (self.line, self.sample), strict=True):
+            before = np.clip(np.searchsorted(nodes, position, side="right") - 1, 0, len(nodes) - 2)
+            share = (position - nodes[before]) / (nodes[before + 1] - nodes[before])
+            cells.append((before, np.clip(share, 0.0, 1.0)[:, None]))
+        return cells
+
+    def _corners(
+        self, values: Array, row: IntArray, column: IntArray
+    ) -> tuple[Array, Array, Array, Array]:
+        """Values (n, 2) at the corners of cells, line by line."""
+        return (
+            values[row, column],
+            values[row, column + 1],
+            values[row + 1, column],
+            values[row + 1, column + 1],
+        )
