@@ -30,7 +30,7 @@ programs: $(READY)
 	$(MAKE) chromium
 
 test-files: $(READY)
-	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
+	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
 		--ignore tests/app/test_openapi.py
 
 # All operations have one name, of which files handed out as a whole run only the first.
@@ -39,7 +39,7 @@ test-operations: $(READY)
 
 # Under two minutes on two cores: no database, no journeys, nothing long. It reports what it leaves out.
 test-fast: $(READY)
-	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --fast -n auto --dist loadfile --no-loadscope-reorder --durations 20
 
 # All operations with all callers, and all hostile values, filters, archives and images: some minutes.
 test-security: postgis
