@@ -1,7 +1,7 @@
 """Control points matched in a scene: their chips, the views combined, every failure with its reason."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -191,6 +191,26 @@ def match_points(
             combination, views, peaks, by_gradient, scene_gsd_m, patch_statistics(patch)
         )
     return _assembled(search, points, matches, order)
+
+
+def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> PointMatches:
+    """Matches of n points, of which some (k,) were searched again: where these were found now."""
+    found = again.reason == FOUND
+    into, of_them = rows[found], np.flatnonzero(found)
+    columns = {}
+    for name in ("line_sample", "displacement_m", "sigma_px", "score", "views", "reason", "by_gradient"):
+        columns[name] = getattr(matches, name).copy()
+        columns[name][into] = getattr(again, name)[of_them]
+    before, after = matches.view_measures, again.view_measures
+    kept, added = ~np.isin(before.point, into), np.isin(after.point, of_them)
+    views = {
+        name: np.concatenate([column[kept], getattr(after, name)[added]])
+        for name, column in vars(before).items()
+    }
+    views["point"] = np.concatenate([before.point[kept], rows[after.point[added]]])
+    order = np.argsort(views["point"], kind="stable")
+    view_measures = ViewMeasures(**{name: column[order] for name, column in views.items()})
+    return replace(matches, view_measures=view_measures, **columns)
 
 
 def _not_searched(reason: str) -> _PointMatch:

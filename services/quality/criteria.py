@@ -148,6 +148,14 @@ _DESCRIPTIONS = {
         "The same for what grows with the height of the points: the lines of sight of the model are "
         "not those of the image.",
     ),
+    "missed_along_lines": _Description(
+        "Lines whose points do not agree",
+        "%",
+        0,
+        "Lines between which fewer of the points tried agree with the scene than chance explains "
+        "(binomial, times the number of intervals, 0.01), as a share of all lines. Points under clouds "
+        "and where pixels are missing do not count. Usable up to 10 %.",
+    ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",
         "",

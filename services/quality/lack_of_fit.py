@@ -8,6 +8,7 @@ import numpy as np
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
+from services.quality.missed_lines import UNFOUND, missed_lines
 from services.types import Array, BoolArray, IntArray
 
 _CRITERIA: dict[Family, str] = {
@@ -27,7 +28,9 @@ _WITHIN = 0.15
 that were lost or repeated rather than ground that moved."""
 
 
-_AS_MANY = 0.75
+_MISSED_PERCENT = 10.0
+"""Share of the lines whose points do not agree, beyond which the scene is not usable."""
+_AS_MANY = 0.5
 """Points that agree elsewhere, over the active points, beyond which neither place is the scene's."""
 
 
@@ -42,6 +45,9 @@ class Elsewhere:
         false_alarms: number of such groups that chance makes.
         missed: number of points that do not agree with the scene.
         share_of_missed: share of them, of those that were searched again, that agree on this place.
+        slope_px: (2,) line and sample by which a metre of height displaces them; None where they are
+            displaced alike.
+        farthest_px: largest displacement, where they differ.
     """
 
     rows: IntArray
@@ -50,6 +56,8 @@ class Elsewhere:
     false_alarms: float
     missed: int
     share_of_missed: float
+    slope_px: Array | None = None
+    farthest_px: float = 0.0
 
 
 def structure_criteria(
@@ -84,6 +92,65 @@ def structure_criteria(
     return criteria
 
 
+def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: int) -> Criterion:
+    """The criterion on lines whose points do not agree, where those of other lines do.
+
+    Args:
+        line: (n,) where the points are expected.
+        active: (n,) those that the adjustment uses.
+        reason: (n,) why others are not.
+        lines: of the image.
+    """
+    tried = active | np.isin(reason, (*UNFOUND, "deactivated"))
+    missed = missed_lines(line, active, tried)
+    if not missed.any():
+        return at_most("missed_along_lines", 0.0, 0.0, "good")
+    beside = tried & ~missed
+    first, last = float(line[missed].min()), float(line[missed].max())
+    percent = 100.0 * _share_of_lines(line, missed, beside, lines)
+    severe = percent > _MISSED_PERCENT
+    criterion = at_most(
+        "missed_along_lines",
+        percent,
+        _MISSED_PERCENT if severe else 0.0,
+        "usable" if severe else "good",
+    )
+    seen = (
+        f"of {int(missed.sum())} points tried between lines {first:.0f} and {last:.0f}, "
+        f"{int((missed & active).sum())} agree with the scene, of {int(beside.sum())} others "
+        f"{int((beside & active).sum())}: lines were lost or repeated, the sensor swung by more than "
+        "the search reaches, or what these lines show has changed"
+    )
+    return replace(criterion, note=seen)
+
+
+def _share_of_lines(line: Array, missed: BoolArray, others: BoolArray, lines: int) -> float:
+    """Share of the lines that lie with missed points between the same two others, or the border."""
+    edges = np.concatenate([[0.0], np.sort(np.clip(line[others], 0.0, lines)), [float(lines)]])
+    gap = np.clip(np.searchsorted(edges, line[missed]), 1, len(edges) - 1)
+    return float(np.diff(edges)[np.unique(gap) - 1].sum() / lines)
+
+
+def against_height(elsewhere: Elsewhere | None, sight: Array, predicted_px: float) -> Criterion | None:
+    """The criterion on points that are displaced in proportion to their heights; None without any.
+
+    Args:
+        elsewhere: points that agree on another displacement.
+        sight: (2,) pixels by which a metre of height moves a point in the image, line and sample.
+        predicted_px: CE90 that is stated, median over the image.
+    """
+    if elsewhere is None or elsewhere.slope_px is None:
+        return None
+    limit_px = float(np.nan_to_num(_GOOD * predicted_px))
+    criterion = at_most("structure_against_height", elsewhere.farthest_px, limit_px, "usable")
+    seen = (
+        f"{len(elsewhere.rows)} points that do not agree with the scene are displaced in proportion to "
+        f"their heights, by up to {elsewhere.farthest_px:.1f} px, of which chance makes "
+        f"{elsewhere.false_alarms:.1g}"
+    )
+    return replace(criterion, note=f"{seen}; {_wrong_sight(elsewhere.slope_px, sight)}")
+
+
 def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active: BoolArray) -> Criterion:
     """The criterion on points that agree on another displacement.
 
@@ -92,7 +159,7 @@ def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active:
         line_sample: (n, 2) where all points are expected.
         active: (n,) those that the adjustment uses.
     """
-    if elsewhere is None:
+    if elsewhere is None or elsewhere.slope_px is not None:
         return at_most("points_elsewhere", 0, 0, "good")
     line = line_sample[elsewhere.rows, 0]
     first, last = float(line.min()), float(line.max())
@@ -126,7 +193,7 @@ def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> s
     line_px, sample_px = (structure.size_px * np.sqrt(2.0)).tolist()
     size = f"{line_px:.2f} px in line and {sample_px:.2f} px in sample"
     if structure.family == "height":
-        return _wrong_sight(structure, sight)
+        return _wrong_sight(structure.slope_px, sight)
     if structure.shape == "step":
         return f"a step of {size} at line {structure.at:.0f}: lines that were lost or repeated"
     if structure.family == "image":
@@ -147,9 +214,9 @@ def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> s
     )
 
 
-def _wrong_sight(structure: Structure, sight: Array) -> str:
-    """A sentence on residuals that grow with height."""
-    slope = float(np.hypot(*structure.slope_px))
+def _wrong_sight(slope_px: Array, sight: Array) -> str:
+    """A sentence on residuals that grow with height by (2,) pixels of line and sample a metre."""
+    slope = float(np.hypot(*slope_px))
     share = slope / max(float(np.hypot(*sight)), 1e-9)
     return (
         f"residuals grow by {100.0 * slope:.2f} px for 100 m of height, {share:.0%} of what the relief "

@@ -11,7 +11,12 @@ from services.quality.accuracy_statement import AccuracyStatement, scene_accurac
 from services.quality.cell_stability import CellStability, measure_cell_stability
 from services.quality.criteria import Criterion, Verdict, at_least, at_most, verdict_of
 from services.quality.frames import why_unknown
-from services.quality.lack_of_fit import elsewhere_criterion, structure_criteria
+from services.quality.lack_of_fit import (
+    against_height,
+    elsewhere_criterion,
+    missed_criterion,
+    structure_criteria,
+)
 from services.quality.predicted import PredictedAccuracy, predict_accuracy
 from services.quality.stability import (
     AdjustedScene,
@@ -338,8 +343,13 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     if len(measures.lon_lat_h):
         sight = scene.model.project_derivative(measures.lon_lat_h)[:, :, 2].mean(axis=0)
     expected = scene.model.project(measures.lon_lat_h)
+    structures = structure_criteria(scene.adjustment.structures, sight, scene.shape, predicted_px)
+    displaced = against_height(scene.elsewhere, sight, predicted_px)
+    if displaced is not None:
+        structures = [displaced if one.name == displaced.name else one for one in structures]
     return [
-        *structure_criteria(scene.adjustment.structures, sight, scene.shape, predicted_px),
+        *structures,
+        missed_criterion(expected[:, 0], measures.active, measures.reason, scene.shape[0]),
         elsewhere_criterion(scene.elsewhere, expected, measures.active),
     ]
 

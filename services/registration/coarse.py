@@ -10,6 +10,7 @@ from services.imagery.source import ImageSource, ReducedImage, reduce_image
 from services.matching.consensus import Voters
 from services.matching.control_points import ChipSearch, match_points
 from services.matching.correlate import PeakThresholds
+from services.registration.another_view import another_view
 from services.registration.chip_selection import has_chip, visibility_probability
 from services.registration.context import PointContext, Prediction
 from services.registration.far import search_far
@@ -66,9 +67,10 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         thresholds=PeakThresholds(options.coarse.min_score, max_second=1.0),
     )
     matches = match_points(chip_search, points, context.chips, options.matching, context.progress)
+    predicted = prediction.model.project(points.lon_lat_h)
     consensus = first_consensus(
         scene,
-        prediction.model.project(points.lon_lat_h),
+        predicted,
         matches.line_sample,
         level_m=gsd_m,
         radius_m=radius_px * gsd_m,
@@ -85,7 +87,14 @@ def search_coarsely(context: PointContext, prediction: Prediction) -> Prediction
         lon_lat_h=points.lon_lat_h,
     )
     context.stages.append(stage)
-    check_consensus(stage, consensus, matches.reason, scene, options.coarse.max_false_alarms)
+    check_consensus(
+        stage,
+        consensus,
+        matches.reason,
+        scene,
+        options.coarse.max_false_alarms,
+        of_another=lambda: another_view(scene, stage, points.lon_lat_h, predicted, matches.line_sample),
+    )
     search = Search(points, rows, matches, consensus.inliers, CHIP_SIZE * gsd_m)
     adjustment = adjust_search(scene, search, options.adjustment, min_points=min(3, stage.inliers))
     corrected = predict(scene, context.points, adjustment)

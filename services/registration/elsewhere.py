@@ -4,14 +4,18 @@ The last search is narrow. A part of a scene that lies elsewhere (lines that wer
 ground that moved) is beyond it: its points count as not found, and nothing else speaks of them.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
 from services.matching.consensus import Voters, a_contrario_consensus, consensus_tolerance_px
-from services.matching.control_points import ChipSearch, match_points
+from services.matching.control_points import ChipSearch, PointMatches, match_points
+from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
 from services.quality.lack_of_fit import Elsewhere, are_whole_lines
+from services.quality.missed_lines import UNFOUND
 from services.registration.context import PointContext, Prediction
 from services.registration.search import FIRST_TOLERANCE_PX, Search
 from services.types import BoolArray, IntArray
@@ -23,7 +27,23 @@ _MOST = 24
 _RADIUS_PX = 56
 """Search radius, pixels of the chips."""
 _MAX_FALSE_ALARMS = 1e-3
-_LIKELY_REASONS = ("low_score", "ambiguous", "border_peak", "views_disagree")
+_EXPLAINED = 0.75
+"""Misfits that a slope with the height leaves, over those without it, at most."""
+
+
+@dataclass(frozen=True)
+class _Again:
+    """A search of points that were missed.
+
+    Attributes:
+        rows: (k,) of the points, among all that the scene may show.
+        matches: of them.
+        missed: number of points that were missed.
+    """
+
+    rows: IntArray
+    matches: PointMatches
+    missed: int
 
 
 def search_elsewhere(
@@ -37,7 +57,22 @@ def search_elsewhere(
         search: the last one.
         adjustment: on it.
     """
-    return _lines_beside(prediction, search, adjustment) or _far_away(context, prediction, search)
+    beside = _lines_beside(prediction, search, adjustment)
+    if beside is not None:
+        return beside
+    missed = _missed(search)
+    rows = _spread(context, prediction, search.rows[missed])
+    if len(rows) < _FEWEST:
+        return None
+    chip_search = ChipSearch(
+        context.image, prediction.model, context.scene.acquisition, context.fine_gsd_m, _RADIUS_PX
+    )
+    points = context.points.take(rows)
+    matches = match_points(chip_search, points, context.chips, context.options.matching)
+    again = _Again(rows, matches, int(missed.sum()))
+    return _as_heights_move(context, prediction, search, adjustment, again) or _far_away(
+        context, prediction, again
+    )
 
 
 def _lines_beside(
@@ -52,7 +87,10 @@ def _lines_beside(
     misfit_px = search.matches.line_sample - expected
     rms_px = float(np.sqrt(np.mean(misfit_px[adjustment.active] ** 2)))
     tolerance_px = consensus_tolerance_px(rms_px)
-    farthest_px = float(np.abs(misfit_px[left]).max(initial=tolerance_px))
+    left = left[np.hypot(*misfit_px[left].T) > tolerance_px]
+    if len(left) < _FEWEST:
+        return None
+    farthest_px = float(np.abs(misfit_px[left]).max())
     group = a_contrario_consensus(misfit_px[left], tolerance_px, farthest_px)
     members = left[group.inliers]
     significant = len(members) >= _FEWEST and group.false_alarms <= _MAX_FALSE_ALARMS
@@ -70,17 +108,59 @@ def _lines_beside(
     )
 
 
-def _far_away(context: PointContext, prediction: Prediction, search: Search) -> Elsewhere | None:
-    """Points that are found together, but far from where they are expected."""
-    missed = _missed(search)
-    rows = _spread(context, prediction, search.rows[missed])
-    if len(rows) < _FEWEST:
+def _as_heights_move(
+    context: PointContext,
+    prediction: Prediction,
+    search: Search,
+    adjustment: SceneAdjustment,
+    again: _Again,
+) -> Elsewhere | None:
+    """Points that are displaced in proportion to their heights: the model is that of another view."""
+    found = np.flatnonzero(search.matches.reason == "")
+    place = np.concatenate([search.rows[found], again.rows])
+    measured = np.concatenate([search.matches.line_sample[found], again.matches.line_sample])
+    active = np.concatenate([adjustment.active[found], np.zeros(len(again.rows), dtype=bool)])
+    lon_lat_h = context.points.lon_lat_h[place]
+    expected = prediction.model.project(lon_lat_h)
+    misfit_px = measured - expected
+    if active.sum() < _FEWEST:
         return None
-    points, gsd_m = context.points.take(rows), context.fine_gsd_m
-    chip_search = ChipSearch(
-        context.image, prediction.model, context.scene.acquisition, gsd_m, _RADIUS_PX
+    plane = np.column_stack([np.ones(len(place)), expected])
+    coefficients = np.linalg.lstsq(plane[active], lon_lat_h[active, 2], rcond=None)[0]
+    above_m = lon_lat_h[:, 2] - plane @ coefficients
+    rms_px = float(np.sqrt(np.mean(misfit_px[active] ** 2)))
+    tolerance_px = consensus_tolerance_px(rms_px)
+    reach_px = np.full(len(place), _RADIUS_PX * context.fine_gsd_m / context.gsd_m)
+    reach_px[: len(found)] = max(float(np.abs(misfit_px[: len(found)]).max()), tolerance_px)
+    group = height_consensus(misfit_px, above_m, tolerance_px, reach_px)
+    members = np.flatnonzero(group.inliers)
+    if group.false_alarms > _MAX_FALSE_ALARMS:
+        return None
+    if len(members) < _FEWEST:
+        # Few lie high enough: the others must agree better, too.
+        others = np.isfinite(misfit_px).all(axis=1) & ~group.inliers
+        without = np.median(np.hypot(*misfit_px[others].T))
+        left_px = misfit_px[others] - above_m[others, None] * group.displacement
+        if np.median(np.hypot(*left_px.T)) > _EXPLAINED * without:
+            return None
+    derivative = prediction.model.project_derivative(lon_lat_h[members]).mean(axis=0)
+    displacement_px = np.median(misfit_px[members], axis=0)
+    return Elsewhere(
+        rows=place[members],
+        displacement_px=displacement_px,
+        displacement_m=float(np.hypot(*np.linalg.solve(derivative[:, :2], displacement_px))),
+        false_alarms=group.false_alarms,
+        missed=int((~active).sum()),
+        share_of_missed=len(members) / max(int((~active).sum()), 1),
+        slope_px=group.displacement,
+        farthest_px=float(np.hypot(*misfit_px[members].T).max()),
     )
-    matches = match_points(chip_search, points, context.chips, context.options.matching)
+
+
+def _far_away(context: PointContext, prediction: Prediction, again: _Again) -> Elsewhere | None:
+    """Points that are found together, but far from where they are expected."""
+    rows, matches = again.rows, again.matches
+    points, gsd_m = context.points.take(rows), context.fine_gsd_m
     tolerance_m = FIRST_TOLERANCE_PX * gsd_m
     displacement_m = matches.displacement_m.copy()
     # Points that lie where they are expected, and were missed before, are of the scene.
@@ -97,7 +177,7 @@ def _far_away(context: PointContext, prediction: Prediction, search: Search) -> 
         ),
         displacement_m=float(np.hypot(*group.displacement)),
         false_alarms=group.false_alarms,
-        missed=int(missed.sum()),
+        missed=again.missed,
         share_of_missed=float(group.inliers.mean()),
     )
 
@@ -105,7 +185,7 @@ def _far_away(context: PointContext, prediction: Prediction, search: Search) -> 
 def _missed(search: Search) -> BoolArray:
     """Points (k,) of a search that it did not find though it may show them, or that do not agree."""
     reason = search.matches.reason
-    return np.asarray(np.isin(reason, _LIKELY_REASONS) | ((reason == "") & ~search.inliers))
+    return np.asarray(np.isin(reason, UNFOUND) | ((reason == "") & ~search.inliers))
 
 
 def _spread(context: PointContext, prediction: Prediction, rows: IntArray) -> IntArray:

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -312,7 +313,13 @@ def first_consensus(
 
 
 def check_consensus(
-    stage: SearchStage, consensus: Consensus, reason: np.ndarray, scene: Scene, max_false_alarms: float
+    stage: SearchStage,
+    consensus: Consensus,
+    reason: np.ndarray,
+    scene: Scene,
+    max_false_alarms: float,
+    *,
+    of_another: Callable[[], str] = lambda: "",
 ) -> None:
     """Refuse a first search whose matches agree no better than by chance.
 
@@ -322,6 +329,7 @@ def check_consensus(
         reason: (k,) why points were not found.
         scene: that was searched.
         max_false_alarms: largest number of false alarms that is accepted.
+        of_another: what the matches tell of another model, where they are refused; "" for nothing.
 
     Raises:
         NoConsensus: with the numbers of the search and the next step.
@@ -344,7 +352,7 @@ def check_consensus(
     raise NoConsensus(
         f"{who} one correction: {stage.tried} {noun} tried within {stage.search_radius_m:.0f} m{where}, "
         f"{stage.matched} found, {agreement}; {format_reasons(reason)}; "
-        + next_step(stage, scene.sigma_m)
+        + (of_another() or next_step(stage, scene.sigma_m))
     )
 
 

@@ -1,0 +1,62 @@
+"""Lines of an image whose points do not agree with the rest, where those of other lines do.
+
+A scanner takes all samples of a line at once: where it jumped, or swung by more than a search reaches,
+whole lines are lost to the adjustment. What hides points hides them here and there.
+"""
+
+import numpy as np
+from scipy.special import bdtr
+
+from services.types import Array, BoolArray, IntArray
+
+UNFOUND = ("low_score", "ambiguous", "border_peak", "views_disagree")
+"""Why points are not found that the scene may show elsewhere: neither clouds nor missing pixels."""
+_MAX_CHANCE = 0.01
+_MOST_GAPS = 3
+_FEWEST = 4
+
+
+def missed_lines(line: Array, agrees: BoolArray, tried: BoolArray) -> BoolArray:
+    """Points (n,) of lines where fewer agree than chance explains.
+
+    The intervals of lines are tried that begin and end with points which do not agree. The chance of one
+    is binomial, times their number, at most 0.01; random orders of the points of real scenes fall below
+    this in about one of a thousand cases, because intervals overlap.
+
+    Args:
+        line: (n,) where the points are expected.
+        agrees: (n,) with the scene.
+        tried: (n,) those that the scene may show.
+    """
+    missed = np.zeros(len(line), dtype=bool)
+    for _ in range(_MOST_GAPS):
+        rows = np.flatnonzero(tried & ~missed)
+        rows = rows[np.argsort(line[rows], kind="stable")]
+        of_interval = _least_likely_interval(agrees[rows])
+        if not len(of_interval):
+            break
+        missed[rows[of_interval]] = True
+    return missed
+
+
+def _least_likely_interval(agrees: BoolArray) -> IntArray:
+    """The run of points (n,) in which the fewest agree for chance; none where chance explains all."""
+    nothing = np.zeros(0, dtype=np.int64)
+    if agrees.all() or not agrees.any():
+        return nothing
+    fails = np.concatenate([[False], ~agrees, [False]])
+    start = np.flatnonzero(fails[1:-1] & ~fails[:-2])
+    end = np.flatnonzero(fails[1:-1] & ~fails[2:]) + 1
+    before = np.concatenate([[0], np.cumsum(agrees)])
+    length = end[None, :] - start[:, None]
+    count = before[end][None, :] - before[start][:, None]
+    possible = length >= _FEWEST
+    if not possible.any():
+        return nothing
+    chance = np.where(
+        possible, bdtr(np.maximum(count, 0), np.maximum(length, 1), agrees.mean()), 1.0
+    ) * float(possible.sum())
+    first, last = np.unravel_index(int(np.argmin(chance)), chance.shape)
+    if chance[first, last] > _MAX_CHANCE:
+        return nothing
+    return np.arange(start[first], end[last], dtype=np.int64)

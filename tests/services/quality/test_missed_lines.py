@@ -1,0 +1,74 @@
+"""Lines whose points do not agree: seen where a band is lost, not where points fail here and there."""
+
+import numpy as np
+import pytest
+
+from services.quality.lack_of_fit import missed_criterion
+from services.quality.missed_lines import missed_lines
+
+LINES = 2000
+
+
+def places(rng: np.random.Generator, n: int) -> np.ndarray:
+    return rng.uniform(0.0, LINES, n)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("n", [30, 120])
+def test_points_that_fail_at_random_accuse_no_lines(share: float, n: int) -> None:
+    rng = np.random.default_rng([7, n, round(10 * share)])
+    accused = 0
+    for _ in range(500):
+        line = places(rng, n)
+        accused += missed_lines(line, rng.random(n) < share, np.ones(n, dtype=bool)).any()
+    assert accused <= 5  # one in a hundred
+
+
+@pytest.mark.parametrize("first", [0.0, 700.0, 1600.0])
+def test_a_band_of_lost_lines_is_found_with_its_borders(first: float) -> None:
+    rng = np.random.default_rng(11)
+    for _ in range(50):
+        line = places(rng, 120)
+        lost = (line >= first) & (line < first + 400.0)
+        agrees = (rng.random(120) < 0.7) & ~lost
+        missed = missed_lines(line, agrees, np.ones(120, dtype=bool))
+        assert missed[lost].all()
+        # Points that fail on their own beside the band are taken with it, a few lines of them.
+        assert (missed & ~lost).sum() <= 8
+
+
+def test_two_bands_are_both_found() -> None:
+    rng = np.random.default_rng(12)
+    line = places(rng, 200)
+    lost = ((line > 300.0) & (line < 600.0)) | (line > 1700.0)
+    missed = missed_lines(line, ~lost & (rng.random(200) < 0.8), np.ones(200, dtype=bool))
+    assert missed[lost].all()
+
+
+def test_points_under_clouds_accuse_no_lines() -> None:
+    rng = np.random.default_rng(13)
+    line = places(rng, 120)
+    clouded = line < 800.0
+    reason = np.where(clouded, "cloud", "")
+    criterion = missed_criterion(line, ~clouded, reason, LINES)
+    assert criterion.met
+    assert criterion.value == 0.0
+
+
+@pytest.mark.parametrize(("lines", "needed_for"), [(120.0, "good"), (500.0, "usable")])
+def test_the_criterion_says_which_lines_and_how_many(lines: float, needed_for: str) -> None:
+    line = np.linspace(0.0, LINES - 1.0, 240)
+    lost = (line >= 900.0) & (line < 900.0 + lines)
+    reason = np.where(lost, "low_score", "")
+    criterion = missed_criterion(line, ~lost, reason, LINES)
+    assert not criterion.met
+    assert criterion.needed_for == needed_for
+    assert criterion.value == pytest.approx(100.0 * lines / LINES, abs=1.0)
+    assert f"lines {line[lost][0]:.0f} and {line[lost][-1]:.0f}" in criterion.note
+
+
+def test_lost_lines_reach_to_the_border_that_no_point_is_beyond() -> None:
+    line = np.linspace(100.0, LINES - 101.0, 240)
+    lost = line >= 1700.0
+    criterion = missed_criterion(line, ~lost, np.where(lost, "border_peak", ""), LINES)
+    assert criterion.value == pytest.approx(15.0, abs=1.0)
