@@ -119,8 +119,8 @@ _DESCRIPTIONS = {
         "px",
         2,
         "Largest displacement by a swing or bend along the lines that residuals show; 0 where chance "
-        "shows one as clearly (F test of the best shape, times the number tried, 0.002). The limit is a "
-        "tenth of the predicted CE90.",
+        "shows one as clearly (F test of the best shape, times the number tried, 0.0001). The limit is "
+        "a tenth of the predicted CE90.",
     ),
     "steps_along_lines": _Description(
         "Steps along the lines",

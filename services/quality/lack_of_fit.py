@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
 from services.quality.missed_lines import UNFOUND, missed_lines
@@ -18,6 +17,8 @@ _CRITERIA: dict[Family, str] = {
     "image": "structure_in_image",
     "height": "structure_against_height",
 }
+_MAX_CHANCE = 1e-4
+"""A family of structures that chance explains with a larger probability is not named."""
 _GOOD, _USABLE, _FOLLOWED = 0.5, 2.0, 0.1
 """Largest displacement by a structure over the predicted CE90: of a good scene, a usable one, and along
 the lines of a usable one."""
@@ -77,7 +78,7 @@ def structure_criteria(
     """
     criteria = []
     for structure in structures:
-        size_px = structure.largest_px if structure.chance < MAX_CHANCE else 0.0
+        size_px = structure.largest_px if structure.chance < _MAX_CHANCE else 0.0
         grade: Grade = "good"
         limit_px = _GOOD * predicted_px
         if structure.family in _OF_THE_MODEL:
