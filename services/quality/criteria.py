@@ -154,7 +154,7 @@ _DESCRIPTIONS = {
         0,
         "Lines between which fewer of the points tried agree with the scene than chance explains "
         "(binomial, times the number of intervals, 0.01), as a share of all lines. Points under clouds "
-        "and where pixels are missing do not count. Usable up to 10 %.",
+        "and where pixels are missing do not count. Usable up to 10 %, and where some do agree.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",

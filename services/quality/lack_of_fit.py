@@ -25,10 +25,10 @@ the lines of a usable one."""
 _OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
 """A model of the whole image follows these, or is wrong."""
 _WITHIN = 0.15
-"""Share of the active points between the lines of points that lie elsewhere, up to which these are lines
-that were lost or repeated rather than ground that moved."""
-
-
+"""Active points between the lines of points that lie elsewhere, over these, up to which lines were lost
+or repeated rather than ground moved."""
+_HARDLY_ANY = 0.1
+"""Share of the points of missed lines that agree, over that of others, up to which they are lost."""
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
 _AS_MANY = 0.5
@@ -109,7 +109,8 @@ def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: 
     beside = tried & ~missed
     first, last = float(line[missed].min()), float(line[missed].max())
     percent = 100.0 * _share_of_lines(line, missed, beside, lines)
-    severe = percent > _MISSED_PERCENT
+    agree, expected = int((missed & active).sum()), missed.sum() * active[beside].mean()
+    severe = percent > _MISSED_PERCENT and agree <= _HARDLY_ANY * expected
     criterion = at_most(
         "missed_along_lines",
         percent,
@@ -118,7 +119,7 @@ def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: 
     )
     seen = (
         f"of {int(missed.sum())} points tried between lines {first:.0f} and {last:.0f}, "
-        f"{int((missed & active).sum())} agree with the scene, of {int(beside.sum())} others "
+        f"{agree} agree with the scene, of {int(beside.sum())} others "
         f"{int((beside & active).sum())}: lines were lost or repeated, the sensor swung by more than "
         "the search reaches, or what these lines show has changed"
     )
@@ -185,8 +186,8 @@ def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active:
 
 def are_whole_lines(line: Array, others: Array) -> bool:
     """Whether hardly any of the other points (m,) lie between the lines (n,) of points."""
-    between = (others >= line.min()) & (others <= line.max())
-    return bool(between.mean() <= _WITHIN) if len(others) else False
+    between = int(((others >= line.min()) & (others <= line.max())).sum())
+    return between <= max(1.0, _WITHIN * len(line))
 
 
 def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> str:

@@ -72,3 +72,14 @@ def test_lost_lines_reach_to_the_border_that_no_point_is_beyond() -> None:
     lost = line >= 1700.0
     criterion = missed_criterion(line, ~lost, np.where(lost, "border_peak", ""), LINES)
     assert criterion.value == pytest.approx(15.0, abs=1.0)
+
+
+def test_ground_that_moved_beside_others_is_not_taken_for_lost_lines() -> None:
+    line = np.linspace(0.0, LINES - 1.0, 240)
+    band = (line >= 900.0) & (line < 1400.0)
+    agrees = ~band
+    agrees[np.flatnonzero(band)[::6]] = True
+    criterion = missed_criterion(line, agrees, np.where(agrees, "", "low_score"), LINES)
+    assert not criterion.met
+    assert criterion.value > 20.0
+    assert criterion.needed_for == "good"
