@@ -15,6 +15,8 @@ _MEDIAN_OF_LARGER = 1.0512
 """Median of the larger of two magnitudes of the standard normal law."""
 _AS_BAD = 0.8
 """Share of the worst residual from which on measures are dropped with it."""
+_OF_THE_AFFINE = 9
+"""Places along each axis to which the affine part of a displacement is fitted."""
 _NODES_A_PERIOD = 32
 _NODES_A_LENGTH = 8
 _NODES_A_GAP = 9
@@ -98,11 +100,16 @@ def solve_profile(
         for along in dict.fromkeys(one.along for one in components)
     ]
     full = with_components(residuals, components)
+    axes = [np.linspace(nodes[0], nodes[-1], _OF_THE_AFFINE) for nodes in (line, sample)]
+    evenly = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    t_evenly = np.column_stack([np.ones(len(evenly)), (evenly - frame.centre) / frame.half_size])
+    fitted = np.linalg.pinv(t_evenly)
     parameters, covariance, displacement, variance = [], [], [], []
     for k in range(2):
         inverse = np.linalg.inv(full.covariance[k])
         weighted = inverse @ full.design
-        own = np.linalg.pinv(full.design.T @ weighted + np.diag(expected[k]), hermitian=True)
+        normal = full.design.T @ weighted + np.diag(expected[k])
+        own = np.asarray(np.linalg.pinv(normal, hermitian=True), np.float64)
         value = own @ (weighted.T @ full.misfit[:, k])
         rest = full.misfit[:, k] - full.design @ value
         seen = [_seen(places, some, k, residuals.line_sample) for places, some in parts]
@@ -110,15 +117,32 @@ def solve_profile(
         moved = sum(one @ full.design for one in gain)
         explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
         unseen = sum(one.variance_px2[k] / one.seen**2 * one.share(nodes) for one in components)
-        of_parameters = moved @ own
-        spread = unseen - explained + (of_parameters * moved).sum(axis=-1)
-        cross = -(of_parameters[..., :3] * t).sum(axis=-1)
+        left = _padded(t, own) - moved
+        total = unseen - explained + (left @ own * left).sum(axis=-1)
+        mean = np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2])
+        # Its affine part belongs to the parameters: both are uncertain by much more than their sum.
+        seen_evenly = _seen(evenly[None], components, k, full.line_sample)[0]
+        gain_evenly = seen_evenly @ inverse
+        affine = fitted @ gain_evenly @ rest
+        left = _padded(t_evenly, own) - gain_evenly @ full.design
+        among = sum(
+            one.variance_px2[k] / one.seen**2 * one.correlation(evenly, evenly) for one in components
+        )
+        errors = among - gain_evenly @ seen_evenly.T + left @ own @ left.T
+        uncertain = fitted @ errors @ fitted.T
+        value[:3] += affine
+        own[:3, :3] = uncertain
         parameters.append(value)
         covariance.append(own)
-        displacement.append(np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2]))
-        variance.append(np.maximum(spread, 0.0) + 2.0 * cross)
+        displacement.append(mean - t @ affine)
+        variance.append(np.maximum(total, 0.0) - (t @ uncertain * t).sum(axis=-1))
     grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1))
     return ProfileSolution(np.array(parameters), np.array(covariance), grid)
+
+
+def _padded(t: Array, own: Array) -> Array:
+    """Derivatives (..., 3) by the affine parameters with zeros for the others of a covariance (k, k)."""
+    return np.concatenate([t, np.zeros((*t.shape[:-1], len(own) - 3))], axis=-1)
 
 
 def _seen(places: Array, components: Sequence[Component], k: int, line_sample: Array) -> Array:
@@ -156,6 +180,7 @@ def _nodes(
             for one in along
             if one.kind == "step"
         ]
-        count = int(np.clip((high - low) / min(steps), _FEWEST_NODES, most)) if steps else 2
+        spacing = min(steps, default=high - low)
+        count = int(np.clip((high - low) / spacing, _FEWEST_NODES, most)) if along else 2
         both.append(np.unique(np.concatenate([np.linspace(low, high, count), *gaps])))
     return both[0], both[1]
