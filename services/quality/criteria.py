@@ -152,9 +152,9 @@ _DESCRIPTIONS = {
         "Lines whose points do not agree",
         "%",
         0,
-        "Lines between which fewer of the points tried agree with the scene than chance explains "
-        "(binomial, times the number of intervals, 0.01), as a share of all lines. Points under clouds "
-        "and where pixels are missing do not count. Usable up to 10 %, and where some do agree.",
+        "Lines between which hardly any of the points tried agree with the scene, fewer than chance "
+        "explains (binomial, times the number of intervals, 0.01), as a share of all lines. Points "
+        "under clouds and where pixels are missing do not count. Usable up to 10 %.",
     ),
     "points_elsewhere": _Description(
         "Points that agree elsewhere",

@@ -27,8 +27,6 @@ _OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
 _WITHIN = 0.15
 """Active points between the lines of points that lie elsewhere, over these, up to which lines were lost
 or repeated rather than ground moved."""
-_HARDLY_ANY = 0.1
-"""Share of the points of missed lines that agree, over that of others, up to which they are lost."""
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
 _AS_MANY = 0.5
@@ -109,8 +107,7 @@ def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: 
     beside = tried & ~missed
     first, last = float(line[missed].min()), float(line[missed].max())
     percent = 100.0 * _share_of_lines(line, missed, beside, lines)
-    agree, expected = int((missed & active).sum()), missed.sum() * active[beside].mean()
-    severe = percent > _MISSED_PERCENT and agree <= _HARDLY_ANY * expected
+    severe = percent > _MISSED_PERCENT
     criterion = at_most(
         "missed_along_lines",
         percent,
@@ -119,7 +116,7 @@ def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: 
     )
     seen = (
         f"of {int(missed.sum())} points tried between lines {first:.0f} and {last:.0f}, "
-        f"{agree} agree with the scene, of {int(beside.sum())} others "
+        f"{int((missed & active).sum())} agree with the scene, of {int(beside.sum())} others "
         f"{int((beside & active).sum())}: lines were lost or repeated, the sensor swung by more than "
         "the search reaches, or what these lines show has changed"
     )

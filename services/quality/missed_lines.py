@@ -14,6 +14,10 @@ UNFOUND = ("low_score", "ambiguous", "border_peak", "views_disagree")
 _MAX_CHANCE = 0.01
 _MOST_GAPS = 3
 _FEWEST = 4
+_MOST_ENDS = 400
+"""Points at which intervals begin, and at which they end: dense references have thousands."""
+_HARDLY_ANY = 0.1
+"""Share of the points of missed lines that agree, over that of all, at most."""
 
 
 def missed_lines(line: Array, agrees: BoolArray, tried: BoolArray) -> BoolArray:
@@ -47,15 +51,18 @@ def _least_likely_interval(agrees: BoolArray) -> IntArray:
     fails = np.concatenate([[False], ~agrees, [False]])
     start = np.flatnonzero(fails[1:-1] & ~fails[:-2])
     end = np.flatnonzero(fails[1:-1] & ~fails[2:]) + 1
+    step = -(-len(start) // _MOST_ENDS)
+    start, end = start[::step], end[::-step]
     before = np.concatenate([[0], np.cumsum(agrees)])
     length = end[None, :] - start[:, None]
     count = before[end][None, :] - before[start][:, None]
-    possible = length >= _FEWEST
-    if not possible.any():
+    tried = length >= _FEWEST
+    # What hides points here and there leaves some; lost lines leave none but by chance.
+    lost = tried & (count <= _HARDLY_ANY * agrees.mean() * length)
+    if not lost.any():
         return nothing
-    chance = np.where(
-        possible, bdtr(np.maximum(count, 0), np.maximum(length, 1), agrees.mean()), 1.0
-    ) * float(possible.sum())
+    chance = bdtr(np.maximum(count, 0), np.maximum(length, 1), agrees.mean()) * tried.sum()
+    chance[~lost] = np.inf
     first, last = np.unravel_index(int(np.argmin(chance)), chance.shape)
     if chance[first, last] > _MAX_CHANCE:
         return nothing
