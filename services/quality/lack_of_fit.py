@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import comb
 
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
@@ -27,6 +28,9 @@ _OF_THE_MODEL: tuple[Family, ...] = ("lines", "steps")
 _WITHIN = 0.15
 """Active points between the lines of points that lie elsewhere, over these, up to which lines were lost
 or repeated rather than ground moved."""
+_ALONG = 0.1
+"""Displacement along the samples over that along the lines, up to which lines alone were displaced."""
+_ENOUGH = 4
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
 _AS_MANY = 0.5
@@ -162,7 +166,7 @@ def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active:
         return at_most("points_elsewhere", 0, 0, "good")
     line = line_sample[elsewhere.rows, 0]
     first, last = float(line.min()), float(line.max())
-    whole_lines = are_whole_lines(line, line_sample[active, 0])
+    whole_lines = _belong_to_whole_lines(line, line_sample[active, 0], elsewhere.displacement_px)
     moved = (
         f"{len(line)} points of lines {first:.0f} to {last:.0f} agree on a place "
         f"{np.hypot(*elsewhere.displacement_px):.0f} px ({elsewhere.displacement_m:.1f} m) away "
@@ -179,6 +183,27 @@ def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active:
     as_many = elsewhere.share_of_missed * elsewhere.missed > _AS_MANY * active.sum()
     criterion = at_most("points_elsewhere", len(line), 0, "usable" if whole_lines or as_many else "good")
     return replace(criterion, note=f"{moved}; {looks}")
+
+
+def _belong_to_whole_lines(line: Array, others: Array, displacement_px: Array) -> bool:
+    """Whether points on another displacement are those of whole lines.
+
+    Lost lines displace along the lines alone: then one point beyond the others may be there by chance.
+    """
+    along = abs(displacement_px[1]) <= _ALONG * abs(displacement_px[0])
+    ordered = np.sort(line)
+    parts = [ordered, ordered[1:], ordered[:-1]] if along and len(line) >= _ENOUGH else [ordered]
+    return any(are_whole_lines(part, others) for part in parts)
+
+
+def chance_of_whole_lines(line: Array, others: Array) -> float:
+    """Chance that n of all n + m points, drawn at random, are those of whole lines, at most."""
+    places = int(len(line) + max(1.0, _WITHIN * len(line)))
+    total = len(line) + len(others)
+    if places >= total:
+        return 1.0
+    windows = (total - places + 1) * float(comb(places, len(line)))
+    return min(windows / float(comb(total, len(line))), 1.0)
 
 
 def are_whole_lines(line: Array, others: Array) -> bool:

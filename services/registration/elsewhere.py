@@ -14,7 +14,7 @@ from services.matching.consensus import Voters, a_contrario_consensus, consensus
 from services.matching.control_points import ChipSearch, PointMatches, match_points
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
-from services.quality.lack_of_fit import Elsewhere, are_whole_lines
+from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_whole_lines
 from services.quality.missed_lines import UNFOUND
 from services.registration.context import PointContext, Prediction
 from services.registration.search import FIRST_TOLERANCE_PX, Search
@@ -93,8 +93,11 @@ def _lines_beside(
     farthest_px = float(np.abs(misfit_px[left]).max())
     group = a_contrario_consensus(misfit_px[left], tolerance_px, farthest_px)
     members = left[group.inliers]
-    significant = len(members) >= _FEWEST and group.false_alarms <= _MAX_FALSE_ALARMS
-    if not significant or not are_whole_lines(expected[members, 0], expected[adjustment.active, 0]):
+    line, others = expected[members, 0], expected[adjustment.active, 0]
+    if len(members) < _FEWEST or not are_whole_lines(line, others):
+        return None
+    false_alarms = group.false_alarms * chance_of_whole_lines(line, others)
+    if false_alarms > _MAX_FALSE_ALARMS:
         return None
     derivative = prediction.model.project_derivative(search.points.lon_lat_h[members]).mean(axis=0)
     moved_m = np.linalg.solve(derivative[:, :2], group.displacement)
@@ -102,7 +105,7 @@ def _lines_beside(
         rows=search.rows[members],
         displacement_px=group.displacement,
         displacement_m=float(np.hypot(*moved_m)),
-        false_alarms=group.false_alarms,
+        false_alarms=false_alarms,
         missed=len(left),
         share_of_missed=len(members) / len(left),
     )
