@@ -162,10 +162,11 @@ def test_an_upload_that_claims_to_be_json_is_not_kept_in_memory(served, unharmed
     image = b"II*\0" + bytes(2 * MEMORY_BYTES)
     headers = {"Content-Type": "application/json", **served.authorization}
     before = resident_bytes(served)
-    connection = HTTPConnection(urlsplit(served.url).netloc)
-    connection.request("POST", "/scenes?name=a.tif", image, headers)
-    assert connection.getresponse().status == 201
-    assert resident_bytes(served) - before < MEMORY_BYTES
+    for _ in range(6):  # one takes half a second, in which the bystander asks twice
+        connection = HTTPConnection(urlsplit(served.url).netloc)
+        connection.request("POST", "/scenes?name=a.tif", image, headers)
+        assert connection.getresponse().status == 201
+        assert resident_bytes(served) - before < MEMORY_BYTES
 
 
 def test_idle_connections_give_way_to_newcomers(served, unharmed) -> None:
