@@ -7,7 +7,7 @@ import numpy as np
 
 from services.adjustment.line_profile import Along, Component, with_components
 from services.adjustment.structure import Residuals
-from services.sensors.correction import no_correction
+from services.sensors.correction import ImageCorrection, no_correction
 from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray
 
@@ -93,7 +93,7 @@ def solve_profile(
     line, sample = _nodes(components, residuals.line_sample, shape)
     nodes = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
     frame = no_correction(shape)
-    t = np.concatenate([np.ones((*nodes.shape[:2], 1)), (nodes - frame.centre) / frame.half_size], -1)
+    t = _by_affine(nodes, frame)
     # What moves whole lines is the same at all nodes of a line: one column is enough.
     parts = [
         (nodes[_WHERE[along]], [one for one in components if one.along == along])
@@ -102,7 +102,7 @@ def solve_profile(
     full = with_components(residuals, components)
     axes = [np.linspace(nodes[0], nodes[-1], _OF_THE_AFFINE) for nodes in (line, sample)]
     evenly = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    t_evenly = np.column_stack([np.ones(len(evenly)), (evenly - frame.centre) / frame.half_size])
+    t_evenly = _by_affine(evenly, frame)
     fitted = np.linalg.pinv(t_evenly)
     parameters, covariance, displacement, variance = [], [], [], []
     for k in range(2):
@@ -138,6 +138,13 @@ def solve_profile(
         variance.append(np.maximum(total, 0.0) - (t @ uncertain * t).sum(axis=-1))
     grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1))
     return ProfileSolution(np.array(parameters), np.array(covariance), grid)
+
+
+def _by_affine(places: Array, frame: ImageCorrection) -> Array:
+    """Derivatives (..., 3) of a coordinate at places (..., 2) by the affine parameters."""
+    return np.concatenate(
+        [np.ones((*places.shape[:-1], 1)), (places - frame.centre) / frame.half_size], axis=-1
+    )
 
 
 def _padded(t: Array, own: Array) -> Array:

@@ -31,6 +31,7 @@ or repeated rather than ground moved."""
 _ALONG = 0.1
 """Displacement along the samples over that along the lines, up to which lines alone were displaced."""
 _ENOUGH = 4
+"""Points that agree elsewhere, from which on one may do so by chance."""
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
 _AS_MANY = 0.5
