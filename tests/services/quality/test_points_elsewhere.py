@@ -10,8 +10,6 @@ from services.quality.lack_of_fit import (
     elsewhere_criterion,
 )
 
-LINES = 2000
-
 
 def judged(line: np.ndarray, others: np.ndarray, displacement_px: tuple[float, float]) -> str:
     """What a scene cannot be whose points of these lines lie elsewhere."""
