@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks._campaign import Outcome, Prepared, registered
+from benchmarks._campaign import Outcome, registered
 from benchmarks._continent import Continent
 from benchmarks._point_errors import BlockErrors
+from benchmarks._scenes import Prepared
 from services.formats.images.scenes import read_scene
 from services.geodesy import move_metres
 from services.matching.predict import in_image

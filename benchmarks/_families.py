@@ -169,7 +169,7 @@ def place_of(scene: Scene) -> Place:
 def fingerprint(*more: str) -> str:
     """A short hash of the sources that outcomes follow from, and of more modules of the benchmarks."""
     digest = hashlib.sha256()
-    names = ("campaign", "distorted_trials", "distortions", "point_errors", "trials", "worlds")
+    names = ("campaign", "distorted_trials", "distortions", "point_errors", "scenes", "trials", "worlds")
     drawn = [ROOT / "benchmarks" / f"_{name}.py" for name in (*names, *more)]
     for path in sorted((ROOT / "services").rglob("*.py")) + drawn:
         digest.update(path.read_bytes())

@@ -10,7 +10,7 @@ import numpy as np
 from services.simulation.tiles import TILE_PX, Tiles
 
 _ROOT = Path(__file__).parent.parent
-_DRAWN = ("campaign", "distorted_trials", "distortions", "trials", "worlds")
+_DRAWN = ("scenes", "distorted_trials", "distortions", "trials", "worlds")
 
 
 @cache

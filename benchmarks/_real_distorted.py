@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._campaign import Outcome, Truth, outcome_of
+from benchmarks._campaign import Outcome, outcome_of
 from benchmarks._distorted_trials import DISTORTED
 from benchmarks._distortions import NOT_DISTORTED, Drawn, distortion_of
 from benchmarks._real_views import VIEWS, RealView, real_view
+from benchmarks._scenes import Truth
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.matching.predict import in_image
 from services.registration.on_points import Registration

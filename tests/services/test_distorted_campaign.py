@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks._campaign import Outcome, Prepared, attempt, prepare
+from benchmarks._campaign import Outcome, attempt
 from benchmarks._distorted_tables import accused, by_kind, distorted_acceptance, figures_of
 from benchmarks._distorted_trials import DISTORTED, distorted_trial
 from benchmarks._distortions import (
@@ -20,6 +20,7 @@ from benchmarks._distortions import (
     distortion_of,
 )
 from benchmarks._families import outcome_line, read_outcomes
+from benchmarks._scenes import Prepared, prepare
 from benchmarks._trials import draw_trial
 from benchmarks._worlds import Block, Place, block_of
 from services.registration.options import RegistrationOptions

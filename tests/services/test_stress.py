@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks._campaign import Outcome, attempt, prepare
+from benchmarks._campaign import Outcome, attempt
 from benchmarks._families import DRAWS, FAMILIES, outcome_line, read_outcomes
+from benchmarks._scenes import prepare
 from benchmarks._stress_tables import acceptance, as_without_damage, by_factor, summary
 from benchmarks._trials import (
     Trial,
