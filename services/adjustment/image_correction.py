@@ -16,7 +16,8 @@ from services.adjustment.shared_errors import (
     likeliest_shared_errors,
     offset_sigma_px,
 )
-from services.adjustment.structure import Structure
+from services.adjustment.short_motion import STILL, ChipStrips, ShortMotion, short_motion
+from services.adjustment.structure import Structure, unfollowed_variance_px2
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.base import SensorModel
 from services.sensors.correction import ImageCorrection, no_correction
@@ -90,6 +91,7 @@ class ControlObservations:
         frame_covariance_m2: (b, 3, 3) of the frames of the blocks, east, north, up, NaN where unknown;
             `block` counts its rows. None when all are unknown.
         chip_side_px: side of the chips in the scene: nearer measures share pixels. 0 when none do.
+        strips: of the chips, as they move against each other; None where it is not known.
     """
 
     lon_lat_h: Array
@@ -102,6 +104,7 @@ class ControlObservations:
     block: IntArray | None = None
     frame_covariance_m2: Array | None = None
     chip_side_px: float = 0.0
+    strips: ChipStrips | None = None
 
 
 @dataclass(frozen=True)
@@ -117,8 +120,9 @@ class SceneAdjustment:
             order leaves out. It is relative to the frame that the blocks of the points scatter about.
         deformation: (6, 6) part of it by what the points share, as they are deformed.
         local_sigma_px: (2,) standard deviation, line and sample, of what parts of the image are off by
-            and no correction follows: seams between detectors, terrain.
+            and no correction follows: seams between detectors, terrain, motion within chips.
         shared: what the residuals tell of errors that the points share.
+        short_motion: what chips show of motion within them.
         apart_px: standard deviation of the offsets of the points' blocks, beyond chance; 0 for one.
         residual_px: (n, 2) observed minus computed, line and sample, of all measures.
         active: (n,) measures that were not deactivated.
@@ -138,6 +142,7 @@ class SceneAdjustment:
     deformation: Array
     local_sigma_px: Array
     shared: SharedErrors
+    short_motion: ShortMotion
     apart_px: float
     residual_px: Array
     active: BoolArray
@@ -181,8 +186,8 @@ def adjust_scene(
         observations: of the control points.
         options: thresholds.
         min_points: smallest number of active measures; that of the options when None.
-        like: an adjustment of these measures and others, whose prior of drift and skew and whose shared
-            errors hold; both are estimated when None.
+        like: an adjustment of these measures and others, whose prior of drift and skew, shared errors
+            and motion hold; they are estimated when None.
 
     Raises:
         NotEnoughPoints: fewer than `min_points` measures are usable.
@@ -293,6 +298,11 @@ def adjust_scene(
     )
     of_image = np.median((1.0 - of_points / declared.variance)[active], axis=0)
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
+    short = like.short_motion if like else _short_motion(measured, observations, active, displacement)
+    tested = (
+        like.structures if like else measured.structures(fit, active, components, shared, along_axes)
+    )
+    unfollowed = unfollowed_variance_px2(tested, of_image)
     return SceneAdjustment(
         correction=correction,
         order=order,
@@ -300,16 +310,33 @@ def adjust_scene(
         slope_px=slope_px,
         covariance=covariance + deformation,
         deformation=deformation,
-        local_sigma_px=np.sqrt(local_px2),
+        local_sigma_px=np.sqrt(np.maximum(local_px2, unfollowed) + short.variance_px2),
         shared=shared,
+        short_motion=short,
         apart_px=apart_px,
         residual_px=np.where((usable | active)[:, None], misfit_px, np.nan),
         active=active,
         sigma0=sigma0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
         components=components,
-        structures=() if like else measured.structures(fit, active, components, shared, along_axes),
+        structures=tested if like else (*tested, short.structure),
     )
+
+
+def _short_motion(
+    measured: PlacedMeasures,
+    observations: ControlObservations,
+    active: BoolArray,
+    displacement: DisplacementGrid | None,
+) -> ShortMotion:
+    """The motion within the chips of active measures (n,) that a displacement does not follow."""
+    if observations.strips is None or not measured.scanned:
+        return STILL
+    place, strips = measured.position_px[active], observations.strips.take(active)
+    if displacement is not None:
+        left_px = strips.displacement_px - strips.against(displacement, place)
+        strips = replace(strips, displacement_px=left_px)
+    return short_motion(strips, place, observations.chip_side_px)
 
 
 def _components(
@@ -333,16 +360,19 @@ def _components(
     """
     wanted = options.profile and options.order is None
     components, along_axes = measured.components(fit, active, wanted=wanted)
-    if components or not wanted or (seen & ~active).sum() < _LEFT_OUT:
-        return components, along_axes
-    # What lies beside a step agrees with itself, and was left out.
-    components, _ = measured.components(clipped, seen)
+    first = components
+    if wanted and not components and (seen & ~active).sum() >= _LEFT_OUT:
+        # What lies beside a step agrees with itself, and was left out.
+        components, _ = measured.components(clipped, seen)
     if not components:
         return (), along_axes
+    # Measures that an affine correction keeps may be wrong beside what moves, and right that it leaves.
     expected = fit.expected(np.inf)
     agreeing = measured.agreeing(fit, seen, components, expected, options.tolerance)
-    again, along_axes = measured.components(fit, agreeing)
-    return again or components, along_axes
+    again, left = measured.components(fit, agreeing)
+    if not again and first:
+        return first, along_axes
+    return again or components, left
 
 
 def _declared_fit(

@@ -4,9 +4,10 @@ Residuals of a correction that fits are independent. Each family of shapes below
 are not: a scanner that shakes or bends along the lines, lines that were lost or repeated, detectors out
 of place along the samples, relief that the model sees from another side, parts of the image that moved.
 
-The test of a family is exact for normal errors: the F statistic of its best shape, on whitened residuals
-from which the affine correction has been projected out, times the number of shapes that were tried
-(Bonferroni), which is conservative.
+The test of a family is exact for normal errors: the F statistic of its best shape, on whitened
+residuals from which the affine correction has been projected out, times the number of shapes that were
+tried (Bonferroni), which is conservative. Bows are two shapes beside hundreds of periods: each kind of
+shape has an equal share of the false alarms.
 """
 
 from collections.abc import Sequence
@@ -20,10 +21,14 @@ from scipy.special import fdtrc
 
 from services.types import Array
 
-Family = Literal["lines", "samples", "steps", "image", "height"]
-"""What residuals may depend on; "steps" are those along the lines."""
+Family = Literal["lines", "samples", "steps", "image", "height", "chips"]
+"""What residuals may depend on; "steps" are those along the lines, "chips" motion within chips."""
 ALONG_AXES: tuple[Family, ...] = ("lines", "steps", "samples")
 OTHERWISE: tuple[Family, ...] = ("image", "height")
+_OF_PLACES: tuple[Family, ...] = (*ALONG_AXES, "image")
+"""Families that say how far off a place is; what depends on height is another model's."""
+_EXPECTED = 0.05
+"""A priori probability that an image moves in some way of a family."""
 
 _LEAST_POINTS = 12
 """Fewer residuals show no structure."""
@@ -159,16 +164,14 @@ def _structure(residuals: Residuals, family: Family) -> Structure:
     if family == "height":
         residuals = _beyond_height_errors(_bent(residuals))
     if len(residuals.misfit) >= max(_LEAST_POINTS, residuals.design.shape[1] + 6):
-        for names, at, shapes in _shapes(residuals, family):
-            if not len(shapes):
-                continue
+        kinds = [shapes for shapes in _shapes(residuals, family) if len(shapes[2])]
+        for names, at, shapes in kinds:
             gain, coefficients = residuals.gains(shapes)
             chance = residuals.chance(gain, shapes.shape[2])
             best = int(np.argmin(chance))
             tried.append(
                 (
-                    float(chance[best]),
-                    len(shapes),
+                    float(chance[best]) * len(shapes) * len(kinds),
                     names[best],
                     at[best],
                     coefficients[best],
@@ -178,12 +181,11 @@ def _structure(residuals: Residuals, family: Family) -> Structure:
     none = np.full(2, np.nan)
     if not tried:
         return Structure(family, 1.0, "", float("nan"), none, 0.0, none)
-    smallest, _, name, at_best, coefficient, shape = min(tried, key=lambda one: one[0])
-    count = sum(one[1] for one in tried)
+    chance_of_family, name, at_best, coefficient, shape = min(tried, key=lambda one: one[0])
     displacement = shape @ coefficient.T
     return Structure(
         family,
-        chance=min(1.0, smallest * count),
+        chance=min(1.0, chance_of_family),
         shape=name,
         at=float(at_best),
         size_px=displacement.std(axis=0),
@@ -218,6 +220,39 @@ def _beyond_height_errors(residuals: Residuals) -> Residuals:
     times = float(coefficients[0, :, 0] @ pull) / max(float(pull @ pull), 1e-300)
     explained = height[:, None] * pull * np.clip(times, 0.0, _MOST_UNDERSTATED)
     return replace(residuals, misfit=residuals.misfit - explained)
+
+
+def probability_of_structure(chance: float) -> float:
+    """Probability that a structure is more than chance, from the chance of one that is as clear.
+
+    A chance of p makes a structure at most 1 / (-e p log p) times more likely than none. Source: Sellke,
+    Bayarri and Berger (2001), Calibration of p values for testing precise null hypotheses.
+    """
+    if chance >= np.exp(-1.0):
+        return 0.0
+    against = -np.e * max(chance, 1e-300) * np.log(max(chance, 1e-300))
+    return float(1.0 / (1.0 + against * (1.0 - _EXPECTED) / _EXPECTED))
+
+
+def unfollowed_variance_px2(found: Sequence[Structure], of_image: Array) -> Array:
+    """What structures that nothing follows add to the variance (2,) of a position, line and sample.
+
+    Families are different words for one misfit: the largest counts.
+
+    Args:
+        found: the structures.
+        of_image: (2,) share of the variance of measures that is an error of the image. Points do not err
+            along lines or samples of an image that they were not made from; what neighbours share in all
+            directions may be an error of the points.
+    """
+    parts = [
+        probability_of_structure(one.chance)
+        * np.nan_to_num(one.size_px) ** 2
+        * (of_image if one.family == "image" else 1.0)
+        for one in found
+        if one.family in _OF_PLACES
+    ]
+    return np.max(parts, axis=0) if parts else np.zeros(2)
 
 
 _Shapes = tuple[Sequence[str], Sequence[float], Array]

@@ -12,6 +12,7 @@ from services.adjustment.parameter_figures import (
     parameter_figures,
 )
 from services.adjustment.shared_errors import SharedErrors
+from services.adjustment.short_motion import STILL
 from services.conventions import CHIP_SIZE
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock
@@ -62,6 +63,7 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
         deformation=deformation,
         local_sigma_px=np.hypot(alone.local_sigma_px if alone else 0.0, nearest.local_px),
         shared=alone.shared if alone else _INDEPENDENT,
+        short_motion=alone.short_motion if alone else STILL,
         apart_px=alone.apart_px if alone else 0.0,
         residual_px=np.where(measured.usable[:, None], residual_px, np.nan),
         active=active,

@@ -5,11 +5,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from services.adjustment.short_motion import ChipStrips
 from services.conventions import CHIP_CENTRE
 from services.geodesy import move_metres
 from services.imagery.gaps import bridged, missing_reason
 from services.imagery.source import ImageSource, ReducedImage, image_gsd_m, low_pass, render_chip
 from services.matching.chip_extent import central_square, visible_half_side
+from services.matching.chip_strips import chip_strips
 from services.matching.correlate import (
     FOUND,
     CorrelationOptions,
@@ -86,6 +88,7 @@ class PointMatches:
         common_covariance_m2: (2, 2) east and north, of the error that all the measures share: see
             `systematic_error`.
         view_measures: result of every view that was tried; its rows are those of the points.
+        strips: how parts of the chips move against each other; None where it is not known.
     """
 
     line_sample: Array
@@ -97,6 +100,7 @@ class PointMatches:
     by_gradient: BoolArray
     common_covariance_m2: Array
     view_measures: ViewMeasures
+    strips: ChipStrips | None = None
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,10 @@ def with_matches(matches: PointMatches, rows: IntArray, again: PointMatches) -> 
     views["point"] = np.concatenate([before.point[kept], rows[after.point[added]]])
     order = np.argsort(views["point"], kind="stable")
     view_measures = ViewMeasures(**{name: column[order] for name, column in views.items()})
-    return replace(matches, view_measures=view_measures, **columns)
+    strips = matches.strips
+    if strips is not None and again.strips is not None:
+        strips = strips.replaced(into, again.strips.take(of_them))
+    return replace(matches, view_measures=view_measures, strips=strips, **columns)
 
 
 def _not_searched(reason: str) -> _PointMatch:
@@ -292,7 +299,15 @@ def _assembled(
         by_gradient=np.array([match.by_gradient for match in matches], dtype=bool),
         common_covariance_m2=_common_covariance_px2(search, points, matches, order) * search.gsd_m**2,
         view_measures=_view_measures(matches),
+        strips=_strips(search, points, matches),
     )
+
+
+def _strips(search: ChipSearch, points: ControlPoints, matches: list[_PointMatch]) -> ChipStrips:
+    """How parts of the chips of all points move against each other in the scene."""
+    derivative = search.model.project_derivative(points.lon_lat_h)
+    by_row_col = search.gsd_m * np.stack([-derivative[:, :, 1], derivative[:, :, 0]], axis=-1)
+    return chip_strips([match.combination for match in matches], by_row_col)
 
 
 def _best_score(peaks: list[Peak]) -> float:

@@ -77,7 +77,8 @@ class Peak:
         row_col: (2,) displacement of the chip from the centre of the patch, chip pixels.
         score: normalised correlation at the peak.
         sigma_px: one standard deviation a coordinate, chip pixels.
-        influence: (c, c, 2) of the squares of the chip on its position; see `least_squares.Fit`.
+        influence, leverage: (c, c, 2) and (c, c, 2, 2) of the squares of the chip on its position; see
+            `least_squares.Fit`.
         reason: `FOUND`, or why the peak is rejected: "flat", "nodata", "saturated", "low_score",
             "border_peak", "ambiguous".
     """
@@ -86,6 +87,7 @@ class Peak:
     score: float
     sigma_px: float
     influence: Array
+    leverage: Array
     reason: str
 
 
@@ -137,12 +139,14 @@ def find_chip(
     if not math.sqrt(max(np.linalg.eigvalsh(covariance)[1], 0.0)) <= options.max_sigma_px:
         return rejected("ambiguous", score)
     centre = (np.array(patch.shape) - chip.shape[0]) / 2.0
-    return Peak(fit.row_col - centre, score, sigma_per_coordinate(covariance), fit.influence, FOUND)
+    sigma_px = sigma_per_coordinate(covariance)
+    return Peak(fit.row_col - centre, score, sigma_px, fit.influence, fit.leverage, FOUND)
 
 
 def rejected(reason: str, score: float = math.nan) -> Peak:
     """A peak that was not accepted, or not searched."""
-    return Peak(np.full(2, np.nan), score, math.nan, np.zeros((0, 0, 2)), reason)
+    nothing = np.zeros((0, 0, 2)), np.zeros((0, 0, 2, 2))
+    return Peak(np.full(2, np.nan), score, math.nan, *nothing, reason)
 
 
 def _pixel_rejection(

@@ -43,11 +43,14 @@ class Fit:
         score: normalised correlation there.
         influence: (c, c, 2) shift of the position, rows and columns, by the residuals in each square of
             the chip; the sum over the squares is zero.
+        leverage: (c, c, 2, 2) shift of the position by a displacement of each square alone; the sum over
+            the squares is the unit matrix.
     """
 
     row_col: Array
     score: float
     influence: Array
+    leverage: Array
 
 
 def fit_chip(
@@ -81,17 +84,17 @@ def fit_chip(
     if np.isfinite(near).all() and np.isfinite(chip).all():
         if weight is None:
             weight = np.ones((chip.shape[0] - 2, chip.shape[1] - 2), dtype=np.float32)
-        row_col, score, influence = fit_position(
+        row_col, score, influence, leverage = fit_position(
             spline_coefficients(near), chip, weight, _ALL, start - first
         )
     else:
-        row_col, score, influence = _fit_valid(near, chip, weight, start - first)
-    return Fit(first + row_col, score, influence) if np.isfinite(score) else None
+        row_col, score, influence, leverage = _fit_valid(near, chip, weight, start - first)
+    return Fit(first + row_col, score, influence, leverage) if np.isfinite(score) else None
 
 
 def _fit_valid(
     patch: FloatImage, chip: FloatImage, weight: FloatImage | None, row_col: Array
-) -> tuple[Array, float, Array]:
+) -> tuple[Array, float, Array, Array]:
     """As `fit_position`, from a patch and over the pixels valid in patch and chip.
 
     A missing pixel of the patch enters the interpolation beside it. There it has the value that the chip

@@ -27,8 +27,8 @@ def fit_position(
     weight: FloatImage,
     used: FloatImage,
     start: Array,
-) -> tuple[Array, float, Array]:
-    """Row and column (2,), score and influence of the fitted position; a NaN score where there is none.
+) -> tuple[Array, float, Array, Array]:
+    """Row and column (2,), score, influence and leverage of the fit; a NaN score where there is none.
 
     Args:
         coefficients: of the spline through the patch.
@@ -44,7 +44,7 @@ def fit_position(
     _centre(centred, used)
     square = _projected(centred, centred, gradients, inverse)[0]
     at = np.empty((side, side), dtype=np.float32)
-    failed = (start, np.nan, np.zeros((1, 1, 2)))
+    failed = (start, np.nan, np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 2)))
     row, col = start
     r, c = row, col
     for _ in range(MAX_STEPS):
@@ -71,8 +71,8 @@ def fit_position(
     _interpolated(coefficients, r + 1.0, c + 1.0, at, 0)
     _centre(at, used)
     position = np.array([r, c])
-    score, influence = _influence(coefficients, at, centred, gradients, position)
-    return position, score, influence
+    score, influence, leverage = _influence(coefficients, at, centred, gradients, position)
+    return position, score, influence, leverage
 
 
 @njit(cache=True, fastmath=_SUMS)
@@ -206,8 +206,8 @@ def _influence(
     chip: FloatImage,
     gradients: FloatImage,
     row_col: Array,
-) -> tuple[float, Array]:
-    """Correlation of chip and patch, and the influences (c, c, 2) of the squares of the chip.
+) -> tuple[float, Array, Array]:
+    """Correlation of chip and patch, influences (c, c, 2) and leverages (c, c, 2, 2) of the squares.
 
     `at` is the patch under the chip; both are centred.
     """
@@ -218,23 +218,30 @@ def _influence(
     _interpolated(coefficients, row + 1.0, col + 1.0, down, 1)
     _interpolated(coefficients, row + 1.0, col + 1.0, right, 2)
     product, square, chip_square = 0.0, 0.0, 0.0
-    m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0
+    cells = -(-side // CELL_PX)
+    information = np.zeros((2, 2, cells, cells))
     for i in range(side):
         for j in range(side):
             value, other = chip[i, j], at[i, j]
             product += value * other
             square += other * other
             chip_square += value * value
-            m00 += gradients[0, i, j] * down[i, j]
-            m01 += gradients[0, i, j] * right[i, j]
-            m10 += gradients[1, i, j] * down[i, j]
-            m11 += gradients[1, i, j] * right[i, j]
+            a, b = i // CELL_PX, j // CELL_PX
+            information[0, 0, a, b] += gradients[0, i, j] * down[i, j]
+            information[0, 1, a, b] += gradients[0, i, j] * right[i, j]
+            information[1, 0, a, b] += gradients[1, i, j] * down[i, j]
+            information[1, 1, a, b] += gradients[1, i, j] * right[i, j]
     score = product / np.sqrt(square * chip_square)
     # Noise in the chip biases the regression gain low, noise in the patch biases its inverse low. The
     # ratio of the spreads lies between the two.
     gain = np.sqrt(square / chip_square)
+    m00, m01 = information[0, 0].sum(), information[0, 1].sum()
+    m10, m11 = information[1, 0].sum(), information[1, 1].sum()
     determinant = m00 * m11 - m01 * m10
-    cells = -(-side // CELL_PX)
+    leverage = np.empty((cells, cells, 2, 2))
+    for k in range(2):
+        leverage[:, :, 0, k] = (m11 * information[0, k] - m01 * information[1, k]) / determinant
+        leverage[:, :, 1, k] = (m00 * information[1, k] - m10 * information[0, k]) / determinant
     influence = np.zeros((cells, cells, 2))
     for i in range(side):
         for j in range(side):
@@ -242,7 +249,7 @@ def _influence(
             by_r, by_c = gradients[0, i, j] * left, gradients[1, i, j] * left
             influence[i // CELL_PX, j // CELL_PX, 0] -= (m11 * by_r - m01 * by_c) / determinant
             influence[i // CELL_PX, j // CELL_PX, 1] -= (m00 * by_c - m10 * by_r) / determinant
-    return score, influence
+    return score, influence, leverage
 
 
 @njit(cache=True, fastmath=_SUMS)

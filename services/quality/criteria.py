@@ -148,6 +148,14 @@ _DESCRIPTIONS = {
         "The same for what grows with the height of the points: the lines of sight of the model are "
         "not those of the image.",
     ),
+    "structure_within_chips": _Description(
+        "Motion within the chips",
+        "px",
+        2,
+        "Largest displacement by a swing over fewer lines than a chip has, by which parts of the chips "
+        "at the same lines are displaced alike (F test, as along the lines). The limit of good is half "
+        "of the predicted CE90, which holds it.",
+    ),
     "missed_along_lines": _Description(
         "Lines whose points do not agree",
         "%",

@@ -17,6 +17,7 @@ _CRITERIA: dict[Family, str] = {
     "samples": "structure_along_samples",
     "image": "structure_in_image",
     "height": "structure_against_height",
+    "chips": "structure_within_chips",
 }
 _MAX_CHANCE = 1e-4
 """A family of structures that chance explains with a larger probability is not named."""
@@ -219,6 +220,12 @@ def _looks_like(structure: Structure, sight: Array, shape: tuple[int, int]) -> s
     size = f"{line_px:.2f} px in line and {sample_px:.2f} px in sample"
     if structure.family == "height":
         return _wrong_sight(structure.slope_px, sight)
+    if structure.family == "chips":
+        return (
+            f"parts of chips move against each other by {size}, most clearly over {structure.at:.0f} "
+            "lines: attitude jitter too fast for positions of whole chips, which no correction follows; "
+            "the predicted accuracy holds it"
+        )
     if structure.shape == "step":
         return f"a step of {size} at line {structure.at:.0f}: lines that were lost or repeated"
     if structure.family == "image":
