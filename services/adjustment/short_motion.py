@@ -174,7 +174,7 @@ class _Contrasts:
 
     @classmethod
     def of(cls, strips: ChipStrips) -> Self:
-        known = np.isfinite(strips.displacement_px).all(axis=2)
+        known = np.asarray(np.isfinite(strips.displacement_px).all(axis=2))
         sigma = np.where(known[:, :, None], strips.sigma_px, np.inf)
         weight = 1.0 / sigma.transpose(2, 0, 1)
         freedom = np.broadcast_to(known.sum(axis=1) - 2.0, weight.shape[:2])

@@ -50,7 +50,7 @@ def strips_of(
 def test_strips_are_displaced_as_the_scene_shows_them() -> None:
     for seed in range(10):
         strips, true = strips_of((0.3, 0.5), seed, UPRIGHT)
-        assert strips.displacement_px[0] == pytest.approx(true, abs=0.2)
+        assert np.sqrt(np.mean((strips.displacement_px[0] - true) ** 2)) < 0.1
         assert np.corrcoef(strips.displacement_px[0].ravel(), true.ravel())[0, 1] > 0.9
         assert (np.diff(strips.line[0]) > 10.0).all()
 
