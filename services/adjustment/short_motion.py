@@ -18,7 +18,7 @@ from services.types import Array, BoolArray, IntArray
 
 STRIPS = 8
 """Strips of a chip across the lines of a scene."""
-_LONGEST = 2.0
+_LONGEST = 1.5
 """Longest period that is tried, sides of a chip: positions of chips show longer ones."""
 _SHORTEST = 2.5
 """The shortest, strips of a chip."""
@@ -115,8 +115,10 @@ def short_motion(strips: ChipStrips, line_sample: Array, side_px: float) -> Shor
         structure = found.structure
         if found is STILL:
             structure = replace(structure, chance=min(chance, 1.0), shape="period", at=periods[best])
-        noise = rest[best] / freedom * np.trace(np.linalg.inv(information[best]), axis1=1, axis2=2)
-        power = np.maximum((coefficient[best] ** 2).sum(axis=1) - noise, 0.0) / 2.0
+        # Of any phase: what mean and slope of a chip hide of a wave, they hide of its noise, too.
+        explained = np.einsum("ki,kij,kj->k", coefficient[best], information[best], coefficient[best])
+        by_chance = 2.0 * rest[best] / freedom
+        power = np.maximum(explained - by_chance, 0.0) / np.trace(information[best], axis1=1, axis2=2)
         variance = found.variance_px2 + probability_of_structure(chance) * power
         largest = float(np.sqrt(2.0 * variance.sum()))
         found = ShortMotion(replace(structure, size_px=np.sqrt(variance), largest_px=largest), variance)

@@ -70,9 +70,8 @@ def search_elsewhere(
     points = context.points.take(rows)
     matches = match_points(chip_search, points, context.chips, context.options.matching)
     again = _Again(rows, matches, int(missed.sum()))
-    return _as_heights_move(context, prediction, search, adjustment, again) or _far_away(
-        context, prediction, again
-    )
+    beside = _as_heights_move(context, prediction, search, adjustment, again)
+    return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
 
 
 def _lines_beside(
@@ -160,14 +159,23 @@ def _as_heights_move(
     )
 
 
-def _far_away(context: PointContext, prediction: Prediction, again: _Again) -> Elsewhere | None:
-    """Points that are found together, but far from where they are expected."""
+def _scatter_m(context: PointContext, adjustment: SceneAdjustment) -> float:
+    """Distance within which points agree with the scene."""
+    residual_px = adjustment.residual_px[adjustment.active]
+    return consensus_tolerance_px(float(np.sqrt(np.mean(residual_px**2)))) * context.gsd_m
+
+
+def _far_away(
+    context: PointContext, prediction: Prediction, again: _Again, scatter_m: float
+) -> Elsewhere | None:
+    """Points that are found together, but farther from where they are expected than points scatter."""
     rows, matches = again.rows, again.matches
     points, gsd_m = context.points.take(rows), context.fine_gsd_m
     tolerance_m = FIRST_TOLERANCE_PX * gsd_m
     displacement_m = matches.displacement_m.copy()
     # Points that lie where they are expected, and were missed before, are of the scene.
-    displacement_m[np.hypot(*displacement_m.T) <= 2.0 * tolerance_m] = np.nan
+    near_m = min(scatter_m, 2.0 * tolerance_m)
+    displacement_m[np.hypot(*displacement_m.T) <= near_m] = np.nan
     voters = Voters(matches.line_sample, CHIP_SIZE * gsd_m / context.gsd_m)
     group = a_contrario_consensus(displacement_m, tolerance_m, _RADIUS_PX * gsd_m, voters)
     if group.inliers.sum() < 3 or group.false_alarms > _MAX_FALSE_ALARMS:
