@@ -1,7 +1,6 @@
 """What holds the house together: imports, the tour, and documents that name everything there is."""
 
 import ast
-import json
 import os
 import re
 import subprocess
@@ -22,8 +21,6 @@ from tests.command_line import amers_here
 from tests.composed_sql import Source, read_sources
 
 ROOT = Path(__file__).parent.parent
-HEAVY = {"numba", "scipy", "cv2", "rasterio", "matplotlib", "pyarrow", "fastapi"}
-STORE = {"sqlalchemy", "geoalchemy2", "psycopg", "numpy", "shapely"}
 README = ROOT / "README.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
 TOUR = (
@@ -166,33 +163,6 @@ def test_a_command_is_documented_and_explains_itself(words):
     for word in words.split()[1:]:
         command = command.commands[word]
     assert command.help
-
-
-def loaded_by(*arguments: str) -> set[str]:
-    """The modules that `amers` with these arguments imports."""
-    program = (
-        "import atexit, json, sys; from app.cli.main import main\n"
-        "atexit.register(lambda: print(json.dumps(list(sys.modules))))\n"
-        f"sys.argv = {['amers', *arguments]}\n"
-        "main()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return set(json.loads(done.stdout.splitlines()[-1]))
-
-
-def test_a_command_starts_without_what_only_others_need():
-    assert HEAVY & loaded_by("token", "--help") == set()
-
-
-def test_a_registration_starts_without_the_statistics_of_scipy():
-    # A third of the time that its start takes.
-    assert "scipy.stats" not in loaded_by("scene", "register", "--help")
-
-
-def test_the_help_starts_without_the_store_and_the_science():
-    assert (HEAVY | STORE) & loaded_by("--help") == set()
 
 
 def test_the_command_tells_its_version():

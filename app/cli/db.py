@@ -1,29 +1,11 @@
-"""`amers db`: the database and its schema, backups of database and files."""
-
-from pathlib import Path
-from typing import Annotated
-
-import typer
+"""`amers db upgrade` and `status`: the schema of the database."""
 
 from app.cli.output import AsJson, show_one
-from app.cli.progress import shown_progress
 from app.config import read_settings
-from app.db import engine, revisions
-from app.db.cluster import backup as archive
+from app.db import revisions
 from app.db.cluster import embedded
-from app.storage import open_storage
-from app.usecases.backups.make import make_backup
-from app.usecases.backups.manifest import Manifest, find_problems, read_manifest
-from app.usecases.backups.restore import restore_backup
-from app.usecases.installation import Installation
-
-app = typer.Typer(no_args_is_help=True)
-
-EXIT_DAMAGED = 1
-EXIT_REFUSED = 2
 
 
-@app.command()
 def upgrade(as_json: AsJson = False) -> None:
     """Upgrade the schema of the database to the version that this Amers needs."""
     with embedded.database(read_settings()) as dsn:
@@ -33,7 +15,6 @@ def upgrade(as_json: AsJson = False) -> None:
     show_one({"from": before.found, "to": after.found}, as_json=as_json)
 
 
-@app.command()
 def status(as_json: AsJson = False) -> None:
     """Show the schema version of the database and the one that this Amers needs."""
     settings = read_settings()
@@ -47,70 +28,3 @@ def status(as_json: AsJson = False) -> None:
         "current": schema.current,
     }
     show_one(record, as_json=as_json)
-
-
-@app.command()
-def backup(
-    folder: Annotated[Path, typer.Argument(help="Folder to write; it must not exist.")],
-    as_json: AsJson = False,
-) -> None:
-    """Write the database and the stored files into a folder, as one set with a manifest."""
-    settings = read_settings()
-    with engine.opened(settings) as database, shown_progress() as progress:
-        here = Installation(database, open_storage(settings), settings)
-        manifest = make_backup(here, folder.absolute(), progress)
-    show_one(_summary(folder, manifest), as_json=as_json)
-    if manifest.damaged:
-        typer.echo(
-            "amers: the backup is complete, but files of the storage are damaged or missing: "
-            + "; ".join(f"{item.key}: {item.reason}" for item in manifest.damaged),
-            err=True,
-        )
-        raise typer.Exit(EXIT_DAMAGED)
-
-
-@app.command()
-def verify_backup(
-    folder: Annotated[Path, typer.Argument(help="A folder written by `amers db backup`.")],
-    as_json: AsJson = False,
-) -> None:
-    """Read a backup and compare it with its manifest: missing, surplus and changed files."""
-    manifest = read_manifest(folder)
-    with shown_progress() as progress:
-        problems = find_problems(folder, manifest, progress)
-    show_one({**_summary(folder, manifest), "problems": problems}, as_json=as_json)
-    if problems:
-        raise typer.Exit(EXIT_REFUSED)
-
-
-@app.command()
-def restore(
-    folder: Annotated[
-        Path, typer.Argument(help="A folder written by `amers db backup`, or only its database.dump.")
-    ],
-    as_json: AsJson = False,
-) -> None:
-    """Verify a backup, and restore it into an empty database and an empty storage."""
-    settings = read_settings()
-    with embedded.database(settings) as dsn:
-        if folder.is_file():
-            archive.restore(dsn, folder)
-            revisions.upgrade(dsn)
-            record: dict[str, object] = {"archive": folder, "revision": revisions.status(dsn).found}
-        else:
-            with shown_progress() as progress:
-                record = _summary(folder, restore_backup(dsn, open_storage(settings), folder, progress))
-    show_one(record, as_json=as_json)
-
-
-def _summary(folder: Path, manifest: Manifest) -> dict[str, object]:
-    return {
-        "backup": folder,
-        "created_at": manifest.created_at,
-        "installation": manifest.installation,
-        "revision": manifest.revision,
-        "files": len(manifest.files),
-        "size_bytes": manifest.size_bytes,
-        "damaged": [item.key for item in manifest.damaged],
-        "outdated": [item.key for item in manifest.outdated],
-    }

@@ -11,10 +11,7 @@ from app.db.references import ReferenceRow
 from app.usecases import references
 from app.usecases.references import NewReference
 
-app = typer.Typer(no_args_is_help=True)
 
-
-@app.command()
 def add(
     image: Annotated[str, typer.Argument(help="Ortho-image: path below AMERS_REFERENCE_FOLDER.")],
     *,
@@ -46,7 +43,6 @@ def add(
     show_one(_record(row), as_json=as_json)
 
 
-@app.command("list")
 def list_references(as_json: AsJson = False) -> None:
     """List the reference images, by name."""
     with transaction() as connection:
@@ -54,7 +50,6 @@ def list_references(as_json: AsJson = False) -> None:
     show([_record(row) for row in rows], as_json=as_json)
 
 
-@app.command()
 def remove(name: Annotated[str, typer.Argument(help="Name of the reference.")]) -> None:
     """Remove a reference image from the installation; its files stay in their folder."""
     with transaction() as connection:

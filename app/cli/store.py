@@ -11,18 +11,12 @@ from app.cli.progress import shown_progress
 from app.cli.transaction import transaction
 from app.config import read_settings
 from app.db import engine
-from app.errors import InputError
-from app.storage import open_storage, trash
+from app.storage import open_storage
 from app.usecases import garbage_collection, storage_identity, usage
 from app.usecases.installation import Installation
 from app.usecases.store_verification import Finding, verify_store
 
-app = typer.Typer(no_args_is_help=True)
-trash_app = typer.Typer(no_args_is_help=True, help="Files that the sweep removed.")
-app.add_typer(trash_app, name="trash")
 
-
-@app.command()
 def adopt(as_json: AsJson = False) -> None:
     """Let the storage belong to the database, after you have checked that they belong together."""
     settings = read_settings()
@@ -33,7 +27,6 @@ def adopt(as_json: AsJson = False) -> None:
     show_one(record, as_json=as_json)
 
 
-@app.command("usage")
 def show_usage(as_json: AsJson = False) -> None:
     """Show what every owner keeps in the storage, and what belongs to nobody."""
     settings = read_settings()
@@ -64,7 +57,6 @@ def show_usage(as_json: AsJson = False) -> None:
     show(rows, as_json=False)
 
 
-@app.command()
 def sweep(as_json: AsJson = False) -> None:
     """Move all files that no row of the database knows into the trash, however many they are."""
     settings = read_settings()
@@ -75,7 +67,6 @@ def sweep(as_json: AsJson = False) -> None:
     show([{"key": key} for key in keys], as_json=as_json)
 
 
-@app.command()
 def verify(
     *,
     repair: Annotated[
@@ -114,38 +105,6 @@ def verify(
         )
     if not outcome.is_whole:
         raise typer.Exit(1)
-
-
-@trash_app.command("list")
-def list_trash(as_json: AsJson = False) -> None:
-    """List the files in the trash, oldest first."""
-    files = trash.batches(open_storage(read_settings()))
-    rows = [{"batch": batch, "key": key} for batch, keys in files.items() for key in keys]
-    show(rows, as_json=as_json)
-
-
-@trash_app.command()
-def restore(
-    batch: Annotated[str, typer.Argument(help="Name of the batch, as `amers store trash list` has it.")],
-    as_json: AsJson = False,
-) -> None:
-    """Put the files of a batch back, except those whose place is taken."""
-    storage = open_storage(read_settings())
-    keys = trash.batches(storage).get(batch)
-    if keys is None:
-        raise InputError(f"no batch {batch} in the trash: `amers store trash list` lists them")
-    show([{"key": key} for key in trash.put_back(storage, batch, keys)], as_json=as_json)
-
-
-@trash_app.command()
-def empty(as_json: AsJson = False) -> None:
-    """Delete all files in the trash."""
-    settings = read_settings()
-    storage = open_storage(settings)
-    with engine.opened(settings) as database:
-        storage_identity.require_match(database, storage)
-        n_deleted = trash.empty(storage)
-    show_one({"deleted": n_deleted}, as_json=as_json)
 
 
 def _finding(finding: Finding) -> Row:

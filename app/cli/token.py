@@ -9,10 +9,7 @@ from app.cli.transaction import transaction
 from app.db.tokens import Token
 from app.usecases import tokens
 
-app = typer.Typer(no_args_is_help=True)
 
-
-@app.command()
 def create(
     name: Annotated[str, typer.Argument(help="Name of the token, for people.")],
     *,
@@ -49,7 +46,6 @@ def create(
     typer.echo(new.secret)
 
 
-@app.command("list")
 def list_tokens(as_json: AsJson = False) -> None:
     """List all tokens, the newest first."""
     with transaction() as connection:
@@ -57,7 +53,6 @@ def list_tokens(as_json: AsJson = False) -> None:
     show([_record(token) for token in all_tokens], as_json=as_json)
 
 
-@app.command()
 def revoke(
     name_or_id: Annotated[str, typer.Argument(help="Id of the token, or its name if it is unique.")],
     as_json: AsJson = False,

@@ -1,4 +1,4 @@
-"""`amers vectors`: vectors digitised on raw scenes, onto the map and back."""
+"""`amers vectors correct` and `project`: vectors digitised on raw scenes, onto the map and back."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -12,10 +12,7 @@ from app.usecases.registered_scene import SceneModel
 from app.usecases.terrain_file import TerrainFile
 from app.usecases.vector_files import CorrectionOptions, ProjectionOptions, VectorFile
 from app.usecases.vectors import correct_file, project_file
-from services.formats.images.canvas import write_canvas
 from services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
-
-app = typer.Typer(no_args_is_help=True)
 
 Vectors = Annotated[Path, typer.Argument(help="GeoPackage, GeoJSON, shapefile or FlatGeobuf.")]
 SceneImage = Annotated[Path, typer.Option(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")]
@@ -53,17 +50,6 @@ VertexFile = Annotated[
 ]
 
 
-@app.command()
-def canvas(
-    scene: Annotated[Path, typer.Argument(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")],
-    *,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Virtual raster to write, .vrt.")],
-) -> None:
-    """Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS."""
-    write_canvas(scene, output)
-
-
-@app.command()
 def correct(
     vectors: Vectors,
     *,
@@ -119,7 +105,6 @@ def correct(
     show_one(record | {one["label"]: one["words"] for one in stated}, as_json=False)
 
 
-@app.command()
 def project(
     vectors: Vectors,
     *,

@@ -1,6 +1,5 @@
 """Blocks: a version of points, published or not as a whole, with its images and files of chips."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,12 +19,11 @@ from sqlalchemy import (
     any_,
     cast,
     func,
-    literal,
     or_,
     select,
     update,
 )
-from sqlalchemy.dialects.postgresql import JSONB, insert
+from sqlalchemy.dialects.postgresql import JSONB
 
 from app.db.constants import text_constant
 from app.db.engine import Connection
@@ -33,9 +31,6 @@ from app.db.rows import among, columns_of
 from app.db.schema import BlockState, block, chip_file, now, point
 from app.db.schema.base import Double
 from services.formats.block.frame_json import parse_frame
-from services.formats.block.reader import BlockContents
-from services.quality.accuracy_statement import StatedAccuracy
-from services.quality.block import BlockQuality, block_accuracy, parse_quality_document, quality_document
 from services.types import Array, Frame, IntArray, SurfaceHeights
 
 ID_BITS = 26
@@ -110,51 +105,6 @@ def lock_sweep(connection: Connection) -> None:
     connection.execute(select(func.pg_advisory_xact_lock(INGESTION_LOCK)))
 
 
-def insert_block(
-    connection: Connection,
-    contents: BlockContents,
-    *,
-    document: str,
-    checksum: str,
-    quality: BlockQuality,
-    priority: int = 0,
-) -> Block | None:
-    """A new block, staged, without its points.
-
-    Args:
-        document: the text of its block.json.
-        checksum: sha256 of the document.
-        priority: against other blocks at the same place.
-
-    Returns:
-        None when there is a block of that id and version.
-    """
-    metadata = contents.document.metadata
-    accuracy = block_accuracy(quality, metadata.frame)
-    statement = (
-        insert(block)
-        .values(
-            id=metadata.id,
-            version=metadata.version,
-            title=metadata.title,
-            state="staged",
-            extent=func.ST_GeomFromWKB(shapely.to_wkb(shapely.Polygon(metadata.extent)), 4326),
-            n_points=len(contents.points),
-            n_views=len(contents.points.views.gsd_m),
-            metadata=cast(literal(document, Text), JSONB),
-            quality=cast(literal(json.dumps(quality_document(quality)), Text), JSONB),
-            checksum=checksum,
-            priority=priority,
-            **_figures("relative", accuracy.relative_to_control_points),
-            **_figures("on_the_earth", accuracy.on_the_earth),
-        )
-        .on_conflict_do_nothing(index_elements=[block.c.id, block.c.version])
-        .returning(*COLUMNS)
-    )
-    row = connection.execute(statement).first()
-    return None if row is None else _block(row)
-
-
 def find_blocks(connection: Connection, reference: str) -> list[Block]:
     """The blocks that a reference may mean: a number, ID@VERSION, or an ID with all its versions."""
     name, _, version = reference.partition("@")
@@ -172,12 +122,6 @@ def list_blocks(connection: Connection, states: tuple[BlockState, ...]) -> list[
     """The blocks in some states, the newest first."""
     statement = select(*COLUMNS).where(block.c.state.in_(states)).order_by(block.c.number.desc())
     return _blocks(connection.execute(statement))
-
-
-def find_quality(connection: Connection, number: int) -> BlockQuality:
-    """The quality figures of a block."""
-    quality = connection.execute(select(block.c.quality).where(block.c.number == number)).scalar_one()
-    return parse_quality_document(quality)
 
 
 @dataclass(frozen=True)
@@ -226,7 +170,7 @@ def set_state(connection: Connection, number: int, state: BlockState) -> Block:
         .values(state=state, state_changed_at=now)
         .returning(*COLUMNS)
     )
-    return _block(connection.execute(statement).one())
+    return block_of_row(connection.execute(statement).one())
 
 
 def set_priority(connection: Connection, number: int, priority: int) -> None:
@@ -236,7 +180,7 @@ def set_priority(connection: Connection, number: int, priority: int) -> None:
 
 def read_block_row(connection: Connection, number: int) -> Block:
     """A block that exists, in its present state."""
-    return _block(connection.execute(select(*COLUMNS).where(block.c.number == number)).one())
+    return block_of_row(connection.execute(select(*COLUMNS).where(block.c.number == number)).one())
 
 
 def find_typology(connection: Connection, point_ids: IntArray) -> list[str | None]:
@@ -264,16 +208,11 @@ def storage_keys(connection: Connection) -> set[str]:
     return set(connection.scalars(select(chip_file.c.storage_key)))
 
 
-def _figures(name: str, stated: StatedAccuracy) -> dict[str, float | None]:
-    """The columns of an accuracy; null where it is unknown."""
-    figures = {f"{name}_ce90_m": stated.ce90_m, f"{name}_le90_m": stated.le90_m}
-    return {column: None if np.isnan(value) else value for column, value in figures.items()}
-
-
 def _blocks(rows: Iterable[Row[Any]]) -> list[Block]:
-    return [_block(row) for row in rows]
+    return [block_of_row(row) for row in rows]
 
 
-def _block(row: Row[Any]) -> Block:
+def block_of_row(row: Row[Any]) -> Block:
+    """The block of a row of `COLUMNS`."""
     outline = shapely.get_coordinates(shapely.from_wkb(row.outline))[:-1]
     return Block(**{**row._mapping, "outline": outline})

@@ -1,6 +1,5 @@
 """The life of a block: check and ingest it (staged), publish, withdraw, restore and prioritise it."""
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
@@ -8,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from app.db import blocks, superseding
+from app.db import block_documents, blocks, superseding
 from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
 from app.db.schema import BlockState
 from app.errors import Conflict, InputError, NotFound
 from app.storage import Storage, StoredFile
+from app.usecases.blocks.listing import find_block as find_block
+from app.usecases.blocks.listing import list_blocks as list_blocks
 from services.errors import FormatError
 from services.formats.block.check import check_block, check_checksums
 from services.formats.block.document import AccuracyFigure
@@ -23,7 +24,7 @@ from services.formats.block.reader import BlockContents, block_member
 from services.formats.chips.checksums import ChipHasher
 from services.formats.chips.npy_files import read_chip_file
 from services.quality.accuracy_statement import AccuracyStatement
-from services.quality.block import BlockQuality, block_accuracy, block_quality, median_accuracy
+from services.quality.block import BlockQuality, block_accuracy, block_quality
 from services.types import Progress, no_progress, part_of
 
 MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
@@ -105,7 +106,7 @@ def ingest_block(
     quality = block_quality(contents.points, contents.n_views, metadata.extent)
     with connection.begin_nested():
         blocks.lock_ingestion(connection)
-        block = blocks.insert_block(
+        block = block_documents.insert_block(
             connection,
             contents,
             document=document.decode(),
@@ -190,22 +191,6 @@ def prioritise_block(connection: Connection, reference: str, priority: int) -> B
     return blocks.read_block_row(connection, block.number)
 
 
-def find_block(connection: Connection, reference: str) -> Block:
-    """The block with this number, ID or ID@VERSION.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: the ID has several versions.
-    """
-    matches = blocks.find_blocks(connection, reference)
-    if not matches:
-        raise NotFound(f"no block {reference:.100}")
-    if len(matches) > 1:
-        versions = ", ".join(f"{block.id}@{block.version}" for block in matches)
-        raise Conflict(f"block {reference} has {len(matches)} versions, name one: {versions}")
-    return matches[0]
-
-
 def find_published(connection: Connection, reference: str) -> Block:
     """The published block with this number, ID or ID@VERSION; an ID has at most one published version.
 
@@ -218,25 +203,10 @@ def find_published(connection: Connection, reference: str) -> Block:
     raise NotFound(f"no block {reference:.100}")
 
 
-def list_blocks(
-    connection: Connection, states: tuple[BlockState, ...] = ("staged", "published", "withdrawn")
-) -> list[Block]:
-    """The blocks in some states, the newest first."""
-    return blocks.list_blocks(connection, states)
-
-
-def stated_accuracies(connection: Connection, numbers: Sequence[int]) -> dict[int, AccuracyStatement]:
-    """The accuracy of the median points of some blocks, by the numbers of the blocks."""
-    stated = blocks.stated_sigmas(connection, numbers)
-    return {
-        number: median_accuracy(one.horizontal_m, one.up_m, one.frame) for number, one in stated.items()
-    }
-
-
 def block_report(connection: Connection, block: Block) -> BlockReport:
     """The quality of a block: figures of its points, and the accuracy that its producer states."""
     document = parse_block_json(blocks.find_document(connection, block.number))
-    quality, metadata = blocks.find_quality(connection, block.number), document.metadata
+    quality, metadata = block_documents.find_quality(connection, block.number), document.metadata
     return BlockReport(quality, block_accuracy(quality, metadata.frame), metadata.accuracy)
 
 

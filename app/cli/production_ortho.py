@@ -1,15 +1,11 @@
-"""`amers production`: make new blocks of points from images."""
+"""`amers production ortho`: a block from ortho-images and the heights of their ground."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from app.cli.image_production import run
-from app.cli.image_selection import select
 from app.cli.output import AsJson, show_one
-from app.cli.planning import plan
-from app.cli.production_points import points as make_known_points
 from app.cli.production_rows import accuracy_row, agreement_row, sampling_pair
 from app.cli.progress import shown_progress
 from app.usecases.production import BlockIdentity, OrthoFiles, run_ortho_production
@@ -17,17 +13,10 @@ from app.usecases.terrain_file import TerrainFile
 from services.production.from_images import ProductionOptions
 from services.production.from_ortho import OrthoPointOptions
 
-app = typer.Typer(no_args_is_help=True)
-app.command()(select)
-app.command()(plan)
-app.command()(run)
-app.command(name="points")(make_known_points)
-
 _DEFAULT = ProductionOptions()
 _ORTHO_DEFAULT = OrthoPointOptions()
 
 
-@app.command()
 def ortho(
     images: Annotated[
         list[Path],

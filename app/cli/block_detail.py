@@ -1,0 +1,22 @@
+"""`amers block show`: one block of the store."""
+
+from app.cli.block_listing import Reference, block_row
+from app.cli.block_renewal import renewal_row
+from app.cli.output import AsJson, print_json, show_one
+from app.cli.transaction import transaction
+from app.usecases.blocks import lifecycle
+from app.usecases.blocks.renewal import find_renewal
+from services.quality.accuracy_statement import accuracy_document
+
+
+def show_block(reference: Reference, as_json: AsJson = False) -> None:
+    """Show one block."""
+    with transaction() as connection:
+        block = lifecycle.find_block(connection, reference)
+        stated = lifecycle.block_report(connection, block).stated
+        renewed = find_renewal(connection, block)
+    if as_json:
+        print_json({**block_row(block), **accuracy_document(stated), "renewal": renewed})
+        return
+    new = {} if renewed is None else renewal_row(renewed)
+    show_one({**block_row(block), **stated.words, **new}, as_json=False)

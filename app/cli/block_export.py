@@ -1,0 +1,45 @@
+"""`amers block export`: served points as a new block folder."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, show_one
+from app.cli.progress import shown_progress
+from app.config import read_settings
+from app.db.engine import opened
+from app.errors import InputError
+from app.storage import open_storage
+from app.usecases.blocks.export import ExportBlock, select_points, write_selected
+from app.usecases.damage import open_chips
+
+
+def export(
+    *,
+    bbox: Annotated[
+        str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
+    name: Annotated[str, typer.Option("--id", help="Id of the new block.")] = "extract",
+    version: Annotated[str, typer.Option(help="Version of the new block.")] = "1",
+    title: Annotated[str, typer.Option(help="Title of the new block.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write the served points of a box, with their chips, into a new block folder."""
+    try:
+        west, south, east, north = (float(part) for part in bbox.split(","))
+    except ValueError:
+        raise InputError(f"--bbox: {bbox!r:.100} found, four numbers W,S,E,N expected") from None
+    settings = read_settings()
+    inputs = ExportBlock((west, south, east, north), name, version, title)
+    with opened(settings) as database:
+        with database.snapshot() as connection:
+            selected = select_points(connection, inputs)
+        chips = open_chips(database, open_storage(settings))
+        try:
+            with shown_progress() as progress:
+                n_points = write_selected(selected, chips, output, progress)
+        finally:
+            chips.close()
+    show_one({"block": output, "points": n_points}, as_json=as_json)

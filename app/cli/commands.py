@@ -1,0 +1,231 @@
+"""All commands of `amers`: noun, then verb, and the function behind each."""
+
+from app.cli.on_demand import Command, Group, Tree
+
+COMMANDS: Tree = {
+    "block": Group(
+        "Blocks of control points: ingest, publish, withdraw, export.",
+        {
+            "ingest": Command(
+                "block_ingestion:ingest",
+                "Check a block folder completely and load it into the store, staged.",
+            ),
+            "list": Command("block_listing:list_blocks", "List all blocks, the newest first."),
+            "show": Command("block_detail:show_block", "Show one block."),
+            "publish": Command(
+                "block_state:publish",
+                "Publish a block, and withdraw the version of it that was published before.",
+            ),
+            "restore": Command(
+                "block_state:restore",
+                "Publish a withdrawn or superseded block again, in place of its published version.",
+            ),
+            "prioritise": Command(
+                "block_state:prioritise",
+                "Set which of overlapping blocks is served: points of the block with the greater "
+                "priority.",
+            ),
+            "withdraw": Command(
+                "block_state:withdraw", "Withdraw a published block; it can be restored."
+            ),
+            "export": Command(
+                "block_export:export",
+                "Write the served points of a box, with their chips, into a new block folder.",
+            ),
+            "quality": Command(
+                "block_quality:quality",
+                "Measure the quality of a block: density, and accuracy against ortho-images and "
+                "heights.",
+            ),
+            "renew": Command(
+                "block_renewal:renew",
+                "Stage a version of a block with views of registered scenes and new points, without "
+                "vanished ones.",
+            ),
+            "frame": Command(
+                "block_frame:frame",
+                "Move a block onto control that came later; its points and chips stay as they are.",
+            ),
+        },
+    ),
+    "points": Group(
+        "Control points of published blocks: query, suspend, reinstate.",
+        {
+            "query": Command(
+                "point_query:query",
+                "Write all points of a box; --json without --output prints only their number.",
+            ),
+            "suspensions": Command(
+                "points:suspensions",
+                "List the points proposed for suspension because they fail in many scenes, the worst "
+                "first.",
+            ),
+            "suspend": Command(
+                "points:suspend",
+                "Suspend a point: neither registrations nor readers get it any more.",
+            ),
+            "reinstate": Command(
+                "points:reinstate",
+                "Serve a suspended point again; its history starts again from nothing.",
+            ),
+        },
+    ),
+    "scene": Group(
+        "Register and orthorectify scenes.",
+        {
+            "register": Command(
+                "scene:register",
+                "Refine the sensor models of scenes on control points; write report, points and "
+                "refined models.",
+            ),
+            "register-many": Command(
+                "scenes_together:register_many",
+                "Refine the models of scenes in one adjustment, on control points and tie points "
+                "between them.",
+            ),
+            "ortho": Command(
+                "scene_ortho:ortho",
+                "Orthorectify a scene through its model and a terrain into a cloud-optimised GeoTIFF.",
+            ),
+        },
+    ),
+    "vectors": Group(
+        "Vectors digitised on raw scenes, onto the map and back.",
+        {
+            "canvas": Command(
+                "vector_canvas:canvas",
+                "Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS.",
+            ),
+            "correct": Command(
+                "vectors:correct",
+                "Bring vectors that were digitised on a raw scene onto the map, with their predicted "
+                "accuracy.",
+            ),
+            "project": Command(
+                "vectors:project",
+                "Bring vectors of the map into the pixel coordinates of a raw scene.",
+            ),
+        },
+    ),
+    "reference": Group(
+        "Reference images, for scenes on ground without control points.",
+        {
+            "add": Command("reference:add", "Add a reference image that scenes can be registered on."),
+            "list": Command("reference:list_references", "List the reference images, by name."),
+            "remove": Command(
+                "reference:remove",
+                "Remove a reference image from the installation; its files stay in their folder.",
+            ),
+        },
+    ),
+    "production": Group(
+        "Make new blocks of points from images.",
+        {
+            "select": Command(
+                "image_selection:select",
+                "Choose the fewest recent, clear and varied images that show all ground often enough.",
+            ),
+            "plan": Command(
+                "planning:plan",
+                "Predict the accuracy of a block, and say where one more known site would help most.",
+            ),
+            "run": Command(
+                "image_production:run",
+                "Make control points with chips from two or more overlapping images.",
+            ),
+            "points": Command(
+                "production_points:points",
+                "Make a block of the points of another base, with its own chips or from images that "
+                "show them.",
+            ),
+            "ortho": Command(
+                "production_ortho:ortho",
+                "Make control points with chips from ortho-images of one place and the heights of its "
+                "ground.",
+            ),
+        },
+    ),
+    "db": Group(
+        "The database: schema, backup and restore with the stored files.",
+        {
+            "upgrade": Command(
+                "db:upgrade",
+                "Upgrade the schema of the database to the version that this Amers needs.",
+            ),
+            "status": Command(
+                "db:status",
+                "Show the schema version of the database and the one that this Amers needs.",
+            ),
+            "backup": Command(
+                "db_backup:backup",
+                "Write the database and the stored files into a folder, as one set with a manifest.",
+            ),
+            "verify-backup": Command(
+                "db_backup:verify_backup",
+                "Read a backup and compare it with its manifest: missing, surplus and changed files.",
+            ),
+            "restore": Command(
+                "db_backup:restore",
+                "Verify a backup, and restore it into an empty database and an empty storage.",
+            ),
+        },
+    ),
+    "store": Group(
+        "The storage of the files: verify, usage, adopt, sweep, trash.",
+        {
+            "adopt": Command(
+                "store:adopt",
+                "Let the storage belong to the database, after you have checked that they belong "
+                "together.",
+            ),
+            "usage": Command(
+                "store:show_usage",
+                "Show what every owner keeps in the storage, and what belongs to nobody.",
+            ),
+            "sweep": Command(
+                "store:sweep",
+                "Move all files that no row of the database knows into the trash, however many they "
+                "are.",
+            ),
+            "verify": Command(
+                "store:verify",
+                "Read every file and report what is rotten, missing or not known; exit code 1 if "
+                "anything is.",
+            ),
+            "trash": Group(
+                "Files that the sweep removed.",
+                {
+                    "list": Command(
+                        "store_trash:list_trash", "List the files in the trash, oldest first."
+                    ),
+                    "restore": Command(
+                        "store_trash:restore",
+                        "Put the files of a batch back, except those whose place is taken.",
+                    ),
+                    "empty": Command("store_trash:empty", "Delete all files in the trash."),
+                },
+            ),
+        },
+    ),
+    "token": Group(
+        "Tokens of the callers of the API.",
+        {
+            "create": Command(
+                "token:create", "Create a token and print its secret, which is shown only now."
+            ),
+            "list": Command("token:list_tokens", "List all tokens, the newest first."),
+            "revoke": Command("token:revoke", "Revoke a token: requests with its secret are refused."),
+        },
+    ),
+    "demo": Command(
+        "demo:demo",
+        "Run the whole work on a simulated world: images, block, store, registration, report.",
+    ),
+    "serve": Command("serve:serve", "Run the API and one worker, until Ctrl-C."),
+    "worker": Command("worker:worker", "Do the jobs of the queue, one after the other, until Ctrl-C."),
+    "audit": Command(
+        "audit:audit",
+        "Show the last changes of tokens, blocks, scenes, jobs and points, the newest first.",
+    ),
+}
+"""Groups and single commands in the order of the help; a test compares the lines with the docstrings."""

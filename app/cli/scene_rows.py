@@ -1,0 +1,70 @@
+"""What the registrations of one scene and of many refuse and print alike."""
+
+from pathlib import Path
+from typing import Any
+
+from app.cli.output import print_json, show, show_one
+from app.cli.scene_registration import Outcome
+from app.errors import InputError
+from services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
+
+_TABLE = ("active", "shift_m", "residual_rms_px", "check_ce90_m", "seconds")
+"""Figures of a scene in the table of many scenes."""
+_STATED = ("relative_to_control_points", "on_the_earth")
+"""The two accuracies of an outcome."""
+
+
+def refuse_shared_files(scenes: list[Path], files_of_one: list[str]) -> None:
+    """Refuse files of one scene with several scenes, and scenes that would share an output folder."""
+    if files_of_one and len(scenes) > 1:
+        raise InputError(
+            f"{', '.join(files_of_one)}: belongs to one scene, but {len(scenes)} scenes are given"
+        )
+    names = [scene.stem for scene in scenes]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "several scenes of the same name would write into the same folder; register them separately"
+        )
+
+
+def show_outcome(outcome: Outcome, *, as_json: bool) -> None:
+    """Print the outcome of one scene."""
+    if as_json:
+        print_json(outcome)
+    else:
+        show_one(_verdict_rows(outcome) | _other_rows(outcome, tuple(outcome)), as_json=False)
+
+
+def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
+    """Print the outcome of every scene, or a table of the figures that compare scenes."""
+    if as_json:
+        print_json(outcomes)
+        return
+    rows = []
+    for outcome in outcomes:
+        row = _verdict_rows(outcome) | _other_rows(outcome, _TABLE)
+        rows.append(row | {"reason": outcome["reason"] if outcome["exit_status"] else None})
+    show(rows, as_json=False)
+
+
+def _verdict_rows(outcome: Outcome) -> dict[str, Any]:
+    """Scene, verdict and the accuracy it speaks of, and the two accuracies, for people."""
+    scope = outcome.get("verdict_scope")
+    verdict = f"{outcome['verdict']}, {scope}" if scope else outcome["verdict"]
+    rows = {"scene": outcome["scene"], "verdict": verdict, RELATIVE: None, ON_THE_EARTH: None}
+    stated = (outcome.get(name) for name in _STATED)
+    return rows | {one["label"]: one["words"] for one in stated if one}
+
+
+def _other_rows(outcome: Outcome, names: tuple[str, ...]) -> dict[str, Any]:
+    """The other figures of an outcome, for people."""
+    shown = {"scene", "verdict", "verdict_scope", *_STATED}
+    return {name: _rounded(outcome.get(name)) for name in names if name not in shown}
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    if isinstance(value, list):
+        return ", ".join(f"{number:+.3f}" for number in value)
+    return value

@@ -1,0 +1,41 @@
+"""`amers store trash`: files that the sweep removed."""
+
+from typing import Annotated
+
+import typer
+
+from app.cli.output import AsJson, show, show_one
+from app.config import read_settings
+from app.db import engine
+from app.errors import InputError
+from app.storage import open_storage, trash
+from app.usecases import storage_identity
+
+
+def list_trash(as_json: AsJson = False) -> None:
+    """List the files in the trash, oldest first."""
+    files = trash.batches(open_storage(read_settings()))
+    rows = [{"batch": batch, "key": key} for batch, keys in files.items() for key in keys]
+    show(rows, as_json=as_json)
+
+
+def restore(
+    batch: Annotated[str, typer.Argument(help="Name of the batch, as `amers store trash list` has it.")],
+    as_json: AsJson = False,
+) -> None:
+    """Put the files of a batch back, except those whose place is taken."""
+    storage = open_storage(read_settings())
+    keys = trash.batches(storage).get(batch)
+    if keys is None:
+        raise InputError(f"no batch {batch} in the trash: `amers store trash list` lists them")
+    show([{"key": key} for key in trash.put_back(storage, batch, keys)], as_json=as_json)
+
+
+def empty(as_json: AsJson = False) -> None:
+    """Delete all files in the trash."""
+    settings = read_settings()
+    storage = open_storage(settings)
+    with engine.opened(settings) as database:
+        storage_identity.require_match(database, storage)
+        n_deleted = trash.empty(storage)
+    show_one({"deleted": n_deleted}, as_json=as_json)

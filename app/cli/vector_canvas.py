@@ -1,0 +1,17 @@
+"""`amers vectors canvas`: a raw scene to draw on."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.formats.images.canvas import write_canvas
+
+
+def canvas(
+    scene: Annotated[Path, typer.Argument(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")],
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Virtual raster to write, .vrt.")],
+) -> None:
+    """Write a view of a raw scene without its georeferencing, to draw on its pixels in QGIS."""
+    write_canvas(scene, output)

@@ -1,0 +1,47 @@
+"""Blocks as the store has them: find one, list them, state their accuracy."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from app.db import blocks
+from app.db.blocks import Block, StatedSigmas
+from app.db.engine import Connection
+from app.db.schema import BlockState
+from app.errors import Conflict, NotFound
+from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
+
+
+def find_block(connection: Connection, reference: str) -> Block:
+    """The block with this number, ID or ID@VERSION.
+
+    Raises:
+        NotFound: there is no such block.
+        Conflict: the ID has several versions.
+    """
+    matches = blocks.find_blocks(connection, reference)
+    if not matches:
+        raise NotFound(f"no block {reference:.100}")
+    if len(matches) > 1:
+        versions = ", ".join(f"{block.id}@{block.version}" for block in matches)
+        raise Conflict(f"block {reference} has {len(matches)} versions, name one: {versions}")
+    return matches[0]
+
+
+def list_blocks(
+    connection: Connection, states: tuple[BlockState, ...] = ("staged", "published", "withdrawn")
+) -> list[Block]:
+    """The blocks in some states, the newest first."""
+    return blocks.list_blocks(connection, states)
+
+
+def stated_accuracies(connection: Connection, numbers: Sequence[int]) -> dict[int, AccuracyStatement]:
+    """The accuracy of the median points of some blocks, by the numbers of the blocks."""
+    stated = blocks.stated_sigmas(connection, numbers)
+    return {number: _median_accuracy(one) for number, one in stated.items()}
+
+
+def _median_accuracy(stated: StatedSigmas) -> AccuracyStatement:
+    """The accuracy of the median point; `services.quality.block` has the same, and loads much more."""
+    sigmas_m = np.array([stated.horizontal_m, stated.horizontal_m, stated.up_m])
+    return points_accuracy(np.diag(sigmas_m**2), stated.frame, "median of the points")

@@ -1,0 +1,95 @@
+"""What a command may import before it works: every package of others costs tenths of a second."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app.cli import commands
+from app.cli.on_demand import Command, Tree
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = frozenset(
+    """
+    alembic cql2 cv2 fastapi geoalchemy2 httpx jinja2 matplotlib numba numpy obstore pandas procrastinate
+    prometheus_client psycopg pyarrow pydantic_settings pyogrio pyproj rasterio scipy scipy.spatial
+    scipy.stats shapely sqlalchemy uvicorn
+    """.split()  # noqa: SIM905
+)
+"""What takes long to import."""
+STORE = frozenset({"geoalchemy2", "numpy", "psycopg", "pydantic_settings", "shapely", "sqlalchemy"})
+"""What the tables and a connection to them need."""
+BUDGETS = {
+    "--version": frozenset(),
+    "--help": frozenset(),
+    "block --help": frozenset(),
+    "serve --help": {"psycopg", "pydantic_settings", "sqlalchemy"},
+    "token list --help": STORE,
+    "audit --help": STORE,
+    # Accuracies follow from the normal law.
+    "block list --help": STORE | {"scipy"},
+    # Without the statistics of scipy: a third of the time that its start takes.
+    "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
+}
+PROGRAM = """
+import atexit, json, sys
+
+class Importers:
+    "Notes which file first imports a package."
+    first = {}
+
+    def find_spec(self, name, path=None, target=None):
+        if name not in self.first:
+            frame = sys._getframe(1)
+            while frame and "importlib" in frame.f_code.co_filename:
+                frame = frame.f_back
+            self.first[name] = f"{frame.f_code.co_filename}:{frame.f_lineno}" if frame else ""
+
+sys.meta_path.insert(0, Importers())
+from app.cli.main import main
+atexit.register(lambda: print(json.dumps(Importers.first)))
+main()
+"""
+
+
+def imported_by(words: str) -> dict[str, str]:
+    """The modules that `amers` with these words imports, each with the line that imported it first."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *words.split()],
+        cwd=ROOT,
+        env=os.environ,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    first: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    return first
+
+
+@pytest.mark.parametrize("words", BUDGETS)
+def test_a_command_imports_no_more_than_its_budget(words):
+    imported = imported_by(words)
+    beyond = {
+        name: line for name, line in imported.items() if name in PACKAGES and name not in BUDGETS[words]
+    }
+    assert beyond == {}, f"amers {words} imports what it does not need; see who asks for it first"
+
+
+def entries(tree: Tree, words: str = "amers") -> list[tuple[str, Command]]:
+    """All commands of a tree with their words."""
+    found = []
+    for name, entry in tree.items():
+        below = f"{words} {name}"
+        found += [(below, entry)] if isinstance(entry, Command) else entries(entry.commands, below)
+    return found
+
+
+def test_the_line_of_a_command_in_lists_is_that_of_its_function():
+    for words, command in entries(commands.COMMANDS):
+        module, function = command.function.split(":")
+        source = (ROOT / "app" / "cli" / f"{module}.py").read_text()
+        body = source[source.index(f"def {function}(") :]
+        assert " ".join(body.split('"""')[1].split("\n\n")[0].split()) == command.help, words
