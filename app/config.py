@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from app.errors import InputError
 
@@ -170,7 +170,13 @@ def read_settings() -> Settings:
         return Settings()
     except ValidationError as error:
         problems = "; ".join(
-            f"AMERS_{'_'.join(str(part) for part in item['loc']).upper()}: {item['msg']}"
+            f"AMERS_{'_'.join(str(part) for part in item['loc']).upper()}: {item['input']!r:.60} found; "
+            f"{item['msg']}"
             for item in error.errors()
         )
         raise InputError(f"environment: {problems}") from None
+    except SettingsError:
+        raise InputError(
+            "environment: AMERS_OIDC_SCOPES: it cannot be read; expected a JSON object such as "
+            '{"amers:read": "read"}'
+        ) from None

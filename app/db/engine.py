@@ -35,8 +35,9 @@ from sqlalchemy.pool import ConnectionPoolEntry, PoolProxiedConnection
 
 from app import request_context
 from app.config import Settings
+from app.db.address import unreachable
 from app.db.cluster import embedded
-from app.db.revisions import DriverConnection, driver_connection, ensure_schema, unreachable
+from app.db.revisions import DriverConnection, driver_connection, ensure_schema
 
 Connection = sqlalchemy.Connection
 
@@ -172,7 +173,7 @@ def connect(dsn: str) -> Iterator[Connection]:
     try:
         connection = _unpooled(dsn).connect()
     except psycopg.OperationalError as error:
-        raise unreachable(error) from error
+        raise unreachable(error, dsn) from error
     with connection:
         set_origin(connection)
         yield connection

@@ -11,6 +11,7 @@ from typing import Any
 import psycopg
 from sqlalchemy import Connection, text
 
+from app.db.address import unreachable
 from app.errors import InputError
 
 DriverConnection = psycopg.Connection[tuple[Any, ...]]
@@ -137,11 +138,6 @@ def driver_connection(dsn: str) -> Iterator[DriverConnection]:
     try:
         connection = psycopg.connect(dsn, connect_timeout=10)
     except psycopg.OperationalError as error:
-        raise unreachable(error) from error
+        raise unreachable(error, dsn) from error
     with connection:
         yield connection
-
-
-def unreachable(error: psycopg.OperationalError) -> InputError:
-    """The error for the user when no connection can be made."""
-    return InputError(f"the database cannot be reached: {str(error).strip()}")

@@ -26,6 +26,7 @@ from psycopg.conninfo import make_conninfo
 from psycopg.pq import PGconn, Ping
 
 from app.config import Settings
+from app.db.address import check_address
 from app.db.cluster.binaries import ServerUser, find_binaries, run_as, server_user
 from app.errors import InputError
 
@@ -63,10 +64,13 @@ def database(settings: Settings) -> Iterator[str]:
     """The connection string of the installation's database, which runs as long as the context lasts.
 
     Raises:
-        InputError: the private cluster cannot be run; the message says why and what to do.
+        InputError: the private cluster cannot be run, or the address of a database of your own cannot be
+            read; the message says why and what to do.
     """
     if settings.database_url is not None:
-        yield settings.database_url.get_secret_value()
+        url = settings.database_url.get_secret_value()
+        check_address(url)
+        yield url
         return
     with _cluster(settings).lease() as dsn:
         yield dsn
