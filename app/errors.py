@@ -16,6 +16,7 @@ __all__ = [
     "NoSuchProcess",
     "NotAllowed",
     "NotFound",
+    "PortInUse",
     "StorageOutage",
     "TooLarge",
     "TooMany",
@@ -37,6 +38,10 @@ NO_MEMORY = re.compile(
 
 class InvalidParameter(InputError):
     """A request parameter has an unusable value; OGC API requires status 400 for it."""
+
+
+class PortInUse(InputError):
+    """Another program listens on the port that the service shall listen on."""
 
 
 class NotFound(AmersError):

@@ -6,15 +6,17 @@
 | 1 | any other failure: a service does not answer, a process was killed, a bug |
 | 2 | the input or the installation cannot be used |
 | 3 | the scene could not be registered, or its verdict is failed; the block misses its specification |
+| 4 | another program uses the port of the service |
 | 130 | interrupted |
 """
 
-from app.errors import AmersError, ComputationError
+from app.errors import AmersError, ComputationError, PortInUse
 
 SUCCESS = 0
 FAILURE = 1
 REFUSED = 2
 NO_RESULT = 3
+PORT_IN_USE = 4
 INTERRUPTED = 130
 
 
@@ -22,4 +24,6 @@ def exit_status(error: Exception) -> int:
     """The exit status of a command that an error ended."""
     if isinstance(error, ComputationError):
         return NO_RESULT
+    if isinstance(error, PortInUse):
+        return PORT_IN_USE
     return REFUSED if isinstance(error, AmersError) else FAILURE

@@ -5,6 +5,7 @@ imports little and reads nothing that a caller sends. A crash of the API ends ne
 connections that wait to be accepted.
 """
 
+import errno
 import logging
 import signal
 import socket
@@ -20,7 +21,7 @@ from app.cli.supervisor import Child, Supervisor
 from app.config import Settings, read_settings
 from app.db import revisions
 from app.db.cluster import embedded
-from app.errors import InputError
+from app.errors import InputError, PortInUse
 
 BACKLOG = 2048
 """Connections that wait to be accepted, as while the API is restarted."""
@@ -34,7 +35,9 @@ log = logging.getLogger(__name__)
 def serve(
     *,
     host: Annotated[str | None, typer.Option(help="Address to listen on; default AMERS_HOST.")] = None,
-    port: Annotated[int | None, typer.Option(help="Port to listen on; default AMERS_PORT.")] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port to listen on; default AMERS_PORT.", min=1, max=65535)
+    ] = None,
     worker: Annotated[bool, typer.Option(help="Run a worker beside the API.")] = True,
 ) -> None:
     """Run the API and one worker, until Ctrl-C."""
@@ -73,7 +76,8 @@ def _listeners(host: str, port: int) -> list[socket.socket]:
     """Sockets that listen on all addresses of a host.
 
     Raises:
-        InputError: there is no such host, or the port is used or forbidden.
+        PortInUse: another program listens there.
+        InputError: there is no such host, or the port is forbidden.
     """
     listeners: list[socket.socket] = []
     try:
@@ -83,8 +87,14 @@ def _listeners(host: str, port: int) -> list[socket.socket]:
     except OSError as error:
         for listener in listeners:
             listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise PortInUse(
+                f"port {port} of {host} is in use by another program: end that program, or choose a "
+                "free port with --port or AMERS_PORT"
+            ) from None
         raise InputError(
-            f"cannot listen on {host}, port {port}: {error.strerror}: choose another with --host, --port"
+            f"cannot listen on {host}, port {port} ({error.strerror}): choose an address of this "
+            "machine with --host and a port that you may use with --port"
         ) from None
     return listeners
 

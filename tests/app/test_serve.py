@@ -95,8 +95,11 @@ def test_a_used_port_ends_the_service_with_the_reason(tmp_path):
             text=True,
             timeout=60,
         )
-    assert run.returncode == 2
-    assert f"amers: cannot listen on 127.0.0.1, port {port}: Address already in use" in run.stderr
+    assert run.returncode == 4
+    assert run.stderr == (
+        f"amers: port {port} of 127.0.0.1 is in use by another program: end that program, or choose a "
+        "free port with --port or AMERS_PORT\n"
+    )
 
 
 def test_a_killed_database_is_restarted(lasting):
