@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from app.cli.box_option import BoxText, box_of
 from app.cli.output import AsJson, show_one
 from app.cli.progress import shown_progress
 from app.config import read_settings
@@ -17,9 +18,7 @@ from app.usecases.damage import open_chips
 
 def export(
     *,
-    bbox: Annotated[
-        str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
-    ],
+    bbox: BoxText,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     name: Annotated[str, typer.Option("--id", help="Id of the new block.")] = "extract",
     version: Annotated[str, typer.Option(help="Version of the new block.")] = "1",
@@ -27,12 +26,13 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write the served points of a box, with their chips, into a new block folder."""
-    try:
-        west, south, east, north = (float(part) for part in bbox.split(","))
-    except ValueError:
-        raise InputError(f"--bbox: {bbox!r:.100} found, four numbers W,S,E,N expected") from None
+    box = box_of(bbox)
+    if box.bounds_height:
+        raise InputError(
+            f"--bbox: {bbox!r:.100} found, four numbers expected: a block has no limits of height"
+        )
     settings = read_settings()
-    inputs = ExportBlock((west, south, east, north), name, version, title)
+    inputs = ExportBlock((box.west, box.south, box.east, box.north), name, version, title)
     with opened(settings) as database:
         with database.snapshot() as connection:
             selected = select_points(connection, inputs)

@@ -9,10 +9,11 @@ from typing import Annotated, BinaryIO
 
 import typer
 
+from app.cli.box_option import BoxText, box_of
 from app.cli.output import AsJson, print_json
 from app.cli.transaction import transaction
+from app.errors import InputError
 from app.usecases.features import points
-from app.usecases.features.query import parse_bbox
 
 
 class PointFormat(StrEnum):
@@ -24,9 +25,7 @@ class PointFormat(StrEnum):
 
 def query(
     *,
-    bbox: Annotated[
-        str, typer.Option(help="W,S,E,N in degrees; W greater than E crosses the antimeridian.")
-    ],
+    bbox: BoxText,
     form: Annotated[
         PointFormat, typer.Option("--format", help="Format of the points.")
     ] = PointFormat.GEOJSON,
@@ -36,7 +35,7 @@ def query(
     as_json: AsJson = False,
 ) -> None:
     """Write all points of a box; --json without --output prints only their number."""
-    parse_bbox(bbox)
+    box_of(bbox)
     with transaction() as connection:
         if as_json and output is None:
             count = points.count_points(connection, bbox)
@@ -62,7 +61,14 @@ def _output_file(path: Path | None) -> Iterator[BinaryIO]:
         return
     partial = path.with_name(f".{path.name}.partial")
     try:
-        with partial.open("wb") as file:
+        file = partial.open("wb")
+    except OSError as error:
+        raise InputError(
+            f"--output: {path} cannot be written ({error.strerror}); expected a file in a folder that "
+            "exists"
+        ) from None
+    try:
+        with file:
             yield file
         partial.replace(path)
     finally:

@@ -112,7 +112,9 @@ def select_points(
         )
     stored = points.control_points(connection, outline, None if most is None else most + 1)
     if len(stored.points) == 0:
-        raise NotFound(f"bbox: no points are served in {list(inputs.bbox)}")
+        raise NotFound(
+            f"bbox: no points are served in {list(inputs.bbox)}; choose a box on a published block"
+        )
     if most is not None and len(stored.points) > most:
         raise InputError(f"bbox: more than {most} points lie in the box; choose a smaller box")
     sources = [
