@@ -5,6 +5,7 @@ AmersError
 │   ├── FormatError         the content of a file or a document is missing or wrong
 │   ├── CoverageError       two data sets that must overlap do not
 │   └── VerticalDatumError  heights whose datum is unknown or not supported
+│       └── MissingGeoid    the grid of their geoid is not installed, and no file of it is given
 └── ComputationError        the input is valid, but gives no trustworthy result
     ├── NotEnoughPoints
     ├── NoConsensus
@@ -35,6 +36,10 @@ class CoverageError(InputError):
 
 class VerticalDatumError(InputError):
     """Heights whose vertical datum is unknown or not supported."""
+
+
+class MissingGeoid(VerticalDatumError):
+    """The grid of the geoid is not installed; entry points add how to give its file."""
 
 
 class ComputationError(AmersError):

@@ -17,8 +17,9 @@ from services.quality.check_points import MARKING_SIGMA_PX
 Control = Annotated[
     list[Path] | None,
     typer.Option(
+        exists=True,
         help="What places the block: folder of an older block, or file of ground points marked in the "
-        "images (CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI); repeat for several."
+        "images (CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI); repeat for several.",
     ),
 ]
 SigmaM = Annotated[
@@ -45,7 +46,8 @@ Vertical = Annotated[
     typer.Option(help="Vertical datum of control points: ellipsoid, EGM96, EGM2008, EPSG:…"),
 ]
 Geoid = Annotated[
-    Path | None, typer.Option(help="Grid file of the control points' geoid, GTX or GeoTIFF.")
+    Path | None,
+    typer.Option(exists=True, help="Grid file of the control points' geoid, GTX or GeoTIFF."),
 ]
 Crs = Annotated[
     str | None, typer.Option(help="Reference system of x and y of a CSV, such as EPSG:32633.")
@@ -56,13 +58,16 @@ Columns = Annotated[
 Neighbour = Annotated[
     Path | None,
     typer.Option(
+        exists=True,
         help="Folder BLOCK.adjustment of a block that was made from some of the same images: both "
-        "agree along their seam."
+        "agree along their seam.",
     ),
 ]
 Ortho = Annotated[
     list[Path] | None,
-    typer.Option(help="Ortho-image that places the block east and north; repeat for several."),
+    typer.Option(
+        exists=True, help="Ortho-image that places the block east and north; repeat for several."
+    ),
 ]
 OrthoSigmaM = Annotated[
     float | None,
@@ -73,14 +78,18 @@ OrthoSigmaM = Annotated[
     ),
 ]
 Dem = Annotated[
-    Path | None, typer.Option(help="GeoTIFF with heights of the ground that places the block in height.")
+    Path | None,
+    typer.Option(
+        exists=True, help="GeoTIFF with heights of the ground that places the block in height."
+    ),
 ]
 DemVertical = Annotated[
     str | None,
     typer.Option(help="Vertical datum of --control-dem: ellipsoid, EGM96, EGM2008, EPSG:…"),
 ]
 DemGeoid = Annotated[
-    Path | None, typer.Option(help="Grid file of the geoid of --control-dem, GTX or GeoTIFF.")
+    Path | None,
+    typer.Option(exists=True, help="Grid file of the geoid of --control-dem, GTX or GeoTIFF."),
 ]
 DemSigmaM = Annotated[
     float | None,
@@ -134,7 +143,9 @@ def control_files(**given: Unpack[GivenControl]) -> ControlFiles:
     _refuse_alone({"--control-ortho-sigma-m": given["ortho_sigma_m"]}, "--control-ortho", given["ortho"])
     heights = None
     if dem is not None:
-        terrain = TerrainFile(dem, given["dem_vertical"], given["dem_geoid"])
+        terrain = TerrainFile(
+            dem, given["dem_vertical"], given["dem_geoid"], geoid_option="--control-dem-geoid"
+        )
         frame_sigma_m = sigma_pair(given["dem_frame_sigma_m"], "--control-dem-frame-sigma-m")
         heights = HeightFile(terrain, given["dem_sigma_m"], frame_sigma_m)
     stated = stated_by_caller(

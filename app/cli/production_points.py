@@ -23,7 +23,9 @@ def points(
     file: Annotated[
         Path,
         typer.Argument(
-            help="Points: GCPLib, Copernicus GCP database, CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, PCI."
+            exists=True,
+            help="Points: GCPLib, Copernicus GCP database, CSV, ASP, OPF, GeoJSON, ODM, QGIS, ENVI, "
+            "PCI.",
         ),
     ],
     *,
@@ -32,13 +34,15 @@ def points(
         list[Path] | None,
         typer.Option(
             "--images",
+            exists=True,
             help="Image with a registered model, or on a map; repeat, the most accurate first.",
         ),
     ] = None,
     chips: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database."
+            exists=True,
+            help="Folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database.",
         ),
     ] = None,
     chip_origin: Annotated[
@@ -50,7 +54,7 @@ def points(
         typer.Option(help="Vertical datum of the points: ellipsoid, EGM96, EGM2008, EPSG:…"),
     ] = None,
     geoid: Annotated[
-        Path | None, typer.Option(help="Grid file of the points' geoid, GTX or GeoTIFF.")
+        Path | None, typer.Option(exists=True, help="Grid file of the points' geoid, GTX or GeoTIFF.")
     ] = None,
     crs: Annotated[
         str | None, typer.Option(help="Reference system of x and y of a CSV, such as EPSG:32633.")
@@ -69,10 +73,12 @@ def points(
         ),
     ] = None,
     dem: Annotated[
-        Path | None, typer.Option(help="GeoTIFF with the heights of points without any.")
+        Path | None, typer.Option(exists=True, help="GeoTIFF with the heights of points without any.")
     ] = None,
     dem_vertical: Annotated[str | None, typer.Option(help="Vertical datum of --dem.")] = None,
-    dem_geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid of --dem.")] = None,
+    dem_geoid: Annotated[
+        Path | None, typer.Option(exists=True, help="Grid file of the geoid of --dem.")
+    ] = None,
     height_sigma_m: Annotated[
         float | None,
         typer.Option(
@@ -123,7 +129,9 @@ def points(
         chip_origin=chip_origin,
         stated=stated_by_caller(geoid or vertical, crs, columns, sigma_axes),
         point_sigma_m=sigma_pair(point_sigma_m, "--point-sigma-m"),
-        terrain=None if dem is None else TerrainFile(dem, dem_vertical, dem_geoid),
+        terrain=None
+        if dem is None
+        else TerrainFile(dem, dem_vertical, dem_geoid, geoid_option="--dem-geoid"),
         height_sigma_m=height_sigma_m,
         sigma_m=sigma_m,
         frame_sigma_m=frame_sigma_m,

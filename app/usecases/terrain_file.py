@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from services.errors import MissingGeoid
 from services.formats.elevation.dem import read_dem
 from services.terrain import Terrain
 
@@ -19,12 +20,14 @@ class TerrainFile:
         vertical: vertical datum of the heights, where the file does not state it; see `read_dem`.
         geoid: grid file of the geoid, where PROJ has none.
         fill_px: voids are filled from heights at most this many nodes away.
+        geoid_option: what gives `geoid`, for the error when the grid is missing.
     """
 
     dem: Path
     vertical: str | None = None
     geoid: Path | None = None
     fill_px: int = 0
+    geoid_option: str = "--geoid"
 
 
 def read_terrain(file: TerrainFile) -> Terrain:
@@ -33,4 +36,7 @@ def read_terrain(file: TerrainFile) -> Terrain:
     Raises:
         InputError: the file cannot be used, or the vertical datum is unknown.
     """
-    return read_dem(file.dem, file.vertical, file.geoid, file.fill_px)
+    try:
+        return read_dem(file.dem, file.vertical, file.geoid, file.fill_px)
+    except MissingGeoid as error:
+        raise MissingGeoid(f"{file.dem}: {error} with {file.geoid_option}") from None

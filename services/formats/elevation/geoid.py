@@ -9,7 +9,7 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
-from services.errors import InputError, VerticalDatumError
+from services.errors import InputError, MissingGeoid, VerticalDatumError
 from services.map_grid import crs_of_code
 from services.terrain import Geoid
 from services.types import Array
@@ -55,14 +55,14 @@ def geoid_of_crs(vertical: CRS) -> Geoid:
     """The height above the ellipsoid of the zero of a vertical reference system.
 
     Raises:
-        VerticalDatumError: PROJ has no transformation to the ellipsoid with an installed grid.
+        MissingGeoid: PROJ has no transformation to the ellipsoid with an installed grid.
     """
     compound = CompoundCRS("position and height", ["EPSG:4326", vertical])
     group = _transformations(compound)
     if not group.transformers:
-        raise VerticalDatumError(
+        raise MissingGeoid(
             f"heights in {vertical.name} cannot be converted to heights above the ellipsoid"
-            f"{missing_grids(compound)}; or give the grid file of the geoid (--geoid)"
+            f"{missing_grids(compound)}; or give the grid file of the geoid"
         )
     return _geoid(group.transformers[0])
 

@@ -27,7 +27,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from services.errors import FormatError, VerticalDatumError
+from services.errors import FormatError, MissingGeoid, VerticalDatumError
 from services.formats.elevation.geoid import (
     geoid_of_crs,
     geoid_of_grid,
@@ -155,6 +155,8 @@ def to_wgs84(
             )
         ground = _transformed(coordinates * [1.0, 1.0, 0.0], crs, source, axes_of_crs)
         geoid = geoid_of_grid(Path(heights)) if vertical is None else geoid_of_crs(vertical)
+    except MissingGeoid as error:
+        raise MissingGeoid(f"{source}: {error} (--geoid, or --control-geoid for control)") from None
     except VerticalDatumError as error:
         raise VerticalDatumError(f"{source}: {error}") from None
     zero_m = geoid(ground[:, :2])
