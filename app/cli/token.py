@@ -11,7 +11,7 @@ from app.usecases import tokens
 
 
 def create(
-    name: Annotated[str, typer.Argument(help="Name of the token, for people.")],
+    name: Annotated[str, typer.Argument(help="Name, for people; no other valid token has it.")],
     *,
     scope: Annotated[
         list[str], typer.Option(help="read, register, monitor or admin; repeat for several scopes.")
@@ -30,7 +30,7 @@ def create(
 ) -> None:
     """Create a token and print its secret, which is shown only now."""
     with transaction() as connection:
-        new = tokens.create_token(
+        new = tokens.issue_token(
             connection,
             name,
             scope,

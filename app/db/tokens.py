@@ -36,6 +36,8 @@ class Token:
 
 
 COLUMNS = columns_of(Token, token)
+NAMES_LOCK = 0x616D657274
+"""Advisory lock held while a token is created under a name of its own."""
 # Each request with a token begins with this one.
 VALID_TOKEN = hot(
     select(*COLUMNS).where(
@@ -118,6 +120,22 @@ def find_tokens(connection: Connection, name_or_id: str) -> list[Token]:
         .order_by(token.c.created_at)
     )
     return every(Token, connection.execute(statement))
+
+
+def lock_names(connection: Connection) -> None:
+    """Let nobody else create a token until the end of the transaction, so that names stay unique."""
+    connection.execute(select(func.pg_advisory_xact_lock(NAMES_LOCK)))
+
+
+def find_valid_name(connection: Connection, name: str) -> Token | None:
+    """The token with a secret that has this name and is neither expired nor revoked."""
+    statement = select(*COLUMNS).where(
+        token.c.name == name,
+        token.c.secret_hash.is_not(None),
+        token.c.revoked_at.is_(None),
+        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+    )
+    return first(Token, connection.execute(statement.order_by(token.c.created_at).limit(1)))
 
 
 def revoke_token(connection: Connection, token_id: UUID) -> Token:

@@ -34,7 +34,7 @@ def create_token(
     """Create a token.
 
     Args:
-        name: for people; several tokens may have the same name.
+        name: for people; `issue_token` refuses one that a valid token has.
         scopes: one or more of `read`, `register`, `monitor`, `admin`.
         days: how long the token is valid; None without end.
         storage_quota_bytes, job_quota: the token's quotas; None for those of the settings.
@@ -62,6 +62,33 @@ def create_token(
     return NewToken(token, secret)
 
 
+def issue_token(
+    connection: Connection,
+    name: str,
+    scopes: Iterable[str],
+    days: int | None = None,
+    *,
+    storage_quota_bytes: int | None = None,
+    job_quota: int | None = None,
+) -> NewToken:
+    """Create a token whose name no other valid token has; the arguments are those of `create_token`.
+
+    Raises:
+        InputError: a property is out of range.
+        Conflict: a valid token has this name.
+    """
+    tokens.lock_names(connection)
+    other = tokens.find_valid_name(connection, name.strip())
+    if other is not None:
+        raise Conflict(
+            f"name: the valid token {other.id} is named {other.name!r} already: choose another name, or "
+            f"revoke that one first with `amers token revoke {other.id}`"
+        )
+    return create_token(
+        connection, name, scopes, days, storage_quota_bytes=storage_quota_bytes, job_quota=job_quota
+    )
+
+
 def list_tokens(connection: Connection) -> list[Token]:
     """All tokens, the newest first, with the revoked and the expired ones."""
     return tokens.list_tokens(connection)
@@ -76,7 +103,7 @@ def revoke_token(connection: Connection, name_or_id: str) -> Token:
     """
     matches = tokens.find_tokens(connection, name_or_id)
     if not matches:
-        raise NotFound(f"no valid token {name_or_id}")
+        raise NotFound(f"no valid token {name_or_id}: `amers token list` lists names and ids")
     if len(matches) > 1:
         ids = ", ".join(str(token.id) for token in matches)
         raise Conflict(f"{len(matches)} tokens are named {name_or_id}: revoke by id ({ids})")

@@ -109,7 +109,8 @@ def test_the_command_line_makes_lists_and_revokes(dsn):
     assert amers(dsn, "token", "revoke", record["id"]).returncode == 0
     again = amers(dsn, "token", "revoke", record["id"])
     assert (again.returncode, again.stdout) == (2, "")
-    assert again.stderr == f"amers: no valid token {record['id']}\n"
+    listed_by = "`amers token list` lists names and ids"
+    assert again.stderr == f"amers: no valid token {record['id']}: {listed_by}\n"
 
 
 def test_on_the_command_line_a_secret_stands_alone_on_its_line(dsn):
