@@ -1,12 +1,17 @@
 """`amers audit`: the record of every change."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
 
-from app.cli.output import AsJson, show
+from app.cli.output import AsJson, as_text, show
 from app.cli.transaction import transaction
+from app.db.audit import Change
 from app.usecases import operations
+
+LONGEST_VALUE = 60
+"""Characters of a value in the table; --json has all."""
 
 
 def audit(
@@ -32,11 +37,32 @@ def audit(
             {
                 "at": change.at,
                 "who": change.actor_name,
-                "what": f"{change.kind} {change.subject} {change.action}",
-                "before": change.before,
-                "after": change.after,
+                "kind": change.kind,
+                "subject": change.subject,
+                "action": change.action,
+                "change": _change_in_words(change),
             }
             for change in changes
         ],
         as_json=False,
     )
+
+
+def _change_in_words(change: Change) -> str:
+    """The values that a change set or replaced: `state: staged -> published`."""
+    before, after = change.before, change.after
+    if before is None or after is None:
+        return "; ".join(
+            f"{name}: {_short(value)}" for name, value in _set_values(after or before or {})
+        )
+    names = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return "; ".join(f"{n}: {_short(before.get(n))} -> {_short(after.get(n))}" for n in names)
+
+
+def _set_values(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    return [(name, value) for name, value in row.items() if value is not None]
+
+
+def _short(value: object) -> str:
+    text = as_text(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]}…"

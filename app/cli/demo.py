@@ -14,6 +14,7 @@ from app.cli.progress import shown_progress
 from app.config import Settings
 from app.errors import InputError
 from app.usecases.demo import DemoOptions, DemoOutcome, run_demo
+from services.quality.accuracy_statement import accuracy_document
 from services.quality.criteria import verdict_scope
 from services.types import Array
 
@@ -31,7 +32,7 @@ def demo(
     with _private_store() as settings, shown_progress() as progress:
         outcome = run_demo(folder, settings, DemoOptions(), progress)
     if as_json:
-        show_one(_record(outcome), as_json=True)
+        show_one(_document(outcome), as_json=True)
         return
     show(_rows(outcome), as_json=False)
     typer.echo(f"\nReport: {outcome.report.absolute()}")
@@ -62,34 +63,62 @@ def _private_store() -> Iterator[Settings]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+LABELS = {
+    "points_produced": "points produced",
+    "points_ingested": "points ingested",
+    "points_served": "points served in the footprint",
+    "points_visible": "points visible",
+    "points_matched": "points matched",
+    "points_active": "points active",
+    "injected_error_east_north_m": "injected error at the centre, east, north (m)",
+    "error_to_recover_east_north_m": "the same in the block's frame (m)",
+    "recovered_error_east_north_m": "recovered error (m)",
+    "ce90_delivered_on_the_earth_m": "CE90 as delivered, on the Earth (m)",
+    "ce90_registered_in_frame_px": "CE90 registered, in the block's frame (px)",
+    "ce90_registered_on_the_earth_m": "CE90 registered, on the Earth (m)",
+    "frame_error_east_north_up_m": "error of the block's frame, east, north, up (m)",
+    "verdict": "verdict",
+    "verdict_scope": "verdict speaks of the accuracy",
+}
+"""The names of the figures in JSON, and for people."""
+
+
 def _record(outcome: DemoOutcome) -> Row:
     qualification = outcome.registration.qualification
     counts = qualification.point_counts
     return {
-        "points produced": outcome.counts.produced,
-        "points ingested": outcome.counts.ingested,
-        "points served in the footprint": outcome.counts.served,
-        "points visible": counts.visible,
-        "points matched": counts.matched,
-        "points active": counts.active,
-        "injected error at the centre, east, north (m)": _metres(outcome.injected_m),
-        "the same in the block's frame (m)": _metres(outcome.to_recover_m),
-        "recovered error (m)": _metres(outcome.recovered_m),
-        "CE90 as delivered, on the Earth (m)": round(outcome.before_m.value, 2),
-        "CE90 registered, in the block's frame (px)": round(outcome.in_frame_px.value, 3),
-        "CE90 registered, on the Earth (m)": round(outcome.absolute_m.value, 2),
-        "error of the block's frame, east, north, up (m)": _metres(outcome.frame_error_m),
+        "points_produced": outcome.counts.produced,
+        "points_ingested": outcome.counts.ingested,
+        "points_served": outcome.counts.served,
+        "points_visible": counts.visible,
+        "points_matched": counts.matched,
+        "points_active": counts.active,
+        "injected_error_east_north_m": _rounded(outcome.injected_m),
+        "error_to_recover_east_north_m": _rounded(outcome.to_recover_m),
+        "recovered_error_east_north_m": _rounded(outcome.recovered_m),
+        "ce90_delivered_on_the_earth_m": round(outcome.before_m.value, 2),
+        "ce90_registered_in_frame_px": round(outcome.in_frame_px.value, 3),
+        "ce90_registered_on_the_earth_m": round(outcome.absolute_m.value, 2),
+        "frame_error_east_north_up_m": _rounded(outcome.frame_error_m),
         "verdict": qualification.verdict,
-        "verdict speaks of the accuracy": verdict_scope(qualification.criteria),
-        **qualification.accuracy.words,
-        "report": str(outcome.report.absolute()),
+        "verdict_scope": verdict_scope(qualification.criteria),
     }
 
 
+def _document(outcome: DemoOutcome) -> Row:
+    accuracy = accuracy_document(outcome.registration.qualification.accuracy)
+    return {**_record(outcome), **accuracy, "report": str(outcome.report.absolute())}
+
+
 def _rows(outcome: DemoOutcome) -> list[Row]:
-    record = {name: value for name, value in _record(outcome).items() if name != "report"}
-    return [{"what": name, "figure": value} for name, value in record.items()]
+    figures = {LABELS[name]: _in_words(value) for name, value in _record(outcome).items()}
+    figures |= outcome.registration.qualification.accuracy.words
+    return [{"what": name, "figure": value} for name, value in figures.items()]
 
 
-def _metres(values: Array) -> str:
-    return ", ".join(f"{value:+.2f}" for value in values)
+def _in_words(value: object) -> object:
+    return ", ".join(f"{one:+.2f}" for one in value) if isinstance(value, list) else value
+
+
+def _rounded(values_m: Array) -> list[float]:
+    return [round(value, 2) for value in values_m.tolist()]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
@@ -19,7 +20,10 @@ Row = Mapping[str, object]
 
 
 def show(rows: Sequence[Row], *, as_json: bool) -> None:
-    """Print records with the same fields as a JSON array, a table or tab-separated lines."""
+    """Print records with the same fields as a JSON array, a table, or tab-separated lines with a header.
+
+    On a pipe, every record is one line and every value one field of it, whatever the values are.
+    """
     if as_json:
         print_json(rows)
     elif sys.stdout.isatty():
@@ -27,9 +31,9 @@ def show(rows: Sequence[Row], *, as_json: bool) -> None:
         for row in rows:
             table.add_row(*map(as_text, row.values()))
         Console().print(table if rows else "none")
-    else:
-        for row in rows:
-            typer.echo("\t".join(map(as_text, row.values())))
+    elif rows:
+        for fields in (map(_field_name, rows[0]), *(map(_field, row.values()) for row in rows)):
+            typer.echo("\t".join(fields))
 
 
 def show_one(record: Row, *, as_json: bool) -> None:
@@ -56,6 +60,16 @@ def as_text(value: object) -> str:
     if isinstance(value, list | tuple | set | frozenset):
         return ", ".join(map(as_text, value))
     return str(value)
+
+
+def _field_name(name: str) -> str:
+    """The name of a field in a header: words joined by underscores, as in JSON."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def _field(value: object) -> str:
+    """A value on one line without tabs."""
+    return re.sub(r"\s", " ", as_text(value))
 
 
 def as_size(size_bytes: int) -> str:

@@ -1,0 +1,92 @@
+"""What commands print for programs and for people, and names of tokens that are theirs alone."""
+
+import csv
+import json
+import os
+import re
+
+import psycopg
+import pytest
+
+from app.cli.demo import LABELS
+from app.db import engine
+from app.errors import Conflict
+from app.storage import Storage
+from app.usecases.blocks.lifecycle import ingest_block, publish_block
+from app.usecases.tokens import issue_token, revoke_token
+from tests.command_line import amers_here
+from tests.factories import make_block
+from tests.statements import run_sql
+
+NAME = re.compile(r"[a-z][a-z0-9_]*")
+LISTS = (("block", "list"), ("token", "list"), ("audit",))
+
+
+@pytest.fixture
+def run(dsn, tmp_path):
+    """Runs a command on a store with a published block and a token, with its output on a pipe."""
+    made = make_block(tmp_path / "block", 5, n_images=2, gsds_m=(2.0,))
+    with engine.connect(dsn) as connection:
+        ingest_block(connection, Storage(tmp_path / "storage"), made.folder)
+        publish_block(connection, "calanques")
+        issue_token(connection, "tab\tand\nline", ["read"])
+    environment = {**os.environ, "AMERS_DATABASE_URL": dsn, "AMERS_DATA_FOLDER": str(tmp_path)}
+
+    def run(*words: str) -> str:
+        done = amers_here(words, environment)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def names_in(value: object) -> set[str]:
+    """All keys of objects in a JSON value, but those of stored rows, which are columns."""
+    if isinstance(value, list):
+        return {name for one in value for name in names_in(one)}
+    if isinstance(value, dict):
+        return set(value) | {name for one in value.values() for name in names_in(one)}
+    return set()
+
+
+def test_a_list_on_a_pipe_has_a_header_and_one_line_a_record(run):
+    for words in LISTS:
+        records = json.loads(run(*words, "--json"))
+        rows = list(csv.reader(run(*words).splitlines(), delimiter="\t", quoting=csv.QUOTE_NONE))
+        assert all(NAME.fullmatch(name) for name in rows[0]), rows[0]
+        assert len(rows) == 1 + len(records) > 1
+        assert {len(row) for row in rows} == {len(rows[0])}
+
+
+def test_names_in_json_have_no_blanks(run):
+    for words in (*LISTS, ("block", "show", "calanques"), ("store", "usage"), ("db", "status")):
+        names = names_in(json.loads(run(*words, "--json")))
+        assert names
+        assert [name for name in names if not NAME.fullmatch(name)] == []
+    assert [name for name in LABELS if not NAME.fullmatch(name)] == []
+
+
+def test_the_audit_shows_what_a_change_replaced(run):
+    rows = list(csv.DictReader(run("audit", "--kind", "block").splitlines(), delimiter="\t"))
+    assert [row["action"] for row in rows] == ["changed", "created"]
+    assert rows[0]["subject"] == "calanques@1"
+    assert "state: staged -> published" in rows[0]["change"]
+    assert "{" not in rows[0]["change"]
+
+
+def test_a_name_belongs_to_one_valid_token(connection):
+    first = issue_token(connection, "survey office", ["read"]).token
+    with pytest.raises(Conflict, match=f"{first.id} is named 'survey office' already"):
+        issue_token(connection, " survey office ", ["admin"])
+    revoke_token(connection, "survey office")
+    issue_token(connection, "survey office", ["read"], days=1)
+    run_sql(connection, "update token set expires_at = now() - interval '1 second'")
+    issue_token(connection, "survey office", ["read"])
+
+
+def test_two_who_take_one_name_at_the_same_time_wait_for_each_other(dsn, connection):
+    issue_token(connection, "survey office", ["read"])
+    with engine.connect(dsn) as other:
+        engine.limit_lock_wait(other, 0.1)
+        with pytest.raises(psycopg.errors.LockNotAvailable):
+            issue_token(other, "survey office", ["read"])
