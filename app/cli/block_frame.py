@@ -15,12 +15,14 @@ from app.usecases.control_files import ControlFiles
 
 
 def frame(
-    block: Annotated[Path, typer.Argument(help="Folder of the block.")],
+    block: Annotated[Path, typer.Argument(exists=True, help="Folder of the block.")],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the moved block.")],
     images: Annotated[
         list[Path],
-        typer.Option("--images", help="Image of the block, in which control is found; repeat."),
+        typer.Option(
+            "--images", exists=True, help="Image of the block, in which control is found; repeat."
+        ),
     ],
     version: Annotated[
         str, typer.Option(help="Version of the moved block; by default the next whole number.")
@@ -44,8 +46,9 @@ def frame(
     check: Annotated[
         list[Path] | None,
         typer.Option(
+            exists=True,
             help="Control that takes no part and tells how good the result is: blocks, or files of "
-            "points with the accuracy that --control-sigma-m and the others state; repeat for several."
+            "points with the accuracy that --control-sigma-m and the others state; repeat for several.",
         ),
     ] = None,
     as_json: AsJson = False,

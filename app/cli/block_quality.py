@@ -40,10 +40,16 @@ def quality(
     block: Annotated[str, typer.Argument(help="Folder, or number, ID or ID@VERSION of a stored block.")],
     *,
     site: Annotated[
-        _Files, typer.Option(help="Reference ortho-image on a map, for checks only; repeat for others.")
+        _Files,
+        typer.Option(
+            exists=True, help="Reference ortho-image on a map, for checks only; repeat for others."
+        ),
     ] = None,
     control_site: Annotated[
-        _Files, typer.Option(help="The same of a place that the production used as control; repeat.")
+        _Files,
+        typer.Option(
+            exists=True, help="The same of a place that the production used as control; repeat."
+        ),
     ] = None,
     site_sigma_m: Annotated[
         float | None,
@@ -57,13 +63,19 @@ def quality(
     ] = None,
     images: Annotated[
         _Files,
-        typer.Option(help="Image of the block (folders only), to be compared with the sites; repeat."),
+        typer.Option(
+            exists=True, help="Image of the block (folders only), to be compared with the sites; repeat."
+        ),
     ] = None,
-    dem: Annotated[Path | None, typer.Option(help="GeoTIFF with heights to compare with.")] = None,
+    dem: Annotated[
+        Path | None, typer.Option(exists=True, help="GeoTIFF with heights to compare with.")
+    ] = None,
     vertical: Annotated[
         str | None, typer.Option(help="Vertical datum of --dem: ellipsoid, EGM96, EGM2008, EPSG:…")
     ] = None,
-    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
+    ] = None,
     dem_sigma_m: Annotated[
         float | None,
         typer.Option(help="Sigma of these heights, metres; by default 0.1 of their step.", min=0.001),
@@ -74,14 +86,17 @@ def quality(
     exclude: Annotated[
         _Files,
         typer.Option(
-            help="Ground without points, such as water: GeoJSON, or image other than 0; repeat."
+            exists=True,
+            help="Ground without points, such as water: GeoJSON, or image other than 0; repeat.",
         ),
     ] = None,
     exclude_heights: Annotated[
-        _Files, typer.Option(help="Ground where --dem is not to be trusted; the same; repeat.")
+        _Files,
+        typer.Option(exists=True, help="Ground where --dem is not to be trusted; the same; repeat."),
     ] = None,
     land_cover: Annotated[
-        Path | None, typer.Option(help="Image of land cover classes, to tell heights apart.")
+        Path | None,
+        typer.Option(exists=True, help="Image of land cover classes, to tell heights apart."),
     ] = None,
     points_per_km2: Annotated[
         float | None, typer.Option(help="Required density; by default that of the block.", min=1e-6)

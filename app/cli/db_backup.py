@@ -41,7 +41,7 @@ def backup(
 
 
 def verify_backup(
-    folder: Annotated[Path, typer.Argument(help="A folder written by `amers db backup`.")],
+    folder: Annotated[Path, typer.Argument(exists=True, help="A folder written by `amers db backup`.")],
     as_json: AsJson = False,
 ) -> None:
     """Read a backup and compare it with its manifest: missing, surplus and changed files."""
@@ -55,7 +55,10 @@ def verify_backup(
 
 def restore(
     folder: Annotated[
-        Path, typer.Argument(help="A folder written by `amers db backup`, or only its database.dump.")
+        Path,
+        typer.Argument(
+            exists=True, help="A folder written by `amers db backup`, or only its database.dump."
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:

@@ -46,7 +46,7 @@ def run(
         ),
     ] = None,
     selection: Annotated[
-        Path | None, typer.Option(help="Folder that `amers production select` has written.")
+        Path | None, typer.Option(exists=True, help="Folder that `amers production select` has written.")
     ] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
     block_id: Annotated[
@@ -92,17 +92,20 @@ def run(
     exclude: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Ground without points: GeoJSON polygons, or an image on a map; repeat for several."
+            exists=True,
+            help="Ground without points: GeoJSON polygons, or an image on a map; repeat for several.",
         ),
     ] = None,
     land_cover: Annotated[
         Path | None,
         typer.Option(
-            help="Image of land cover classes: the typology of the points; water, snow and ice get none."
+            exists=True,
+            help="Image of land cover classes: the typology of the points; water, snow and ice get "
+            "none.",
         ),
     ] = None,
     area: Annotated[
-        Path | None, typer.Option(help="GeoJSON of the ground to see, for --catalogue.")
+        Path | None, typer.Option(exists=True, help="GeoJSON of the ground to see, for --catalogue.")
     ] = None,
     since: Annotated[
         datetime | None,
@@ -111,8 +114,9 @@ def run(
     work: Annotated[
         Path | None,
         typer.Option(
+            exists=True,
             help="Folder of intermediate results, which is kept; by default OUTPUT.work, until the "
-            "block is complete. An interrupted production goes on from there."
+            "block is complete. An interrupted production goes on from there.",
         ),
     ] = None,
     jobs: Annotated[
@@ -127,6 +131,11 @@ def run(
     sources = (images or None, catalogue, selection)
     if sum(source is not None for source in sources) != 1:
         raise InputError("one of --images, --catalogue and --selection is expected")
+    absent = [image for image in images or () if "://" not in image and not Path(image).exists()]
+    if absent:
+        raise InputError(
+            f"--images: no file {', '.join(absent)}; expected paths, s3://BUCKET/KEY or https://…"
+        )
     fine_m, coarse_m = sampling_pair(gsd_m)
     options = ProductionOptions(
         fine_gsd_m=fine_m, coarse_gsd_m=coarse_m, spacing_m=spacing_m, points=points, min_views=min_views

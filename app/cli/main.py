@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from app.cli.commands import COMMANDS
-from app.cli.exit_status import INTERRUPTED, exit_status
+from app.cli.exit_status import FAILURE, INTERRUPTED, REFUSED
+from app.cli.failures import failure, print_traceback
 from app.cli.on_demand import GroupOnDemand
 from app.errors import AmersError
 
@@ -50,18 +51,38 @@ def amers(
 
 
 def main() -> None:
-    """Run one command; an `AmersError` is printed as one line, without a traceback."""
+    """Run one command; an error is printed as one sentence, without a traceback."""
     gc.set_threshold(OBJECTS_BEFORE_COLLECTION)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _exit)
     try:
-        app()
-    except AmersError as error:
-        typer.echo(f"amers: {error}", err=True)
-        sys.exit(exit_status(error))
+        sys.exit(app(prog_name="amers", standalone_mode=False))
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    except Exception as error:
+        if _is_help(error):
+            sys.exit(REFUSED)
+        sentence, status = failure(error)
+        if status == FAILURE and _debugs():
+            print_traceback(error)
+        typer.echo(f"amers: {sentence}", err=True)
+        sys.exit(status)
+
+
+def _is_help(error: Exception) -> bool:
+    """Whether a group was called without a command: its help was printed."""
+    return type(error).__name__ == "NoArgsIsHelpError"
+
+
+def _debugs() -> bool:
+    """Whether the settings ask for details."""
+    from app.config import read_settings  # most errors need no settings
+
+    try:
+        return read_settings().log_level == "debug"
+    except AmersError:
+        return False
 
 
 def _exit(number: int, frame: FrameType | None) -> None:

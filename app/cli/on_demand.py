@@ -10,6 +10,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from app.cli.arguments import CheckedCommand
+
 
 @dataclass(frozen=True)
 class Command:
@@ -82,5 +84,5 @@ def _load(name: str, entry: Command | Group) -> Any:
         return GroupOnDemand(entry.commands, name=name, help=entry.help, no_args_is_help=True)
     module, _, function = entry.function.partition(":")
     one = typer.Typer(add_completion=False)
-    one.command(name)(getattr(import_module(f"app.cli.{module}"), function))
+    one.command(name, cls=CheckedCommand)(getattr(import_module(f"app.cli.{module}"), function))
     return get_command(one)

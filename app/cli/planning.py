@@ -16,7 +16,9 @@ _TABLE_WIDTH = 100
 
 
 def plan(
-    configuration: Annotated[Path, typer.Argument(help="The plan: images, sites, sigmas, JSON.")],
+    configuration: Annotated[
+        Path, typer.Argument(exists=True, help="The plan: images, sites, sigmas, JSON.")
+    ],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")],
     selection: Annotated[

@@ -21,17 +21,23 @@ def ortho(
     images: Annotated[
         list[Path],
         typer.Argument(
-            help="GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate first."
+            exists=True,
+            help="GeoTIFF (or COG) or JPEG 2000 on a map; several of one place, the most accurate "
+            "first.",
         ),
     ],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder of the block.")],
-    dem: Annotated[Path | None, typer.Option(help="GeoTIFF with the heights of the ground.")] = None,
+    dem: Annotated[
+        Path | None, typer.Option(exists=True, help="GeoTIFF with the heights of the ground.")
+    ] = None,
     vertical: Annotated[
         str | None,
         typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…"),
     ] = None,
-    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
+    ] = None,
     height_m: Annotated[
         float | None,
         typer.Option(help="Height of flat ground above the ellipsoid, metres; replaces --dem."),
@@ -78,7 +84,8 @@ def ortho(
     ] = _ORTHO_DEFAULT.min_views,
     bands: Annotated[str | None, typer.Option(help="Bands to use: 2, or 1,2,3, or 3:0.3,2:0.7.")] = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Image of the same ground; no points where it is not 0.")
+        Path | None,
+        typer.Option(exists=True, help="Image of the same ground; no points where it is not 0."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -30,19 +30,25 @@ def register(
     ],
     *,
     block: Annotated[
-        Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
+        Path | None,
+        typer.Option(exists=True, help="Use the points of this block folder instead of the store."),
     ] = None,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Ortho-image to register on; with --block only where it has no points."),
+        typer.Option(
+            exists=True, help="Ortho-image to register on; with --block only where it has no points."
+        ),
     ] = None,
     dem: Annotated[
-        Path | None, typer.Option(help="GeoTIFF with the heights of the reference's ground.")
+        Path | None,
+        typer.Option(exists=True, help="GeoTIFF with the heights of the reference's ground."),
     ] = None,
     vertical: Annotated[
         str | None, typer.Option(help="Vertical datum of these heights: ellipsoid, EGM96, EPSG:…")
     ] = None,
-    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
+    ] = None,
     reference_sigma_m: Annotated[
         float | None,
         typer.Option(help="Accuracy of the reference on the Earth, one sigma, metres.", min=0.001),
@@ -55,16 +61,19 @@ def register(
         float | None, typer.Option(help="Accuracy of the model, one sigma, metres.", min=0.01)
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(help="File of the model; by default it is found by its name.")
+        Path | None,
+        typer.Option(exists=True, help="File of the model; by default it is found by its name."),
     ] = None,
     bands: Annotated[
         str | None, typer.Option(help="Bands to use: 2, or 1,2,3 for their mean, or 3:0.3,2:0.7.")
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Image of the same ground; pixels that are not 0 are not used.")
+        Path | None,
+        typer.Option(exists=True, help="Image of the same ground; pixels that are not 0 are not used."),
     ] = None,
     check_points: Annotated[
-        Path | None, typer.Option(help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF.")
+        Path | None,
+        typer.Option(exists=True, help="Points held out: ASP, QGIS, ENVI, ODM, PCI, GeoJSON or OPF."),
     ] = None,
     check_heights: Annotated[
         str | None,

@@ -15,19 +15,23 @@ from services.orthorectification.rectify import OrthoOptions
 
 
 def ortho(
-    scene: Annotated[Path, typer.Argument(help="GeoTIFF, JPEG 2000 or NITF.")],
+    scene: Annotated[Path, typer.Argument(exists=True, help="GeoTIFF, JPEG 2000 or NITF.")],
     *,
-    dem: Annotated[Path, typer.Option(help="GeoTIFF with the heights of the ground.")],
+    dem: Annotated[Path, typer.Option(exists=True, help="GeoTIFF with the heights of the ground.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="GeoTIFF to write.")],
     model: Annotated[
         Path | None,
-        typer.Option(help="File of the model, such as a refined one; by default found by its name."),
+        typer.Option(
+            exists=True, help="File of the model, such as a refined one; by default found by its name."
+        ),
     ] = None,
     vertical: Annotated[
         str | None,
         typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…"),
     ] = None,
-    geoid: Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")] = None,
+    geoid: Annotated[
+        Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
+    ] = None,
     fill_px: Annotated[
         int, typer.Option(help="Fill voids of the terrain from this many nodes away.", min=0, max=50)
     ] = 0,

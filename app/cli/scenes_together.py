@@ -20,11 +20,15 @@ def register_many(
     ],
     *,
     block: Annotated[
-        Path | None, typer.Option(help="Use the points of this block folder instead of the store.")
+        Path | None,
+        typer.Option(exists=True, help="Use the points of this block folder instead of the store."),
     ] = None,
     join: Annotated[
         Path | None,
-        typer.Option(help="Output folder of scenes registered together before; they stay as they are."),
+        typer.Option(
+            exists=True,
+            help="Output folder of scenes registered together before; they stay as they are.",
+        ),
     ] = None,
     sigma_m: Annotated[
         float | None, typer.Option(help="Accuracy of the models, one sigma, metres.", min=0.01)

@@ -9,7 +9,7 @@ from services.formats.images.canvas import write_canvas
 
 
 def canvas(
-    scene: Annotated[Path, typer.Argument(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")],
+    scene: Annotated[Path, typer.Argument(exists=True, help="Raw image: GeoTIFF, JPEG 2000 or NITF.")],
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Virtual raster to write, .vrt.")],
 ) -> None:

@@ -14,21 +14,27 @@ from app.usecases.vector_files import CorrectionOptions, ProjectionOptions, Vect
 from app.usecases.vectors import correct_file, project_file
 from services.formats.vector.pixel_coordinates import PIXEL_ORIGINS, PixelOrigin
 
-Vectors = Annotated[Path, typer.Argument(help="GeoPackage, GeoJSON, shapefile or FlatGeobuf.")]
-SceneImage = Annotated[Path, typer.Option(help="Raw image: GeoTIFF, JPEG 2000 or NITF.")]
-Dem = Annotated[Path, typer.Option(help="GeoTIFF with the heights of the ground.")]
+Vectors = Annotated[
+    Path, typer.Argument(exists=True, help="GeoPackage, GeoJSON, shapefile or FlatGeobuf.")
+]
+SceneImage = Annotated[Path, typer.Option(exists=True, help="Raw image: GeoTIFF, JPEG 2000 or NITF.")]
+Dem = Annotated[Path, typer.Option(exists=True, help="GeoTIFF with the heights of the ground.")]
 Output = Annotated[Path, typer.Option("-o", "--output", help="File to write; its suffix is the format.")]
 Layer = Annotated[str | None, typer.Option(help="Layer of the file; by default its only one.")]
 Registration = Annotated[
-    Path | None, typer.Option(help="Folder of the scene's registration (`amers scene register -o`).")
+    Path | None,
+    typer.Option(exists=True, help="Folder of the scene's registration (`amers scene register -o`)."),
 ]
 Model = Annotated[
-    Path | None, typer.Option(help="File of the delivered model; by default found by its name.")
+    Path | None,
+    typer.Option(exists=True, help="File of the delivered model; by default found by its name."),
 ]
 Vertical = Annotated[
     str | None, typer.Option(help="Vertical datum of the heights: ellipsoid, EGM96, EGM2008, EPSG:…")
 ]
-GeoidGrid = Annotated[Path | None, typer.Option(help="Grid file of the geoid, GTX or GeoTIFF.")]
+GeoidGrid = Annotated[
+    Path | None, typer.Option(exists=True, help="Grid file of the geoid, GTX or GeoTIFF.")
+]
 FillPx = Annotated[
     int, typer.Option(help="Fill voids of the terrain from this many nodes away.", min=0, max=50)
 ]

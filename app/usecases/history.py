@@ -43,7 +43,7 @@ def find_history(connection: Connection, point_id: int) -> PointHistory:
     """
     point = history.find_history(connection, point_id) if abs(point_id) < 2**63 else None
     if point is None:
-        raise NotFound(f"no point {point_id}")
+        raise NotFound(f"no point {point_id}: expected the id of a point of the store")
     return point
 
 

@@ -200,7 +200,9 @@ def find_published(connection: Connection, reference: str) -> Block:
     for block in blocks.find_blocks(connection, reference):
         if block.state == "published":
             return block
-    raise NotFound(f"no block {reference:.100}")
+    raise NotFound(
+        f"no published block {reference:.100}: expected the number, ID or ID@VERSION of one of the store"
+    )
 
 
 def block_report(connection: Connection, block: Block) -> BlockReport:

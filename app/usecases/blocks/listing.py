@@ -21,7 +21,9 @@ def find_block(connection: Connection, reference: str) -> Block:
     """
     matches = blocks.find_blocks(connection, reference)
     if not matches:
-        raise NotFound(f"no block {reference:.100}")
+        raise NotFound(
+            f"no block {reference:.100}: expected the number, ID or ID@VERSION of a block of the store"
+        )
     if len(matches) > 1:
         versions = ", ".join(f"{block.id}@{block.version}" for block in matches)
         raise Conflict(f"block {reference} has {len(matches)} versions, name one: {versions}")

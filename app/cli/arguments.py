@@ -1,0 +1,72 @@
+"""Check of the arguments of a command: all that is missing or wrong is reported at once."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+
+class CheckedCommand(TyperCommand):
+    """A command that names everything wrong on its command line in one error, not one per run."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments.
+
+        Raises:
+            UsageError: values are missing or wrong; its message is one sentence on all of them.
+        """
+        given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            first = error
+        problems = list(dict.fromkeys(self._problems(ctx, given))) or [first.format_message()]
+        ctx.fail("; ".join(problems))
+        raise first
+
+    def _problems(self, ctx: Any, args: list[str]) -> Iterator[str]:
+        """What is missing, then what is wrong with each value."""
+        values, _, _ = self.make_parser(ctx).parse_args(args=args)
+        missing, wrong = [], []
+        for parameter in self.get_params(ctx):
+            for value, error in _errors_of(parameter, ctx, values):
+                if type(error) is typer.BadParameter:
+                    wrong.append(f"{_name(parameter)}: {_words(value, error)}")
+                else:
+                    missing.append(_name(parameter))
+        if missing:
+            yield f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+        yield from wrong
+
+
+def _errors_of(
+    parameter: Any, ctx: Any, values: dict[str, Any]
+) -> Iterator[tuple[object, typer.BadParameter]]:
+    """The errors of one parameter with the values that they are about."""
+    given = values.get(parameter.name)
+    alone = [[value] for value in given] if isinstance(given, list | tuple) and given else [given]
+    for one in alone:
+        try:
+            parameter.handle_parse_result(ctx, {**values, parameter.name: one}, [])
+        except typer.BadParameter as error:
+            yield (one[0] if isinstance(one, list) and one else one), error
+
+
+def _words(value: object, error: typer.BadParameter) -> str:
+    """What is wrong with a value: the value, and what was expected."""
+    message = error.message.removeprefix("Value error, ").rstrip(".")
+    shown = f"{value!r:.100}"
+    return message if shown in message else f"{shown} found; {message[:1].lower()}{message[1:]}"
+
+
+def _name(parameter: Any) -> str:
+    """The longest name of an option, or the name of an argument as the help has it."""
+    if parameter.param_type_name == "option":
+        return str(max(parameter.opts, key=len))
+    return str(parameter.name).upper()
+
+
+def _listed(names: list[str]) -> str:
+    """Names as a list in words."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
