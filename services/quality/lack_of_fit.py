@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.special import comb
 
 from services.adjustment.structure import Family, Structure
@@ -35,8 +36,11 @@ _ENOUGH = 4
 """Points that agree elsewhere, from which on one may do so by chance."""
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
-_AS_MANY = 0.5
-"""Points that agree elsewhere, over the active points, beyond which neither place is the scene's."""
+_LARGE_PART = 0.25
+"""Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
+scene's."""
+_NODES = 30
+"""Places along each side of the image at which the nearest point is sought."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,6 @@ class Elsewhere:
         displacement_px: (2,) line and sample, from where the registered model expects them.
         displacement_m: its length on the ground.
         false_alarms: number of such groups that chance makes.
-        missed: number of points that do not agree with the scene.
-        share_of_missed: share of them, of those that were searched again, that agree on this place.
         slope_px: (2,) line and sample by which a metre of height displaces them; None where they are
             displaced alike.
         farthest_px: largest displacement, where they differ.
@@ -59,8 +61,6 @@ class Elsewhere:
     displacement_px: Array
     displacement_m: float
     false_alarms: float
-    missed: int
-    share_of_missed: float
     slope_px: Array | None = None
     farthest_px: float = 0.0
 
@@ -156,13 +156,16 @@ def against_height(elsewhere: Elsewhere | None, sight: Array, predicted_px: floa
     return replace(criterion, note=f"{seen}; {_wrong_sight(elsewhere.slope_px, sight)}")
 
 
-def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active: BoolArray) -> Criterion:
+def elsewhere_criterion(
+    elsewhere: Elsewhere | None, line_sample: Array, active: BoolArray, shape: tuple[int, int]
+) -> Criterion:
     """The criterion on points that agree on another displacement.
 
     Args:
         elsewhere: these points; None when there are none.
         line_sample: (n, 2) where all points are expected.
         active: (n,) those that the adjustment uses.
+        shape: lines and samples of the image.
     """
     if elsewhere is None or elsewhere.slope_px is not None:
         return at_most("points_elsewhere", 0, 0, "good")
@@ -182,9 +185,22 @@ def elsewhere_criterion(elsewhere: Elsewhere | None, line_sample: Array, active:
         else "others beside them do not: ground that moved (a landslide, a quarry, ice), or a part of "
         "another image"
     )
-    as_many = elsewhere.share_of_missed * elsewhere.missed > _AS_MANY * active.sum()
-    criterion = at_most("points_elsewhere", len(line), 0, "usable" if whole_lines or as_many else "good")
+    part = _nearest_share(line_sample[elsewhere.rows], line_sample[active], shape)
+    large = part > _LARGE_PART
+    if large and not whole_lines:
+        looks += f"; they are nearest to {part:.0%} of the image, so that neither place is the scene's"
+    criterion = at_most("points_elsewhere", len(line), 0, "usable" if whole_lines or large else "good")
     return replace(criterion, note=f"{moved}; {looks}")
+
+
+def _nearest_share(some: Array, others: Array, shape: tuple[int, int]) -> float:
+    """Share of an image that is nearer to some points (n, 2) than to others (m, 2)."""
+    if not len(others):
+        return 1.0
+    axes = [(np.arange(_NODES) + 0.5) / _NODES * size for size in shape]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    nearest_some, nearest_others = (KDTree(points).query(places)[0] for points in (some, others))
+    return float(np.mean(nearest_some < nearest_others))
 
 
 def _belong_to_whole_lines(line: Array, others: Array, displacement_px: Array) -> bool:

@@ -350,7 +350,7 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
     return [
         *structures,
         missed_criterion(expected[:, 0], measures.active, measures.reason, scene.shape[0]),
-        elsewhere_criterion(scene.elsewhere, expected, measures.active),
+        elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]
 
 

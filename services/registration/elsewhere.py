@@ -38,12 +38,10 @@ class _Again:
     Attributes:
         rows: (k,) of the points, among all that the scene may show.
         matches: of them.
-        missed: number of points that were missed.
     """
 
     rows: IntArray
     matches: PointMatches
-    missed: int
 
 
 def search_elsewhere(
@@ -69,7 +67,7 @@ def search_elsewhere(
     )
     points = context.points.take(rows)
     matches = match_points(chip_search, points, context.chips, context.options.matching)
-    again = _Again(rows, matches, int(missed.sum()))
+    again = _Again(rows, matches)
     beside = _as_heights_move(context, prediction, search, adjustment, again)
     return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
 
@@ -105,8 +103,6 @@ def _lines_beside(
         displacement_px=group.displacement,
         displacement_m=float(np.hypot(*moved_m)),
         false_alarms=false_alarms,
-        missed=len(left),
-        share_of_missed=len(members) / len(left),
     )
 
 
@@ -152,8 +148,6 @@ def _as_heights_move(
         displacement_px=displacement_px,
         displacement_m=float(np.hypot(*np.linalg.solve(derivative[:, :2], displacement_px))),
         false_alarms=group.false_alarms,
-        missed=int((~active).sum()),
-        share_of_missed=len(members) / max(int((~active).sum()), 1),
         slope_px=group.displacement,
         farthest_px=float(np.hypot(*misfit_px[members].T).max()),
     )
@@ -188,8 +182,6 @@ def _far_away(
         ),
         displacement_m=float(np.hypot(*group.displacement)),
         false_alarms=group.false_alarms,
-        missed=again.missed,
-        share_of_missed=float(group.inliers.mean()),
     )
 
 

@@ -13,12 +13,12 @@ from services.quality.lack_of_fit import (
 
 def judged(line: np.ndarray, others: np.ndarray, displacement_px: tuple[float, float]) -> str:
     """What a scene cannot be whose points of these lines lie elsewhere."""
-    elsewhere = Elsewhere(np.arange(len(line)), np.array(displacement_px), 10.0, 1e-5, len(line), 1.0)
+    elsewhere = Elsewhere(np.arange(len(line)), np.array(displacement_px), 10.0, 1e-5)
     line_sample = np.column_stack(
         [np.concatenate([line, others]), np.full(len(line) + len(others), 5.0)]
     )
     active = np.arange(len(line_sample)) >= len(line)
-    criterion = elsewhere_criterion(elsewhere, line_sample, active)
+    criterion = elsewhere_criterion(elsewhere, line_sample, active, (2000, 10))
     assert not criterion.met
     return criterion.needed_for
 
@@ -45,6 +45,23 @@ def test_ground_that_moved_along_the_lines_has_others_beside_it(others: np.ndarr
 
 def test_three_points_are_too_few_to_leave_one_out(others: np.ndarray) -> None:
     assert judged(np.array([84.0, 146.0, 1748.0]), others, (19.3, 0.0)) == "good"
+
+
+@pytest.mark.parametrize(("side", "needed_for"), [(0.3, "good"), (0.7, "usable")])
+def test_a_part_that_lies_elsewhere_counts_by_its_area_not_by_its_points(
+    side: float, needed_for: str
+) -> None:
+    """Few points show a large part where it is woods, many a small one where it is a town."""
+    rng = np.random.default_rng(7)
+    place = rng.random((4000, 2))
+    inside = (place < side).all(axis=1)
+    few, many = place[inside][:8], place[~inside][:60]
+    line_sample = 1000.0 * np.concatenate([few, many])
+    elsewhere = Elsewhere(np.arange(8), np.array([9.0, 11.0]), 10.0, 1e-5)
+    active = np.arange(len(line_sample)) >= 8
+    criterion = elsewhere_criterion(elsewhere, line_sample, active, (1000, 1000))
+    assert not criterion.met
+    assert criterion.needed_for == needed_for
 
 
 @pytest.mark.parametrize(("n", "m"), [(3, 6), (4, 12), (5, 12), (8, 12)])
