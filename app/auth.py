@@ -1,4 +1,4 @@
-"""Authentication and authorisation: bearer tokens of 256 random bits with scopes."""
+"""Authentication and authorisation: tokens of 256 random bits with scopes."""
 
 import hashlib
 import secrets
@@ -13,7 +13,10 @@ from app.oidc import Identity
 
 SECRET_BYTES = 32
 INVALID_TOKEN = "the token is unknown, expired or revoked"
-MISSING_TOKEN = "this request needs a token: send the header `Authorization: Bearer TOKEN`"
+MISSING_TOKEN = (
+    "this request needs a token: send the header `Authorization: Bearer TOKEN`, "
+    "or Basic with the token as password"
+)
 
 
 class Scope(StrEnum):

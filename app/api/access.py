@@ -12,10 +12,10 @@ from typing import Any, Literal, TypeVar
 from fastapi import Depends
 from fastapi.dependencies.models import Dependant
 
+from app.api.credentials import BASIC, BEARER
 from app.auth import Scope
 from app.config import Settings
 
-BEARER = "bearer"
 FURTHER_SCOPES = "x-further-scopes"
 """Member of an operation: the scopes that some of its inputs need in addition to its own."""
 
@@ -38,7 +38,12 @@ class Access:
         """The member `security` of the operation in the OpenAPI description."""
         scopes = [] if self.scope is None else [str(self.scope)]
         public = self.public_if is not None and bool(getattr(settings, self.public_if))
-        return [{BEARER: scopes}, *([{}] if public else [])]
+        return [*either_scheme(scopes), *([{}] if public else [])]
+
+
+def either_scheme(scopes: list[str]) -> list[dict[str, list[str]]]:
+    """The requirement of a token with these scopes, whichever way it is sent."""
+    return [{BEARER: scopes}, {BASIC: scopes}]
 
 
 _DECLARED: dict[Callable[..., Any], Access | None] = {}

@@ -13,12 +13,12 @@ from starlette.concurrency import run_in_threadpool
 from app import request_context
 from app.api.access import needs
 from app.api.body import body_of
+from app.api.credentials import BASIC, credentials_of, refuse_other_sites
 from app.api.turns import Turns
 from app.auth import Scope, authenticate, authenticate_identity, require, require_token
 from app.config import Settings
 from app.db.engine import Database
 from app.db.tokens import Token
-from app.errors import NotAllowed
 from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
 from app.usecases.installation import Installation
@@ -89,15 +89,15 @@ async def identify(request: Request) -> Token | None:
 
     Raises:
         NotAllowed: the token is invalid.
+        HTTPException: a page of another site uses a password that the browser has kept.
     """
     caller = None
-    authorization = request.headers.get("authorization")
-    if authorization is not None:
-        kind, _, secret = authorization.partition(" ")
-        if kind.lower() != "bearer" or not secret.strip():
-            raise NotAllowed("the Authorization header must read `Bearer TOKEN`", authenticated=False)
+    credentials = credentials_of(request.headers)
+    if credentials is not None:
+        if credentials.scheme == BASIC:
+            refuse_other_sites(request)
         state = request.app.state
-        caller = await run_in_threadpool(_token, state.issuer, state.database, secret.strip())
+        caller = await run_in_threadpool(_token, state.issuer, state.database, credentials.secret)
         here = request_context.current()
         here.actor, here.actor_name = caller.id, caller.name
     request.scope[CALLER] = caller

@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
+from app.api.credentials import challenges
 from app.errors import (
     AmersError,
     ComputationError,
@@ -49,7 +50,7 @@ PROBLEM_TYPES: dict[type[Exception], str] = {
 UNUSABLE = (None, "22003", "22021", "22P05")
 """SQLSTATEs of numbers and characters that PostgreSQL cannot store; None: the driver refused them."""
 RETRY_SECONDS = "5"
-HEADERS = {401: {"WWW-Authenticate": 'Bearer realm="amers"'}, 429: {"Retry-After": RETRY_SECONDS}}
+HEADERS = {429: {"Retry-After": RETRY_SECONDS}}
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +107,12 @@ def _refused(request: Request, error: Exception) -> JSONResponse:
     status = status_of(error)
     headers = HEADERS.get(status)
     kind = {"type": PROBLEM_TYPES[type(error)]} if type(error) in PROBLEM_TYPES else {}
-    return problem(status, str(error), headers=headers, error=type(error).__name__, **kind)
+    reply = problem(status, str(error), headers=headers, error=type(error).__name__, **kind)
+    if status == HTTPStatus.UNAUTHORIZED:
+        # Each in a header of its own: some clients understand only the first of a list.
+        for challenge in challenges(request.headers):
+            reply.headers.append("WWW-Authenticate", challenge)
+    return reply
 
 
 def _damaged(request: Request, error: Exception) -> JSONResponse:

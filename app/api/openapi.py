@@ -9,7 +9,8 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from pydantic.json_schema import models_json_schema
 
-from app.api.access import BEARER, declared_security
+from app.api.access import declared_security, either_scheme
+from app.api.credentials import BASIC, BEARER
 from app.api.json_schemas import collection_schemas, property_schema, reference, schema_name
 from app.api.models.base import Link, Problem
 from app.api.negotiation import DOCUMENTS, FEATURES, GEOJSON, HTML, JSON, PROBLEM_JSON
@@ -22,6 +23,14 @@ from app.usecases.features.tiles import MATRIX_SET, MOST_ZOOM
 REFUSED = {
     "description": "The request cannot be served; problem details say why.",
     "content": {PROBLEM_JSON: {"schema": reference("Problem")}},
+}
+SECURITY_SCHEMES = {
+    BEARER: {"type": "http", "scheme": "bearer", "description": "The token."},
+    BASIC: {
+        "type": "http",
+        "scheme": "basic",
+        "description": "The token as password, with any user name, for clients without bearer tokens.",
+    },
 }
 COMMA_SEPARATED = ("bbox", "collections", "ids")
 PLACES: dict[str, dict[str, Any]] = {
@@ -63,7 +72,7 @@ def _completed(document: dict[str, Any]) -> dict[str, Any]:
     for collection in COLLECTIONS.values():
         schemas |= collection_schemas(collection)
     schemas |= _model_schemas()
-    document["components"]["securitySchemes"] = {BEARER: {"type": "http", "scheme": "bearer"}}
+    document["components"]["securitySchemes"] = SECURITY_SCHEMES
     for path, operations in list(document["paths"].items()):
         for operation in operations.values():
             operation["responses"].pop("422", None)
@@ -131,7 +140,7 @@ def _of_collection(operation: dict[str, Any], collection: Collection, path: str)
         "parameters": parameters,
     }
     if not collection.is_open:
-        own["security"] = [{BEARER: [str(Scope.REGISTER)]}]
+        own["security"] = either_scheme([str(Scope.REGISTER)])
     if path.endswith("/items"):
         own["parameters"] = parameters + [_equal(item) for item in collection.queryables.values()]
     if path.endswith(("/items", "/search")):

@@ -1,7 +1,9 @@
 """Headers of all replies: whether they may be stored, and that browsers must not guess their type."""
 
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.api.credentials import sends_password
 
 NO_STORE = "no-store"
 FIRST_ERROR = 400
@@ -10,7 +12,8 @@ FIRST_ERROR = 400
 class ReplyHeaders:
     """Middleware that adds `X-Content-Type-Options: nosniff` and `Cache-Control: no-store`.
 
-    A successful reply that states its own `Cache-Control` keeps it: tiles, chips and the map page.
+    A successful reply that states its own `Cache-Control` keeps it: tiles, chips and the map page. What
+    is sent to a password is not embedded by other sites: `Cross-Origin-Resource-Policy: same-origin`.
 
     Attributes:
         app: the application that gets the requests.
@@ -25,10 +28,15 @@ class ReplyHeaders:
             await self.app(scope, receive, send)
             return
 
+        by_password = sends_password(Headers(scope=scope))
+
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["X-Content-Type-Options"] = "nosniff"
+                if by_password:
+                    # A browser sends it with images that other sites embed, too.
+                    headers["Cross-Origin-Resource-Policy"] = "same-origin"
                 if message["status"] >= FIRST_ERROR or "Cache-Control" not in headers:
                     headers["Cache-Control"] = NO_STORE
             await send(message)

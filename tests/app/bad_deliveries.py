@@ -312,7 +312,8 @@ BLOCKS = [
 ]
 TOKENS = [
     called("none", "", "Bearer"),
-    called("basic", "Basic YWRtaW46YWRtaW4=", "Bearer"),
+    called("basic", "Basic YWRtaW46YWRtaW4="),
+    called("basic without Base64", "Basic admin:admin", "Base64"),
     called("empty", "Bearer ", "Bearer"),
     called("made up", "Bearer " + "A" * 43),
     called("one letter wrong", "Bearer <secret_but_one>"),

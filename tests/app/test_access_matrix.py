@@ -4,6 +4,7 @@ Operations, and who may use them, come from the OpenAPI document: an operation a
 too. It is refused when it does not declare its access, or has a path parameter without a value here.
 """
 
+from base64 import b64encode
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,8 @@ from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
 
 from app.api import openapi
-from app.api.access import BEARER, FURTHER_SCOPES
+from app.api.access import FURTHER_SCOPES
+from app.api.credentials import BEARER
 from app.auth import INCLUDED, Scope
 from app.config import Settings
 from app.main import ROUTERS, create_app
@@ -93,7 +95,8 @@ class Operation:
     def allows(self, role: str) -> bool:
         """Whether the declared scope is one that a caller has."""
         included = {scope for own in SCOPES[role] for scope in INCLUDED[own]}
-        return any(set(item.get(BEARER, [])) <= set(map(str, included)) for item in self.security or [])
+        scopes = [set(needed) for item in self.security or [] for needed in item.values()]
+        return self.is_public or any(needed <= set(map(str, included)) for needed in scopes)
 
     def url(self, store: Installation) -> str:
         """The path, filled with things of the caller `other`."""
@@ -246,6 +249,19 @@ def test_allowed_callers_are_let_in_and_see_nothing_of_others(store: Installatio
             ), reply.text[:300]
         else:
             assert discloses(store, operation, reply) == [], role
+
+
+def test_the_token_as_password_of_basic_is_taken_wherever_bearer_is(store: Installation):
+    """By a caller whose scope few operations allow, so that nothing changes."""
+    secret = store.headers["monitor"]["Authorization"].split()[1]
+    password = b64encode(f"anybody:{secret}".encode()).decode()
+    store.headers["monitor by basic"] = {"Authorization": f"Basic {password}"}
+    for name, operation in zip(IDS, OPERATIONS, strict=True):
+        if operation.checks_tokens:
+            by_bearer, by_basic = (
+                send(store, operation, role) for role in ("monitor", "monitor by basic")
+            )
+            assert by_basic.status_code == by_bearer.status_code != 401, name
 
 
 @pytest.mark.parametrize("thing", OWNED.values())

@@ -450,6 +450,39 @@ def test_an_invalid_token_is_refused_with_the_message_of_the_service(visit):
     expect(page.get_by_role("alert")).to_contain_text("unknown, expired or revoked")
 
 
+def test_a_password_that_the_browser_keeps_serves_no_other_site(
+    browser, service, world, administrator, secret
+):
+    """The browser answers the challenge with the token; then another site posts a form."""
+    elsewhere = "http://elsewhere.example/"
+    withdraw = f"{service.url}/blocks/flat/withdraw"
+    attack = (
+        f'<form method="post" action="{withdraw}" enctype="text/plain"><input name="x"></form>'
+        "<script>document.forms[0].submit()</script>"
+    )
+    password = {"username": "ada", "password": administrator, "origin": service.url}
+    headers = {"Authorization": f"Bearer {secret}"}
+    with browser.new_context(http_credentials=password) as context:
+        context.route(
+            f"{elsewhere}*", lambda route: route.fulfill(body=attack, content_type="text/html")
+        )
+        page = context.new_page()
+        reply = page.goto(f"{service.url}/collections/blocks/items?f=html")
+        assert reply is not None
+        assert reply.status == 200
+        expect(page.get_by_role("heading", name="Blocks")).to_be_visible()
+        with page.expect_response(withdraw) as attacked:
+            page.goto(elsewhere)
+        assert attacked.value.status == 403, "401 would be a request without the password"
+        items = httpx.get(f"{service.url}/collections/points/items", headers=headers).json()
+        assert items["numberMatched"] == points_of_the_block
+
+        page.goto(f"{service.url}/map")
+        post = "address => fetch(address, {method: 'POST'}).then(reply => reply.status)"
+        assert page.evaluate(post, withdraw) == 200
+        assert page.evaluate(post, withdraw.replace("withdraw", "publish")) == 200
+
+
 VIEWS = {
     "points": "Control points",
     "scenes": "Scenes",

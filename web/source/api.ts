@@ -56,7 +56,8 @@ export async function call(path: string, request: RequestInit = {}): Promise<Res
   const headers = { Accept: "application/json", ...authorization(), ...request.headers };
   let reply: Response;
   try {
-    reply = await fetch(address(path), { ...request, headers });
+    // Without credentials that the browser keeps: it would ask for a password when it has none.
+    reply = await fetch(address(path), { ...request, headers, credentials: "omit" });
   } catch (error) {
     if (request.signal?.aborted) throw error;
     throw new Refused(0, "The service does not answer.");
