@@ -14,6 +14,7 @@ from app.api import (
     blocks,
     chips,
     collections,
+    connect,
     deps,
     error_responses,
     features,
@@ -74,6 +75,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     results.router,
     tokens.router,
     operations.router,
+    connect.router,
     page.router,
 )
 

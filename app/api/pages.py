@@ -59,9 +59,16 @@ class Page:
     drawing: Drawing | None = None
 
 
-def document_page(request: Request, page: Page) -> HTMLResponse:
-    """A page as HTML."""
-    text = TEMPLATES.get_template("page.html").render(page=page, base=str(request.base_url))
+def document_page(
+    request: Request, page: Page, template: str = "page.html", **more: Any
+) -> HTMLResponse:
+    """A page as HTML.
+
+    Args:
+        template: extends `page.html`.
+        more: what else the template shows.
+    """
+    text = TEMPLATES.get_template(template).render(page=page, base=str(request.base_url), **more)
     return HTMLResponse(text, headers={"Content-Security-Policy": POLICY})
 
 

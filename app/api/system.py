@@ -72,6 +72,7 @@ LINKS = (
     (f"{REL}processes", "processes", JSON, "the processes"),
     (f"{REL}job-list", "jobs", JSON, "the jobs"),
     ("related", "map", HTML, "the map"),
+    ("related", "connect", HTML, "how QGIS, GDAL and Python connect"),
 )
 
 

@@ -1,12 +1,15 @@
 """Unmodified standard clients on a service that is a separate process.
 
-They receive a token as in practice: GDAL by a setting, OWSLib by an argument.
+They receive a token as in practice: GDAL by a setting, OWSLib by an argument. The lines of the page
+`/connect` run as its readers run them, one after the other in a folder.
 """
 
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import geopandas
 import httpx
@@ -17,6 +20,7 @@ from numpy.testing import assert_allclose
 from owslib.ogcapi.features import Features
 from pyproj import CRS
 
+from app.api.connect import EXAMPLE, RECIPES, Recipe, as_markdown
 from tests.app.running_service import Served, service_with_a_block
 
 BOX = (5.22, 43.21, 5.27, 43.26)
@@ -27,7 +31,7 @@ in_single_precision = 1e-7
 
 @pytest.fixture(scope="module")
 def served(cluster, tmp_path_factory) -> Iterator[Served]:
-    with service_with_a_block(cluster, tmp_path_factory.mktemp("served"), "read") as served:
+    with service_with_a_block(cluster, tmp_path_factory.mktemp("served"), "register") as served:
         yield served
 
 
@@ -189,3 +193,71 @@ def test_clients_without_a_valid_token_get_an_error(served):
         Features(served.url, headers={"Authorization": "Bearer wrong"}).feature_collections()
     with pytest.raises(pyogrio.errors.DataSourceError, match="401"):
         pyogrio.read_info(f"OAPIF:{served.url}", layer="points")
+
+
+RUN = [recipe for recipe in RECIPES if recipe.steps[0].language != "text"]
+SHOWN = {
+    "The token, once": "",
+    "curl": '"numberMatched": {}',
+    "GDAL 3.6 and 3.12": "Feature Count: 60",
+    "geopandas 1": "saliency  n_views",
+    "OWSLib": "{} [",
+    "pystac-client": "",
+}
+"""What the lines of a client print; `{}` is the number of points in the box."""
+
+
+@pytest.fixture(scope="module")
+def reader_s_folder(served, tmp_path_factory) -> Path:
+    """The folder of a reader of the page who has done its first section."""
+    folder = tmp_path_factory.mktemp("reader")
+    run_lines(RECIPES[0], served, folder)
+    assert (folder / "amers-header").stat().st_mode & 0o077 == 0
+    return folder
+
+
+def run_lines(recipe: Recipe, served: Served, folder: Path) -> str:
+    """The output of the lines for one client; the token is pasted where they ask for it."""
+    secret = served.authorization["Authorization"].split()[1]
+    text = "\n".join(lines.at(served.url) for lines in recipe.steps)
+    language = recipe.steps[0].language
+    shell = [sys.executable, "-c"] if language == "python" else ["bash", "-euo", "pipefail", "-c"]
+    result = subprocess.run(
+        [*shell, text],
+        cwd=folder,
+        env={**os.environ, "TOKEN": secret},
+        input=f"{secret}\n",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize("recipe", RUN, ids=[recipe.client for recipe in RUN])
+def test_the_lines_of_the_page_connect_run_as_they_are(recipe, served, reader_s_folder, in_box):
+    if "ogr2ogr" in recipe.steps[0].text and shutil.which("ogr2ogr") is None:
+        pytest.skip("Debian's gdal-bin is not installed")
+    assert SHOWN[recipe.client].format(in_box.sum()) in run_lines(recipe, served, reader_s_folder)
+    if recipe.client == "curl":
+        strong = (served.points.saliency > 0.3) & (served.points.n_views >= 3)
+        assert len(geopandas.read_parquet(reader_s_folder / "points.parquet")) == strong.sum()
+
+
+def test_the_page_connect_has_the_address_of_the_service(served):
+    reply = httpx.get(f"{served.url}/connect", headers={"Accept": "text/html"})
+    assert reply.status_code == 200
+    assert reply.headers["content-type"].startswith("text/html")
+    assert "default-src 'none'" in reply.headers["content-security-policy"]
+    assert "BASE" not in reply.text
+    assert f"ogrinfo -so OAPIF:{served.url} points" in reply.text
+    for recipe in RECIPES:
+        assert f"<h2>{recipe.client}</h2>" in reply.text
+    landing = httpx.get(f"{served.url}/").json()
+    assert f"{served.url}/connect" in [link["href"] for link in landing["links"]]
+
+
+def test_the_page_of_the_documentation_is_that_of_the_service():
+    root = Path(__file__).parents[2]
+    assert (root / "docs" / "connect.md").read_text() == as_markdown(EXAMPLE)

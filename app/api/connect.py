@@ -1,0 +1,195 @@
+"""How standard clients connect: a page with lines to copy, which carry the address of this service.
+
+The same recipes make `docs/connect.md` (`scripts/make_connect_page.py`), and the tests run them.
+"""
+
+from dataclasses import dataclass, field
+from textwrap import fill
+from typing import Literal
+
+from fastapi import APIRouter, Request, Response
+
+from app.api.negotiation import refuse_unknown
+from app.api.pages import Page, document_page
+
+router = APIRouter(include_in_schema=False)
+
+TITLE = "Connect"
+INTRODUCTION = (
+    "Lines to copy for clients that people have. The tests of Amers run them against a service, all "
+    "but those for the forms of QGIS. Points need a token of scope `read`, scenes one of scope "
+    "`register`; an administrator makes one with `amers token create`. Where points are public, leave "
+    "the token out."
+)
+EXAMPLE = "https://gcp.example.org"
+"""The address of the service in the documentation."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines to copy.
+
+    Attributes:
+        language: that they are written in; `text`: values for a form.
+        text: the lines; `BASE` is the address of the service without a slash at its end.
+    """
+
+    language: Literal["bash", "python", "text"]
+    text: str
+
+    def at(self, base: str) -> str:
+        """The lines for the service at an address."""
+        return self.text.strip("\n").replace("BASE", base)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one client connects.
+
+    Attributes:
+        client: its name, with the versions.
+        about: what its user has to know; code stands between backticks.
+        steps: to copy, in their order.
+        after: what can be done then.
+    """
+
+    client: str
+    about: str
+    steps: tuple[Lines, ...]
+    after: str = field(default="")
+
+
+RECIPES = (
+    Recipe(
+        "The token, once",
+        "The other lines read the token from the variable `TOKEN` or from the file `amers-header`, "
+        "which only you can read. So the token is on no command line, which other users of a machine "
+        "can see. The first line waits for you to paste the token.",
+        (
+            Lines("bash", "read -rs TOKEN && export TOKEN"),
+            Lines("bash", '(umask 077 && echo "Authorization: Bearer $TOKEN" > amers-header)'),
+        ),
+    ),
+    Recipe(
+        "curl",
+        "Points of a box as GeoJSON and, with a filter in CQL2, as GeoParquet. Other formats: `csv`, "
+        "`fgb`, `gpkg`.",
+        (
+            Lines(
+                "bash",
+                """
+curl -f -H @amers-header "BASE/collections/points/items?bbox=5.22,43.21,5.27,43.26&limit=10"
+curl -f -H @amers-header -G BASE/collections/points/items -d f=parquet \\
+     --data-urlencode "filter=saliency > 0.3 AND n_views >= 3" -o points.parquet
+""",
+            ),
+        ),
+    ),
+    Recipe(
+        "GDAL 3.6 and 3.12",
+        "`ogrinfo` and `ogr2ogr`; the service evaluates the box and the condition. "
+        "`GDAL_HTTP_HEADER_FILE` works with both versions.",
+        (
+            Lines(
+                "bash",
+                """
+export GDAL_HTTP_HEADER_FILE="$PWD/amers-header"
+ogrinfo -so OAPIF:BASE points
+ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BASE points
+""",
+            ),
+        ),
+    ),
+    Recipe(
+        "QGIS 3.22 and later",
+        "Menu *Layer*, *Add Layer*, *Add WFS / OGC API - Features Layer*, *New*. Create an "
+        "authentication configuration of the method *Basic authentication*: any user name, the token "
+        "as password. From QGIS 3.24 on, the method *API Header* with the name `Authorization` and "
+        "the value `Bearer TOKEN` does the same.",
+        (Lines("text", "URL      BASE\nVersion  OGC API - Features"),),
+        "*Connect* lists the layers `points`, `blocks` and `density`. *Only request features "
+        "overlapping the view extent* keeps requests small. Many points are faster as vector tiles: "
+        "*Add Vector Tile Layer*, *New Generic Connection*, with the same authentication and "
+        "`BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
+    ),
+    Recipe(
+        "geopandas 1",
+        "Reads through the GDAL of pyogrio, box and condition included.",
+        (
+            Lines(
+                "python",
+                """
+import geopandas
+import pyogrio
+
+pyogrio.set_gdal_config_options({"GDAL_HTTP_HEADER_FILE": "amers-header"})
+points = geopandas.read_file(
+    "OAPIF:BASE", layer="points", bbox=(5.22, 43.21, 5.27, 43.26), where="saliency > 0.3"
+)
+print(points[["saliency", "n_views", "geometry"]])
+""",
+            ),
+        ),
+    ),
+    Recipe(
+        "OWSLib",
+        "Collections and features; `owslib.ogcapi.processes` starts registrations the same way.",
+        (
+            Lines(
+                "python",
+                """
+import os
+
+from owslib.ogcapi.features import Features
+
+service = Features("BASE", headers={"Authorization": f"Bearer {os.environ['TOKEN']}"})
+page = service.collection_items("points", bbox=[5.22, 43.21, 5.27, 43.26], limit=10)
+print(page["numberMatched"], [feature["id"] for feature in page["features"]])
+""",
+            ),
+        ),
+    ),
+    Recipe(
+        "pystac-client",
+        "Your scenes with their verdicts, as items of a STAC catalogue. The token needs scope "
+        "`register`.",
+        (
+            Lines(
+                "python",
+                """
+import os
+
+from pystac_client import Client
+
+catalog = Client.open("BASE", headers={"Authorization": f"Bearer {os.environ['TOKEN']}"})
+for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.26]).items():
+    print(item.id, item.properties["title"], item.properties.get("amers:verdict"))
+""",
+            ),
+        ),
+    ),
+)
+
+
+@router.get("/connect")
+def connect(request: Request) -> Response:
+    """Return the page, with the address at which the request has arrived."""
+    refuse_unknown(request, set())
+    page = Page(TITLE, INTRODUCTION)
+    base = str(request.base_url).rstrip("/")
+    return document_page(request, page, "connect.html", recipes=RECIPES, address=base)
+
+
+def as_markdown(base: str) -> str:
+    """The page as Markdown, for the service at an address."""
+
+    def paragraph(text: str) -> str:
+        return fill(text.replace("BASE", base), 128, break_long_words=False, break_on_hyphens=False)
+
+    parts = [f"# {TITLE}", paragraph(INTRODUCTION)]
+    parts.append("The service shows this page with its own address at `/connect`.")
+    for recipe in RECIPES:
+        parts += [f"## {recipe.client}", paragraph(recipe.about)]
+        parts += [f"```{lines.language}\n{lines.at(base)}\n```" for lines in recipe.steps]
+        parts += [paragraph(recipe.after)] if recipe.after else []
+    return "\n\n".join(parts) + "\n"
