@@ -124,7 +124,10 @@ import pyogrio
 
 pyogrio.set_gdal_config_options({"GDAL_HTTP_HEADER_FILE": "amers-header"})
 points = geopandas.read_file(
-    "OAPIF:BASE", layer="points", bbox=(5.22, 43.21, 5.27, 43.26), where="saliency > 0.3"
+    "OAPIF:BASE",
+    layer="points",
+    bbox=(5.22, 43.21, 5.27, 43.26),
+    where="saliency > 0.3",
 )
 print(points[["saliency", "n_views", "geometry"]])
 """,
@@ -138,11 +141,11 @@ print(points[["saliency", "n_views", "geometry"]])
             Lines(
                 "python",
                 """
-import os
+from os import environ
 
 from owslib.ogcapi.features import Features
 
-service = Features("BASE", headers={"Authorization": f"Bearer {os.environ['TOKEN']}"})
+service = Features("BASE", headers={"Authorization": f"Bearer {environ['TOKEN']}"})
 page = service.collection_items("points", bbox=[5.22, 43.21, 5.27, 43.26], limit=10)
 print(page["numberMatched"], [feature["id"] for feature in page["features"]])
 """,
@@ -157,11 +160,11 @@ print(page["numberMatched"], [feature["id"] for feature in page["features"]])
             Lines(
                 "python",
                 """
-import os
+from os import environ
 
 from pystac_client import Client
 
-catalog = Client.open("BASE", headers={"Authorization": f"Bearer {os.environ['TOKEN']}"})
+catalog = Client.open("BASE", headers={"Authorization": f"Bearer {environ['TOKEN']}"})
 for item in catalog.search(collections=["scenes"], bbox=[5.22, 43.21, 5.27, 43.26]).items():
     print(item.id, item.properties["title"], item.properties.get("amers:verdict"))
 """,

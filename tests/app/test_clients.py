@@ -241,8 +241,10 @@ def test_the_lines_of_the_page_connect_run_as_they_are(recipe, served, reader_s_
         pytest.skip("Debian's gdal-bin is not installed")
     assert SHOWN[recipe.client].format(in_box.sum()) in run_lines(recipe, served, reader_s_folder)
     if recipe.client == "curl":
-        strong = (served.points.saliency > 0.3) & (served.points.n_views >= 3)
-        assert len(geopandas.read_parquet(reader_s_folder / "points.parquet")) == strong.sum()
+        strong = geopandas.read_parquet(reader_s_folder / "points.parquet")
+        assert 0 < len(strong) < len(served.points.saliency)
+        assert strong["saliency"].min() > 0.3
+        assert strong["n_views"].min() >= 3
 
 
 def test_the_page_connect_has_the_address_of_the_service(served):
