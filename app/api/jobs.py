@@ -1,5 +1,6 @@
 """OGC API - Processes: jobs, their states and messages."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 from uuid import UUID
 
@@ -7,7 +8,7 @@ from fastapi import APIRouter, BackgroundTasks, Depends, Query, Request
 from pydantic import BaseModel, Field
 
 from app.api.deps import DatabaseDep, Reader, StorageDep
-from app.api.models.base import Link
+from app.api.models.base import Link, stated_accuracy
 from app.api.models.jobs import JobError, Jobs, Message, Messages, StatusInfo
 from app.api.negotiation import JSON
 from app.api.routes import CallerRoute
@@ -72,12 +73,13 @@ def list_jobs(
     """List the jobs of the caller, newest first; administrators see all jobs."""
     with database.reading() as connection:
         listed = jobs.list_jobs(connection, caller, query.job_filter, query.limit + 1, query.after)
-    page = listed[: query.limit]
+        page = listed[: query.limit]
+        names = jobs.names_of_scenes(connection, page)
     links = [Link(rel="self", href=str(request.url), type=JSON)]
     if len(listed) > query.limit:
         following = str(request.url.include_query_params(after=page[-1].id))
         links.append(Link(rel="next", href=following, type=JSON))
-    return Jobs(jobs=[status_info(request, job) for job in page], links=links)
+    return Jobs(jobs=[status_info(request, job, names) for job in page], links=links)
 
 
 @router.get("/jobs/{job_id}")
@@ -89,7 +91,7 @@ def show_job(*, job_id: JobId, request: Request, database: DatabaseDep, caller: 
     """
     with database.reading() as connection:
         job = jobs.visible_job(connection, caller, job_id)
-        status = status_info(request, job)
+        status = status_info(request, job, jobs.names_of_scenes(connection, [job]))
         outlook = jobs.outlook(connection, job)
         status.queue_position, status.estimated_end = outlook.position, outlook.expected_end
     return status
@@ -127,9 +129,10 @@ def dismiss_job(
     """
     with database.transaction() as connection:
         job = jobs.dismiss(connection, caller, job_id)
+        names = jobs.names_of_scenes(connection, [job])
     if job.results_removed_at is not None:
         after_commit.add_task(delete_files, storage, results_folder(job_id))
-    return status_info(request, job)
+    return status_info(request, job, names)
 
 
 def job_url(request: Request, job: Job) -> str:
@@ -137,8 +140,14 @@ def job_url(request: Request, job: Job) -> str:
     return f"{request.base_url}jobs/{job.id}"
 
 
-def status_info(request: Request, job: Job) -> StatusInfo:
-    """A job as OGC API - Processes describes it."""
+def status_info(request: Request, job: Job, names: Mapping[str, str] | None = None) -> StatusInfo:
+    """A job as OGC API - Processes describes it.
+
+    Args:
+        names: of scenes, by id.
+    """
+    names, made = names or {}, job.results or {}
+    scene_names = [names[scene] for scene in jobs.scenes_of(job) if scene in names]
     here = job_url(request, job)
     links = [
         Link(rel="self", href=here, type=JSON),
@@ -151,8 +160,7 @@ def status_info(request: Request, job: Job) -> StatusInfo:
             Link(rel="related", href=f"{here}/results/{name}", type=media_type(name), title=name)
             for name in results.kept_files(job)
         ]
-    one = [job.inputs["scene"]] if "scene" in job.inputs else []
-    for scene in job.inputs.get("scenes", one):
+    for scene in jobs.scenes_of(job):
         href = f"{request.base_url}scenes/{scene}"
         links.append(Link(rel="related", href=href, type=JSON, title="scene"))
     return StatusInfo(
@@ -169,6 +177,9 @@ def status_info(request: Request, job: Job) -> StatusInfo:
         updated=job.updated_at,
         error=JobError.model_validate(job.error) if job.error else None,
         priority=job.priority or None,
-        verdict=(job.results or {}).get("verdict"),
+        verdict=made.get("verdict"),
+        scene_names=scene_names or None,
+        relative_to_control_points=stated_accuracy(made.get("relative_to_control_points")),
+        on_the_earth=stated_accuracy(made.get("on_the_earth")),
         links=links,
     )

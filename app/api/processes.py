@@ -145,10 +145,11 @@ def execute(
     job_request = JobRequest(process_id, inputs, outputs, body.response, body.priority)
     with installation.database.transaction() as connection:
         job = jobs.execute(connection, installation.settings, caller, job_request, idempotency_key)
+        names = jobs.names_of_scenes(connection, [job])
     response.headers["Location"] = job_url(request, job)
     if "respond-async" in (prefer or ""):
         response.headers["Preference-Applied"] = "respond-async"
-    return status_info(request, job)
+    return status_info(request, job, names)
 
 
 def _input_value(request: Request, name: str, value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import re
 from base64 import b64decode
+from collections.abc import Sequence
 from email.message import Message
 from typing import Annotated
 from uuid import UUID
@@ -12,8 +13,11 @@ from pydantic import BaseModel, Field
 from app.api.body import BINARY_BODY, announced_length, body_chunks
 from app.api.deps import DatabaseDep, InstallationDep, Registrar, SettingsDep, StorageDep, UploadTurn
 from app.api.files import file_reply
+from app.api.models import scenes as models
+from app.api.models.base import stated_accuracy
 from app.api.models.scenes import Scene, Scenes, StoredFile
 from app.api.routes import CallerRoute
+from app.db.scene_registrations import SceneRegistration
 from app.db.scenes import SceneRow
 from app.errors import InputError
 from app.usecases import scenes
@@ -23,6 +27,7 @@ from app.usecases.scenes import SentFile
 router = APIRouter(tags=["scenes"], route_class=CallerRoute)
 
 MOST_LISTED = 1000
+REGISTRATIONS_SHOWN = 20
 
 
 class SceneOnServer(BaseModel):
@@ -126,14 +131,17 @@ def list_scenes(
     """List the scenes of the caller, newest first; administrators see all scenes."""
     with database.reading() as connection:
         rows = scenes.list_scenes(connection, caller, limit)
-    return Scenes(scenes=[_scene(row) for row in rows])
+        last = scenes.registrations_of(connection, caller, rows, 1)
+    return Scenes(scenes=[_scene(row, last.get(row.id, ())) for row in rows])
 
 
 @router.get("/scenes/{scene_id}")
 def show_scene(*, scene_id: UUID, database: DatabaseDep, caller: Registrar) -> Scene:
     """Return one scene."""
     with database.reading() as connection:
-        return _scene(scenes.visible_scene(connection, caller, scene_id))
+        row = scenes.visible_scene(connection, caller, scene_id)
+        last = scenes.registrations_of(connection, caller, [row], REGISTRATIONS_SHOWN)
+    return _scene(row, last.get(row.id, ()))
 
 
 @router.delete("/scenes/{scene_id}", status_code=status.HTTP_204_NO_CONTENT)
@@ -151,7 +159,7 @@ def remove_scene(
     after_commit.add_task(scenes.delete_files, storage, scene_id)
 
 
-def _scene(row: SceneRow) -> Scene:
+def _scene(row: SceneRow, registrations: Sequence[SceneRegistration] = ()) -> Scene:
     return Scene(
         id=row.id,
         name=row.name,
@@ -167,6 +175,20 @@ def _scene(row: SceneRow) -> Scene:
         footprint=row.footprint,
         created=row.created_at,
         removed=row.removed_at,
+        registrations=[_registration(one) for one in registrations],
+    )
+
+
+def _registration(row: SceneRegistration) -> models.SceneRegistration:
+    return models.SceneRegistration(
+        job=row.job_id,
+        process=row.process,
+        outcome=row.outcome,
+        verdict=row.verdict,
+        relative_to_control_points=stated_accuracy(row.relative_to_control_points),
+        on_the_earth=stated_accuracy(row.on_the_earth),
+        created=row.created_at,
+        finished=row.finished_at,
     )
 
 

@@ -207,6 +207,12 @@ def newest_scenes(connection: Connection, owner: UUID | None, limit: int) -> lis
     return every(SceneRow, connection.execute(statement))
 
 
+def scene_names(connection: Connection, scene_ids: list[UUID]) -> dict[UUID, str]:
+    """The names of some scenes."""
+    statement = select(scene.c.id, scene.c.name).where(among(scene.c.id, scene_ids))
+    return {row.id: row.name for row in connection.execute(statement)}
+
+
 def set_footprint(connection: Connection, scene_id: UUID, outline: Array) -> None:
     """Store the ground that a scene can show.
 

@@ -4,7 +4,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from tempfile import gettempdir
@@ -21,6 +21,7 @@ from app.db.jobs import progress as job_progress
 from app.db.jobs.attempts import LostJob
 from app.db.jobs.jobs import Job, JobFilter
 from app.db.jobs.progress import JobMessage, Outlook
+from app.db.scenes import scene_names
 from app.db.schema import JobResponse
 from app.db.tokens import Token
 from app.errors import AmersError, DamagedFile, InputError, NoSuchJob, NoSuchProcess, is_no_memory
@@ -180,6 +181,18 @@ def visible_job(connection: Connection, caller: Token, job_id: UUID) -> Job:
     if job is None or not may_access(caller, job.owner):
         raise NoSuchJob(f"no job {job_id}")
     return job
+
+
+def scenes_of(job: Job) -> list[str]:
+    """The ids of the scenes among the inputs of a job."""
+    one = [job.inputs["scene"]] if "scene" in job.inputs else []
+    return [str(scene) for scene in job.inputs.get("scenes", one)]
+
+
+def names_of_scenes(connection: Connection, listed: Sequence[Job]) -> dict[str, str]:
+    """The names of the scenes among the inputs of some jobs, by id."""
+    ids = {UUID(scene) for job in listed for scene in scenes_of(job)}
+    return {str(scene): name for scene, name in scene_names(connection, list(ids)).items()}
 
 
 def list_jobs(

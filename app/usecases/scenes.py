@@ -12,6 +12,7 @@ from app.auth import may_access, owner_filter
 from app.config import Settings
 from app.db import scenes, uploads
 from app.db.engine import Connection
+from app.db.scene_registrations import SceneRegistration, last_registrations
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.db.uploads import AnnouncedFile
@@ -310,6 +311,13 @@ def file_key(connection: Connection, caller: Token, scene_id: UUID, name: str) -
 def list_scenes(connection: Connection, caller: Token, limit: int) -> list[SceneRow]:
     """The newest scenes that the caller may see: owners see their own, administrators all."""
     return scenes.newest_scenes(connection, owner_filter(caller), limit)
+
+
+def registrations_of(
+    connection: Connection, caller: Token, rows: list[SceneRow], most: int
+) -> dict[UUID, list[SceneRegistration]]:
+    """The last registrations of scenes that the caller may see, the newest first."""
+    return last_registrations(connection, [row.id for row in rows], caller.id, most)
 
 
 def remove_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:

@@ -158,8 +158,16 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     me = bearer("register")
     # The points lie 8 m from where a model with a stated accuracy of 0.1 m expects them.
     image = world.tagged.read_bytes()
-    scene = client.post("/scenes?name=scene.tif&sigma_m=0.1", content=image, headers=me).json()["id"]
-    body = {"inputs": {"scene": scene}}
+    scene = client.post(f"/scenes?name=scene.tif&sigma_m={SIGMA_M}", content=image, headers=me).json()[
+        "id"
+    ]
+    body = {"inputs": {"scene": scene, "sigma_m": 0.1}}
+    for unusable in (0, -1):
+        wrong = {"inputs": body["inputs"] | {"sigma_m": unusable}}
+        assert (
+            client.post("/processes/register-scene/execution", json=wrong, headers=me).status_code == 422
+        )
+    assert client.get(f"/scenes/{scene}", headers=me).json()["registrations"] == []
     asked = client.post("/processes/register-scene/execution", json=body, headers=me)
     with running_worker(settings, tmp_path / "log"):
         job = ended(client, asked.headers["location"], me)
@@ -180,6 +188,9 @@ def test_a_job_that_finds_no_consensus_keeps_the_report_of_its_failure(
     assert client.get(links["report.html"]["href"], headers=bearer("register")).status_code == 404
     (listed,) = client.get("/jobs", headers=me).json()["jobs"]
     assert listed["amers:verdict"] == "not registered"
+    (one,) = client.get(f"/scenes/{scene}", headers=me).json()["registrations"]
+    assert (one["job"], one["outcome"], one["verdict"]) == (job["jobID"], "failed", "not registered")
+    assert client.get("/scenes", headers=bearer("register")).json()["scenes"] == []
     metrics = client.get("/metrics", headers=bearer("admin")).text
     assert 'amers_registration_jobs{verdict="not registered"} 1.0' in metrics
     # The files belong to the job: sweeps keep them, and retention removes them.
@@ -231,6 +242,16 @@ def test_a_job_whose_verdict_is_failed_says_so_in_every_list(
     assert {job["jobID"]: job["amers:verdict"] for job in listed} == {
         job["jobID"]: job["amers:verdict"] for job in (failed, done)
     }
+    assert [job["amers:sceneNames"] for job in listed] == [["scene.tif"]] * 2
+    (newest,) = client.get("/scenes", headers=me).json()["scenes"][0]["registrations"]
+    assert (newest["job"], newest["outcome"]) == (done["jobID"], "registered")
+    for name in ("relative_to_control_points", "on_the_earth"):
+        assert newest[name] == done[f"amers:{name}"]
+    both = client.get(f"/scenes/{scene}", headers=me).json()["registrations"]
+    assert [(one["outcome"], one["verdict"]) for one in both] == [
+        ("registered", done["amers:verdict"]),
+        ("failed", "failed"),
+    ]
 
 
 def test_a_block_is_ingested_by_a_job_of_an_administrator(

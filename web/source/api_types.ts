@@ -498,6 +498,7 @@ export interface Scene {
   footprint: Geometry | null;
   created: string;
   removed: string | null;
+  registrations: SceneRegistration[];
 }
 
 export interface SceneFeature {
@@ -534,6 +535,17 @@ export interface ScenePage {
   numberMatched: number;
   numberReturned: number;
   "amers:numberMatchedIsExact"?: boolean;
+}
+
+export interface SceneRegistration {
+  job: string;
+  process: string;
+  outcome: "registered" | "failed" | "under way";
+  verdict: string | null;
+  relative_to_control_points: StatedAccuracy | null;
+  on_the_earth: StatedAccuracy | null;
+  created: string;
+  finished: string | null;
 }
 
 export interface Scenes {
@@ -593,6 +605,9 @@ export interface StatusInfo {
   "amers:estimatedEnd"?: string;
   "amers:priority"?: number;
   "amers:verdict"?: "good" | "usable" | "failed" | "not registered";
+  "amers:sceneNames"?: string[];
+  "amers:relative_to_control_points"?: StatedAccuracy;
+  "amers:on_the_earth"?: StatedAccuracy;
 }
 
 export interface StoredFile {

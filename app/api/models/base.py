@@ -73,3 +73,9 @@ class StatedAccuracy(Reply):
     ce90_m: float | None
     le90_m: float | None
     words: str
+
+
+def stated_accuracy(stated: Any) -> StatedAccuracy | None:
+    """The accuracy in a stored document; None in those of earlier versions, which do not have it."""
+    known = isinstance(stated, dict) and set(StatedAccuracy.model_fields) <= set(stated)
+    return StatedAccuracy.model_validate(stated) if known else None

@@ -9,7 +9,7 @@ from uuid import UUID
 
 from pydantic import ConfigDict, Field
 
-from app.api.models.base import JsonObject, Link, Missing, Reply, missing
+from app.api.models.base import JsonObject, Link, Missing, Reply, StatedAccuracy, missing
 from app.db.schema import JobState
 
 Percent = Annotated[int, Field(ge=0, le=100)]
@@ -77,6 +77,10 @@ class StatusInfo(Reply):
     `status` says whether the job ran to its end; `amers:verdict` says whether the registration that it
     made can be used. A job that failed after a search has a report too, under a link.
 
+    `amers:sceneNames` are the names of the scenes among the inputs.
+    `amers:relative_to_control_points` and `amers:on_the_earth` are the accuracy that the registration of
+    one scene states.
+
     `amers:queuePosition` is the place in the queue of a job that waits. `amers:estimatedEnd` is
     estimated from the durations of earlier jobs. `amers:priority` is that of a job to which an
     administrator gave one.
@@ -99,6 +103,9 @@ class StatusInfo(Reply):
     estimated_end: datetime | None = missing("amers:estimatedEnd")
     priority: int | None = missing("amers:priority")
     verdict: Literal["good", "usable", "failed", "not registered"] | None = missing("amers:verdict")
+    scene_names: list[str] | None = missing("amers:sceneNames")
+    relative_to_control_points: StatedAccuracy | None = missing("amers:relative_to_control_points")
+    on_the_earth: StatedAccuracy | None = missing("amers:on_the_earth")
 
 
 class Jobs(Reply):

@@ -4,13 +4,30 @@ from datetime import datetime
 from typing import Literal
 from uuid import UUID
 
-from app.api.models.base import Reply
+from app.api.models.base import Reply, StatedAccuracy
 from app.api.models.features import AnyGeometry
+from app.db.scene_registrations import RegistrationOutcome
 from app.db.schema import SceneState, UploadPurpose
 
 
+class SceneRegistration(Reply):
+    """A registration of a scene; `outcome` is `registered` where it made a model that can be used."""
+
+    job: UUID
+    process: str
+    outcome: RegistrationOutcome
+    verdict: str | None
+    relative_to_control_points: StatedAccuracy | None
+    on_the_earth: StatedAccuracy | None
+    created: datetime
+    finished: datetime | None
+
+
 class Scene(Reply):
-    """A scene; what its files state about it is null until it is registered."""
+    """A scene; what its files state about it is null until it is registered.
+
+    `registrations` are the last ones, the newest first; in a list of scenes only the newest.
+    """
 
     id: UUID
     name: str
@@ -26,6 +43,7 @@ class Scene(Reply):
     footprint: AnyGeometry | None
     created: datetime
     removed: datetime | None
+    registrations: list[SceneRegistration]
 
 
 class Scenes(Reply):

@@ -1,6 +1,7 @@
 """The process `register-scene`: register an uploaded scene on points and references of the store."""
 
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
@@ -44,6 +45,7 @@ class RegisterScene:
 
     Attributes:
         scene: id of an uploaded scene.
+        sigma_m: accuracy of its model, metres (1 sigma); by default that stated at the upload.
         model: name of the file with the scene's model; by default it is found by its name.
         method: "points", "reference", or "auto": on points, and where there are none on a reference.
         bands: bands to use, such as "2" or "1,2,3" or "3:0.3,2:0.7"; by default the panchromatic band or
@@ -56,6 +58,7 @@ class RegisterScene:
     """
 
     scene: UUID
+    sigma_m: float | None = None
     model: str | None = None
     method: Method = "auto"
     bands: str | None = None
@@ -69,6 +72,8 @@ class RegisterScene:
 def _check(connection: Connection, caller: Token, inputs: RegisterScene) -> None:
     check_scene(connection, caller, inputs.scene)
     check_file_names(inputs, "model", "mask", "check_points")
+    if inputs.sigma_m is not None and not 0.0 < inputs.sigma_m < inf:
+        raise InputError(f"sigma_m: {inputs.sigma_m} found, metres above 0 expected")
     if inputs.bands is not None:
         parse_bands(inputs.bands)
     if inputs.check_heights is not None:
@@ -141,7 +146,11 @@ def _control_sources(work: Work, method: Method) -> ControlSources:
 
 
 def scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> SceneFiles:
-    """The files of a scene, which lie beside its image under the names of the inputs."""
+    """The files of a scene, which lie beside its image under the names of the inputs.
+
+    Args:
+        sigma_m: as stated when the scene was uploaded.
+    """
 
     def beside(name: str | None) -> Path | None:
         return None if name is None else image.with_name(name)
@@ -149,7 +158,7 @@ def scene_files(inputs: RegisterScene, image: Path, sigma_m: float | None) -> Sc
     return SceneFiles(
         image=image,
         model=beside(inputs.model),
-        sigma_m=sigma_m,
+        sigma_m=sigma_m if inputs.sigma_m is None else inputs.sigma_m,
         bands=inputs.bands,
         mask=beside(inputs.mask),
         check_points=beside(inputs.check_points),
