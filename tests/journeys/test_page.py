@@ -36,6 +36,7 @@ BUILT = ROOT / "app" / "web" / "built" / "index.html"
 AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
 ARTEFACTS = ROOT / "tests" / "artefacts"
 DESKTOP = {"width": 1280, "height": 800}
+WIDE = {"width": 1440, "height": 900}
 PHONE = {"width": 390, "height": 844}
 patience_ms = 90_000
 chip_px = 101
@@ -257,16 +258,78 @@ def test_what_is_drawn_on_the_raw_image_appears_on_the_map_and_returns(
     page.screenshot(path=ARTEFACTS / "draw-phone.png")
 
 
-def registered(service: Service, secret: str, world: FlatWorld) -> str:
+def registered(service: Service, secret: str, world: FlatWorld, name: str = "drawn-on.tif") -> str:
     """The job that registered the scene of the world."""
     headers = {"Authorization": f"Bearer {secret}"}
     with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
-        sent = client.post("/scenes?name=drawn-on.tif", content=world.tagged.read_bytes())
+        sent = client.post(f"/scenes?name={name}", content=world.tagged.read_bytes())
         inputs = {"inputs": {"scene": sent.raise_for_status().json()["id"]}}
         asked = client.post("/processes/register-scene/execution", json=inputs)
         job: str = asked.raise_for_status().json()["jobID"]
         assert until(lambda: client.get(f"/jobs/{job}").json()["status"] == "successful")
     return job
+
+
+def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(
+    visit, world, secret, service
+):
+    headers = {"Authorization": f"Bearer {secret}"}
+    with httpx.Client(base_url=service.url, headers=headers, timeout=30.0) as client:
+        new = client.post("/scenes?name=new.tif", content=world.tagged.read_bytes()).json()["id"]
+        job = registered(service, secret, world, "again.tif")
+        made = client.get(f"/jobs/{job}").json()
+        page = visit("#/scenes", secret)
+        rows = page.get_by_role("listitem").filter(has_text="again.tif")
+        figures = f"CE90 {made['amers:relative_to_control_points']['ce90_m']:.2g}"
+        for row, state in ((rows.first, "successful"), (rows.last, "registered")):
+            expect(row).to_contain_text(state)
+            expect(row).to_contain_text(f"verdict {made['amers:verdict']}")
+            expect(row).to_contain_text(figures)
+            expect(row).to_contain_text("on the Earth")
+        expect(page.get_by_role("listitem").filter(has_text="new.tif")).to_contain_text(
+            "not registered yet"
+        )
+        assert_readable(page, "scenes")
+        rows.last.get_by_role("link").click()
+        expect(page.get_by_role("link", name="See the results")).to_have_attribute(
+            "href", f"#/job/{job}"
+        )
+        assert_readable(page, "scene")
+        page.get_by_text("Register again").first.click()
+        page.get_by_label("Accuracy of the model").fill("20")
+        page.get_by_label("Correction").select_option("drift")
+        page.get_by_label("Registered on").select_option("points")
+        page.get_by_text("Bands, mask, check points").click()
+        page.get_by_label("Bands", exact=False).first.fill("1")
+        assert_readable(page, "scene-form")
+        page.get_by_role("button", name="Register again").click()
+        expect(page.get_by_role("link", name="Open the report")).to_be_visible()
+        again = client.get(f"/jobs/{page.url.rsplit('/', 1)[1]}").json()
+        inputs = again["inputs"]
+        assert (inputs["sigma_m"], inputs["method"], inputs["bands"]) == (20, "points", "1")
+        assert inputs["options"]["adjustment"]["order"] == "drift"
+        report = report_of(page, service, secret)
+        assert report["correction"]["order"] == "drift"
+        page.goto(f"{service.url}/map#/scene/{new}")
+        expect(page.get_by_role("button", name="Register", exact=True)).to_be_visible()
+        page.goto(f"{service.url}/map#/scene/{inputs['scene']}")
+        expect(page.locator(".story li")).to_have_count(2)
+
+
+def assert_readable(page: Page, view: str) -> None:
+    """Check that a view is accessible and fits a phone; pictures of it are for people."""
+    until_drawn(page)
+    for size in (WIDE, PHONE):
+        page.set_viewport_size(size)
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            page.wait_for_timeout(poll_ms)
+            until_drawn(page)
+            page.screenshot(path=ARTEFACTS / f"{view}-{size['width']}-{scheme}.png")
+            page.evaluate(AXE.read_text(encoding="utf-8"))
+            findings = page.evaluate("axe.run().then((found) => found.violations)")
+            assert [(found["id"], found["nodes"][0]["html"]) for found in findings] == [], view
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"], view
 
 
 @pytest.fixture(scope="module")

@@ -36,8 +36,8 @@ export function accuracy({ relative_to_control_points: relative, on_the_earth: e
 }
 
 interface Stated {
-  relative_to_control_points?: { label: string; words: string };
-  on_the_earth?: { label: string; words: string };
+  relative_to_control_points?: { label: string; words: string } | undefined;
+  on_the_earth?: { label: string; words: string } | undefined;
 }
 
 /** A state as a word, after what it is a state of; its colour repeats the word and adds nothing. */
@@ -68,6 +68,10 @@ export function bytes(count: number): string {
 export function when(date: string | null | undefined): string {
   if (!date) return "";
   return new Date(date).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+}
+
+export function day(date: string): string {
+  return new Date(date).toLocaleDateString("en-GB", { dateStyle: "medium" });
 }
 
 export function plural(count: number, word: string): string {

@@ -1,9 +1,10 @@
 // Scenes: those of the caller, and the upload and registration of a new one.
 
 import type { Feature } from "geojson";
-import { get, post } from "./api";
-import type { Jobs, Scene, Scenes, StatusInfo } from "./api_types";
-import { badge, bytes, facts, figure, fill, h, plural, problem, when } from "./elements";
+import { register, registrationForm } from "./again";
+import { get } from "./api";
+import type { Jobs, Scene, SceneRegistration, Scenes, StatedAccuracy, StatusInfo } from "./api_types";
+import { accuracy, badge, bytes, day, facts, figure, fill, h, problem, when } from "./elements";
 import { go, type Place, type ShowView } from "./place";
 import { send, uploadBeside } from "./upload";
 
@@ -31,44 +32,43 @@ export const showScenes: ShowView = async (place) => {
     h("h1", { tabindex: -1 }, "Scenes"),
     uploadForm(place),
     h("h2", {}, "Jobs"),
-    jobs.length ? h("ul", { class: "list" }, ...jobs.map(jobRow)) : h("p", { class: "quiet" }, "None yet."),
+    jobs.length ? h("ul", { class: "list story" }, ...jobs.map(jobRow)) : h("p", { class: "quiet" }, "None yet."),
     h("h2", {}, "My scenes"),
-    scenes.length ? h("ul", { class: "list" }, ...scenes.map(sceneRow)) : h("p", { class: "quiet" }, "None yet."),
+    scenes.length ? h("ul", { class: "list story" }, ...scenes.map(sceneRow)) : h("p", { class: "quiet" }, "None yet."),
   );
 };
 
-/** Shows one scene: its files, and a button to register it again. */
+/** Shows one scene: its state, its registrations with their results, and a form to register it again. */
 export const showScene: ShowView = async ({ panel, atlas, signal }, id) => {
   const scene = await get<Scene>(`scenes/${encodeURIComponent(id)}`, signal);
+  const [last] = scene.registrations;
   await atlas.show("scenes", outlines([scene]));
   atlas.fit(scene.footprint);
-  const message = h("div");
-  const again = h("button", { type: "button", class: "strong", onclick: () => void start() }, "Register");
   fill(
     panel,
     h("p", {}, h("a", { href: "#/scenes" }, "← Scenes")),
     h("h1", { tabindex: -1 }, scene.name),
+    h("p", { class: "state" }, ...states(scene)),
+    last ? accuracy(stated(last)) : null,
+    last ? h("p", {}, h("a", { class: "button strong", href: `#/job/${last.job}` }, RESULTS[last.outcome])) : null,
     facts({
-      State: badge(scene.state),
       Image: `${scene.file}, ${bytes(scene.size_bytes ?? 0)}`,
-      Models: scene.models.join(", "),
-      "Accuracy of its model": scene.sigma_m == null ? "unknown" : figure(scene.sigma_m, "m"),
+      Acquired: when(scene.acquired),
+      Sensor: scene.sensor,
+      "Ground sampling": scene.gsd_m == null ? null : figure(scene.gsd_m, "m"),
+      "Files beside it": scene.models.join(", "),
+      "Accuracy of its model as stated": scene.sigma_m == null ? "unknown" : figure(scene.sigma_m, "m"),
       Uploaded: when(scene.created),
     }),
-    scene.removed ? h("p", { class: "quiet" }, `The files were removed on ${when(scene.removed)}.`) : h("p", {}, again),
-    message,
+    scene.removed
+      ? h("p", { class: "quiet" }, `The files were removed on ${when(scene.removed)}.`)
+      : h("details", { class: "card", open: !last }, h("summary", {}, last ? "Register again" : "Register"), registrationForm(scene)),
+    scene.registrations.length ? h("h2", {}, "Registrations") : null,
+    h("ul", { class: "list story" }, ...scene.registrations.map(registrationRow)),
   );
-
-  async function start(): Promise<void> {
-    again.disabled = true;
-    try {
-      go(`#/job/${await register(scene.id)}`);
-    } catch (error) {
-      again.disabled = false;
-      message.replaceChildren(problem(error));
-    }
-  }
 };
+
+const RESULTS = { registered: "See the results", failed: "See what was tried", "under way": "See its progress" };
 
 /** Outlines of scenes for the map. */
 export function outlines(scenes: Scene[]): Feature[] {
@@ -113,20 +113,24 @@ function uploadForm({ signal }: Place): HTMLElement {
   }
 }
 
-/** Start the registration of a scene; returns the id of its job. */
-async function register(scene: string): Promise<string> {
-  const job = await post<StatusInfo>("processes/register-scene/execution", { inputs: { scene } });
-  return job.jobID;
+function sceneRow(scene: Scene): HTMLElement {
+  const [last] = scene.registrations;
+  const date = scene.acquired ? `acquired ${day(scene.acquired)}` : `uploaded ${day(scene.created)}`;
+  return story(h("a", { href: `#/scene/${scene.id}` }, scene.name), states(scene), last ? stated(last) : {}, date);
 }
 
-function sceneRow(scene: Scene): HTMLElement {
-  return h(
-    "li",
-    {},
-    h("a", { href: `#/scene/${scene.id}` }, scene.name),
-    badge(scene.state),
-    h("span", { class: "quiet" }, `${bytes(scene.size_bytes ?? 0)} · ${plural(scene.models.length, "model file")} · ${when(scene.created)}`),
-  );
+function registrationRow(one: SceneRegistration): HTMLElement {
+  const process = one.process === "register-scenes" ? "together with other scenes" : "this scene alone";
+  return story(h("a", { href: `#/job/${one.job}` }, when(one.created)), outcome(one), stated(one), process);
+}
+
+function jobRow(job: StatusInfo): HTMLElement {
+  const process = job.processID.replaceAll("-", " ");
+  const names = job["amers:sceneNames"] ?? [];
+  const title = names.length > 2 ? `${names[0]} and ${names.length - 1} more scenes` : names.join(", ");
+  const figures = { relative_to_control_points: job["amers:relative_to_control_points"], on_the_earth: job["amers:on_the_earth"] };
+  const state = [badge(job.status), verdict(job)];
+  return story(h("a", { href: `#/job/${job.jobID}` }, title || process), state, figures, `${title ? `${process} · ` : ""}${when(job.created)}`);
 }
 
 /** The verdict on the registration of a job: a job that ran to its end may have made a model not to be used. */
@@ -135,13 +139,36 @@ export function verdict(job: StatusInfo): HTMLElement | null {
   return word ? badge(word, "verdict ") : null;
 }
 
-function jobRow(job: StatusInfo): HTMLElement {
-  return h(
-    "li",
-    {},
-    h("a", { href: `#/job/${job.jobID}` }, job.processID.replace("-", " ")),
-    badge(job.status),
-    verdict(job),
-    h("span", { class: "quiet" }, when(job.created)),
-  );
+/** What a scene is: removed or arriving, else how its last registration ended. */
+function states(scene: Scene): (HTMLElement | null)[] {
+  if (scene.state !== "uploaded") return [badge(scene.state)];
+  const [last] = scene.registrations;
+  return last ? outcome(last) : [badge("not registered yet")];
+}
+
+/** How a registration ended; its verdict where that adds something. */
+function outcome({ outcome: word, verdict: judged }: SceneRegistration): (HTMLElement | null)[] {
+  return [badge(word), judged && judged !== word ? badge(judged, "verdict ") : null];
+}
+
+interface Figures {
+  relative_to_control_points?: StatedAccuracy | undefined;
+  on_the_earth?: StatedAccuracy | undefined;
+}
+
+function stated({ relative_to_control_points: relative, on_the_earth: earth }: SceneRegistration): Figures {
+  return { relative_to_control_points: relative ?? undefined, on_the_earth: earth ?? undefined };
+}
+
+/** A row of a list: what it is about, its state, its accuracy, its date. */
+function story(link: HTMLElement, state: (HTMLElement | null)[], figures: Figures, date: string): HTMLElement {
+  const { relative_to_control_points: relative, on_the_earth: earth } = figures;
+  const known = relative?.ce90_m != null || earth?.ce90_m != null;
+  const words = known ? `CE90 ${metres(relative)} relative · ${metres(earth)} on the Earth` : null;
+  return h("li", {}, link, ...state, words ? h("span", { class: "figures" }, words) : null, h("span", { class: "quiet" }, date));
+}
+
+/** A CE90 with two significant digits, as the words of the service have it. */
+function metres(one: StatedAccuracy | undefined): string {
+  return one?.ce90_m == null ? "unknown" : figure(Number(one.ce90_m.toPrecision(2)), "m");
 }
