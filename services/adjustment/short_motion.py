@@ -2,8 +2,8 @@
 
 Strips of the chips are displaced against their chips, see `services.matching.chip_strips`. What relief
 does to a chip changes from point to point; what the sensor did at a line is the same in all chips that
-show it. Mean and slope of each chip are left out, so that neither errors of the points nor slopes of the
-ground count.
+show it. A parabola is left out of each chip, so that neither errors of the points nor smooth relief
+count.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +25,8 @@ _SHORTEST = 2.5
 _OVERSAMPLING = 2.0
 _APART = 0.8
 """Distance of the chips that count, sides of a chip: nearer ones share their noise."""
+_DEGREE = 2
+"""Of the polynomial that is left out of each chip: its place, slopes of the ground, and its relief."""
 _FEWEST_CHIPS, _FEWEST_STRIPS = 8, 5
 _ODD = 9.0
 """Variance of the strips of a chip over that of the median chip, beyond which it is left out."""
@@ -115,7 +117,7 @@ def short_motion(strips: ChipStrips, line_sample: Array, side_px: float) -> Shor
         structure = found.structure
         if found is STILL:
             structure = replace(structure, chance=min(chance, 1.0), shape="period", at=periods[best])
-        # Of any phase: what mean and slope of a chip hide of a wave, they hide of its noise, too.
+        # Of any phase: what the ground hides of a wave, it hides of its noise, too.
         explained = np.einsum("ki,kij,kj->k", coefficient[best], information[best], coefficient[best])
         by_chance = 2.0 * rest[best] / freedom
         power = np.maximum(explained - by_chance, 0.0) / np.trace(information[best], axis1=1, axis2=2)
@@ -162,7 +164,7 @@ def _fitted(waves: Array, left: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class _Contrasts:
-    """Displacements of strips in units of their sigmas, beyond mean and slope of each chip.
+    """Displacements of strips in units of their sigmas, beyond a parabola for each chip.
 
     Attributes:
         weight: (2, n, s) 1 over sigma; 0 where nothing is known.
@@ -179,13 +181,14 @@ class _Contrasts:
         known = np.asarray(np.isfinite(strips.displacement_px).all(axis=2))
         sigma = np.where(known[:, :, None], strips.sigma_px, np.inf)
         weight = 1.0 / sigma.transpose(2, 0, 1)
-        freedom = np.broadcast_to(known.sum(axis=1) - 2.0, weight.shape[:2])
+        freedom = np.broadcast_to(known.sum(axis=1) - (_DEGREE + 1.0), weight.shape[:2])
         displacement = np.nan_to_num(strips.displacement_px).transpose(2, 0, 1)
-        left = _projected(displacement * weight, weight)
+        left = _beyond_parabolas(displacement * weight, weight)
         variance = (left**2).sum(axis=2) / freedom
         typical = np.median(variance, axis=1, keepdims=True)
         counts = np.asarray((variance <= _ODD * typical).all(axis=0), dtype=np.float64)
-        return cls(weight * counts[:, None], (left * counts[:, None]).reshape(2, -1), freedom * counts)
+        left = (left * counts[:, None]).reshape(2, -1)
+        return cls(weight * counts[:, None], left, freedom * counts)
 
     def waves(self, periods: Array, line: Array, height_px: float) -> Array:
         """Cosine and sine (m, 2, n * s, 2) of periods (m,), as strips at lines (n, s) show them."""
@@ -193,18 +196,20 @@ class _Contrasts:
         seen = np.sinc(height_px / periods)[:, None, None]
         parts = []
         for wave in (np.cos(phase), np.sin(phase)):
-            white = _projected((seen * wave)[:, None] * self.weight, self.weight)
+            white = _beyond_parabolas((seen * wave)[:, None] * self.weight, self.weight)
             parts.append(white.reshape(len(periods), 2, -1))
         return np.stack(parts, axis=-1)
 
 
-def _projected(white: Array, weight: Array) -> Array:
-    """Whitened values (..., 2, n, s) without the mean and the slope of each chip."""
+def _beyond_parabolas(white: Array, weight: Array) -> Array:
+    """Whitened values (..., 2, n, s) without the closest parabola of each chip."""
     place = np.linspace(-1.0, 1.0, weight.shape[-1])
-    first = weight / np.maximum(np.linalg.norm(weight, axis=-1, keepdims=True), 1e-300)
-    second = weight * place
-    second = second - first * (first * second).sum(axis=-1, keepdims=True)
-    second = second / np.maximum(np.linalg.norm(second, axis=-1, keepdims=True), 1e-300)
-    for column in (first, second):
+    columns: list[Array] = []
+    for degree in range(_DEGREE + 1):
+        column = weight * place**degree
+        for other in columns:
+            column = column - other * (other * column).sum(axis=-1, keepdims=True)
+        columns.append(column / np.maximum(np.linalg.norm(column, axis=-1, keepdims=True), 1e-300))
+    for column in columns:
         white = white - column * (column * white).sum(axis=-1, keepdims=True)
     return np.asarray(white)

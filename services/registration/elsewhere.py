@@ -162,13 +162,13 @@ def _scatter_m(context: PointContext, adjustment: SceneAdjustment) -> float:
 def _far_away(
     context: PointContext, prediction: Prediction, again: _Again, scatter_m: float
 ) -> Elsewhere | None:
-    """Points that are found together, but farther from where they are expected than points scatter."""
+    """Points that are found together, but far from where they are expected."""
     rows, matches = again.rows, again.matches
     points, gsd_m = context.points.take(rows), context.fine_gsd_m
     tolerance_m = FIRST_TOLERANCE_PX * gsd_m
     displacement_m = matches.displacement_m.copy()
     # Points that lie where they are expected, and were missed before, are of the scene.
-    near_m = min(scatter_m, 2.0 * tolerance_m)
+    near_m = min(2.0 * scatter_m, 2.0 * tolerance_m)
     displacement_m[np.hypot(*displacement_m.T) <= near_m] = np.nan
     voters = Voters(matches.line_sample, CHIP_SIZE * gsd_m / context.gsd_m)
     group = a_contrario_consensus(displacement_m, tolerance_m, _RADIUS_PX * gsd_m, voters)
