@@ -36,7 +36,7 @@ _ENOUGH = 4
 """Points that agree elsewhere, from which on one may do so by chance."""
 _MISSED_PERCENT = 10.0
 """Share of the lines whose points do not agree, beyond which the scene is not usable."""
-_LARGE_PART = 0.25
+_LARGE_PART = 0.4
 """Share of the image to which points that agree elsewhere are nearest, beyond which neither place is the
 scene's."""
 _NODES = 30
