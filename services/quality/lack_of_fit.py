@@ -72,7 +72,8 @@ def structure_criteria(
 
     A structure that is larger than the stated accuracy makes this wrong: no usable registration has it.
     What the profile should follow and does not is held to a tenth of it: points on the other side of a
-    step, or at the crest of a wave, were left out of what is seen.
+    step, or at the crest of a wave, were left out of what is seen. A model of other lines of sight is
+    wrong wherever the ground has other heights than the points: it is not usable.
 
     Args:
         structures: of the residuals of the final adjustment.
@@ -87,6 +88,8 @@ def structure_criteria(
         limit_px = _GOOD * predicted_px
         if structure.family in _OF_THE_MODEL:
             grade, limit_px = "usable", _FOLLOWED * predicted_px
+        elif structure.family == "height":
+            grade = "usable"
         elif size_px > _USABLE * predicted_px:
             grade, limit_px = "usable", _USABLE * predicted_px
         criterion = at_most(_CRITERIA[structure.family], size_px, float(np.nan_to_num(limit_px)), grade)
