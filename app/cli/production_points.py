@@ -41,7 +41,6 @@ def points(
     chips: Annotated[
         Path | None,
         typer.Option(
-            exists=True,
             help="Folder of the base's own chips, in place of images: GCPLib, Copernicus GCP database.",
         ),
     ] = None,

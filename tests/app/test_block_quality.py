@@ -1,6 +1,7 @@
 """`amers block quality` and the process `assess-block`: what was put in is found and reported."""
 
 import json
+import os
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -37,6 +38,7 @@ from tests.app.quality_world import (
     QualityWorld,
     make_quality_world,
 )
+from tests.command_line import amers_here
 
 a_decimetre = 0.1
 a_tenth = 0.1
@@ -190,7 +192,6 @@ def test_a_specification_that_nothing_was_measured_for_is_not_shown(world: Quali
         (("--images", "{image}"), "--site"),
         (("--site", "{site}", "--images", "{site}"), "airport is no image of the block"),
         (("--site", "{site}", "--control-site", "{site}"), "two files are named airport"),
-        (("--site", "{dem}x"), "dem.tifx"),
         (("--exclude", "{block}/block.json"), "Polygon or MultiPolygon expected"),
         (("--site", "{far}", "--images", "{image}"), "none of 1 shows the middle of a site"),
     ],
@@ -201,6 +202,14 @@ def test_references_that_cannot_be_used_are_refused(
     given = [word.format(**vars(world)) for word in words]
     with pytest.raises(InputError, match=message):
         run(world.block, *given)
+
+
+def test_references_that_do_not_exist_are_all_named(world: QualityWorld) -> None:
+    words = ("block", "quality", world.block, "--site", f"{world.dem}x", "--dem", f"{world.site}x")
+    done = amers_here(words, os.environ)
+    assert done.returncode == 2
+    assert f"--site: path '{world.dem}x' does not exist" in done.stderr
+    assert f"--dem: path '{world.site}x' does not exist" in done.stderr
 
 
 def test_a_site_elsewhere_is_told_to_show_nothing(world: QualityWorld, tmp_path: Path) -> None:

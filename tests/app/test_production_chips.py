@@ -162,6 +162,7 @@ def test_what_is_missing_or_meaningless_is_refused_and_nothing_is_written(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = write_gcplib(tmp_path, base_points(3))
+    (tmp_path / "x.tif").touch()
     monkeypatch.chdir(tmp_path)
     code, said = run(capsys, monkeypatch, file, "-o", tmp_path / "block", *STATED, *words)
     assert code == 2
