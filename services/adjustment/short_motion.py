@@ -33,6 +33,10 @@ _ODD = 9.0
 MAX_CHANCE = 1e-4
 """Beside a period that chance explains with a larger probability no further one is looked for."""
 _MOST_PERIODS = 6
+_MOST_CHIPS = 120
+"""The most precise chips tell enough."""
+_AT_ONCE = 64
+"""Periods that are tried at once: large scenes have thousands."""
 
 
 @dataclass(frozen=True)
@@ -106,27 +110,25 @@ def short_motion(strips: ChipStrips, line_sample: Array, side_px: float) -> Shor
     freedom = float(contrasts.freedom.sum())
     if not len(periods) or freedom < 4 * _FEWEST_CHIPS:
         return STILL
-    waves = contrasts.waves(periods, line, side_px / STRIPS)
     left, found = contrasts.left, STILL
     for _ in range(_MOST_PERIODS):
         freedom -= 4.0
-        gain, coefficient, information = _fitted(waves, left)
-        rest = np.maximum((left**2).sum() - gain, 1e-300)
-        best = int(np.argmax(gain / rest))
-        chance = float(fdtrc(4.0, freedom, gain[best] / rest[best] * freedom / 4.0)) * len(periods)
+        best = _clearest(contrasts, left, periods, line, side_px / STRIPS)
+        rest = max(float((left**2).sum()) - best.gain, 1e-300)
+        chance = float(fdtrc(4.0, freedom, best.gain / rest * freedom / 4.0)) * len(periods)
         structure = found.structure
         if found is STILL:
-            structure = replace(structure, chance=min(chance, 1.0), shape="period", at=periods[best])
-        # Of any phase: what the ground hides of a wave, it hides of its noise, too.
-        explained = np.einsum("ki,kij,kj->k", coefficient[best], information[best], coefficient[best])
-        by_chance = 2.0 * rest[best] / freedom
-        power = np.maximum(explained - by_chance, 0.0) / np.trace(information[best], axis1=1, axis2=2)
+            structure = replace(structure, chance=min(chance, 1.0), shape="period", at=best.period)
+        # Of any phase: what the parabolas hide of a wave, they hide of its noise, too.
+        explained = np.einsum("ki,kij,kj->k", best.coefficient, best.information, best.coefficient)
+        by_chance = 2.0 * rest / freedom
+        power = np.maximum(explained - by_chance, 0.0) / np.trace(best.information, axis1=1, axis2=2)
         variance = found.variance_px2 + probability_of_structure(chance) * power
         largest = float(np.sqrt(2.0 * variance.sum()))
         found = ShortMotion(replace(structure, size_px=np.sqrt(variance), largest_px=largest), variance)
         if chance > MAX_CHANCE:
             break
-        left = left - (waves[best] @ coefficient[best][:, :, None])[:, :, 0]
+        left = left - (best.wave @ best.coefficient[:, :, None])[:, :, 0]
     return found
 
 
@@ -141,6 +143,8 @@ def _apart(strips: ChipStrips, line_sample: Array, side_px: float) -> IntArray:
         distance = np.linalg.norm(line_sample[kept] - line_sample[row], axis=1)
         if (distance >= _APART * side_px).all():
             kept.append(row)
+        if len(kept) == _MOST_CHIPS:
+            break
     return np.array(kept, dtype=np.int64)
 
 
@@ -149,17 +153,6 @@ def _periods(line: Array, side_px: float) -> Array:
     extent = _OVERSAMPLING * float(np.ptp(line))
     fewest = max(1, int(extent / (_LONGEST * side_px)))
     return extent / np.arange(fewest, int(extent / (_SHORTEST * side_px / STRIPS)) + 1)
-
-
-def _fitted(waves: Array, left: Array) -> tuple[Array, Array, Array]:
-    """What waves (m, 2, c, 2) explain of contrasts (2, c): gains (m,), coefficients, information."""
-    information = waves.transpose(0, 1, 3, 2) @ waves
-    right = (waves.transpose(0, 1, 3, 2) @ left[:, :, None])[..., 0]
-    information = information + 1e-9 * np.trace(information, axis1=2, axis2=3)[..., None, None] * np.eye(
-        2
-    )
-    coefficient = np.linalg.solve(information, right[..., None])[..., 0]
-    return np.asarray((coefficient * right).sum(axis=(1, 2))), coefficient, information
 
 
 @dataclass(frozen=True)
@@ -213,3 +206,42 @@ def _beyond_parabolas(white: Array, weight: Array) -> Array:
     for column in columns:
         white = white - column * (column * white).sum(axis=-1, keepdims=True)
     return np.asarray(white)
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """A period, fitted to c contrasts of line and sample.
+
+    Attributes:
+        period: lines.
+        gain: what it explains of the sum of their squares.
+        coefficient: (2, 2) of cosine and sine, for line and sample.
+        information: (2, 2, 2) of the coefficients.
+        wave: (2, c, 2) cosine and sine.
+    """
+
+    period: float
+    gain: float
+    coefficient: Array
+    information: Array
+    wave: Array
+
+
+def _clearest(
+    contrasts: _Contrasts, left: Array, periods: Array, line: Array, height_px: float
+) -> _Wave:
+    """The period that explains the most of what is left (2, c) of strips at lines (n, s)."""
+    best: _Wave | None = None
+    for some in np.array_split(periods, -(-len(periods) // _AT_ONCE)):
+        waves = contrasts.waves(some, line, height_px)
+        information = waves.transpose(0, 1, 3, 2) @ waves
+        right = (waves.transpose(0, 1, 3, 2) @ left[:, :, None])[..., 0]
+        scale = np.trace(information, axis1=2, axis2=3)[..., None, None]
+        information = information + 1e-9 * scale * np.eye(2)
+        coefficient = np.linalg.solve(information, right[..., None])[..., 0]
+        gain = (coefficient * right).sum(axis=(1, 2))
+        k = int(np.argmax(gain))
+        if best is None or gain[k] > best.gain:
+            best = _Wave(float(some[k]), float(gain[k]), coefficient[k], information[k], waves[k])
+    assert best is not None
+    return best

@@ -50,7 +50,7 @@ class Fit:
     row_col: Array
     score: float
     influence: Array
-    leverage: Array
+    leverage: FloatImage
 
 
 def fit_chip(
@@ -94,7 +94,7 @@ def fit_chip(
 
 def _fit_valid(
     patch: FloatImage, chip: FloatImage, weight: FloatImage | None, row_col: Array
-) -> tuple[Array, float, Array, Array]:
+) -> tuple[Array, float, Array, FloatImage]:
     """As `fit_position`, from a patch and over the pixels valid in patch and chip.
 
     A missing pixel of the patch enters the interpolation beside it. There it has the value that the chip

@@ -27,7 +27,7 @@ def fit_position(
     weight: FloatImage,
     used: FloatImage,
     start: Array,
-) -> tuple[Array, float, Array, Array]:
+) -> tuple[Array, float, Array, FloatImage]:
     """Row and column (2,), score, influence and leverage of the fit; a NaN score where there is none.
 
     Args:
@@ -44,7 +44,7 @@ def fit_position(
     _centre(centred, used)
     square = _projected(centred, centred, gradients, inverse)[0]
     at = np.empty((side, side), dtype=np.float32)
-    failed = (start, np.nan, np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 2)))
+    failed = (start, np.nan, np.zeros((1, 1, 2)), np.zeros((1, 1, 2, 2), dtype=np.float32))
     row, col = start
     r, c = row, col
     for _ in range(MAX_STEPS):
@@ -206,7 +206,7 @@ def _influence(
     chip: FloatImage,
     gradients: FloatImage,
     row_col: Array,
-) -> tuple[float, Array, Array]:
+) -> tuple[float, Array, FloatImage]:
     """Correlation of chip and patch, influences (c, c, 2) and leverages (c, c, 2, 2) of the squares.
 
     `at` is the patch under the chip; both are centred.
@@ -238,7 +238,8 @@ def _influence(
     m00, m01 = information[0, 0].sum(), information[0, 1].sum()
     m10, m11 = information[1, 0].sum(), information[1, 1].sum()
     determinant = m00 * m11 - m01 * m10
-    leverage = np.empty((cells, cells, 2, 2))
+    # Hundreds of points keep those of all their views.
+    leverage = np.empty((cells, cells, 2, 2), dtype=np.float32)
     for k in range(2):
         leverage[:, :, 0, k] = (m11 * information[0, k] - m01 * information[1, k]) / determinant
         leverage[:, :, 1, k] = (m00 * information[1, k] - m10 * information[0, k]) / determinant

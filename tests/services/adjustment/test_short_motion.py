@@ -1,5 +1,6 @@
 """Motion within the lines of a chip is found in strips of chips, and is in the stated accuracy."""
 
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -128,6 +129,23 @@ def test_few_or_unknown_strips_show_nothing() -> None:
     unknown = replace(shown, displacement_px=np.full(shown.displacement_px.shape, np.nan))
     for some, where in ((shown.take(np.arange(5)), place[:5]), (unknown, place)):
         assert not short_motion(some, where, SIDE_PX).variance_px2.any()
+
+
+def test_the_memory_does_not_grow_with_the_scene() -> None:
+    """A scene of 60,000 lines has thousands of periods and points."""
+    rng = np.random.default_rng(5)
+    place = rng.random((2000, 2)) * [60_000.0, 20_000.0]
+    middle = MIDDLE / SIDE_PX * 100.0
+    shown = ChipStrips(
+        np.broadcast_to(middle, (2000, STRIPS)),
+        rng.normal(0.0, NOISE_PX, (2000, STRIPS, 2)),
+        np.full((2000, STRIPS, 2), NOISE_PX),
+    )
+    tracemalloc.start()
+    assert short_motion(shown, place, 100.0).structure.chance > MAX_CHANCE
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40e6
 
 
 def adjusted(motion: Motion, seed: int, of_points_px: float) -> tuple[SceneAdjustment, float]:
