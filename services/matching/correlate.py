@@ -87,7 +87,7 @@ class Peak:
     score: float
     sigma_px: float
     influence: Array
-    leverage: Array
+    leverage: FloatImage
     reason: str
 
 
@@ -145,7 +145,7 @@ def find_chip(
 
 def rejected(reason: str, score: float = math.nan) -> Peak:
     """A peak that was not accepted, or not searched."""
-    nothing = np.zeros((0, 0, 2)), np.zeros((0, 0, 2, 2))
+    nothing = np.zeros((0, 0, 2)), np.zeros((0, 0, 2, 2), dtype=np.float32)
     return Peak(np.full(2, np.nan), score, math.nan, *nothing, reason)
 
 

@@ -31,7 +31,7 @@ def peaks_of_a_point(rng: np.random.Generator, views: int, tau_px: float) -> lis
         residuals = shifts - shifts.mean(axis=(0, 1))
         row_col = shifts.sum(axis=(0, 1)) + tau_px * rng.standard_normal(2)
         sigma_px = sigma_per_coordinate(covariance_from_influence(residuals))
-        leverage = np.broadcast_to(np.eye(2) / CELLS**2, (CELLS, CELLS, 2, 2))
+        leverage = np.broadcast_to(np.eye(2) / CELLS**2, (CELLS, CELLS, 2, 2)).astype(np.float32)
         peaks.append(Peak(row_col, 0.9, sigma_px, residuals, leverage, FOUND))
     return peaks
 
