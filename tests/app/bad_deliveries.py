@@ -304,7 +304,14 @@ BLOCKS = [
         json={"priority": 1, "state": "published"},
     ),
     Bad("block published by a registrar", "POST", "/blocks/<staged>/publish", "scope", "register", 403),
-    Bad("block quality of a staged one", "GET", "/blocks/<staged>/quality", "no block", "read", 404),
+    Bad(
+        "block quality of a staged one",
+        "GET",
+        "/blocks/<staged>/quality",
+        "no published block",
+        "read",
+        404,
+    ),
     Bad("block ingested by two ways", "POST", "/blocks", "either", json={"path": "a", "upload": NO_ID}),
     Bad(
         "block ingested from an upload that is no id", "POST", "/blocks", "upload", json={"upload": "x"}

@@ -179,7 +179,8 @@ def test_a_folder_of_scenes_is_registered_by_two_processes_and_a_bad_scene_stops
         assert_registered(folder / name, world)
     table = amers(*command[:2], tmp_path / "c.tif", scenes / "a.tif", *command[4:], *options)
     assert table.returncode == 0, table.stderr
-    rows = [line.split("\t") for line in table.stdout.splitlines()]
+    header, *rows = [line.split("\t") for line in table.stdout.splitlines()]
+    assert header[:2] == ["scene", "verdict"]
     assert [(Path(row[0]).name, row[1]) for row in rows] == [
         ("c.tif", f"{last['verdict']}, relative to the control points"),
         ("a.tif", f"{first['verdict']}, relative to the control points"),
@@ -295,7 +296,9 @@ def test_a_service_uses_its_own_points_and_references(
     amers: Amers, world: FlatWorld, tmp_path: Path, words: tuple[str, str], message: str
 ):
     scene = ("scene", "register", world.tagged, "--server", "http://127.0.0.1:1", "-o", tmp_path / "out")
-    refused = amers(*scene, *words)
+    option, name = words
+    (tmp_path / name).touch()
+    refused = amers(*scene, option, tmp_path / name)
     assert (refused.returncode, message in refused.stderr) == (2, True), refused.stderr
     assert not (tmp_path / "out").exists()
 
@@ -359,7 +362,7 @@ def test_every_scene_is_listed_in_the_order_given_and_failures_are_printed(
     assert all(record["reason"] and record["verdict"] for record in records)
     # Without the first: it takes as long as the last.
     printed = amers("scene", "register", *scenes[1:], *control)
-    rows = [line.split("\t") for line in printed.stdout.splitlines()]
+    _, *rows = [line.split("\t") for line in printed.stdout.splitlines()]
     assert [row[0] for row in rows] == [str(scene) for scene in scenes[1:]]
     assert "no sensor model" in rows[1][-1]
     assert "no sensor model" in printed.stderr

@@ -11,7 +11,7 @@ from uuid import uuid4
 import httpx
 import pytest
 
-from app.cli import store
+from app.cli import store_trash
 from app.config import Settings
 from app.db import engine
 from app.db.cluster.embedded import Cluster
@@ -83,10 +83,10 @@ def test_the_trash_of_another_installation_is_not_emptied(
     with another(cluster) as empty:
         monkeypatch.setenv("AMERS_DATABASE_URL", empty)
         with pytest.raises(Conflict, match="amers store adopt"):
-            store.empty()
+            store_trash.empty()
     assert contents(storage) == before
     monkeypatch.setenv("AMERS_DATABASE_URL", full.dsn)
-    store.empty()
+    store_trash.empty()
     assert storage.keys(TRASH) == []
 
 

@@ -69,17 +69,24 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path):
     ],
 )
 def test_an_impossible_production_states_the_reason_and_leaves_nothing(tmp_path, words, says):
-    refused = amers("production", "run", *words, "-o", tmp_path / "block")
+    images = [tmp_path / "one.tif", tmp_path / "two.tif"]
+    for image in images:
+        image.touch()
+    there = {image.name: image for image in images}
+    refused = amers(
+        "production", "run", *(there.get(word, word) for word in words), "-o", tmp_path / "block"
+    )
     assert refused.returncode == 2
     assert says in refused.stderr
     assert "Traceback" not in refused.stderr
-    assert list(tmp_path.iterdir()) == []
+    assert sorted(tmp_path.iterdir()) == images
 
 
 def test_a_block_that_is_there_is_not_written_over(tmp_path):
     (tmp_path / "block").mkdir()
-    refused = amers(
-        "production", "run", "--images", "a.tif", "--images", "b.tif", "-o", tmp_path / "block"
-    )
+    first, second = tmp_path / "a.tif", tmp_path / "b.tif"
+    first.touch()
+    second.touch()
+    refused = amers("production", "run", "--images", first, "--images", second, "-o", tmp_path / "block")
     assert refused.returncode == 2
     assert "already exists" in refused.stderr
