@@ -351,13 +351,16 @@ def displaced(
     return out
 
 
-@pytest.mark.parametrize("of_points_px", [0.0, 2.0])
+@pytest.mark.parametrize(("of_points_px", "least"), [(0.0, 0.7), (2.0, 0.6)])
 def test_what_parts_of_the_image_are_off_by_is_in_the_accuracy_of_every_place(
-    of_points_px: float,
+    of_points_px: float, least: float
 ) -> None:
-    """No points err along the samples of an image that they were not made from."""
+    """No points err along the samples of an image that they were not made from.
+
+    Points that state 2 px and err by none make the accuracy stated a little too large.
+    """
     squares = [square for _, square in displaced(seam, of_points_px)]
-    assert 0.4 < np.mean(squares) < 1.5
+    assert least < np.mean(squares) < 1.5
 
 
 def test_points_that_may_err_explain_what_neighbours_share() -> None:
