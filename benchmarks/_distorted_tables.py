@@ -16,7 +16,7 @@ FOLLOWED, NAMED = 0.8, 0.9
 """Shares that must be delivered and right where a distortion can be followed, and named elsewhere."""
 
 LACK_OF_FIT = {
-    "jitter": ("along_lines",),
+    "jitter": ("along_lines", "within_chips"),
     "bow": ("along_lines", "along_samples", "structure_in_image"),
     "steps": ("along_lines", "points_elsewhere"),
     "moved": ("points_elsewhere", "structure_in_image", "second_consensus"),
