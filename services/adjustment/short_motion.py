@@ -231,8 +231,8 @@ def _clearest(
     contrasts: _Contrasts, left: Array, periods: Array, line: Array, height_px: float
 ) -> _Wave:
     """The period that explains the most of what is left (2, c) of strips at lines (n, s)."""
-    best: _Wave | None = None
-    for some in np.array_split(periods, -(-len(periods) // _AT_ONCE)):
+
+    def clearest_of(some: Array) -> _Wave:
         waves = contrasts.waves(some, line, height_px)
         information = waves.transpose(0, 1, 3, 2) @ waves
         right = (waves.transpose(0, 1, 3, 2) @ left[:, :, None])[..., 0]
@@ -241,7 +241,7 @@ def _clearest(
         coefficient = np.linalg.solve(information, right[..., None])[..., 0]
         gain = (coefficient * right).sum(axis=(1, 2))
         k = int(np.argmax(gain))
-        if best is None or gain[k] > best.gain:
-            best = _Wave(float(some[k]), float(gain[k]), coefficient[k], information[k], waves[k])
-    assert best is not None
-    return best
+        return _Wave(float(some[k]), float(gain[k]), coefficient[k], information[k], waves[k])
+
+    parts = np.array_split(periods, -(-len(periods) // _AT_ONCE))
+    return max(map(clearest_of, parts), key=lambda wave: wave.gain)
