@@ -1,0 +1,121 @@
+"""Lost and repeated lines are seen in the pixels, at their lines, and nothing else is taken for them."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from services.formats.images.scenes import read_scene
+from services.imagery.line_breaks import line_breaks
+from services.imagery.source import ArrayImage, Window
+from services.types import FloatImage
+
+LINES, SAMPLES = 900, 700
+REAL_VIEWS = (
+    "phr_calanques_triplet/img_01.tif",
+    "phr_calanques_triplet/img_03.tif",
+    "phr_gizeh_pair/img1.tif",
+    "phr_iceland_pair/img_02.tif",
+    "phr_ventoux_pair/left_image.tif",
+)
+
+
+def ground(seed: int, shape: tuple[int, int] = (LINES, SAMPLES), noise: float = 3.0) -> FloatImage:
+    """Pixels of ground that a sensor blurs, with its noise."""
+    rng = np.random.default_rng(seed)
+    fine = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 1.2)
+    coarse = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), 6.0)
+    image = 500.0 + 300.0 * fine + 900.0 * coarse + noise * rng.normal(size=shape)
+    return np.asarray(image, dtype=np.float32)
+
+
+def broken(pixels: FloatImage, line: int, lost: int) -> FloatImage:
+    """The image without some lines from one on; a negative number of them is repeated."""
+    return np.concatenate([pixels[:line], pixels[line + lost :]])
+
+
+def found(pixels: FloatImage) -> list[int]:
+    return line_breaks(ArrayImage(pixels)).tolist()
+
+
+@pytest.mark.parametrize("lost", [2, 3, 10, 100, -3, -10, -100])
+def test_lost_and_repeated_lines_are_seen_at_their_line(lost: int) -> None:
+    for seed in range(4):
+        line = int(np.random.default_rng(seed).integers(150, LINES - 250))
+        assert found(broken(ground(seed), line, lost)) == [line]
+
+
+def test_an_image_that_is_whole_has_no_breaks() -> None:
+    assert not any(found(ground(seed)) for seed in range(20))
+
+
+def test_each_of_several_breaks_is_seen() -> None:
+    twice = broken(broken(ground(1), 600, 20), 200, -7)
+    assert found(twice) == [200, 607]
+
+
+def test_a_break_is_seen_where_half_of_the_image_has_no_pixels_or_is_saturated() -> None:
+    pixels = broken(ground(2), 400, 12)
+    pixels[:, : SAMPLES // 4] = np.nan
+    pixels[:, -SAMPLES // 4 :] = np.inf
+    assert found(pixels) == [400]
+
+
+def test_bad_lines_are_no_breaks() -> None:
+    pixels = ground(3)
+    pixels[[120, 300, 555]] = np.random.default_rng(3).normal(500.0, 50.0, (3, SAMPLES))
+    assert not found(pixels)
+
+
+def test_blocks_of_a_compression_are_no_breaks() -> None:
+    pixels = ground(4)
+    level = np.random.default_rng(4).normal(0.0, 60.0, (LINES // 8 + 1, SAMPLES // 8 + 1))
+    blocks = np.kron(level, np.ones((8, 8)))[:LINES, :SAMPLES]
+    assert not found(pixels + blocks.astype(np.float32))
+
+
+def test_an_edge_of_the_ground_along_a_line_is_no_break() -> None:
+    pixels = ground(5)
+    pixels[450:, : SAMPLES // 3] += 400.0
+    assert not found(pixels)
+
+
+def test_an_image_of_one_value_or_of_few_lines_has_no_breaks() -> None:
+    assert not found(np.full((300, 300), 7.0, dtype=np.float32))
+    assert not found(np.full((300, 300), np.nan, dtype=np.float32))
+    assert not found(ground(6, (10, 300)))
+    assert not found(ground(6, (300, 5)))
+
+
+@dataclass(frozen=True)
+class Watched(ArrayImage):
+    """An image that remembers the windows that are read."""
+
+    windows: list[Window] = field(default_factory=list)
+
+    def read(self, window: Window) -> FloatImage:
+        self.windows.append(window)
+        return super().read(window)
+
+
+def test_of_a_wide_image_strips_are_read_piece_by_piece() -> None:
+    lines = 2500
+    image = Watched(broken(ground(7, (lines + 30, 6000)), 1800, 30))
+    assert line_breaks(image).tolist() == [1800]
+    assert max(one.lines * one.samples for one in image.windows) < 1_000_000
+    assert sum(one.samples for one in image.windows if one.line == 0) < 2_500
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("file", REAL_VIEWS)
+def test_real_images_are_whole_until_lines_are_taken_out(real_data: Path, file: str) -> None:
+    image = read_scene(real_data / file).image
+    pixels = image.read(Window(0, 0, *image.shape))
+    assert not found(pixels)
+    assert not found(np.ascontiguousarray(pixels.T))
+    rng = np.random.default_rng(1)
+    drawn = [(int(rng.integers(130, len(pixels) - 130)), lost) for lost in (3, 8, 40, -5, -25) * 3]
+    seen = [found(broken(pixels, line, lost)) == [line] for line, lost in drawn]
+    assert np.mean(seen) > 0.9
