@@ -18,10 +18,10 @@ FOLLOWED, NAMED = 0.8, 0.9
 LACK_OF_FIT = {
     "jitter": ("along_lines", "within_chips"),
     "bow": ("along_lines", "along_samples", "structure_in_image"),
-    "steps": ("along_lines", "points_elsewhere"),
+    "steps": ("along_lines", "points_elsewhere", "behind_breaks"),
     "moved": ("points_elsewhere", "structure_in_image", "second_consensus"),
     "wrong_model": ("against_height", "another view", "another scene", "swapped", "mirrored", "upside"),
-    "otherwise": ("structure_", "steps_along_lines", "points_elsewhere"),
+    "otherwise": ("structure_", "steps_along_lines", "points_elsewhere", "behind_breaks"),
 }
 """Parts of the names of criteria, or of why a scene is refused, that tell what a family is."""
 _OF_ANY = LACK_OF_FIT["otherwise"]

@@ -6,6 +6,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
+from services.adjustment.broken_image import (
+    MOST_BEYOND,
+    held_parts,
+    on_one_side,
+    part_of_line,
+    steps_at_breaks,
+)
 from services.adjustment.line_profile import Component, unit_variance, with_components
 from services.adjustment.order_selection import choose_order
 from services.adjustment.placed_measures import PlacedMeasures
@@ -92,6 +99,8 @@ class ControlObservations:
             `block` counts its rows. None when all are unknown.
         chip_side_px: side of the chips in the scene: nearer measures share pixels. 0 when none do.
         strips: of the chips, as they move against each other; None where it is not known.
+        breaks: (k,) first lines behind breaks of the image, where lines are missing or repeated; None
+            for none.
     """
 
     lon_lat_h: Array
@@ -105,6 +114,7 @@ class ControlObservations:
     frame_covariance_m2: Array | None = None
     chip_side_px: float = 0.0
     strips: ChipStrips | None = None
+    breaks: IntArray | None = None
 
 
 @dataclass(frozen=True)
@@ -240,14 +250,16 @@ def adjust_scene(
     along_axes: tuple[Structure, ...] = ()
     if like is None:
         clipped = fit.clipped(start, 2.0 * limit * scale)
+        known = _known_steps(observations, start, shape, options)
         components, along_axes = _components(
-            measured, fit, clipped, seen=seen, active=active, options=options
+            measured, fit, clipped, seen=seen, active=active, known=known, options=options
         )
     else:
         components = like.components
     shared_fit, of_shared = declared, agreeing
     if components:
         active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
+        active &= _in_held_parts(observations, active)
         followed = solve_profile(measured.residuals(fit, active), components, expected, shape)
         shared_fit, of_shared = measured.without(followed.displacement, declared), active
     shared = (
@@ -332,11 +344,41 @@ def _short_motion(
     """The motion within the chips of active measures (n,) that a displacement does not follow."""
     if observations.strips is None or not measured.scanned:
         return STILL
+    if observations.breaks is not None:
+        # Beyond a break, a chip shows other lines, not a motion.
+        line, side_px = observations.line_sample[:, 0], observations.chip_side_px
+        active = active & on_one_side(observations.breaks, line, side_px, 0.0)
     place, strips = measured.position_px[active], observations.strips.take(active)
     if displacement is not None:
         left_px = strips.displacement_px - strips.against(displacement, place)
         strips = replace(strips, displacement_px=left_px)
     return short_motion(strips, place, observations.chip_side_px)
+
+
+def _follows(options: AdjustmentOptions) -> bool:
+    """Whether a displacement beyond the affine correction is followed."""
+    return options.profile and options.order is None
+
+
+def _known_steps(
+    observations: ControlObservations,
+    parameters: Array,
+    shape: tuple[int, int],
+    options: AdjustmentOptions,
+) -> tuple[Component, ...]:
+    """The steps at breaks of an image, where a correction with these parameters places them."""
+    if observations.breaks is None or not _follows(options):
+        return ()
+    return steps_at_breaks(observations.breaks, parameters[:, :3], shape)
+
+
+def _in_held_parts(observations: ControlObservations, active: BoolArray) -> BoolArray:
+    """Measures (n,) in parts of a broken image whose place more than two active ones tell."""
+    if observations.breaks is None:
+        return np.ones_like(active)
+    line = np.nan_to_num(observations.line_sample[:, 0])
+    held = held_parts(observations.breaks, line, active)
+    return held[part_of_line(observations.breaks, line)]
 
 
 def _components(
@@ -346,6 +388,7 @@ def _components(
     *,
     seen: BoolArray,
     active: BoolArray,
+    known: tuple[Component, ...],
     options: AdjustmentOptions,
 ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
     """What the measures show that no affine correction follows, and what is left along the axes.
@@ -356,10 +399,13 @@ def _components(
         clipped: the same, whose residuals are limited.
         seen: (n,) measures that there are.
         active: (n,) those that agree with an affine correction.
+        known: steps at breaks of the image.
         options: whether it may be followed.
     """
-    wanted = options.profile and options.order is None
-    components, along_axes = measured.components(fit, active, wanted=wanted)
+    wanted = _follows(options)
+    if known:
+        active = measured.agreeing(fit, seen, known, fit.expected(np.inf), options.tolerance)
+    components, along_axes = measured.components(fit, active, known, wanted=wanted)
     first = components
     if wanted and not components and (seen & ~active).sum() >= _LEFT_OUT:
         # What lies beside a step agrees with itself, and was left out.
@@ -369,7 +415,7 @@ def _components(
     # Measures that an affine correction keeps may be wrong beside what moves, and right that it leaves.
     expected = fit.expected(np.inf)
     agreeing = measured.agreeing(fit, seen, components, expected, options.tolerance)
-    again, left = measured.components(fit, agreeing)
+    again, left = measured.components(fit, agreeing, known)
     if not again and first:
         return first, along_axes
     return again or components, left
@@ -382,6 +428,9 @@ def _declared_fit(
     line_sample, sigma_px = observations.line_sample, observations.sigma_px
     misfit = line_sample - model.project(observations.lon_lat_h)
     seen = np.isfinite(misfit).all(axis=1) & np.isfinite(sigma_px)
+    if observations.breaks is not None:
+        side_px = observations.chip_side_px
+        seen &= on_one_side(observations.breaks, line_sample[:, 0], side_px, MOST_BEYOND)
     usable = seen if observations.usable is None else seen & observations.usable
     derivative = np.nan_to_num(model.project_derivative(observations.lon_lat_h))
     covariance_px2 = derivative @ observations.covariance_m2 @ derivative.transpose(0, 2, 1)

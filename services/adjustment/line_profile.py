@@ -5,7 +5,7 @@ components: smooth ones (bow, slow attitude, distortion of the optics), narrow b
 (lost or repeated lines). A component is added as long as the residuals show one
 that chance does not explain and that predicts blocks of lines or samples which were held out. Kernels
 and variances are those of the largest restricted likelihood (Patterson and Thompson, 1971); estimate and
-covariance are those of universal kriging.
+covariance are those of universal kriging. Where the pixels show a break, there is a step of any size.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class Component:
     """One component of a displacement.
 
     Attributes:
-        kind: "smooth", "period" or "step".
+        kind: "smooth", "period", "step" or "break", which is a step that the pixels show.
         length_px: over which it is correlated; of a step, the width of the gap that holds it.
         at_px: period; first line, or sample, of the gap that holds a step.
         variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
@@ -72,7 +72,7 @@ class Component:
         along: lines or samples.
     """
 
-    kind: Literal["smooth", "period", "step"]
+    kind: Literal["smooth", "period", "step", "break"]
     length_px: float
     at_px: float
     variance_px2: Array
@@ -84,16 +84,21 @@ class Component:
         """Of the positions that it depends on: 0 along lines, 1 along samples."""
         return _AXIS[self.along]
 
+    @property
+    def is_step(self) -> bool:
+        """Whether it displaces all that lies behind a line alike."""
+        return self.kind in ("step", "break")
+
     def share(self, line_sample: Array) -> Array:
         """Share (...) of its variance at positions (..., 2): before a step there is none."""
         position = line_sample[..., self.axis]
-        if self.kind == "step":
+        if self.is_step:
             return np.clip((position - self.at_px) / self.length_px, 0.0, 1.0)
         return np.ones_like(position)
 
     def correlation(self, first: Array, second: Array) -> Array:
         """Correlation (m, n) of the displacements at positions (m, 2) and (n, 2)."""
-        if self.kind == "step":
+        if self.is_step:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
         apart = first[:, self.axis][:, None] - second[:, self.axis][None, :]
         smooth = np.exp(-0.5 * (apart / self.length_px) ** 2)
@@ -124,14 +129,16 @@ class _Judged:
 
 
 def likeliest_components(
-    residuals: Residuals, extent_px: float
+    residuals: Residuals, extent_px: float, known: Sequence[Component] = ()
 ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
     """The components that residuals of an affine correction show, and what they leave along the axes.
 
     Args:
         residuals: of the active measures.
         extent_px: side of the image, to which errors that neighbours share are compared.
+        known: steps at breaks of the image, which there are whatever the residuals show.
     """
+    residuals = beside_breaks(residuals, known)
     components: list[Component] = []
     told = 0.0
     affine = found = structures(residuals, ALONG_AXES)
@@ -152,8 +159,8 @@ def likeliest_components(
         components = _again(residuals, [*components, best.component])
         found = structures(beyond(residuals, components), ALONG_AXES)
     if components and told <= _LEAST_EVIDENCE + _of_shared_errors(residuals, extent_px):
-        return (), affine
-    return tuple(components), found
+        return tuple(known), affine
+    return (*known, *components), found
 
 
 def _again(residuals: Residuals, components: list[Component]) -> list[Component]:
@@ -183,7 +190,14 @@ def with_components(residuals: Residuals, components: Sequence[Component]) -> Re
 
 def beyond(residuals: Residuals, components: Sequence[Component]) -> Residuals:
     """The residuals for tests of what the components leave: what they can follow counts as followed."""
-    return with_components(residuals, [component.scaled(_LOOSE) for component in components])
+    loose = [component.scaled(_LOOSE) for component in components if component.kind != "break"]
+    return with_components(beside_breaks(residuals, components), loose)
+
+
+def beside_breaks(residuals: Residuals, components: Sequence[Component]) -> Residuals:
+    """The residuals of an adjustment that estimates the steps at breaks as well."""
+    steps = [one.share(residuals.line_sample) for one in components if one.kind == "break"]
+    return replace(residuals, design=np.column_stack([residuals.design, *steps]))
 
 
 def unit_variance(residuals: Residuals) -> float:

@@ -90,19 +90,25 @@ class PlacedMeasures:
         )
 
     def components(
-        self, fit: AffineFit, rows: BoolArray, *, wanted: bool = True
+        self,
+        fit: AffineFit,
+        rows: BoolArray,
+        known: tuple[Component, ...] = (),
+        *,
+        wanted: bool = True,
     ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
         """What no affine correction follows, and what is left along lines and samples.
 
         Args:
             fit: of the measures.
             rows: (n,) those that are used.
+            known: steps at breaks, which are followed in any case.
             wanted: whether it may be followed; else all is left.
         """
         residuals = self.residuals(fit, rows)
         if not (wanted and self.scanned):
             return (), structures(residuals, ALONG_AXES)
-        return likeliest_components(residuals, self.size_px)
+        return likeliest_components(residuals, self.size_px, known)
 
     def agreeing(
         self,

@@ -21,6 +21,9 @@ _NODES_A_PERIOD = 32
 _NODES_A_LENGTH = 8
 _NODES_A_GAP = 9
 _FEWEST_NODES = 33
+_NODES_OF_BROKEN = 513
+"""Nodes along a broken image: parts that no point holds are uncertain by tens of pixels, and what the
+affine parameters have of it is taken out of the variance of the others, quadratic between nodes."""
 _MOST_NODES = 1025, 129
 """Along the lines, which shake, and along the samples."""
 _WHERE: dict[Along, tuple[slice, slice]] = {
@@ -136,7 +139,8 @@ def solve_profile(
         covariance.append(own)
         displacement.append(mean - t @ affine)
         variance.append(np.maximum(total, 0.0) - (t @ uncertain * t).sum(axis=-1))
-    grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1))
+    breaks = np.array([one.at_px + one.length_px / 2.0 for one in components if one.kind == "break"])
+    grid = DisplacementGrid(line, sample, np.stack(displacement, -1), np.stack(variance, -1), breaks)
     return ProfileSolution(np.array(parameters), np.array(covariance), grid)
 
 
@@ -180,14 +184,15 @@ def _nodes(
         steps = [
             one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH
             for one in along
-            if one.kind != "step"
+            if not one.is_step
         ]
         gaps = [
             np.linspace(one.at_px, one.at_px + one.length_px, _NODES_A_GAP)
             for one in along
-            if one.kind == "step"
+            if one.is_step
         ]
         spacing = min(steps, default=high - low)
-        count = int(np.clip((high - low) / spacing, _FEWEST_NODES, most)) if along else 2
+        fewest = _NODES_OF_BROKEN if any(one.kind == "break" for one in along) else _FEWEST_NODES
+        count = int(np.clip((high - low) / spacing, fewest, most)) if along else 2
         both.append(np.unique(np.concatenate([np.linspace(low, high, count), *gaps])))
     return both[0], both[1]

@@ -8,6 +8,7 @@ import numpy as np
 
 from services.adjustment.known_images import KnownImages
 from services.errors import ComputationError, CoverageError, DoesNotFit
+from services.imagery.line_breaks import scene_breaks
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage, image_gsds_m
 from services.joint.block import JointBlock, repeated
@@ -227,6 +228,7 @@ def _searched_again(
             options=options,
             progress=progress,
             stages=list(measured.stages),
+            breaks=scene_breaks(scene),
             points=shown,
             chips=chips,
             image=CachedImage(scene.image),

@@ -173,6 +173,7 @@ def registered_scene(
         scene_gsd_m(measured.scene),
         frame,
         control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
+        breaks=measured.search.breaks,
     )
 
     def of_scene(

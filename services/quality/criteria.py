@@ -156,6 +156,14 @@ _DESCRIPTIONS = {
         "at the same lines are displaced alike (F test, as along the lines). The limit of good is half "
         "of the predicted CE90, which holds it.",
     ),
+    "lines_behind_breaks": _Description(
+        "Lines behind breaks of the image",
+        "%",
+        0,
+        "Where lines are missing or repeated, neighbouring lines differ over the width of the image by "
+        "more than elsewhere (1.4 times at least; chance makes 0.0001 such places). Lines of the parts "
+        "between these breaks that fewer than three active points hold, as a share of all lines.",
+    ),
     "missed_along_lines": _Description(
         "Lines whose points do not agree",
         "%",

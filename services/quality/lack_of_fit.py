@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import comb
 
+from services.adjustment.broken_image import FEWEST_IN_PART, held_parts, part_of_line
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion, Grade, at_most
 from services.quality.missed_lines import UNFOUND, missed_lines
@@ -100,7 +101,39 @@ def structure_criteria(
     return criteria
 
 
-def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: int) -> Criterion:
+def breaks_criterion(breaks: IntArray, line: Array, followed: bool, lines: int) -> Criterion:
+    """The criterion on lines between breaks of an image of which too few points say where they lie.
+
+    They may lie anywhere, so that no usable scene has any.
+
+    Args:
+        breaks: (k,) first lines behind breaks, one at least.
+        line: (n,) of the active points.
+        followed: whether the correction has a step at each break; else the part with most points counts.
+        lines: of the image.
+    """
+    part = part_of_line(breaks, line)
+    most = np.bincount(part, minlength=len(breaks) + 1).argmax()
+    held = held_parts(breaks, line, np.ones(len(line), dtype=bool))
+    held &= followed | (np.arange(len(held)) == most)
+    edges = np.concatenate([[0], breaks, [lines]])
+    percent = 100.0 * float(np.diff(edges)[~held].sum()) / lines
+    criterion = at_most("lines_behind_breaks", percent, 0.0, "usable")
+    if criterion.met:
+        return criterion
+    where = ", ".join(str(one) for one in breaks.tolist())
+    why = (
+        f"fewer than {FEWEST_IN_PART} points agree in {int((~held).sum())} of the {len(held)} parts"
+        if followed
+        else "this correction does not follow that"
+    )
+    shown = f"the pixels show lost or repeated lines at line {where}; {why}"
+    return replace(criterion, note=f"{shown}: cut the image there, and register its parts")
+
+
+def missed_criterion(
+    line: Array, active: BoolArray, reason: np.ndarray, lines: int, shown: BoolArray | None = None
+) -> Criterion:
     """The criterion on lines whose points do not agree, where those of other lines do.
 
     Args:
@@ -108,8 +141,11 @@ def missed_criterion(line: Array, active: BoolArray, reason: np.ndarray, lines: 
         active: (n,) those that the adjustment uses.
         reason: (n,) why others are not.
         lines: of the image.
+        shown: (n,) points whose chips no break of the image cuts; all when None.
     """
     tried = active | np.isin(reason, (*UNFOUND, "deactivated"))
+    if shown is not None:
+        tried &= shown | active
     missed = missed_lines(line, active, tried)
     if not missed.any():
         return at_most("missed_along_lines", 0.0, 0.0, "good")

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
+from services.adjustment.broken_image import on_one_side
+from services.conventions import CHIP_SIZE
 from services.matching.consensus import a_contrario_consensus, consensus_tolerance_px
 from services.quality.accuracy import Statistics, statistics
 from services.quality.accuracy_statement import AccuracyStatement, scene_accuracy
@@ -13,6 +15,7 @@ from services.quality.criteria import Criterion, Verdict, at_least, at_most, ver
 from services.quality.frames import why_unknown
 from services.quality.lack_of_fit import (
     against_height,
+    breaks_criterion,
     elsewhere_criterion,
     missed_criterion,
     structure_criteria,
@@ -25,7 +28,7 @@ from services.quality.stability import (
     measure_stability,
     residuals_in_image,
 )
-from services.types import Array, Frame, Measures
+from services.types import Array, BoolArray, Frame, Measures
 
 _ENOUGH_RESIDUALS = 6
 """Active points whose residuals tell a standard deviation."""
@@ -349,9 +352,29 @@ def _of_fit(scene: AdjustedScene, predicted_px: float) -> list[Criterion]:
         structures = [displaced if one.name == displaced.name else one for one in structures]
     return [
         *structures,
-        missed_criterion(expected[:, 0], measures.active, measures.reason, scene.shape[0]),
+        *_behind_breaks(scene),
+        missed_criterion(
+            expected[:, 0], measures.active, measures.reason, scene.shape[0], _whole(scene, expected)
+        ),
         elsewhere_criterion(scene.elsewhere, expected, measures.active, scene.shape),
     ]
+
+
+def _whole(scene: AdjustedScene, expected: Array) -> BoolArray | None:
+    """Points (n,) expected at places (n, 2) whose chips no break of the image cuts; None for all."""
+    if scene.breaks is None:
+        return None
+    side_px = CHIP_SIZE * scene.control_gsd_m / scene.gsd_m
+    return on_one_side(scene.breaks, expected[:, 0], side_px, 0.0)
+
+
+def _behind_breaks(scene: AdjustedScene) -> list[Criterion]:
+    """The criterion on breaks of the image, where it has any."""
+    if scene.breaks is None or not len(scene.breaks):
+        return []
+    line, active = scene.measures.line_sample[:, 0], scene.measures.active
+    followed = any(one.kind == "break" for one in scene.adjustment.components)
+    return [breaks_criterion(scene.breaks, line[active], followed, scene.shape[0])]
 
 
 def _on_earth(predicted: PredictedAccuracy, limit_m: float, frame: Frame) -> Criterion:

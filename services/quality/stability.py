@@ -31,6 +31,8 @@ class AdjustedScene:
         elsewhere: points that agree on another displacement than the rest; None when there are none.
         control_gsd_m: ground sampling of the chips or of the reference that the scene was measured on;
             0 where it was measured on none.
+        breaks: first lines behind breaks of the image, where lines are missing or repeated; None where
+            it was not looked for any.
     """
 
     model: SensorModel
@@ -42,6 +44,7 @@ class AdjustedScene:
     refit: Callable[[BoolArray], SceneAdjustment] | None = None
     elsewhere: Elsewhere | None = None
     control_gsd_m: float = 0.0
+    breaks: IntArray | None = None
 
 
 Repetition = tuple[IntArray, SceneAdjustment | None]

@@ -10,7 +10,7 @@ from services.imagery.scene import Scene, scene_gsd_m
 from services.imagery.source import CachedImage
 from services.registration.options import RegistrationOptions
 from services.sensors.correction import CorrectedModel
-from services.types import Array, ChipSource, ControlPoints, Progress, part_of
+from services.types import Array, ChipSource, ControlPoints, IntArray, Progress, part_of
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,14 @@ class RegistrationContext:
         options: of all stages.
         progress: receives the fraction done and the work under way.
         stages: summaries of the searches so far, in order, also of one that was refused.
+        breaks: first lines behind breaks of the image, where lines are missing or repeated.
     """
 
     scene: Scene
     options: RegistrationOptions
     progress: Progress
     stages: list[SearchStage]
+    breaks: IntArray
 
     @cached_property
     def gsd_m(self) -> float:

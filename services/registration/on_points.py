@@ -7,6 +7,7 @@ import numpy as np
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
 from services.errors import ComputationError, CoverageError, NoConsensus, NotEnoughPoints
+from services.imagery.line_breaks import scene_breaks
 from services.imagery.scene import Scene
 from services.imagery.source import CachedImage
 from services.matching.consensus import Voters
@@ -148,6 +149,7 @@ def search_scene(
         options=options,
         progress=progress,
         stages=[] if stages is None else stages,
+        breaks=scene_breaks(scene),
         points=points,
         chips=chips,
         image=CachedImage(scene.image),
@@ -203,7 +205,9 @@ def search_near(context: PointContext, prediction: Prediction, rows: IntArray) -
     )
     context.stages.append(stage)
     displacement = prediction.model.correction.displacement
-    return Search(points, rows, matches, inliers, CHIP_SIZE * gsd_m, displacement), tolerance_px
+    side_m = CHIP_SIZE * gsd_m
+    search = Search(points, rows, matches, inliers, side_m, displacement, context.breaks)
+    return search, tolerance_px
 
 
 def build_registration(
@@ -242,6 +246,7 @@ def build_registration(
         refit,
         elsewhere,
         control_gsd_m=context.stages[-1].chip_gsd_m,
+        breaks=context.breaks,
     )
     rng = np.random.default_rng(options.seed)
     qualification = qualify(adjusted, options.qualification, rng)

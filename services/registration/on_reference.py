@@ -7,6 +7,7 @@ import numpy as np
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE, MAX_ERROR_SIGMAS
 from services.errors import ComputationError, CoverageError, NoConsensus
+from services.imagery.line_breaks import scene_breaks
 from services.imagery.scene import Scene, scene_centre, scene_gsd_m
 from services.imagery.source import ImageSource, ReducedImage, image_gsds_m, reduce_image
 from services.matching.consensus import Voters
@@ -115,6 +116,7 @@ def register_on_reference(
         options=options,
         progress=progress,
         stages=[] if stages is None else stages,
+        breaks=scene_breaks(scene),
         reference=reference,
         finest_factor=_finest_factor(scene, reference),
     )
@@ -261,7 +263,8 @@ def _search(
         check_consensus(stage, consensus, matches.reason, scene, options.reference.max_false_alarms)
     else:
         check_inliers(stage, tolerance_px, matches.reason, scene, options.adjustment.min_points)
-    search = Search(points, np.arange(len(points)), matches, inliers, matching.window_px * level_m)
+    side_m, breaks = matching.window_px * level_m, None if level.is_first else context.breaks
+    search = Search(points, np.arange(len(points)), matches, inliers, side_m, breaks=breaks)
     return search, adjust_search(scene, search, options.adjustment)
 
 

@@ -52,6 +52,7 @@ class Search:
         inliers: (k,) points that agree on one displacement of the image.
         chip_side_m: side on the ground of the chips that were searched.
         displacement: of the model of the search, beyond an affine one; None where it has none.
+        breaks: first lines behind breaks of the image; None for none.
     """
 
     points: ControlPoints
@@ -60,6 +61,7 @@ class Search:
     inliers: BoolArray
     chip_side_m: float
     displacement: DisplacementGrid | None = None
+    breaks: IntArray | None = None
 
 
 def largest_error_m(uncertainty_m: Array) -> float:
@@ -125,6 +127,7 @@ def control_observations(scene: Scene, search: Search, usable: BoolArray) -> Con
         frame_covariance_m2=np.array([frame.covariance_m2 for frame in search.points.frames]),
         chip_side_px=chip_side_px,
         strips=strips,
+        breaks=search.breaks,
     )
 
 

@@ -174,6 +174,8 @@ def _component_in_words(component: Component) -> str:
     if component.kind == "step":
         last = component.at_px + component.length_px
         return f"a step between the {component.along} {component.at_px:.0f} and {last:.0f}"
+    if component.kind == "break":
+        return f"a step at line {component.at_px + component.length_px:.0f}, where the image is broken"
     if component.kind == "period":
         return f"jitter with a period of {component.at_px:.0f} {component.along}"
     return f"a bend that changes over {component.length_px:.0f} {component.along}"

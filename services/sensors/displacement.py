@@ -1,11 +1,13 @@
 """A displacement of image positions that no affine correction follows, on a grid of nodes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from services.types import Array, IntArray
 
+_BESIDE_PX = 1.0
+"""Distance from a break at which its displacement is that of one side."""
 _AVERAGED = 33
 """Places along each axis over which a displacement is averaged."""
 
@@ -24,12 +26,15 @@ class DisplacementGrid:
         variance_px2: (k, m, 2) what the errors of the displacement add to the variance of a corrected
             position by those of the affine parameters. It holds their covariance, too, so that it may be
             negative.
+        breaks: (b,) lines at which it jumps, because the image is broken there: no chip shows the mean
+            of both sides.
     """
 
     line: Array
     sample: Array
     displacement_px: Array
     variance_px2: Array
+    breaks: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, line_sample: Array) -> Array:
         """Displacement (n, 2) of positions (n, 2) of the uncorrected model."""
@@ -38,14 +43,25 @@ class DisplacementGrid:
     def averaged(self, line_sample: Array, side: float) -> Array:
         """Mean displacement (n, 2) over a side around positions (n, 2): what a chip of this side shows.
 
-        Exact where lines and samples move independently of each other.
+        Exact where lines and samples move independently of each other. Across a break, a chip shows the
+        side of its middle.
         """
         offsets = np.linspace(-0.5, 0.5, _AVERAGED) * side
-        along_lines = [self.at(line_sample + [offset, 0.0]) for offset in offsets]
+        along_lines = [self.at(self._before_breaks(line_sample, offset)) for offset in offsets]
         along_samples = [self.at(line_sample + [0.0, offset]) for offset in offsets]
         return np.asarray(
             np.mean(along_lines, axis=0) + np.mean(along_samples, axis=0) - self.at(line_sample)
         )
+
+    def _before_breaks(self, line_sample: Array, offset: float) -> Array:
+        """Positions (n, 2) some lines away, or at the break that lies between."""
+        line = line_sample[:, 0] + offset
+        for jump in self.breaks.tolist():
+            behind = line_sample[:, 0] > jump
+            line = np.where(
+                behind, np.maximum(line, jump + _BESIDE_PX), np.minimum(line, jump - _BESIDE_PX)
+            )
+        return np.column_stack([line, line_sample[:, 1]])
 
     def derivative(self, line_sample: Array) -> Array:
         """Derivative (n, 2, 2) of `at` by the line and by the sample."""

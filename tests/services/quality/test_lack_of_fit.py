@@ -5,7 +5,7 @@ import pytest
 
 from services.adjustment.structure import Family, Structure
 from services.quality.criteria import Criterion
-from services.quality.lack_of_fit import structure_criteria
+from services.quality.lack_of_fit import breaks_criterion, structure_criteria
 
 SIGHT = np.array([0.1, 0.0])
 SHAPE = (4000, 3000)
@@ -62,3 +62,36 @@ def test_what_chance_explains_is_not_named_however_large(family: Family) -> None
 )
 def test_a_structure_says_what_it_looks_like(family: Family, words: str) -> None:
     assert words in judged(family, 5.0).note
+
+
+LINES = 2000
+BREAKS = np.array([500, 1500])
+
+
+def behind_breaks(line: list[float], followed: bool = True) -> Criterion:
+    return breaks_criterion(BREAKS, np.array(line), followed, LINES)
+
+
+def test_parts_of_a_broken_image_that_points_hold_are_good() -> None:
+    held = behind_breaks([10, 200, 400, 600, 900, 1400, 1600, 1700, 1900])
+    assert held.met
+    assert held.value == 0.0
+
+
+def test_a_scene_is_not_usable_where_no_three_points_hold_a_quarter_of_its_lines() -> None:
+    without = behind_breaks([10, 200, 400, 600, 900, 1400, 1600, 1700])
+    assert (without.met, without.needed_for, without.value) == (False, "usable", 25.0)
+    assert "line 500, 1500" in without.note
+    assert "1 of the 3 parts" in without.note
+
+
+def test_a_short_part_that_nothing_holds_is_enough() -> None:
+    criterion = breaks_criterion(np.array([1900]), np.arange(0.0, 1800.0, 100.0), True, LINES)
+    assert (criterion.met, criterion.needed_for, criterion.value) == (False, "usable", 5.0)
+    assert "cut the image there" in criterion.note
+
+
+def test_a_correction_that_follows_no_break_holds_one_part_alone() -> None:
+    unfollowed = behind_breaks([10, 200, 400, 600, 900, 1200, 1400, 1600, 1700, 1900], followed=False)
+    assert (unfollowed.met, unfollowed.needed_for, unfollowed.value) == (False, "usable", 50.0)
+    assert "does not follow" in unfollowed.note

@@ -82,3 +82,11 @@ def test_ground_that_moved_beside_others_is_not_taken_for_lost_lines() -> None:
     criterion = missed_criterion(line, agrees, np.where(agrees, "", "low_score"), LINES)
     assert criterion.met
     assert criterion.value == 0.0
+
+
+def test_chips_that_a_break_of_the_image_cuts_do_not_count() -> None:
+    line = np.linspace(0.0, LINES - 1.0, 240)
+    cut = np.abs(line - 1000.0) < 100.0
+    reason = np.where(cut, "deactivated", "")
+    assert not missed_criterion(line, ~cut, reason, LINES).met
+    assert missed_criterion(line, ~cut, reason, LINES, ~cut).met

@@ -24,6 +24,8 @@ from tests.services.simulated import block, world
 
 pytestmark = pytest.mark.long
 
+LOST = {"repeated lines": (0.65, -40), "lost lines": (0.4, 25), "repeated at the border": (0.93, -30)}
+"""Share of the lines at which some are missing, and how many; a negative number is repeated."""
 WRONG = 3.0
 """True over predicted CE90 from which on a result is wrong."""
 
@@ -41,8 +43,9 @@ def distortion(name: str) -> Distortion:
         smooth = (Waves(np.array([[0.5, 2.5]]), np.array([0.8 * lines]), np.array([[0.3, 1.9]])),)
     elif name == "bow":
         smooth = (Bend(np.array([[0.0, 0.0], [0.0, 0.0], [2.0, 5.0]]), 0, lines),)
-    elif name == "repeated lines":
-        steps = (Step(int(0.65 * lines), -40),)
+    elif name in LOST:
+        part, lost = LOST[name]
+        steps = (Step(int(part * lines), lost),)
     elif name == "moved ground":
         centre = np.array([0.3 * lines, 0.35 * samples])
         moved = MovedGround(centre, np.array([0.27, 0.3]) * shape(), 0.4, np.array([18.0, -14.0]))
@@ -87,14 +90,26 @@ def test_jitter_and_bow_are_followed_with_the_stated_accuracy(name: str) -> None
     assert np.quantile(np.hypot(*error.T), 0.9) < 1.2
 
 
-def test_lines_that_were_repeated_are_followed_or_named() -> None:
-    result = registered("repeated lines")
-    named = unmet("repeated lines") & {"points_elsewhere", "steps_along_lines", "structure_along_lines"}
-    assert named or (result.adjustment.components and ratio("repeated lines") < WRONG)
-    if named:
-        assert result.qualification.verdict == "failed"
-        note = next(one.note for one in result.qualification.criteria if one.name in named)
-        assert "lines" in note
+@pytest.mark.parametrize("name", ["repeated lines", "lost lines"])
+def test_lost_and_repeated_lines_are_followed_on_both_sides(name: str) -> None:
+    result = registered(name)
+    assert result.qualification.verdict in ("good", "usable")
+    assert [one.kind for one in result.adjustment.components] == ["break"]
+    assert ratio(name) < WRONG
+    error, _ = errors(name)
+    assert np.quantile(np.hypot(*error.T), 0.9) < 1.2
+
+
+def test_lines_that_are_repeated_beyond_all_points_are_named() -> None:
+    result = registered("repeated at the border")
+    assert "lines_behind_breaks" in unmet("repeated at the border")
+    assert result.qualification.verdict == "failed"
+    error, covariance = errors("repeated at the border")
+    assert np.hypot(*error.T).max() < 1.5
+    assert np.median(normal_ce90(covariance)) < 1.5
+    lines, samples = shape()
+    behind = np.array([[0.97 * lines, 0.2 * samples], [0.99 * lines, 0.8 * samples]])
+    assert normal_ce90(result.adjustment.covariance_at(behind)).min() > 50.0
 
 
 @pytest.mark.parametrize("name", ["swapped", "mirrored", "upside down"])
