@@ -1,11 +1,11 @@
 """Images of which lines are missing, or repeated, at known breaks: the parts between them move apart."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
 from services.adjustment.line_profile import Component
-from services.sensors.correction import no_correction
+from services.sensors.correction import ImageCorrection
 from services.types import Array, BoolArray, IntArray
 
 FEWEST_IN_PART = 3
@@ -14,26 +14,47 @@ _LOST_LINES = 50.0
 """A priori standard deviation of the lines that are missing, or repeated, at a break."""
 _BREAK_PX = 1.0
 """Lines within which a break lies."""
+_BESIDE_PX = 1.0
+"""Lines from there at which the displacement is that of a side."""
 MOST_BEYOND = 0.25
 """Share of a chip beyond a break, above which its match lies somewhere between both parts."""
 
 
-def steps_at_breaks(
-    breaks: IntArray, parameters: Array, shape: tuple[int, int]
-) -> tuple[Component, ...]:
+def steps_at_breaks(breaks: IntArray, correction: ImageCorrection) -> tuple[Component, ...]:
     """A step of any size at each break: lines are displaced, samples are not.
 
     Args:
         breaks: (k,) first lines behind them, in the image.
-        parameters: (2, 3) of an affine correction, which says where the model expects these lines.
-        shape: lines and samples of the image.
+        correction: affine, which says where the model expects these lines.
     """
-    correction = replace(no_correction(shape), parameters=parameters)
     places = np.column_stack([breaks - 0.5, np.full(len(breaks), correction.centre[1])])
-    variance_px2 = np.array([_LOST_LINES**2, 0.0])
-    return tuple(
-        Component("break", _BREAK_PX, line - _BREAK_PX / 2.0, variance_px2)
-        for line in correction.invert(places)[:, 0].tolist()
+    return tuple(map(_step, correction.invert(places)[:, 0].tolist()))
+
+
+def placed_steps(
+    breaks: IntArray, steps: Sequence[Component], correction: ImageCorrection
+) -> tuple[Component, ...]:
+    """The steps, each in the middle between where both its sides expect their lines to end.
+
+    Where lines are missing, the model has them between the sides; where lines are repeated, both sides
+    have them.
+
+    Args:
+        breaks: (k,) first lines behind them, in the image.
+        steps: (k) of the correction.
+        correction: that follows them.
+    """
+    expected = np.array([one.at_px for one in steps])
+    sides = []
+    for away_px in (-_BESIDE_PX, _BREAK_PX + _BESIDE_PX):
+        places = np.column_stack([expected + away_px, np.full(len(steps), correction.centre[1])])
+        sides.append(breaks - 0.5 - (correction.apply(places) - places)[:, 0])
+    return tuple(map(_step, np.mean(sides, axis=0).tolist()))
+
+
+def _step(line: float) -> Component:
+    return Component(
+        "break", _BREAK_PX, line - _BREAK_PX / 2.0, variance_px2=np.array([_LOST_LINES**2, 0.0])
     )
 
 

@@ -6,18 +6,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
-from services.adjustment.broken_image import (
-    MOST_BEYOND,
-    held_parts,
-    on_one_side,
-    part_of_line,
-    steps_at_breaks,
-)
+from services.adjustment.broken_image import MOST_BEYOND, held_parts, on_one_side, part_of_line
 from services.adjustment.line_profile import Component, unit_variance, with_components
 from services.adjustment.order_selection import choose_order
 from services.adjustment.placed_measures import PlacedMeasures
 from services.adjustment.profile_solution import joined, solve_profile
 from services.adjustment.robust import deactivate
+from services.adjustment.scene_motion import what_moves
 from services.adjustment.shared_errors import (
     SharedErrors,
     likeliest_shared_errors,
@@ -33,9 +28,6 @@ from services.types import Array, BoolArray, IntArray
 
 _LOOSE_PX = 1000.0
 """A priori standard deviation of the offset of a block before anything is known of it."""
-
-_LEFT_OUT = 5
-"""Measures that disagree with an affine correction, from which on a profile is looked for in all."""
 
 _THIN = 1e-3
 """Smallest width of the area of the points that determines drift and skew, half sizes of the image."""
@@ -249,10 +241,19 @@ def adjust_scene(
     expected, limit = fit.expected(slope_px), options.tolerance
     along_axes: tuple[Structure, ...] = ()
     if like is None:
-        clipped = fit.clipped(start, 2.0 * limit * scale)
-        known = _known_steps(observations, start, shape, options)
-        components, along_axes = _components(
-            measured, fit, clipped, seen=seen, active=active, known=known, options=options
+        components, along_axes = (
+            what_moves(
+                measured,
+                fit,
+                start,
+                fit.clipped(start, 2.0 * limit * scale),
+                seen=seen,
+                active=active,
+                breaks=observations.breaks,
+                tolerance=limit,
+            )
+            if options.profile and options.order is None
+            else measured.components(fit, active, wanted=False)
         )
     else:
         components = like.components
@@ -355,23 +356,6 @@ def _short_motion(
     return short_motion(strips, place, observations.chip_side_px)
 
 
-def _follows(options: AdjustmentOptions) -> bool:
-    """Whether a displacement beyond the affine correction is followed."""
-    return options.profile and options.order is None
-
-
-def _known_steps(
-    observations: ControlObservations,
-    parameters: Array,
-    shape: tuple[int, int],
-    options: AdjustmentOptions,
-) -> tuple[Component, ...]:
-    """The steps at breaks of an image, where a correction with these parameters places them."""
-    if observations.breaks is None or not _follows(options):
-        return ()
-    return steps_at_breaks(observations.breaks, parameters[:, :3], shape)
-
-
 def _in_held_parts(observations: ControlObservations, active: BoolArray) -> BoolArray:
     """Measures (n,) in parts of a broken image whose place more than two active ones tell."""
     if observations.breaks is None:
@@ -379,46 +363,6 @@ def _in_held_parts(observations: ControlObservations, active: BoolArray) -> Bool
     line = np.nan_to_num(observations.line_sample[:, 0])
     held = held_parts(observations.breaks, line, active)
     return held[part_of_line(observations.breaks, line)]
-
-
-def _components(
-    measured: PlacedMeasures,
-    fit: AffineFit,
-    clipped: AffineFit,
-    *,
-    seen: BoolArray,
-    active: BoolArray,
-    known: tuple[Component, ...],
-    options: AdjustmentOptions,
-) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
-    """What the measures show that no affine correction follows, and what is left along the axes.
-
-    Args:
-        measured: the measures.
-        fit: of them.
-        clipped: the same, whose residuals are limited.
-        seen: (n,) measures that there are.
-        active: (n,) those that agree with an affine correction.
-        known: steps at breaks of the image.
-        options: whether it may be followed.
-    """
-    wanted = _follows(options)
-    if known:
-        active = measured.agreeing(fit, seen, known, fit.expected(np.inf), options.tolerance)
-    components, along_axes = measured.components(fit, active, known, wanted=wanted)
-    first = components
-    if wanted and not components and (seen & ~active).sum() >= _LEFT_OUT:
-        # What lies beside a step agrees with itself, and was left out.
-        components, _ = measured.components(clipped, seen)
-    if not components:
-        return (), along_axes
-    # Measures that an affine correction keeps may be wrong beside what moves, and right that it leaves.
-    expected = fit.expected(np.inf)
-    agreeing = measured.agreeing(fit, seen, components, expected, options.tolerance)
-    again, left = measured.components(fit, agreeing, known)
-    if not again and first:
-        return first, along_axes
-    return again or components, left
 
 
 def _declared_fit(

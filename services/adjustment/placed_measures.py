@@ -27,7 +27,7 @@ class PlacedMeasures:
         height_pull: (2,) see `Residuals`.
         overlapping: (n, n) correlation by overlapping chips.
         chip_side_px: of a chip in the scene.
-        size_px: side of the image.
+        shape: lines and samples of the image.
         scanned: whether the image was scanned line by line.
     """
 
@@ -36,7 +36,7 @@ class PlacedMeasures:
     height_pull: Array
     overlapping: Array
     chip_side_px: float
-    size_px: float
+    shape: tuple[int, int]
     scanned: bool
 
     @classmethod
@@ -62,9 +62,14 @@ class PlacedMeasures:
             np.nanmean(derivative @ covariance_m2[:, :, 2:], axis=0)[:, 0],
             overlap_correlation(position_px, chip_side_px, own_share),
             chip_side_px,
-            float(np.sqrt(shape[0] * shape[1])),
+            shape,
             not isinstance(model, OrthoModel),
         )
+
+    @property
+    def size_px(self) -> float:
+        """Side of a square image of as many pixels."""
+        return float(np.sqrt(self.shape[0] * self.shape[1]))
 
     @property
     def position(self) -> Array:

@@ -93,7 +93,7 @@ def solve_profile(
         expected: (2, k) a priori weights of the parameters.
         shape: lines and samples of the image, which the nodes cover.
     """
-    line, sample = _nodes(components, residuals.line_sample, shape)
+    line, sample = _nodes(components, residuals, shape)
     nodes = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
     frame = no_correction(shape)
     t = _by_affine(nodes, frame)
@@ -173,13 +173,18 @@ def joined(covariance: Array) -> Array:
 
 
 def _nodes(
-    components: Sequence[Component], line_sample: Array, shape: tuple[int, int]
+    components: Sequence[Component], residuals: Residuals, shape: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Lines (k,) and samples (m,) of the nodes: close enough for short components, and at steps."""
+    """Lines (k,) and samples (m,) of the nodes: close enough for short components, and at steps.
+
+    They cover the places of the points and of the whole image, wherever the model expects it.
+    """
     both = []
     for axis, most in enumerate(_MOST_NODES):
-        low = min(0.0, float(line_sample[:, axis].min()))
-        high = max(shape[axis] - 1.0, float(line_sample[:, axis].max()))
+        place, moved = residuals.line_sample[:, axis], residuals.misfit[:, axis]
+        last = shape[axis] - 1.0
+        low = float(min(0.0, place.min(), -moved.max()))
+        high = float(max(last, place.max(), last - moved.min()))
         along = [one for one in components if one.axis == axis]
         steps = [
             one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH

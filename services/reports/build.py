@@ -161,7 +161,7 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
     displacement = adjustment.correction.displacement
     if displacement is not None:
         line, sample = np.ptp(displacement.displacement_px, axis=(0, 1))
-        kinds = ", ".join(map(_component_in_words, adjustment.components))
+        kinds = ", ".join(_component_in_words(one, adjustment) for one in adjustment.components)
         sentences.append(
             f"beyond the affine correction, {kinds}: within {line:.2f} px in line, {sample:.2f} px in "
             "sample"
@@ -169,13 +169,15 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
     return tuple(sentences)
 
 
-def _component_in_words(component: Component) -> str:
+def _component_in_words(component: Component, adjustment: SceneAdjustment) -> str:
     """What a component of the displacement is."""
     if component.kind == "step":
         last = component.at_px + component.length_px
         return f"a step between the {component.along} {component.at_px:.0f} and {last:.0f}"
     if component.kind == "break":
-        return f"a step at line {component.at_px + component.length_px:.0f}, where the image is broken"
+        before = np.array([[component.at_px, adjustment.correction.centre[1]]])
+        line = adjustment.correction.apply(before)[0, 0]
+        return f"a step at about line {line:.0f}, where the pixels show lost or repeated lines"
     if component.kind == "period":
         return f"jitter with a period of {component.at_px:.0f} {component.along}"
     return f"a bend that changes over {component.length_px:.0f} {component.along}"

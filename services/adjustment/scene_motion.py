@@ -1,0 +1,79 @@
+"""What moves the lines and samples of a scene, as its measures and the breaks of its image show."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from services.adjustment.affine_fit import AffineFit
+from services.adjustment.broken_image import placed_steps, steps_at_breaks
+from services.adjustment.line_profile import Component
+from services.adjustment.placed_measures import PlacedMeasures
+from services.adjustment.profile_solution import solve_profile
+from services.adjustment.structure import Structure
+from services.sensors.correction import no_correction
+from services.types import Array, BoolArray, IntArray
+
+_LEFT_OUT = 5
+"""Measures that disagree with an affine correction, from which on a profile is looked for in all."""
+
+
+def what_moves(
+    measured: PlacedMeasures,
+    fit: AffineFit,
+    start: Array,
+    clipped: AffineFit,
+    *,
+    seen: BoolArray,
+    active: BoolArray,
+    breaks: IntArray | None,
+    tolerance: float,
+) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
+    """What the measures show that no affine correction follows, and what it leaves along the axes.
+
+    Args:
+        measured: the measures.
+        fit: of them.
+        start: (2, 3 + b) parameters of a robust solution.
+        clipped: the fit, whose residuals from it are limited.
+        seen: (n,) measures that there are.
+        active: (n,) those that agree with an affine correction.
+        breaks: first lines behind breaks of the image; None for none.
+        tolerance: of the measures, standard deviations.
+    """
+    expected = fit.expected(np.inf)
+    known: tuple[Component, ...] = ()
+    if measured.scanned and breaks is not None and len(breaks):
+        known = _known_steps(measured, fit, start, seen=seen, breaks=breaks, tolerance=tolerance)
+        active = measured.agreeing(fit, seen, known, expected, tolerance)
+    components, along_axes = measured.components(fit, active, known)
+    first = components
+    if not components and (seen & ~active).sum() >= _LEFT_OUT:
+        # What lies beside a step agrees with itself, and was left out.
+        components, _ = measured.components(clipped, seen)
+    if not components:
+        return (), along_axes
+    # Measures that an affine correction keeps may be wrong beside what moves, and right that it leaves.
+    agreeing = measured.agreeing(fit, seen, components, expected, tolerance)
+    again, left = measured.components(fit, agreeing, known)
+    if not again and first:
+        return first, along_axes
+    return again or components, left
+
+
+def _known_steps(
+    measured: PlacedMeasures,
+    fit: AffineFit,
+    start: Array,
+    *,
+    seen: BoolArray,
+    breaks: IntArray,
+    tolerance: float,
+) -> tuple[Component, ...]:
+    """The steps at breaks of the image, placed by a correction that follows them."""
+    affine = replace(no_correction(measured.shape), parameters=start[:, :3])
+    steps, expected = steps_at_breaks(breaks, affine), fit.expected(np.inf)
+    agreeing = measured.agreeing(fit, seen, steps, expected, tolerance)
+    solution = solve_profile(measured.residuals(fit, agreeing), steps, expected, measured.shape)
+    parameters, displacement = solution.parameters[:, :3], solution.displacement
+    followed = replace(affine, parameters=parameters, displacement=displacement)
+    return placed_steps(breaks, steps, followed)
