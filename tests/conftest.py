@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from tests.run_folders import end_dead_runs, run_folder
+from tests.run_folders import DISK, MEMORY, end_dead_runs, place_of_databases, run_folder
 
 settings.register_profile("amers", deadline=None)
 settings.load_profile("amers")
@@ -96,9 +96,16 @@ def _begin_long_ones_first(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def open_folder() -> Iterator[Path]:
     """A short temporary folder that the server's user can pass, unlike pytest's own."""
-    end_dead_runs()
+    end_dead_runs(DISK, MEMORY)
     with run_folder() as folder:
         yield folder
+
+
+@pytest.fixture(scope="session")
+def cluster_folder(open_folder: Path) -> Iterator[Path]:
+    """A temporary folder for the cluster of this process, in memory if there is enough."""
+    with run_folder(place_of_databases()) as folder:
+        yield folder / "postgres"
 
 
 @pytest.fixture(scope="session")

@@ -10,14 +10,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+DISK = Path("/tmp")
+MEMORY = Path("/dev/shm")
+ENOUGH_BYTES = 8 * 2**30
+"""Of free memory, for the databases of all processes of the tests."""
 PREFIX = "amers-test-"
 MARK = "run"
 """A file that the process of the tests locks as long as it lives."""
 PATIENCE_S = 10.0
 
 
+def place_of_databases() -> Path:
+    """In memory if there is enough: a database is made and dropped there in a tenth of the time."""
+    free_bytes = shutil.disk_usage(MEMORY).free if MEMORY.is_dir() else 0
+    return MEMORY if free_bytes >= ENOUGH_BYTES else DISK
+
+
 @contextmanager
-def run_folder(where: Path = Path("/tmp")) -> Iterator[Path]:
+def run_folder(where: Path = DISK) -> Iterator[Path]:
     """A temporary folder with a short path that the server's user can enter, unlike pytest's."""
     folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=where))
     folder.chmod(0o755)
@@ -30,10 +40,10 @@ def run_folder(where: Path = Path("/tmp")) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def end_dead_runs(where: Path = Path("/tmp")) -> list[Path]:
+def end_dead_runs(*places: Path) -> list[Path]:
     """Kill the remaining processes of killed runs and delete their folders; returns the folders."""
     ended = []
-    for mark in where.glob(f"{PREFIX}*/{MARK}"):
+    for mark in (mark for place in places for mark in place.glob(f"{PREFIX}*/{MARK}")):
         with suppress(OSError), mark.open() as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _end_processes_in(mark.parent)

@@ -58,6 +58,19 @@ def test_the_database_of_a_run_that_was_killed_is_ended_by_the_next(place: Path)
     assert not its_folder.exists()
 
 
+@pytest.mark.database
+def test_dead_runs_are_ended_wherever_they_have_their_databases(place: Path):
+    places = [place / "memory", place / "disk"]
+    dead = []
+    for where in places:
+        where.mkdir(mode=0o755)
+        with running(where) as (run, folder):
+            run.kill()
+            dead.append(folder)
+    assert end_dead_runs(*places, place / "missing") == dead
+    assert all(processes_in(folder) == {} and not folder.exists() for folder in dead)
+
+
 def test_a_folder_without_the_mark_of_a_run_is_left_alone(place: Path):
     other = place / f"{PREFIX}of-somebody-else"
     other.mkdir()

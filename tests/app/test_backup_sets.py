@@ -30,7 +30,7 @@ from app.usecases.backups.manifest import (
 from app.usecases.backups.restore import RESTORING, restore_backup
 from app.usecases.installation import Installation
 from app.worker.sweep import sweep_files
-from tests.app.conftest import fresh_database
+from tests.app.conftest import EMPTY_TEMPLATE, fresh_database
 from tests.app.full_storage import Full, contents
 from tests.statements import run_sql
 
@@ -122,7 +122,7 @@ def test_a_backup_restores_database_and_files_of_an_installation(
     assert (record["files"], record["damaged"], record["outdated"]) == (len(placed(full)) + 1, [], [])
     checked = amers(full.settings, "db", "verify-backup", tmp_path / "backup", "--json")
     assert (checked.returncode, json.loads(checked.stdout)["problems"]) == (0, []), checked.stderr
-    with fresh_database(cluster, "template1") as dsn:
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
         settings = empty(full, dsn, tmp_path / "restored")
         # As AMERS_STORAGE_URL of the command.
         restore_backup(dsn, open_storage(settings), tmp_path / "backup")
@@ -205,7 +205,7 @@ def test_a_backup_that_is_not_as_it_was_written_is_refused_and_restores_nothing(
     full: Full, cluster: Cluster, tmp_path: Path
 ):
     backed_up(full, tmp_path / "backup")
-    with fresh_database(cluster, "template1") as dsn:
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
         storage = Storage(tmp_path / "restored")
         for number, change in enumerate(CHANGES):
             copy = tmp_path / f"copy-{number}"
@@ -253,7 +253,7 @@ def test_a_killed_restore_is_continued_by_the_next_one(full: Full, cluster: Clus
     backup = tmp_path / "backup"
     backed_up(full, backup)
     for number, stage in enumerate(RESTORE_STAGES):
-        with fresh_database(cluster, "template1") as dsn:
+        with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
             settings = empty(full, dsn, tmp_path / f"restored-{number}")
             assert amers(settings, "db", "restore", backup, killed_at=stage).returncode == KILLED
             restore_backup(dsn, open_storage(settings), backup)

@@ -19,7 +19,7 @@ from app.db.cluster.embedded import SUPERUSER, Cluster
 from app.db.jobs import attempts
 from app.main import create_app
 from app.worker.sweep import sweep_jobs
-from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.app.full_storage import database_name
 from tests.app.job_queue import LEASE_S
 from tests.app.test_schema import catalogue, differences
@@ -41,7 +41,7 @@ Counts = dict[str, int]
 @pytest.fixture(scope="module", params=DUMPS, ids=lambda path: path.name.split(".")[0])
 def upgraded(cluster: Cluster, request: pytest.FixtureRequest) -> Iterator[tuple[str, Counts]]:
     """The connection string of an upgraded dump, and how many rows its tables had before."""
-    with fresh_database(cluster, "template1") as dsn:
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
         # As in the private cluster of a release before roles: a superuser owns all of it.
         name = database_name(dsn)
         with psycopg.connect(cluster.dsn(name, SUPERUSER)) as connection:

@@ -11,7 +11,7 @@ from app.db.cluster.embedded import Cluster
 from app.db.ddl import EXTENSION
 from app.db.schema import metadata
 from app.db.statements import sql_file
-from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 
 # Everything that the catalogues record of the store: (what, name, definition). Objects of extensions, of
 # the queue and of Alembic are left out.
@@ -173,7 +173,7 @@ def differences(one: Catalogue, other: Catalogue) -> dict[str, tuple[str | None,
 @pytest.fixture(scope="module")
 def from_schema(cluster: Cluster) -> Iterator[Catalogue]:
     """The catalogue of a database that SQLAlchemy made from the schema, with the SQL files."""
-    with fresh_database(cluster, "template1") as dsn:
+    with fresh_database(cluster, EMPTY_TEMPLATE) as dsn:
         engine = create_engine(
             "postgresql+psycopg://", creator=lambda: psycopg.connect(dsn), poolclass=NullPool
         )

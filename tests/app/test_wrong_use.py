@@ -19,7 +19,7 @@ from app.db.cluster.embedded import Cluster
 from app.storage import MARKER, Storage
 from app.usecases.blocks.lifecycle import ingest_block
 from app.usecases.tokens import create_token
-from tests.app.conftest import TEMPLATE, fresh_database
+from tests.app.conftest import EMPTY_TEMPLATE, TEMPLATE, fresh_database
 from tests.command_line import Done, amers_here
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -370,7 +370,7 @@ def place(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     made = make_block(folder / "block", 5, n_images=2, gsds_m=(2.0,))
     with (
         fresh_database(cluster, TEMPLATE) as dsn,
-        fresh_database(cluster, "template1") as empty,
+        fresh_database(cluster, EMPTY_TEMPLATE) as empty,
         refusing_server() as refusing,
         socket.create_server(("127.0.0.1", 0)) as used,
     ):

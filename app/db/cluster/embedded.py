@@ -56,7 +56,8 @@ log_timezone = 'UTC'
 log_min_messages = warning
 log_checkpoints = off
 """
-FORGETFUL = "fsync = off\nfull_page_writes = off\n"
+FORGETFUL = "fsync = off\nfull_page_writes = off\nshared_preload_libraries = 'postgis-3'\n"
+"""Of clusters of tests: nothing outlasts a power cut, and connections find PostGIS loaded."""
 
 
 @contextmanager
