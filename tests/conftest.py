@@ -1,6 +1,7 @@
 """What every test may ask for, and which tests a fast run leaves out."""
 
 import fcntl
+import gc
 import os
 from collections import Counter
 from collections.abc import Iterator
@@ -42,6 +43,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--fast"):
         _keep_fast(config, items)
     _begin_long_ones_first(items)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what lives to the end: all modules and tests."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)
