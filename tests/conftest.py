@@ -28,7 +28,9 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add `--fast` and `--attacks`."""
     parser.addoption(
-        "--fast", action="store_true", help="leave out journeys, long tests, tests that need a database"
+        "--fast",
+        action="store_true",
+        help="leave out journeys, Monte Carlo tests, long tests, tests that need a database",
     )
     parser.addoption(
         "--attacks",
@@ -83,6 +85,8 @@ def _slow_because(item: pytest.Item) -> str | None:
         return "journeys"
     if "open_folder" in getattr(item, "fixturenames", ()) or item.get_closest_marker("database"):
         return "tests that need a database"
+    if item.get_closest_marker("monte_carlo"):
+        return "Monte Carlo tests"
     return "long tests" if item.get_closest_marker("long") else None
 
 

@@ -92,6 +92,7 @@ def point_errors(trial: Trial) -> tuple[Array, Array]:
     return error_m - np.median(error_m, axis=0), trial.block.point_covariance_m2[held]
 
 
+@pytest.mark.monte_carlo
 def test_shifts_are_recovered_within_their_stated_covariance(trials: list[Trial]) -> None:
     squares = []
     for trial in trials:

@@ -39,6 +39,7 @@ def frame_error_m(block: BlockAdjustment, truth: Array) -> Array:
     return np.asarray(np.nanmedian(difference_m(block.lon_lat_h, truth[: len(block.lon_lat_h)]), axis=0))
 
 
+@pytest.mark.monte_carlo
 def test_the_frame_is_that_of_the_control_and_covers_the_truth() -> None:
     normalised = []
     for trial in range(trials):

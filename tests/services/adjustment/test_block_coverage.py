@@ -15,6 +15,7 @@ by_chance = 1.65
 """Standard deviations of the draw by which an honest cell misses in one of twenty repetitions."""
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize(
     "case",
     [
@@ -39,6 +40,7 @@ def test_regions_of_points_hold_the_truth_relative_and_on_the_earth(case: Case) 
     assert coverage.refused <= 2
 
 
+@pytest.mark.monte_carlo
 def test_a_strip_that_drifts_by_a_pixel_states_what_its_points_share() -> None:
     coverage = measure(Case("strip", 1.0, 0.1), 4, seed=1)
     assert lowest <= coverage.relative <= 1.0

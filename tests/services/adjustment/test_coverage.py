@@ -4,6 +4,8 @@ import pytest
 
 from benchmarks.coverage import LOWEST, Case, measure
 
+pytestmark = pytest.mark.monte_carlo
+
 TRIALS = 40
 
 

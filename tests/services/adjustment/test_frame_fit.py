@@ -39,6 +39,7 @@ def drawn(
     return fit_frame(BEFORE, control, found, own), frame_m
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("wrong", [pytest.param(0, marks=pytest.mark.endurance), 3])
 def test_the_frame_is_as_accurate_as_it_states_and_wrong_ground_leaves(wrong: int) -> None:
     rng = np.random.default_rng(3)

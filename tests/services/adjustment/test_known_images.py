@@ -107,6 +107,7 @@ def total_covariance(block: BlockAdjustment, names: Sequence[str], move: Array) 
     return block.known.take(rows).relative + move @ block.known.frame.covariance_m2 @ move.T
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("layout", ["star", "strip"])
 def test_the_frame_of_a_neighbour_carries_over_and_covers_the_truth(layout) -> None:
     on_earth, of_frame, ratios = [], [], []

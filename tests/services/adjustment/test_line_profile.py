@@ -138,6 +138,7 @@ MOTIONS = {
 }
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("name", list(MOTIONS))
 def test_what_points_show_along_lines_and_samples_is_followed_with_the_stated_accuracy(
     name: str,
@@ -165,6 +166,7 @@ def test_an_affine_correction_alone_would_be_wrong_and_say_nothing(name: str) ->
     assert off_px > WRONG * float(np.median(stated))
 
 
+@pytest.mark.monte_carlo
 def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
     trials = [trial(still, seed, count=60) for seed in range(150)]
     assert sum(one.named for one in trials) <= 3
@@ -172,6 +174,7 @@ def test_scenes_that_do_not_move_are_not_accused_and_not_bent() -> None:
     assert 0.7 < np.mean([one.normalised for one in trials]) < 1.3
 
 
+@pytest.mark.monte_carlo
 def test_the_chance_of_each_family_is_what_it_says() -> None:
     """Of independent errors, at most 5 % have a chance below 5 %, and not far fewer."""
     trials = [trial(still, seed, count=60, wrong=0.0) for seed in range(300, 450)]
@@ -181,6 +184,7 @@ def test_the_chance_of_each_family_is_what_it_says() -> None:
     assert np.mean([one.chance("height") < 0.5 for one in trials]) > 0.3
 
 
+@pytest.mark.monte_carlo
 def test_chips_show_less_of_a_fast_jitter_which_is_taken_into_account() -> None:
     fast = jitter(130.0, (0.0, 4.0))
     trials = [trial(fast, seed, count=160, averaged=True) for seed in range(6)]

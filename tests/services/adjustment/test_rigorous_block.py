@@ -78,6 +78,7 @@ def errors_of(block: BlockAdjustment, truth: Array) -> tuple[float, float]:
     return relative, normalised(mean_m[None], frame_m2[None])
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("controlled", [False, True], ids=["tie points", "control"])
 @pytest.mark.parametrize("kind", ["rigorous", "with an RPC"])
 def test_positions_are_recovered_within_what_is_declared(kind: str, controlled: bool) -> None:
@@ -108,6 +109,7 @@ def held_by_regions(block: BlockAdjustment, truth: Array) -> float:
     return float(((off_m * whitened).sum(axis=1) < ninety_percent).mean())
 
 
+@pytest.mark.monte_carlo
 def test_a_tenth_of_wrong_observations_leaves_the_regions_as_good() -> None:
     images, held = mixed(), []
     for trial in range(trials):

@@ -18,6 +18,8 @@ from benchmarks.toutin import (
     with_poor_points,
 )
 
+pytestmark = pytest.mark.monte_carlo
+
 TRIALS = 5
 marks_m = 1.8
 """A coordinate: a distance of 2.5 m, the middle of the two to three metres of the paper."""

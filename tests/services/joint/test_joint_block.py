@@ -89,6 +89,7 @@ def normalised(truth: JointTruth, block: JointBlock, number: int) -> tuple[float
     )  # type: ignore[return-value]
 
 
+@pytest.mark.monte_carlo
 def test_errors_are_those_stated_relative_and_on_the_earth() -> None:
     squares = []
     for trial in range(TRIALS):
@@ -193,6 +194,7 @@ def test_every_scene_is_qualified_with_the_stability_of_the_block() -> None:
     assert held_cells(measures)
 
 
+@pytest.mark.monte_carlo
 def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
     squares, accurate = [], []
     for trial in range(4):

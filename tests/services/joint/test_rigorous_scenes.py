@@ -139,6 +139,7 @@ def largest_m(truth: JointTruth, block: JointBlock, number: int) -> float:
     return float(np.hypot(*error.T).max() * image.plan.gsd_m)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("free", [SRP, TOUTIN], ids=["SRP", "Toutin"])
 def test_a_mixed_block_is_as_accurate_as_stated(free: ParameterSet) -> None:
     squares, of_parameters, errors_m = [], [], []
@@ -164,6 +165,7 @@ def test_a_mixed_block_is_as_accurate_as_stated(free: ParameterSet) -> None:
     assert 0.5 < np.mean(of_parameters) < 1.6
 
 
+@pytest.mark.monte_carlo
 def test_a_rigorous_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
     """It joins a mixed block; and an image with an RPC joins a block of rigorous models alone."""
     squares, accurate = [], []

@@ -225,6 +225,7 @@ def correlated(ground: FloatImage, scene: FloatImage, step_px: int, a_side: int)
     return np.array(position, dtype=np.float64), np.array(displacement, dtype=np.float64)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("step_px", [4, 12, 18, 25])
 def test_overlapping_chips_of_unrelated_ground_are_not_significant(step_px: int) -> None:
     """Counted singly, 64 chips 4 px apart are "significant" in nearly every pair of textures."""
@@ -242,6 +243,7 @@ def test_overlapping_chips_of_unrelated_ground_are_not_significant(step_px: int)
         assert np.mean(np.array(singly) < 1e-4) > 0.5
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize(("step_px", "in_common"), [(12, 0.5), (18, 0.5), (25, 0.4)])
 def test_overlapping_chips_of_the_same_ground_are_significant(step_px: int, in_common: float) -> None:
     rng, accepted = np.random.default_rng(step_px), []

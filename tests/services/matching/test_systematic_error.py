@@ -87,6 +87,7 @@ def stated_and_true_px(seen: BoolArray, image_offset: Array) -> tuple[Array, Arr
     return stated, measure.mean(axis=0)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("dominant", [False, True])
 @pytest.mark.parametrize("images", [2, 3, 4, 6])
 def test_the_stated_error_covers_the_offsets_of_images_of_any_share(images: int, dominant: bool) -> None:

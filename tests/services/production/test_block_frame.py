@@ -114,6 +114,7 @@ def test_the_height_of_the_frame_of_independent_images_is_weaker_than_its_positi
     np.testing.assert_allclose(sigma_m, expected_m, rtol=a_percent)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("count", [5, 2])
 def test_errors_of_the_frame_are_as_large_as_stated(count: int) -> None:
     covariance = frame_covariance_m2(acquired(count, three_days))
@@ -129,6 +130,7 @@ def test_images_of_one_pass_do_not_average_their_horizontal_errors() -> None:
     np.testing.assert_allclose(sigma_m[2], ring_m[2], rtol=a_percent)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("shared", [False, True])
 def test_the_frame_of_a_pass_covers_errors_that_its_images_share_or_not(shared: bool) -> None:
     sigma_m = frame_sigmas_m(acquired(5, a_minute))

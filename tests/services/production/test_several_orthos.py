@@ -16,6 +16,8 @@ from services.types import Array
 from tests.services.production.test_from_ortho import FLAT, GSD_M, SIDE, chips_of, land, ortho
 from tests.services.textures import as_pixels, texture
 
+pytestmark = pytest.mark.long
+
 OPTIONS = OrthoPointOptions(points=100)
 LOCAL_PX = 0.8
 """Standard deviation of the position of a detail relative to the rest of its image."""

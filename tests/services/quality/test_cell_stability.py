@@ -29,6 +29,7 @@ def medians(registered, **made):
     )
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("points_px", [0.0, 2.0])
 def test_with_independent_errors_both_find_what_is_predicted(registered, points_px):
     at_random, by_cells, over_stated = medians(registered, points_px=points_px)
@@ -37,6 +38,7 @@ def test_with_independent_errors_both_find_what_is_predicted(registered, points_
     assert over_stated == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.monte_carlo
 @pytest.mark.parametrize("shared_px", [0.4, 0.8])
 def test_errors_that_neighbours_share_show_by_cells_only(registered, shared_px):
     at_random, by_cells, over_stated = medians(registered, shared_px=shared_px)
@@ -45,12 +47,14 @@ def test_errors_that_neighbours_share_show_by_cells_only(registered, shared_px):
     assert over_stated < 1.6, "the stated accuracy knows most of them"
 
 
+@pytest.mark.monte_carlo
 def test_a_model_that_bends_shows_by_cells_only(registered):
     at_random, by_cells, _ = medians(registered, bend_px=0.5)
     assert at_random == pytest.approx(1.0, abs=0.25)
     assert by_cells > 2.0
 
 
+@pytest.mark.monte_carlo
 def test_errors_that_neighbours_share_move_the_corners_more_by_cells(registered):
     ratios = []
     for seed in SEEDS:
