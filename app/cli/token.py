@@ -30,7 +30,7 @@ def create(
 ) -> None:
     """Create a token and print its secret, which is shown only now."""
     with transaction() as connection:
-        new = tokens.issue_token(
+        new = tokens.create_token(
             connection,
             name,
             scope,

@@ -31,62 +31,39 @@ def create_token(
     storage_quota_bytes: int | None = None,
     job_quota: int | None = None,
 ) -> NewToken:
-    """Create a token.
+    """Create a token whose name no other valid token has.
 
     Args:
-        name: for people; `issue_token` refuses one that a valid token has.
+        name: for people.
         scopes: one or more of `read`, `register`, `monitor`, `admin`.
         days: how long the token is valid; None without end.
         storage_quota_bytes, job_quota: the token's quotas; None for those of the settings.
 
     Raises:
         InputError: no name, an unknown scope or none, or a number out of range.
+        Conflict: a valid token has this name.
     """
-    if not 0 < len(name.strip()) <= LONGEST_NAME:
-        raise InputError(f"name: {len(name.strip())} characters found, 1 to {LONGEST_NAME} expected")
+    name = name.strip()
+    if not 0 < len(name) <= LONGEST_NAME:
+        raise InputError(f"name: {len(name)} characters found, 1 to {LONGEST_NAME} expected")
     if days is not None and not 1 <= days <= LONGEST_DAYS:
         raise InputError(f"days: {days} found, 1 to {LONGEST_DAYS} expected")
     for field, quota in (("storage_quota_bytes", storage_quota_bytes), ("job_quota", job_quota)):
         if quota is not None and not 0 <= quota <= LARGEST_QUOTA[field]:
             raise InputError(f"{field}: {quota} found, 0 to {LARGEST_QUOTA[field]} expected")
+    checked_scopes = _checked_scopes(scopes)
+    _refuse_taken_name(connection, name)
     secret = new_secret()
     token = tokens.insert_token(
         connection,
-        name=name.strip(),
+        name=name,
         secret_hash=secret_hash(secret),
-        scopes=_checked_scopes(scopes),
+        scopes=checked_scopes,
         days=days,
         storage_quota_bytes=storage_quota_bytes,
         job_quota=job_quota,
     )
     return NewToken(token, secret)
-
-
-def issue_token(
-    connection: Connection,
-    name: str,
-    scopes: Iterable[str],
-    days: int | None = None,
-    *,
-    storage_quota_bytes: int | None = None,
-    job_quota: int | None = None,
-) -> NewToken:
-    """Create a token whose name no other valid token has; the arguments are those of `create_token`.
-
-    Raises:
-        InputError: a property is out of range.
-        Conflict: a valid token has this name.
-    """
-    tokens.lock_names(connection)
-    other = tokens.find_valid_name(connection, name.strip())
-    if other is not None:
-        raise Conflict(
-            f"name: the valid token {other.id} is named {other.name!r} already: choose another name, or "
-            f"revoke that one first with `amers token revoke {other.id}`"
-        )
-    return create_token(
-        connection, name, scopes, days, storage_quota_bytes=storage_quota_bytes, job_quota=job_quota
-    )
 
 
 def list_tokens(connection: Connection) -> list[Token]:
@@ -108,6 +85,17 @@ def revoke_token(connection: Connection, name_or_id: str) -> Token:
         ids = ", ".join(str(token.id) for token in matches)
         raise Conflict(f"{len(matches)} tokens are named {name_or_id}: revoke by id ({ids})")
     return tokens.revoke_token(connection, matches[0].id)
+
+
+def _refuse_taken_name(connection: Connection, name: str) -> None:
+    """Refuse a name that a valid token has; until the end of the transaction nobody else takes it."""
+    tokens.lock_names(connection)
+    other = tokens.find_valid_name(connection, name)
+    if other is not None:
+        raise Conflict(
+            f"name: the valid token {other.id} is named {other.name!r} already: choose another name, or "
+            f"revoke that one first with `amers token revoke {other.id}`"
+        )
 
 
 def _checked_scopes(names: Iterable[str]) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """A real PostGIS for the tests: one private cluster a session, one database a test."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -122,10 +123,13 @@ def client(settings: Settings) -> Iterator[TestClient]:
 @pytest.fixture
 def token(dsn: str) -> Callable[[str], str]:
     """Makes a token with a scope and returns its secret."""
+    made: Counter[str] = Counter()
 
     def make(scope: str) -> str:
+        made[scope] += 1
+        name = f"a token to {scope}" if made[scope] == 1 else f"token {made[scope]} to {scope}"
         with engine.connect(dsn) as connection:
-            return create_token(connection, f"a token to {scope}", [scope]).secret
+            return create_token(connection, name, [scope]).secret
 
     return make
 

@@ -13,7 +13,7 @@ from app.db import engine
 from app.errors import Conflict
 from app.storage import Storage
 from app.usecases.blocks.lifecycle import ingest_block, publish_block
-from app.usecases.tokens import issue_token, revoke_token
+from app.usecases.tokens import create_token, revoke_token
 from tests.command_line import amers_here
 from tests.factories import make_block
 from tests.statements import run_sql
@@ -29,7 +29,7 @@ def run(dsn, tmp_path):
     with engine.connect(dsn) as connection:
         ingest_block(connection, Storage(tmp_path / "storage"), made.folder)
         publish_block(connection, "calanques")
-        issue_token(connection, "tab\tand\nline", ["read"])
+        create_token(connection, "tab\tand\nline", ["read"])
     environment = {**os.environ, "AMERS_DATABASE_URL": dsn, "AMERS_DATA_FOLDER": str(tmp_path)}
 
     def run(*words: str) -> str:
@@ -75,18 +75,18 @@ def test_the_audit_shows_what_a_change_replaced(run):
 
 
 def test_a_name_belongs_to_one_valid_token(connection):
-    first = issue_token(connection, "survey office", ["read"]).token
+    first = create_token(connection, "survey office", ["read"]).token
     with pytest.raises(Conflict, match=f"{first.id} is named 'survey office' already"):
-        issue_token(connection, " survey office ", ["admin"])
+        create_token(connection, " survey office ", ["admin"])
     revoke_token(connection, "survey office")
-    issue_token(connection, "survey office", ["read"], days=1)
+    create_token(connection, "survey office", ["read"], days=1)
     run_sql(connection, "update token set expires_at = now() - interval '1 second'")
-    issue_token(connection, "survey office", ["read"])
+    create_token(connection, "survey office", ["read"])
 
 
 def test_two_who_take_one_name_at_the_same_time_wait_for_each_other(dsn, connection):
-    issue_token(connection, "survey office", ["read"])
+    create_token(connection, "survey office", ["read"])
     with engine.connect(dsn) as other:
         engine.limit_lock_wait(other, 0.1)
         with pytest.raises(psycopg.errors.LockNotAvailable):
-            issue_token(other, "survey office", ["read"])
+            create_token(other, "survey office", ["read"])

@@ -25,7 +25,7 @@ ALLOWED = {
 
 def test_a_secret_opens_its_own_token(connection):
     new = create_token(connection, "survey office", ["read"], days=30)
-    other = create_token(connection, "survey office", ["read"])
+    other = create_token(connection, "mapping office", ["read"])
     assert new.secret != other.secret
     assert authenticate(connection, new.secret) == new.token
     assert (new.token.expires_at - new.token.created_at).days == 30
@@ -61,9 +61,22 @@ def test_an_expired_token_is_refused(connection):
         authenticate(connection, new.secret)
 
 
+def test_a_name_of_a_valid_token_is_refused_over_the_api(client, bearer):
+    admin = bearer("admin")
+    body = {"name": "survey office", "scopes": ["read"]}
+    made = client.post("/tokens", json=body, headers=admin)
+    again = client.post("/tokens", json=body, headers=admin)
+    assert (made.status_code, again.status_code) == (201, 409)
+    assert f"{made.json()['id']} is named 'survey office' already" in again.json()["detail"]
+    client.delete(f"/tokens/{made.json()['id']}", headers=admin)
+    assert client.post("/tokens", json=body, headers=admin).status_code == 201
+
+
 def test_a_token_is_revoked_by_name_only_when_the_name_is_unique(connection):
     first = create_token(connection, "survey office", ["read"]).token
-    create_token(connection, "survey office", ["admin"])
+    create_token(connection, "mapping office", ["admin"])
+    # As databases have them from before names were unique.
+    run_sql(connection, "update token set name = 'survey office'")
     with pytest.raises(Conflict, match=str(first.id)):
         revoke_token(connection, "survey office")
     assert revoke_token(connection, str(first.id)).revoked_at is not None
