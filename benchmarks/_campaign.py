@@ -10,8 +10,9 @@ from benchmarks._trials import Trial
 from benchmarks._worlds import Block, Place
 from services.errors import AmersError
 from services.imagery.scene import Scene
-from services.quality.accuracy import accuracy, normal_ce90, normalised_error
+from services.quality.accuracy import accuracy, normalised_error
 from services.quality.frames import frame_in_image
+from services.quality.normal_law import normal_ce90
 from services.registration.on_points import Registration, register_scene
 from services.registration.options import RegistrationOptions
 from services.simulation.tiles import Tiles

@@ -23,7 +23,8 @@ from services.imagery.scene import Scene
 from services.imagery.source import ImageSource, render_chip
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
 from services.matching.multi_image import refine_on_chips
-from services.quality.accuracy import LINEAR_LE90, accuracy, normal_ce90, normalised_error
+from services.quality.accuracy import accuracy, normalised_error
+from services.quality.normal_law import LINEAR_LE90, normal_ce90
 from services.simulation.archive import ArchiveView
 from services.simulation.orbit import sun_direction
 from services.simulation.render import Radiometry

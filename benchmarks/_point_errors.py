@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks._trials import Trial
 from benchmarks._worlds import FINE_GSD_M
 from services.geodesy import metres_per_degree, move_metres
-from services.quality.accuracy import CIRCULAR_CE90
+from services.quality.normal_law import CIRCULAR_CE90
 from services.types import Array, ControlPoints, Frame, IntArray
 
 LE90_OF_CE90 = 5.0 / 3.0

@@ -39,7 +39,7 @@ from services.adjustment.image_correction import (
     adjust_scene,
 )
 from services.errors import ComputationError
-from services.quality.accuracy import normal_ce90
+from services.quality.normal_law import normal_ce90
 from services.quality.stability import image_places
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array

@@ -29,8 +29,7 @@ BUDGETS = {
     "serve --help": {"psycopg", "pydantic_settings", "sqlalchemy"},
     "token list --help": STORE,
     "audit --help": STORE,
-    # Accuracies follow from the normal law.
-    "block list --help": STORE | {"scipy"},
+    "block list --help": STORE,
     # Without the statistics of scipy: a third of the time that its start takes.
     "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
 }
@@ -76,6 +75,17 @@ def test_a_command_imports_no_more_than_its_budget(words):
         name: line for name, line in imported.items() if name in PACKAGES and name not in BUDGETS[words]
     }
     assert beyond == {}, f"amers {words} imports what it does not need; see who asks for it first"
+
+
+def test_rows_on_a_pipe_are_printed_without_the_tables_of_terminals():
+    program = """
+import sys
+from app.cli.output import show
+show([{"number": 7}], as_json=False)
+print("rich" in sys.modules)
+"""
+    printed = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True)
+    assert printed.split() == ["number", "7", "False"]
 
 
 def entries(tree: Tree, words: str = "amers") -> list[tuple[str, Command]]:

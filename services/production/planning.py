@@ -13,7 +13,7 @@ from services.production.block_plan import (
     observed_and_known,
     plan_geometry,
 )
-from services.quality.accuracy import LINEAR_LE90, normal_ce90
+from services.quality.normal_law import LINEAR_LE90, normal_ce90
 from services.types import Array, IntArray, Progress, no_progress
 
 

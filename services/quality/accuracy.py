@@ -1,10 +1,9 @@
-"""Accuracy of positions: sample quantiles with their confidence intervals, moments, predicted CE90."""
+"""Accuracy of positions: sample quantiles with their confidence intervals, moments."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from scipy.special import bdtr, erf, gammaincinv, ndtri
+from scipy.special import bdtr, gammaincinv
 
 from services.types import Array, IntArray
 
@@ -17,11 +16,6 @@ QUANTILE_CONFIDENCE = 0.9
 """Confidence of the intervals of CE90 and LE90."""
 NORMALISED_CONFIDENCE = 0.95
 """Confidence of the interval of an honest normalised error."""
-
-CIRCULAR_CE90 = float(np.sqrt(2.0 * np.log(10.0)))
-"""CE90 of a circular normal law of unit sigma (2.1460)."""
-LINEAR_LE90 = float(ndtri(0.95))
-"""LE90 of a normal law of unit sigma (1.6449)."""
 
 
 @dataclass(frozen=True)
@@ -232,37 +226,3 @@ def normalised_error(error: Array, covariance: Array) -> NormalisedError:
     lower, upper = 2.0 * gammaincinv(freedom / 2.0, tails) / freedom
     mean_square = float(np.sum(weighted * error[finite]) / freedom)
     return NormalisedError(mean_square, float(lower), float(upper), rows, confidence)
-
-
-def normal_ce90(covariance: Array) -> Array:
-    """CE90 of normal errors without bias, predicted by their covariance.
-
-    Args:
-        covariance: (n, 2, 2).
-
-    Returns:
-        (n,) radius that holds 90 %, in the square root of the covariance's unit; NaN for a NaN.
-    """
-    (a, b), (c, d) = covariance.transpose(1, 2, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        # The larger eigenvalue, and the square of the ratio of both.
-        large = np.maximum((a + d) / 2.0 + np.hypot((a - d) / 2.0, (b + c) / 2.0), 0.0)
-        ratio = np.where(large > 0.0, np.clip((a * d - b * c) / large**2, 0.0, 1.0), 0.0)
-        return np.sqrt(large) * np.interp(np.sqrt(ratio), *_ce90_of_ratio())
-
-
-@lru_cache(maxsize=1)
-def _ce90_of_ratio() -> tuple[Array, Array]:
-    """CE90 of normal laws of standard deviations 1 and a ratio, by bisection of their integral."""
-    ratio = np.linspace(0.0, 1.0, 129)
-    nodes, weights = np.polynomial.legendre.leggauss(128)
-    angle = nodes * np.pi / 2.0
-    low, high = np.full(len(ratio), 1.0), np.full(len(ratio), 3.0)
-    width = np.maximum(ratio, 1e-9)[:, None] * np.sqrt(2.0)
-    for _ in range(40):
-        radius = ((low + high) / 2.0)[:, None]
-        density = np.exp(-((radius * np.sin(angle)) ** 2) / 2.0) / np.sqrt(2.0 * np.pi)
-        inside = density * erf(radius * np.cos(angle) / width) * radius * np.cos(angle)
-        enough = inside @ weights * np.pi / 2.0 > 0.9
-        low, high = np.where(enough, low, radius[:, 0]), np.where(enough, radius[:, 0], high)
-    return ratio, (low + high) / 2.0

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from services.quality.accuracy import LINEAR_LE90, normal_ce90
 from services.quality.frames import frame_le90_m, why_unknown
+from services.quality.normal_law import LINEAR_LE90, normal_ce90
 from services.types import Array, Frame
 
 RELATIVE = "Relative to the control points"
@@ -96,6 +96,12 @@ def points_accuracy(covariance_m2: Array, frame: Frame, of: str) -> AccuracyStat
         StatedAccuracy(RELATIVE, *relative, relative_words),
         StatedAccuracy(ON_THE_EARTH, *earth, _with_reason(earth_words, frame)),
     )
+
+
+def median_accuracy(horizontal_m: float, up_m: float, frame: Frame) -> AccuracyStatement:
+    """The statement for the median point of a block, by its standard deviations of a coordinate."""
+    covariance_m2 = np.diag(np.array([horizontal_m, horizontal_m, up_m]) ** 2)
+    return points_accuracy(covariance_m2, frame, "median of the points")
 
 
 def vertices_accuracy(

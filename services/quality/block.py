@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
+from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
 from services.quality.density import DensityCells, density_cells, share_reaching
 from services.types import Array, ControlPoints, Frame, IntArray
 
@@ -98,12 +98,6 @@ def produced_accuracy(points: ControlPoints) -> AccuracyStatement:
     """The accuracy of the median of new points of one block, in its frame and on the Earth."""
     horizontal_m, up_m = _sigmas_m(points)
     return median_accuracy(float(np.median(horizontal_m)), float(np.median(up_m)), points.frames[0])
-
-
-def median_accuracy(horizontal_m: float, up_m: float, frame: Frame) -> AccuracyStatement:
-    """The accuracy of the median point of a block by its standard deviations, a coordinate."""
-    covariance_m2 = np.diag(np.array([horizontal_m, horizontal_m, up_m]) ** 2)
-    return points_accuracy(covariance_m2, frame, "median of the points")
 
 
 def _sigmas_m(points: ControlPoints) -> tuple[Array, Array]:

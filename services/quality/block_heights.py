@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 
 from services.quality.accuracy import (
-    LINEAR_LE90,
     NormalisedError,
     Quantile,
     effective_number,
@@ -16,6 +15,7 @@ from services.quality.accuracy import (
     statistics,
 )
 from services.quality.density import GroundMask
+from services.quality.normal_law import LINEAR_LE90
 from services.terrain import Terrain
 from services.types import Array, ControlPoints, IntArray
 

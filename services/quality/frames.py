@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.quality.accuracy import LINEAR_LE90
+from services.quality.normal_law import LINEAR_LE90
 from services.types import Array, BoolArray, ControlPoints, Frame
 
 

@@ -6,13 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from services.quality.accuracy import (
-    Accuracy,
-    NormalisedError,
-    accuracy,
-    normal_ce90,
-    normalised_error,
-)
+from services.quality.accuracy import Accuracy, NormalisedError, accuracy, normalised_error
+from services.quality.normal_law import normal_ce90
 from services.quality.site_errors import POINTS, SiteErrors
 from services.types import Array, Frame, IntArray
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.quality.accuracy import normal_ce90
 from services.quality.frames import frame_in_image
+from services.quality.normal_law import normal_ce90
 from services.quality.stability import AdjustedScene
 from services.types import Array
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from services.quality.accuracy import normal_ce90
 from services.quality.correction_accuracy import CorrectionAccuracy
+from services.quality.normal_law import normal_ce90
 from services.sensors.base import SensorModel
 from services.terrain import Terrain
 from services.types import Array

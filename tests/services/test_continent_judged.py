@@ -32,7 +32,7 @@ from services.geodesy import box_around, move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import render_chip
 from services.matching.correlate import CorrelationOptions, find_chip
-from services.quality.accuracy import normal_ce90
+from services.quality.normal_law import normal_ce90
 from services.simulation.land import WATER
 from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry

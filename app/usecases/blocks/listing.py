@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from app.db import blocks
-from app.db.blocks import Block, StatedSigmas
+from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.schema import BlockState
 from app.errors import Conflict, NotFound
-from services.quality.accuracy_statement import AccuracyStatement, points_accuracy
+from services.quality.accuracy_statement import AccuracyStatement, median_accuracy
 
 
 def find_block(connection: Connection, reference: str) -> Block:
@@ -40,10 +38,6 @@ def list_blocks(
 def stated_accuracies(connection: Connection, numbers: Sequence[int]) -> dict[int, AccuracyStatement]:
     """The accuracy of the median points of some blocks, by the numbers of the blocks."""
     stated = blocks.stated_sigmas(connection, numbers)
-    return {number: _median_accuracy(one) for number, one in stated.items()}
-
-
-def _median_accuracy(stated: StatedSigmas) -> AccuracyStatement:
-    """The accuracy of the median point; `services.quality.block` has the same, and loads much more."""
-    sigmas_m = np.array([stated.horizontal_m, stated.horizontal_m, stated.up_m])
-    return points_accuracy(np.diag(sigmas_m**2), stated.frame, "median of the points")
+    return {
+        number: median_accuracy(one.horizontal_m, one.up_m, one.frame) for number, one in stated.items()
+    }

@@ -14,7 +14,8 @@ from services.adjustment.image_correction import (
 )
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family
-from services.quality.accuracy import normal_ce90, normalised_error
+from services.quality.accuracy import normalised_error
+from services.quality.normal_law import normal_ce90
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.displacement import DisplacementGrid
 from services.sensors.refined import LOUD_PX, refined_rpc

@@ -17,7 +17,7 @@ from services.production.block_plan import (
     plan_geometry,
 )
 from services.production.planning import block_of, forecast
-from services.quality.accuracy import normal_ce90
+from services.quality.normal_law import normal_ce90
 from services.sensors.correction import CorrectedModel
 from services.types import Array
 

@@ -5,14 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.quality.accuracy import (
-    CIRCULAR_CE90,
-    accuracy,
-    normal_ce90,
-    normalised_error,
-    sample_quantile,
-    statistics,
-)
+from services.quality.accuracy import accuracy, normalised_error, sample_quantile, statistics
+from services.quality.normal_law import CIRCULAR_CE90, normal_ce90
 
 a_ten_thousandth = 1e-4
 

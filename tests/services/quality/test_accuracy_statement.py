@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from services.quality.accuracy import normal_ce90
 from services.quality.accuracy_statement import points_accuracy, scene_accuracy
 from services.quality.frames import frame_in_image
+from services.quality.normal_law import normal_ce90
 from services.types import UNKNOWN_FRAME, Frame
 
 a_percent = 0.01

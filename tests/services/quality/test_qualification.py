@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from services.errors import NotEnoughPoints
-from services.quality.accuracy import CIRCULAR_CE90
 from services.quality.criteria import verdict_of, verdict_scope
+from services.quality.normal_law import CIRCULAR_CE90
 from services.quality.predicted import predict_accuracy
 from services.quality.qualification import (
     QualificationOptions,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.errors import NoConsensus
-from services.quality.accuracy import normal_ce90
+from services.quality.normal_law import normal_ce90
 from services.registration.on_points import Registration, register_scene
 from services.simulation.distortion import (
     Bend,
