@@ -1,8 +1,8 @@
 """A real PostGIS for the tests: one private cluster a session, one database a test."""
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING
 from uuid import uuid4
@@ -19,7 +19,7 @@ from app.db.cluster.embedded import ROLE, SUPERUSER, Cluster
 from app.db.engine import Connection, Database
 from app.main import create_app
 from app.storage import MARKER, Storage
-from app.usecases.tokens import create_token
+from app.usecases.tokens import create_token, list_tokens
 
 if TYPE_CHECKING:
     from tests.app import full_storage
@@ -123,12 +123,12 @@ def client(settings: Settings) -> Iterator[TestClient]:
 @pytest.fixture
 def token(dsn: str) -> Callable[[str], str]:
     """Makes a token with a scope and returns its secret."""
-    made: Counter[str] = Counter()
 
     def make(scope: str) -> str:
-        made[scope] += 1
-        name = f"a token to {scope}" if made[scope] == 1 else f"token {made[scope]} to {scope}"
         with engine.connect(dsn) as connection:
+            taken = {token.name for token in list_tokens(connection)}
+            names = chain([f"a token to {scope}"], (f"token {n} to {scope}" for n in count(2)))
+            name = next(name for name in names if name not in taken)
             return create_token(connection, name, [scope]).secret
 
     return make

@@ -263,12 +263,12 @@ def test_the_log_and_the_audit_name_the_token_and_hold_no_secret(
     secret = token("register")
     caplog.set_level(logging.DEBUG)
     headers = basic(secret, "user-7f3a91")
-    holder = client.get("/tokens/self", headers=headers).json()["id"]
+    holder = client.get("/tokens/self", headers=headers).json()
     assert client.post("/scenes?name=a.tif", content=TIFF, headers=headers).status_code == 201
     assert client.get("/jobs", headers=basic(f"{secret}x", "user-7f3a91")).status_code == 401
     changes = "select kind, actor_name from audit where actor = %s and action = 'created'"
-    assert run_sql(connection, changes, [holder]).fetchall() == [
-        {"kind": "scene", "actor_name": "a token to register"}
+    assert run_sql(connection, changes, [holder["id"]]).fetchall() == [
+        {"kind": "scene", "actor_name": holder["name"]}
     ]
     everything = caplog.text + str(run_sql(connection, "select audit::text from audit").fetchall())
     for hidden in (secret, headers["Authorization"].split()[1], "user-7f3a91"):
