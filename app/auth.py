@@ -7,7 +7,13 @@ from enum import StrEnum
 from uuid import UUID
 
 from app.db.engine import Connection, Database
-from app.db.tokens import Token, find_subject, find_valid_token, keep_subject
+from app.db.tokens import (
+    Token,
+    find_subject,
+    find_valid_token,
+    find_valid_token_by_id,
+    keep_subject,
+)
 from app.errors import NotAllowed
 from app.oidc import Identity
 
@@ -15,7 +21,7 @@ SECRET_BYTES = 32
 INVALID_TOKEN = "the token is unknown, expired or revoked"
 MISSING_TOKEN = (
     "this request needs a token: send the header `Authorization: Bearer TOKEN`, "
-    "or Basic with the token as password"
+    "or Basic with the token as password; in a browser, sign in at /sign-in"
 )
 
 
@@ -53,6 +59,18 @@ def authenticate(connection: Connection, secret: str) -> Token:
         NotAllowed: the secret is unknown, expired or revoked; the message is the same for all three.
     """
     token = find_valid_token(connection, secret_hash(secret))
+    if token is None:
+        raise NotAllowed(INVALID_TOKEN, authenticated=False)
+    return token
+
+
+def authenticate_session(connection: Connection, token_id: UUID) -> Token:
+    """The token that a session was opened with.
+
+    Raises:
+        NotAllowed: the token is expired or revoked.
+    """
+    token = find_valid_token_by_id(connection, token_id)
     if token is None:
         raise NotAllowed(INVALID_TOKEN, authenticated=False)
     return token

@@ -27,6 +27,7 @@ from app.api import (
     references,
     results,
     scenes,
+    sign_in,
     stac,
     system,
     tiles,
@@ -76,6 +77,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     tokens.router,
     operations.router,
     connect.router,
+    sign_in.router,
     page.router,
 )
 

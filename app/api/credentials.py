@@ -1,8 +1,10 @@
-"""Credentials of a request: a token in the header Authorization, as bearer or as the password of Basic.
+"""Credentials of a request: a token in the header Authorization, as bearer or as the password of Basic,
+or the session of a browser.
 
 A browser that has asked its user for a password sends it by itself with every later request, also with
-those that pages of other sites cause. No browser does that with a bearer token. So a request with Basic
-has to come from a program, from this service or from the user: `refuse_other_sites`.
+those that pages of other sites cause, as it does with cookies. No browser does that with a bearer token.
+So a request with Basic or with a session has to come from a program, from this service or from the user:
+`refuse_other_sites`; and a session serves no request that changes something.
 
 Source: RFC 6750, bearer tokens; RFC 7617, Basic; RFC 9110, section 11; W3C, Fetch Metadata Request
 Headers.
@@ -18,6 +20,7 @@ from fastapi import Request
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 
+from app.api.session_cookie import COOKIE
 from app.errors import NotAllowed
 
 BEARER: Literal["bearer"] = "bearer"
@@ -29,8 +32,8 @@ OWN_SITES = ("same-origin", "none")
 """Values of `Sec-Fetch-Site`: a page of this service; an address that the user has typed or kept."""
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 OTHER_SITE = (
-    "this request comes from a page of another site, with a password that the browser has kept: "
-    "such a page sends the token as `Authorization: Bearer TOKEN`"
+    "this request comes from a page of another site, with a password or a session that the browser "
+    "has kept: such a page sends the token as `Authorization: Bearer TOKEN`"
 )
 
 
@@ -86,9 +89,15 @@ def refuse_other_sites(request: Request) -> None:
     raise HTTPException(403, OTHER_SITE)
 
 
-def sends_password(headers: Headers) -> bool:
+def session_of(request: Request) -> str | None:
+    """The session cookie of a request that only reads; None without one."""
+    return request.cookies.get(COOKIE) if request.method in SAFE_METHODS else None
+
+
+def browser_may_have_added(headers: Headers) -> bool:
     """Whether a request has credentials that a browser may have added by itself."""
-    return headers.get("authorization", "").lower().startswith(f"{BASIC} ")
+    by_password = headers.get("authorization", "").lower().startswith(f"{BASIC} ")
+    return by_password or f"{COOKIE}=" in headers.get("cookie", "")
 
 
 def challenges(headers: Headers) -> list[str]:

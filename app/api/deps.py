@@ -5,7 +5,9 @@ endpoint takes a database connection in its own thread and for as long as it nee
 held a connection and waited for a thread could wait for a thread that waits for a connection.
 """
 
+import time
 from typing import Annotated
+from uuid import UUID
 
 from fastapi import Depends, Request
 from starlette.concurrency import run_in_threadpool
@@ -13,14 +15,23 @@ from starlette.concurrency import run_in_threadpool
 from app import request_context
 from app.api.access import needs
 from app.api.body import body_of
-from app.api.credentials import BASIC, credentials_of, refuse_other_sites
+from app.api.credentials import BASIC, credentials_of, refuse_other_sites, session_of
+from app.api.session_cookie import parse_session
 from app.api.turns import Turns
-from app.auth import Scope, authenticate, authenticate_identity, require, require_token
+from app.auth import (
+    Scope,
+    authenticate,
+    authenticate_identity,
+    authenticate_session,
+    require,
+    require_token,
+)
 from app.config import Settings
 from app.db.engine import Database
 from app.db.tokens import Token
 from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
+from app.usecases.features.items import page_secret
 from app.usecases.installation import Installation
 
 UPLOADS_AT_ONCE = 32
@@ -89,15 +100,21 @@ async def identify(request: Request) -> Token | None:
 
     Raises:
         NotAllowed: the token is invalid.
-        HTTPException: a page of another site uses a password that the browser has kept.
+        HTTPException: a page of another site uses a password or a session that the browser has kept.
     """
     caller = None
     credentials = credentials_of(request.headers)
+    session = session_of(request) if credentials is None else None
+    if session is not None or (credentials is not None and credentials.scheme == BASIC):
+        refuse_other_sites(request)
+    state = request.app.state
     if credentials is not None:
-        if credentials.scheme == BASIC:
-            refuse_other_sites(request)
-        state = request.app.state
         caller = await run_in_threadpool(_token, state.issuer, state.database, credentials.secret)
+    elif session is not None:
+        secret = await installation_secret(request, state.database)
+        token_id = parse_session(session, time.time(), secret)
+        caller = await run_in_threadpool(_session_token, state.database, token_id)
+    if caller is not None:
         here = request_context.current()
         here.actor, here.actor_name = caller.id, caller.name
     request.scope[CALLER] = caller
@@ -109,6 +126,27 @@ def _token(issuer: Issuer | None, database: Database, secret: str) -> Token:
         return authenticate_identity(database, issuer.identify(secret))
     with database.reading() as connection:
         return authenticate(connection, secret)
+
+
+def _session_token(database: Database, token_id: UUID) -> Token:
+    with database.reading() as connection:
+        return authenticate_session(connection, token_id)
+
+
+async def installation_secret(request: Request, database: DatabaseDep) -> bytes:
+    """The key that page tokens and sessions are signed with; each process reads it once."""
+    secret: bytes | None = getattr(request.app.state, "page_secret", None)
+    if secret is None:
+        secret = request.app.state.page_secret = await run_in_threadpool(_read_secret, database)
+    return secret
+
+
+def _read_secret(database: Database) -> bytes:
+    with database.reading() as connection:
+        return page_secret(connection)
+
+
+SecretDep = Annotated[bytes, Depends(installation_secret)]
 
 
 async def caller_of(request: Request) -> Token | None:

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
-from starlette.concurrency import run_in_threadpool
 
 from app.api.access import needs
-from app.api.deps import CallerDep, DatabaseDep, SettingsDep
+from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
 from app.api.negotiation import FEATURES, GEOJSON, HTML, JSON, chosen_format, refuse_unknown
 from app.api.pages import Page, count_text, features_page
 from app.api.routes import CallerRoute
@@ -63,20 +62,6 @@ async def _viewer(collection: CollectionDep, caller: CallerDep, settings: Settin
 ViewerDep = Annotated[Viewer, Depends(_viewer)]
 
 
-async def _secret(request: Request, database: DatabaseDep) -> bytes:
-    """The key that page tokens are signed with; each process reads it once."""
-    secret: bytes | None = getattr(request.app.state, "page_secret", None)
-    if secret is None:
-        secret = request.app.state.page_secret = await run_in_threadpool(_read_secret, database)
-    return secret
-
-
-def _read_secret(database: Database) -> bytes:
-    with database.reading() as connection:
-        return features.page_secret(connection)
-
-
-SecretDep = Annotated[bytes, Depends(_secret)]
 FILES: dict[str, Callable[[FeatureTable, str], bytes]] = {
     "fgb": format_flatgeobuf,
     "parquet": format_parquet,

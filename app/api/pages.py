@@ -9,11 +9,15 @@ from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader
 
 from app.api.models.base import Link
+from app.api.session_cookie import COOKIE
 from app.db.features.collection import Collection
 from app.usecases.features.items import FeaturePage
 
 TEMPLATES = Environment(loader=PackageLoader("app.api", "templates"), autoescape=True)
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; frame-ancestors 'none'"
+POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src 'self'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
 MARGIN = 0.05
 
 
@@ -68,7 +72,10 @@ def document_page(
         template: extends `page.html`.
         more: what else the template shows.
     """
-    text = TEMPLATES.get_template(template).render(page=page, base=str(request.base_url), **more)
+    signed_in = COOKIE in request.cookies
+    text = TEMPLATES.get_template(template).render(
+        page=page, base=str(request.base_url), signed_in=signed_in, **more
+    )
     return HTMLResponse(text, headers={"Content-Security-Policy": POLICY})
 
 

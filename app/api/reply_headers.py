@@ -3,7 +3,7 @@
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.credentials import sends_password
+from app.api.credentials import browser_may_have_added
 
 NO_STORE = "no-store"
 FIRST_ERROR = 400
@@ -13,7 +13,8 @@ class ReplyHeaders:
     """Middleware that adds `X-Content-Type-Options: nosniff` and `Cache-Control: no-store`.
 
     A successful reply that states its own `Cache-Control` keeps it: tiles, chips and the map page. What
-    is sent to a password is not embedded by other sites: `Cross-Origin-Resource-Policy: same-origin`.
+    is sent to a password or a session is not embedded by other sites:
+    `Cross-Origin-Resource-Policy: same-origin`.
 
     Attributes:
         app: the application that gets the requests.
@@ -28,13 +29,13 @@ class ReplyHeaders:
             await self.app(scope, receive, send)
             return
 
-        by_password = sends_password(Headers(scope=scope))
+        by_browser = browser_may_have_added(Headers(scope=scope))
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["X-Content-Type-Options"] = "nosniff"
-                if by_password:
+                if by_browser:
                     # A browser sends it with images that other sites embed, too.
                     headers["Cross-Origin-Resource-Policy"] = "same-origin"
                 if message["status"] >= FIRST_ERROR or "Cache-Control" not in headers:

@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from uuid import UUID, uuid4
 
-from sqlalchemy import Text, bindparam, cast, func, or_, select, update
+from sqlalchemy import Text, and_, bindparam, cast, func, or_, select, update
 from sqlalchemy.dialects.postgresql import insert
 
 from app.db.engine import Connection, driver
 from app.db.rows import columns_of, every, first, only
 from app.db.schema import job, now, token
-from app.db.statements import hot
+from app.db.statements import HotStatement, hot
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,14 @@ class Token:
 COLUMNS = columns_of(Token, token)
 NAMES_LOCK = 0x616D657274
 """Advisory lock held while a token is created under a name of its own."""
+_IS_VALID = and_(
+    token.c.revoked_at.is_(None), or_(token.c.expires_at.is_(None), token.c.expires_at > now)
+)
 # Each request with a token begins with this one.
-VALID_TOKEN = hot(
+VALID_TOKEN = hot(select(*COLUMNS).where(token.c.secret_hash == bindparam("secret_hash"), _IS_VALID))
+VALID_TOKEN_BY_ID = hot(
     select(*COLUMNS).where(
-        token.c.secret_hash == bindparam("secret_hash"),
-        token.c.revoked_at.is_(None),
-        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+        token.c.id == bindparam("token_id"), token.c.secret_hash.is_not(None), _IS_VALID
     )
 )
 
@@ -77,11 +79,18 @@ def insert_token(
 
 def find_valid_token(connection: Connection, secret_hash: bytes) -> Token | None:
     """The token of a secret if it is neither expired nor revoked."""
-    row = (
-        driver(connection)
-        .execute(VALID_TOKEN.sql, VALID_TOKEN.parameters({"secret_hash": secret_hash}))
-        .fetchone()
-    )
+    return _find_valid(connection, VALID_TOKEN, {"secret_hash": secret_hash})
+
+
+def find_valid_token_by_id(connection: Connection, token_id: UUID) -> Token | None:
+    """The token with a secret that has this id if it is neither expired nor revoked."""
+    return _find_valid(connection, VALID_TOKEN_BY_ID, {"token_id": token_id})
+
+
+def _find_valid(
+    connection: Connection, statement: HotStatement, values: dict[str, object]
+) -> Token | None:
+    row = driver(connection).execute(statement.sql, statement.parameters(values)).fetchone()
     if row is None:
         return None
     found = Token(*row)
@@ -132,8 +141,7 @@ def find_valid_name(connection: Connection, name: str) -> Token | None:
     statement = select(*COLUMNS).where(
         token.c.name == name,
         token.c.secret_hash.is_not(None),
-        token.c.revoked_at.is_(None),
-        or_(token.c.expires_at.is_(None), token.c.expires_at > now),
+        _IS_VALID,
     )
     return first(Token, connection.execute(statement.order_by(token.c.created_at).limit(1)))
 

@@ -1,0 +1,51 @@
+"""The session of a browser: a signed cookie with the id of a token and the end of the session.
+
+The cookie opens what the token may read, and nothing else: requests that change something need the token
+itself, which no browser adds to them. So no page of another site can forge one. The cookie holds no
+secret of the token, and ends with it: every request looks the token up.
+
+Source: RFC 6265bis, cookies; OWASP, Cross-Site Request Forgery Prevention.
+"""
+
+import hmac
+from uuid import UUID
+
+from app.errors import NotAllowed
+
+COOKIE = "amers_session"
+LIFETIME_S = 3600
+
+
+def format_session(token_id: UUID, now_s: float, secret: bytes) -> str:
+    """The value of the cookie for a session that begins now.
+
+    Args:
+        now_s: seconds since 1970.
+        secret: of the installation.
+    """
+    content = f"{token_id}.{int(now_s) + LIFETIME_S}"
+    return f"{content}.{_seal(content, secret)}"
+
+
+def parse_session(value: str, now_s: float, secret: bytes) -> UUID:
+    """The id of the token of a session.
+
+    Raises:
+        NotAllowed: this service did not make the cookie, or the session has ended.
+    """
+    content, _, seal = value.rpartition(".")
+    if not hmac.compare_digest(seal.encode(), _seal(content, secret).encode()):
+        raise _ended("the session cookie is not one of this service")
+    token_id, _, end_s = content.partition(".")
+    if now_s >= int(end_s):
+        raise _ended("the session has ended")
+    return UUID(token_id)
+
+
+def _seal(content: str, secret: bytes) -> str:
+    """The signature of a session; page tokens are signed with the same secret, under other names."""
+    return hmac.digest(secret, f"session {content}".encode(), "sha256").hex()
+
+
+def _ended(why: str) -> NotAllowed:
+    return NotAllowed(f"{why}: sign in again at /sign-in", authenticated=False)

@@ -1,0 +1,133 @@
+"""The session of a browser, which opens the HTML pages."""
+
+import time
+from collections.abc import Callable
+from uuid import uuid4
+
+import pytest
+from fastapi.testclient import TestClient
+
+from app.api import session_cookie
+from app.api.session_cookie import COOKIE, LIFETIME_S, format_session
+from app.usecases.features.items import page_secret
+from tests.statements import run_sql
+
+pytestmark = pytest.mark.security
+
+PAGE = "/collections/points/items?f=html"
+MINE = "/tokens/self"
+THERE = "https://elsewhere.example"
+
+
+@pytest.fixture
+def signed_in(client: TestClient, token: Callable[[str], str]) -> TestClient:
+    """A browser that has signed in with scope `admin`."""
+    assert client.post("/sign-in", data={"token": token("admin")}).status_code == 200
+    return client
+
+
+def test_a_session_shows_the_pages_that_the_token_may_read(client, token):
+    assert client.get(PAGE).status_code == 401
+    reply = client.post("/sign-in", data={"token": f" {token('read')} "}, follow_redirects=False)
+    assert (reply.status_code, reply.headers["location"]) == (303, "http://testserver/")
+    assert client.get(PAGE).status_code == 200
+    assert client.get(MINE).json()["name"] == "a token to read"
+    assert client.get("/tokens").status_code == 403, "the scopes are those of the token"
+
+
+def test_the_cookie_is_short_lived_and_out_of_reach_of_scripts_and_other_sites(client, token):
+    secret = token("read")
+    for base, is_secure in (("http://testserver", False), ("https://testserver", True)):
+        reply = client.post(f"{base}/sign-in", data={"token": secret}, follow_redirects=False)
+        cookie = reply.headers["set-cookie"]
+        words = {word.strip().lower() for word in cookie.split(";")}
+        assert {"httponly", "samesite=lax", "path=/", f"max-age={LIFETIME_S}"} <= words
+        assert ("secure" in words) == is_secure
+        assert secret not in cookie
+
+
+def test_a_session_changes_nothing(signed_in, connection):
+    body = {"name": "forged", "scopes": ["admin"]}
+    for headers in ({}, {"Sec-Fetch-Site": "same-origin"}, {"Origin": THERE}):
+        assert signed_in.post("/tokens", json=body, headers=headers).status_code == 401
+    mine = signed_in.get(MINE).json()["id"]
+    assert signed_in.delete(f"/tokens/{mine}").status_code == 401
+    names = run_sql(connection, "select name from token where revoked_at is null").fetchall()
+    assert names == [{"name": "a token to admin"}]
+
+
+def test_pages_of_other_sites_get_nothing_with_a_session(signed_in):
+    other = {"Sec-Fetch-Site": "cross-site"}
+    image = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"}
+    link = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+    assert signed_in.get(PAGE, headers=other | image).status_code == 403
+    assert signed_in.get(PAGE, headers=other | link).status_code == 200
+    assert signed_in.get(PAGE).headers["cross-origin-resource-policy"] == "same-origin"
+
+
+@pytest.mark.parametrize("headers", [{"Sec-Fetch-Site": "cross-site"}, {"Origin": THERE}])
+def test_no_other_site_signs_a_browser_in_or_out(client, token, headers):
+    data = {"token": token("read")}
+    assert client.post("/sign-in", data=data, headers=headers).status_code == 403
+    assert COOKIE not in client.cookies
+    assert client.post("/sign-in", data=data).status_code == 200
+    assert client.post("/sign-out", headers=headers).status_code == 403
+    assert client.get(PAGE).status_code == 200
+
+
+def test_a_browser_signs_out(signed_in):
+    assert "Sign out" in signed_in.get("/?f=html").text
+    signed_in.post("/sign-out")
+    assert COOKIE not in signed_in.cookies
+    assert "Sign in" in signed_in.get("/?f=html").text
+    assert signed_in.get(PAGE).status_code == 401
+
+
+def test_a_wrong_token_opens_no_session(client):
+    for body in ("token=wrong", "token=%00%ff", "token=", "", "a=b"):
+        headers = {"Content-Type": "application/x-www-form-urlencoded"}
+        reply = client.post("/sign-in", content=body, headers=headers)
+        assert (reply.status_code, reply.headers["content-type"][:9]) == (403, "text/html")
+        assert "unknown, expired or revoked" in reply.text
+        assert COOKIE not in client.cookies
+
+
+def test_a_session_ends_with_its_hour_and_with_its_token(client, token, connection):
+    client.post("/sign-in", data={"token": token("read")})
+    mine = client.get(MINE).json()["id"]
+    secret = page_secret(connection)
+    client.cookies.clear()
+
+    def status(cookie: str) -> int:
+        return client.get(MINE, headers={"Cookie": f"{COOKIE}={cookie}"}).status_code
+
+    assert status(format_session(mine, time.time() - LIFETIME_S + 60.0, secret)) == 200
+    assert status(format_session(mine, time.time() - LIFETIME_S - 1.0, secret)) == 401
+    run_sql(connection, "update token set revoked_at = now()")
+    connection.commit()
+    assert status(format_session(mine, time.time(), secret)) == 401
+
+
+def test_a_forged_session_is_refused(client, token, connection):
+    client.post("/sign-in", data={"token": token("read")})
+    value = client.cookies[COOKIE]
+    client.cookies.clear()
+    token_id, end_s, seal = value.split(".")
+    forged = (
+        f"{token_id}.{int(end_s) + 1}.{seal}",
+        f"{uuid4()}.{end_s}.{seal}",
+        f"{token_id}.{end_s}.",
+        format_session(token_id, time.time(), b"another installation"),
+        "x",
+        "..",
+        "\xe9.\xe9.\xe9",
+    )
+    for cookie in forged:
+        header = f"{COOKIE}={cookie}".encode("latin-1")
+        assert client.get(MINE, headers=[(b"cookie", header)]).status_code == 401, cookie
+    assert client.get(MINE, headers={"Cookie": f"{COOKIE}={value}"}).status_code == 200
+
+
+def test_a_token_in_the_header_comes_before_the_session(signed_in, bearer):
+    assert signed_in.get(MINE, headers=bearer("read")).json()["name"] == "a token to read"
+    assert session_cookie.COOKIE in signed_in.cookies
