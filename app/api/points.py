@@ -20,7 +20,7 @@ from app.api.negotiation import (
     described,
     refuse_unknown,
 )
-from app.api.pages import Page, features_page
+from app.api.point_page import point_page
 from app.api.routes import CallerRoute
 from app.db.features.collection import Viewer
 from app.db.point_detail import PointDetail, PointView
@@ -73,12 +73,9 @@ def item(
         if crs is not None:
             text, reply_crs = find_feature(connection, POINTS, Viewer(), str(point_id), crs)
             feature["geometry"] = json.loads(text)["geometry"]
-    text = json.dumps(feature, default=_plain)
     if chosen_format(request, {"json": GEOJSON, "html": HTML}, f) == "html":
-        row = json.loads(text)
-        row["properties"]["views"] = len(point.views)
-        page = Page(f"Point {point_id}", POINTS.description, row["links"])
-        return features_page(request, POINTS, [row], page)
+        return point_page(request, point)
+    text = json.dumps(feature, default=_plain)
     return Response(text, media_type=GEOJSON, headers={"Content-Crs": f"<{reply_crs.uri}>"})
 
 

@@ -20,6 +20,7 @@ from app.api.negotiation import (
     json_reply,
     refuse_unknown,
 )
+from app.api.operations_page import operations_page
 from app.api.pages import Cell, Page, document_page
 from app.api.routes import CallerRoute
 from app.usecases.readiness import Readiness, overall
@@ -117,26 +118,14 @@ def conformance(*, request: Request, f: Format = None) -> Response:
 
 @router.get("/api", include_in_schema=False)
 def description(*, request: Request, f: Format = None) -> Response:
-    """Return the description of the API in OpenAPI 3.1, or a list of its operations."""
+    """Return the description of the API in OpenAPI 3.1, or a page of its operations."""
     refuse_unknown(request, {"f"})
     document: dict[str, Any] = request.app.openapi()
     form = chosen_format(request, {"json": OPENAPI_JSON, "plain": JSON, "html": HTML}, f)
     if form != "html":
         # GDAL refuses the media type of OpenAPI 3.1; its Accept header also allows plain JSON.
         return JSONResponse(document, media_type=OPENAPI_JSON if form == "json" else JSON)
-    rows = [
-        [Cell(method.upper()), Cell(path), Cell(operation.get("description", ""))]
-        for path, operations in document["paths"].items()
-        for method, operation in operations.items()
-    ]
-    info = document["info"]
-    page = Page(
-        f"{info['title']} {info['version']}",
-        info["description"],
-        columns=("method", "path", "operation"),
-        rows=rows,
-    )
-    return document_page(request, page)
+    return operations_page(request, document)
 
 
 @router.get("/healthz", dependencies=[Public])

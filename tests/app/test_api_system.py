@@ -100,6 +100,20 @@ def test_the_description_of_the_api_is_openapi_3_1(client):
     assert client.get("/api").json()["openapi"].startswith("3.1")
 
 
+def test_the_page_of_the_api_has_all_operations_with_their_parameters(client):
+    document = client.get("/api").json()
+    page = client.get("/api?f=html").text
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            start = page.index(f"<code>{method.upper()} {path}</code>")
+            part = page[start : page.index("</details>", start)]
+            for parameter in operation["parameters"]:
+                assert f"<code>{parameter['name']}</code>" in part, (path, parameter["name"])
+    items = page.partition("GET /collections/points/items</code>")[2].partition("</details>")[0]
+    assert "a token with scope read" in items
+    assert "at least 1; at most" in items, "the bounds of limit"
+
+
 @pytest.mark.parametrize("path", ["/scope/read", "/scope/register", "/scope/admin", "/scope/points"])
 def test_an_endpoint_refuses_callers_without_a_token(client, path):
     reply = client.get(path)

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 
 import cv2
 import numpy as np
@@ -375,3 +376,20 @@ def test_the_command_refuses_a_wrong_box_and_names_it(run):
     result = CliRunner().invoke(commands, ["points", "query", "--bbox", "1,2,3"])
     assert isinstance(result.exception, InputError)
     assert "'1,2,3'" in str(result.exception)
+
+
+def test_the_page_of_a_point_shows_place_accuracy_and_chips(made, get):
+    point = get(f"{ITEMS}?limit=1").json()["features"][0]
+    item = get(f"{ITEMS}/{point['id']}").json()
+    page = get(f"{ITEMS}/{point['id']}?f=html").text
+
+    lon, lat, height_m = item["geometry"]["coordinates"]
+    for place in (f"{lat:.8f}° N", f"{lon:.8f}° E", f"{height_m:.2f} m above"):
+        assert place in page
+    for against in ("relative_to_control_points", "on_the_earth"):
+        assert item["properties"][against]["words"] in page
+    pictures = re.findall(r'<img src="([^"]*)"', page)
+    assert len(pictures) == len(item["properties"]["views"]) > 0
+    for picture in pictures:
+        assert get(picture).headers["content-type"] == "image/png"
+    assert "no scene has tried it yet" in page
