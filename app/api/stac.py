@@ -20,12 +20,11 @@ from pydantic import (
 
 from app.api import features
 from app.api.access import needs
-from app.api.deps import CallerDep, DatabaseDep, SettingsDep
+from app.api.deps import CallerDep, DatabaseDep, SecretDep, SettingsDep
 from app.api.features import (
     CrsUri,
     Format,
     ItemsQuery,
-    SecretDep,
     equal_parameters,
     parameter_names,
     viewer_of,
