@@ -6,10 +6,13 @@ import numpy as np
 from services.reports.figure_data import Quicklook
 from services.reports.plot import WIDTH, Figure, Panel
 from services.reports.report import RegistrationReport
+from services.types import Array, BoolArray, FloatImage
 
 ACTIVE, DEACTIVATED, NOT_MATCHED = "#2f7ed8", "#e8862e", "#8b939c"
 MATCHED = "#8db7ea"
 ARROW = "#ffb000"
+_DARK_ROOM, _CONTRAST_LIMIT, _PARTS = 8.0, 3.0, 4
+"""How much more room dark values get than bright ones; limit of contrast, and parts across the image."""
 _UNCROWDED = 300
 _LABEL_LENGTH = 34
 _TALLEST = 540.0
@@ -61,9 +64,22 @@ def _draw_quicklook(panel: Panel, quicklook: Quicklook, darkness: float) -> None
         share = cv2.resize(opaque.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA) / np.maximum(share, 1e-3)
         opaque = share > 0.5
+    panel.image(darkness * _stretched(pixels, opaque), opaque)
+
+
+def _stretched(pixels: FloatImage, opaque: BoolArray) -> Array:
+    """Grey values, 0 to 255, in which ground has its contrast also beside clouds and beside water.
+
+    A stretch between percentiles gives most greys to clouds. The inverse hyperbolic sine makes room for
+    dark values (Lupton, Gunn and Szalay, A modified magnitude system, 1999), the equalisation of parts
+    of the image with limited contrast gives it to what is there (Zuiderveld, Contrast limited adaptive
+    histogram equalization, 1994).
+    """
     low, high = np.percentile(pixels[opaque], [1.0, 99.0]) if opaque.any() else (0.0, 1.0)
-    gain = 255.0 * darkness / max(float(high - low), 1e-6)
-    panel.image(np.clip((pixels - low) * gain, 0.0, 255.0), opaque)
+    share = (np.clip(pixels, low, high) - low) / max(float(high - low), 1e-6)
+    grey = np.arcsinh(_DARK_ROOM * share) * (255.0 / np.arcsinh(_DARK_ROOM))
+    equalise = cv2.createCLAHE(_CONTRAST_LIMIT, (_PARTS, _PARTS))
+    return np.asarray(equalise.apply(grey.astype(np.uint8)), dtype=np.float64)
 
 
 def crowding(n: int) -> float:

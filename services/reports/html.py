@@ -11,7 +11,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from services.quality.criteria import Criterion
+from services.reports.criteria_rows import criterion_rows, unmet_criteria
 from services.reports.figure_data import ChipPair
 from services.reports.figures import FIGURES, figure_markup
 from services.reports.numbers import (
@@ -49,7 +49,8 @@ def format_html(report: RegistrationReport) -> str:
     """The report as a self-contained page for screen, phone and paper."""
     return page_template("registration.html").render(
         report=report,
-        unmet=unmet_criteria(report),
+        unmet=unmet_criteria(report.criteria),
+        criteria=criterion_rows(report.criteria),
         figures={draw.__name__: Markup(figure_markup(draw, report)) for draw in FIGURES},
         gallery=choose_pairs(report.figure_data.gallery),
         published=published_tables(report),
@@ -77,7 +78,6 @@ def page_template(name: str) -> Template:
         quantile=quantile,
         criterion_value=criterion_value,
         criterion_limit=criterion_limit,
-        margin=margin_words,
         chip=chip_uri,
         reason_label=reason_label,
         group_means_text=group_means_text,
@@ -85,12 +85,6 @@ def page_template(name: str) -> Template:
         time=lambda moment: f"{moment:%Y-%m-%d %H:%M} UTC" if moment else ABSENT,
     )
     return environment.get_template(name)
-
-
-def unmet_criteria(report: RegistrationReport) -> list[Criterion]:
-    """Criteria that are not met, those that make a registration unfit for use first."""
-    unmet = [criterion for criterion in report.criteria if not criterion.met]
-    return sorted(unmet, key=lambda criterion: criterion.needed_for == "good")
 
 
 def choose_pairs(gallery: tuple[ChipPair, ...]) -> tuple[GalleryGroup, ...]:
@@ -125,14 +119,6 @@ def chip_uri(chip: ChipArray) -> str:
         grey[valid] = np.clip(stretched, 0.0, 255.0).astype(np.uint8)
     _, encoded = cv2.imencode(".png", grey)
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
-
-
-def margin_words(criterion: Criterion) -> str:
-    """Distance from value to limit in percent of the limit, positive where the criterion is met."""
-    if criterion.limit == 0.0 or not np.isfinite(criterion.value):
-        return ABSENT
-    distance = (criterion.value - criterion.limit) / criterion.limit
-    return f"{100.0 * (distance if criterion.comparison == 'at least' else -distance):+.0f} %"
 
 
 def flat_options(options: Any, prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -15,7 +15,12 @@ from services.quality.accuracy_statement import StatedAccuracy
 from services.quality.criteria import Verdict
 from services.quality.qualification import PointCounts
 from services.quality.stability import ImageResiduals, Stability
-from services.reports.published import PublishedTable, published_tables
+from services.reports.published import (
+    GROUND_COLUMNS,
+    GROUND_WORDS,
+    PublishedTable,
+    published_tables,
+)
 from services.reports.report import NOT_IN_JSON, BlockUsed, RegistrationReport
 from services.types import Array
 
@@ -307,7 +312,8 @@ def _ground_table(report: JointReport) -> tuple[PublishedTable, list[tuple[float
         rows.append((-east.mean, -north.mean, east.std, north.std, -up.mean, up.std))
     table = PublishedTable(
         "Ground residuals, m",
-        ("dx_amer", "dy_amer", "ectx_amer", "ecty_amer", "dZ_amer", "ectZ_amer"),
+        GROUND_WORDS,
+        GROUND_COLUMNS,
         rows[0],
         (2,) * 6,
         "Adjusted minus known position of the active control points that two scenes or more show: east, "

@@ -94,7 +94,7 @@ def residual_map(report: RegistrationReport) -> Figure:
     with panel.clipped():
         figure.arrows(tails, heads, colour, width)
     key = key_px * enlarged * panel.width / report.scene.samples
-    figure.arrows(np.array([[2.0, 9.0]]), np.array([[2.0 + key, 9.0]]), ACTIVE, 1.3)
+    figure.arrows(np.array([[2.0, 9.0]]), np.array([[2.0 + key, 9.0]]), colour, 1.3)
     words = f"{key_px:g} px = {key_px * report.scene.gsd_m:.2g} m"
     figure.text(8.0 + key, 12.5, words)
     return figure

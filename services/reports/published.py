@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from services.reports.report import RegistrationReport
 
 ABSENT = math.nan
+GROUND_WORDS = ("Mean east", "Mean north", "Std east", "Std north", "Mean up", "Std up")
+GROUND_COLUMNS = ("dx_amer", "dy_amer", "ectx_amer", "ecty_amer", "dZ_amer", "ectZ_amer")
+CORNERS = ("First corner", "Second corner", "Third corner", "Fourth corner", "Centre")
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,7 @@ class PublishedTable:
 
     Attributes:
         title: plain words for its content, with the unit.
+        words: plain heads.
         columns: heads as published.
         values: NaN where a single scene gives none.
         decimals: of each value.
@@ -25,10 +29,16 @@ class PublishedTable:
     """
 
     title: str
+    words: tuple[str, ...]
     columns: tuple[str, ...]
     values: tuple[float, ...]
     decimals: tuple[int, ...]
     note: str
+
+    @property
+    def known(self) -> tuple[int, ...]:
+        """The columns that have a value."""
+        return tuple(k for k, value in enumerate(self.values) if not math.isnan(value))
 
 
 def published_tables(report: RegistrationReport) -> tuple[PublishedTable, ...]:
@@ -45,7 +55,8 @@ def published_tables(report: RegistrationReport) -> tuple[PublishedTable, ...]:
 def _point_counts(report: RegistrationReport) -> PublishedTable:
     counts = report.point_counts
     return PublishedTable(
-        'Point counts (published as "Equipment")',
+        'Points (published as "Equipment")',
+        ("Active of matched, %", "Active of visible, %", "Active", "Matched", "Visible"),
         ("Pct_app", "Pct_app-ini", "Actif_app", "Spatio_app", "Popini_app"),
         (
             100.0 * counts.active_of_matched,
@@ -66,6 +77,7 @@ def _image_residuals(report: RegistrationReport) -> PublishedTable:
     x, y, gsd_m = report.image_residuals_px.x, report.image_residuals_px.y, report.scene.gsd_m
     return PublishedTable(
         "Image residuals, m",
+        ("Mean x", "Mean y", "Mean xy", "Std x", "Std y", "Std xy"),
         ("dx_app", "dy_app", "dxy_app", "ectx_app", "ecty_app", "ectxy_app"),
         tuple(
             gsd_m * value
@@ -82,7 +94,8 @@ def _ground_residuals(report: RegistrationReport) -> PublishedTable:
     east, north = report.ground_residuals_m.east, report.ground_residuals_m.north
     return PublishedTable(
         "Ground residuals, m",
-        ("dx_amer", "dy_amer", "ectx_amer", "ecty_amer", "dZ_amer", "ectZ_amer"),
+        GROUND_WORDS,
+        GROUND_COLUMNS,
         (east.mean, north.mean, east.std, north.std, ABSENT, ABSENT),
         (2,) * 6,
         "Image residuals converted to the ground at the height of each point, east and north. In the "
@@ -97,6 +110,7 @@ def _displacements(report: RegistrationReport) -> PublishedTable:
     names = tuple(f"d{axis}{corner}" for corner in "0123c" for axis in "XY")
     return PublishedTable(
         f"Displacement with {100 * report.stability.kept_share:.0f} % of the points, m",
+        (*(f"{place} {axis}" for place in CORNERS for axis in "XY"), "Incidence (°)"),
         (*names, "Incidence (°)"),
         (*moved, report.scene.acquisition.incidence_deg),
         (*(2,) * 10, 1),
@@ -111,6 +125,7 @@ def _held_out(report: RegistrationReport) -> PublishedTable:
     x, y = report.stability.held_out_m.x, report.stability.held_out_m.y
     return PublishedTable(
         f"Points held out ({100 * (1 - report.stability.kept_share):.0f} %), m",
+        ("Points", "Mean X", "Std X", "Mean Y", "Std Y", "Mean XY", "Std XY", "Incidence (°)"),
         ("POP", "dX_moy", "dX_ect", "dY_moy", "dY_ect", "dXY_moy", "dXY_ect", "Incidence (°)"),
         (report.stability.held_out_per_draw, x.mean, x.std, y.mean, y.std)
         + (math.hypot(x.mean, y.mean), math.hypot(x.std, y.std), report.scene.acquisition.incidence_deg),

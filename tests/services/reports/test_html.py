@@ -12,12 +12,14 @@ import pytest
 from services.quality.criteria import Criterion
 from services.registration.options import RegistrationOptions
 from services.reports.charts import funnel
-from services.reports.drawing import round_number
+from services.reports.criteria_rows import margin_words
+from services.reports.drawing import ACTIVE, ARROW, round_number
 from services.reports.figure_data import Quicklook
 from services.reports.figures import FIGURES, figure_markup
-from services.reports.html import chip_uri, choose_pairs, flat_options, format_html, margin_words
+from services.reports.html import chip_uri, choose_pairs, flat_options, format_html
 from services.reports.maps import coverage_map, residual_map
 from services.reports.plot import tick_words, ticks
+from services.types import Acquisition
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -324,3 +326,68 @@ def test_options_inside_options_are_listed_by_dotted_names():
 )
 def test_the_scale_arrow_has_a_round_length(value, rounded):
     assert round_number(value) == pytest.approx(rounded)
+
+
+def test_each_criterion_stands_once_with_the_level_it_reaches(material):
+    report = material(n=12, lost=0, wrong=0).report()
+    markup = format_html(report)
+    table = markup[markup.index("<h2>Criteria</h2>") :]
+    for name in {criterion.name for criterion in report.criteria}:
+        levels = [criterion for criterion in report.criteria if criterion.name == name]
+        assert table.count(f'<th scope="row">{levels[0].label}</th>') == 1, name
+        missed = {criterion.needed_for for criterion in levels if not criterion.met}
+        level = "not usable" if "usable" in missed else "usable" if missed else "good"
+        row = table[table.index(f'<th scope="row">{levels[0].label}</th>') :].partition("</tr>")[0]
+        assert f"<td>{level}</td>" in row, name
+    verdict = markup[markup.index('aria-label="Verdict"') :].partition("</section>")[0]
+    unmet = {criterion.name for criterion in report.criteria if not criterion.met}
+    assert verdict.count("<li>") == len(unmet) > 0
+
+
+def test_tables_have_plain_words_first_and_published_names_second(material):
+    markup = page(material())
+    assert "Active of matched, %<small>Pct_app</small>" in markup
+    assert re.search(r"<th[^>]*>(Pct_app|dx_app|dX0|POP|dx_amer)", markup) is None
+
+
+def test_what_does_not_apply_is_left_out(material):
+    texts = Page(page(material())).texts
+    assert {"Incidence", "Sun elevation"} <= set(texts)
+    assert {"dZ_amer", "LE90"}.isdisjoint(texts), "one scene gives no heights, nor have its check points"
+    made = material()
+    made = replace(made, scene=replace(made.scene, acquisition=Acquisition("IMG_1")))
+    assert {"Incidence", "Sun elevation"}.isdisjoint(Page(page(made)).texts)
+
+
+def test_sizes_have_their_unit_and_what_they_are_of(material):
+    markup = page(material())
+    assert "5000 samples, pixels of 0.50 m on the ground" in markup
+    assert "50 m wide, pixels of 0.5 m" in markup
+
+
+def test_the_arrow_of_the_scale_has_the_colour_of_the_arrows(material):
+    made = material()
+    on_paper = replace(made, figure_data=replace(made.figure_data, quicklook=None))
+    for shown, colour, other in ((made, ARROW, ACTIVE), (on_paper, ACTIVE, ARROW)):
+        markup = figure_markup(residual_map, shown.report())
+        assert markup.count(colour) == 4, "shafts and heads of the arrows, and of the scale"
+        assert other not in markup
+
+
+@pytest.mark.parametrize("clouds", [0.0, 0.1, 0.4, 0.6])
+def test_ground_is_seen_as_well_beside_clouds(material, clouds):
+    """Clouds are ten times as bright; the ground keeps nearly the contrast that it has without them."""
+    made = material()
+    ground = made.figure_data.quicklook.pixels
+    rows = round(clouds * len(ground))
+    cloudy = ground.copy()
+    cloudy[:rows] = 10.0 * ground.mean() + ground[:rows]
+
+    def contrast(pixels):
+        shown = replace(made.figure_data, quicklook=Quicklook(pixels, 10.0))
+        markup = figure_markup(coverage_map, replace(made, figure_data=shown).report())
+        encoded = base64.b64decode(re.search(r"base64,([^\"]+)", markup).group(1))
+        grey = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return grey[rows:].std()
+
+    assert contrast(cloudy) > 0.7 * contrast(ground)
