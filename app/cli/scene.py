@@ -17,7 +17,7 @@ from app.cli.scene_registration import (
     register_scenes,
     worst_status,
 )
-from app.cli.scene_rows import refuse_shared_files, show_outcome, show_outcomes
+from app.cli.scene_rows import refuse_shared_files, show_outcome, show_outcomes, write_overview
 from app.errors import InputError
 from app.usecases.registration.reference_source import ReferenceFiles, check_map
 from app.usecases.registration.register import SceneFiles
@@ -143,6 +143,7 @@ def register(
     if is_one_scene:
         show_outcome(outcomes[0], as_json=as_json)
     else:
+        write_overview(outcomes, output)
         show_outcomes(outcomes, as_json=as_json)
     raise typer.Exit(worst_status(outcomes))
 

@@ -1,13 +1,18 @@
 """What the registrations of one scene and of many refuse and print alike."""
 
+import math
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from app.cli.output import print_json, show, show_one
 from app.cli.scene_registration import Outcome
 from app.errors import InputError
 from services.quality.accuracy_statement import ON_THE_EARTH, RELATIVE
+from services.reports.overview import OverviewRow, format_overview
 
+OVERVIEW = "overview.html"
+"""File of the page over the reports of several scenes."""
 _TABLE = ("active", "shift_m", "residual_rms_px", "check_ce90_m", "seconds")
 """Figures of a scene in the table of many scenes."""
 _STATED = ("relative_to_control_points", "on_the_earth")
@@ -45,6 +50,30 @@ def show_outcomes(outcomes: list[Outcome], *, as_json: bool) -> None:
         row = _verdict_rows(outcome) | _other_rows(outcome, _TABLE)
         rows.append(row | {"reason": outcome["reason"] if outcome["exit_status"] else None})
     show(rows, as_json=False)
+
+
+def write_overview(outcomes: list[Outcome], folder: Path) -> None:
+    """Write a page over the reports of all scenes into their folder, if any has one."""
+    if not any("output" in outcome for outcome in outcomes):
+        return
+    page = format_overview([_overview_row(outcome, folder) for outcome in outcomes])
+    (folder / OVERVIEW).write_text(page, encoding="utf-8")
+
+
+def _overview_row(outcome: Outcome, folder: Path) -> OverviewRow:
+    stated = [(outcome.get(name) or {}).get("words", "") for name in _STATED]
+    report = None if "output" not in outcome else Path(outcome["output"]) / "report.html"
+    is_there = report is not None and report.is_file()
+    return OverviewRow(
+        scene=Path(outcome["scene"]).name,
+        verdict=outcome["verdict"],
+        relative=stated[0],
+        on_the_earth=stated[1],
+        points=f"{outcome['active']} of {outcome['visible']}" if "active" in outcome else "",
+        shift_m=outcome.get("shift_m", math.nan),
+        reason=str(outcome["reason"]) if outcome["exit_status"] else "",
+        report=quote(report.relative_to(folder).as_posix()) if report and is_there else "",
+    )
 
 
 def _verdict_rows(outcome: Outcome) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -177,6 +178,10 @@ def test_a_folder_of_scenes_is_registered_by_two_processes_and_a_bad_scene_stops
         assert record["exit_status"] == 0
         assert Path(record["output"]) == folder / name
         assert_registered(folder / name, world)
+    overview = (folder / "overview.html").read_text()
+    assert re.findall(r'<a href="([^"]*)">', overview) == [f"{name}/report.html" for name in "abc"]
+    assert all((folder / name / "report.html").is_file() for name in "abc")
+    assert "truncated or damaged" in overview
     table = amers(*command[:2], tmp_path / "c.tif", scenes / "a.tif", *command[4:], *options)
     assert table.returncode == 0, table.stderr
     header, *rows = [line.split("\t") for line in table.stdout.splitlines()]
