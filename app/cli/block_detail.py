@@ -5,6 +5,7 @@ from app.cli.block_renewal import renewal_row
 from app.cli.output import AsJson, print_json, show_one
 from app.cli.transaction import transaction
 from app.usecases.blocks import lifecycle
+from app.usecases.blocks.listing import block_extent
 from app.usecases.blocks.renewal import find_renewal
 from services.quality.accuracy_statement import accuracy_document
 
@@ -15,8 +16,13 @@ def show_block(reference: Reference, as_json: AsJson = False) -> None:
         block = lifecycle.find_block(connection, reference)
         stated = lifecycle.block_report(connection, block).stated
         renewed = find_renewal(connection, block)
+    extent = block_extent(block)
     if as_json:
-        print_json({**block_row(block), **accuracy_document(stated), "renewal": renewed})
+        print_json(
+            {**block_row(block), "extent": extent, **accuracy_document(stated), "renewal": renewed}
+        )
         return
     new = {} if renewed is None else renewal_row(renewed)
-    show_one({**block_row(block), **stated.words, **new}, as_json=False)
+    # As --bbox takes it.
+    box = {"extent": ",".join(f"{value:.6f}" for value in extent)}
+    show_one({**block_row(block), **box, **stated.words, **new}, as_json=False)

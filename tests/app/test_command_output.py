@@ -58,6 +58,14 @@ def test_a_list_on_a_pipe_has_a_header_and_one_line_a_record(run):
         assert {len(row) for row in rows} == {len(rows[0])}
 
 
+def test_the_extent_of_a_block_is_a_box_that_a_query_takes(run):
+    shown = dict(line.split(None, 1) for line in run("block", "show", "calanques").splitlines())
+    box = json.loads(run("block", "show", "calanques", "--json"))["extent"]
+    assert shown["extent"] == ",".join(f"{value:.6f}" for value in box)
+    found = run("points", "query", "--bbox", shown["extent"], "--format", "csv").splitlines()
+    assert len(found) == 1 + int(shown["points"]) == 6
+
+
 def test_names_in_json_have_no_blanks(run):
     for words in (*LISTS, ("block", "show", "calanques"), ("store", "usage"), ("db", "status")):
         names = names_in(json.loads(run(*words, "--json")))
