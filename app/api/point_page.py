@@ -9,8 +9,6 @@ from app.api.pages import Page, document_page
 from app.db.point_detail import PointDetail, PointView
 from app.usecases.features.points import point_accuracy
 
-UNKNOWN = "unknown"
-
 
 @dataclass(frozen=True)
 class ChipFigure:
@@ -73,12 +71,10 @@ def _sigmas(point: PointDetail) -> dict[str, str]:
 
 def _caption(view: PointView) -> tuple[str, ...]:
     """Image, date, size of pixels and direction of a view, as far as they are known."""
-    taken = UNKNOWN if view.acquired_at is None else f"{view.acquired_at:%Y-%m-%d %H:%M}"
-    lines = [
-        " ".join(part for part in (view.sensor, view.image_id) if part),
-        f"taken {taken}",
-        f"pixels of {view.gsd_m:g} m",
-    ]
+    lines = [" ".join(part for part in (view.sensor, view.image_id) if part)]
+    if view.acquired_at is not None:
+        lines.append(f"taken {view.acquired_at:%Y-%m-%d %H:%M} UTC")
+    lines.append(f"pixels of {view.gsd_m:g} m")
     if view.incidence_deg is not None:
         lines.append(f"{view.incidence_deg:.0f}\N{DEGREE SIGN} from the vertical")
     if view.sun_elevation_deg is not None:
