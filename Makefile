@@ -13,7 +13,7 @@ PAGE := app/web/built/index.html
 WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium
+.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput postgis page chromium pictures
 
 demo: postgis
 	$(BIN)/amers demo
@@ -48,6 +48,9 @@ test-security: postgis
 # Repeated kills, cuts and floods, bombs, further cases and real views.
 test-endurance: postgis
 	$(BIN)/python -m pytest -m endurance -n auto --dist load
+
+pictures: page chromium
+	$(BIN)/python scripts/make_pictures.py demo-output
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -29,6 +29,7 @@ PAGES = {
 """Documents outside docs/ and the names of their pages."""
 
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<target>[^)#\s]*)(?P<anchor>#[^)\s]*)?\)")
+PICTURE = re.compile(r"!\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\(?P<open>[(\[])(?P<latex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
 )
@@ -109,7 +110,15 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     here = names.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     if page.file.src_uri.startswith("library/"):
         return markdown
+    if not here.startswith("docs/"):
+        markdown = PICTURE.sub(lambda picture: site_picture(picture, here), markdown)
     return LINK.sub(lambda link: site_link(link, here, page.file.src_uri), markdown)
+
+
+def site_picture(picture: re.Match[str], here: str) -> str:
+    """A picture in a document outside docs/, as its page has it: the site has the files of docs/."""
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(here), picture["target"]))
+    return f"![{picture['text']}]({path.removeprefix('docs/')})"
 
 
 def site_link(link: re.Match[str], here: str, page: str) -> str:

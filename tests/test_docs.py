@@ -1,6 +1,7 @@
 """The documentation site."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -36,6 +37,14 @@ def test_the_site_has_the_guide_the_methods_and_the_library(site):
         "contributing",
     )
     assert [page for page in pages if not (site / f"{page}.html").is_file()] == []
+
+
+def test_the_site_shows_the_pictures_of_the_readme(site):
+    page = (site / "index.html").read_text()
+    pictures = re.findall(r'<img[^>]* src="([^"]+)"', page)
+    assert [Path(picture).name for picture in pictures] == ["report.jpg", "map.jpg"]
+    for picture in pictures:
+        assert 10_000 < (site / picture).stat().st_size < 200_000
 
 
 def test_a_formula_is_mathml_and_needs_no_script(site):

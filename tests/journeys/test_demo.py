@@ -1,15 +1,23 @@
-"""The demonstration on the simulated world, as a new user runs it."""
+"""The demonstration on the simulated world, as a new user runs it, and what the README does with it."""
 
 import json
 import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 
 from tests.command_line import Done, amers_here, amers_process
+from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
 
+README = Path(__file__).parents[2] / "README.md"
 half_a_pixel = 0.5
 injected_m = 50.0
 
@@ -20,7 +28,7 @@ def amers(*words: str | Path) -> Done:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    words = ("demo", "-o", tmp_path_factory.mktemp("demo") / "out", "--json")
+    words = ("demo", "-o", tmp_path_factory.mktemp("demo") / "demo-output", "--json")
     result = amers_process(words, os.environ)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
@@ -90,3 +98,66 @@ def test_a_block_that_is_there_is_not_written_over(tmp_path):
     refused = amers("production", "run", "--images", first, "--images", second, "-o", tmp_path / "block")
     assert refused.returncode == 2
     assert "already exists" in refused.stderr
+
+
+def lines_of_readme(heading: str, language: str) -> str:
+    """The first lines to copy below a heading, or below a paragraph that begins in bold."""
+    below = README.read_text(encoding="utf-8").partition(heading)[2]
+    match = re.search(rf"```{language}\n(.*?)```", below, re.DOTALL)
+    assert match is not None
+    return match[1]
+
+
+def run(words: list[str], service: Service, folder: Path) -> str:
+    """What a command prints in a folder, with the store of a service, once it has ended well."""
+    environment = {**service.environment, "PYTHONPATH": str(README.parent)}
+    done = subprocess.run(
+        words, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def first_run(demo, open_folder) -> Iterator[tuple[Service, Path, dict[str, str]]]:
+    """A running service, the folder of `demo-output`, and what the commands of the README print."""
+    folder = Path(demo["report"]).parents[2]
+    service = Service(open_folder / uuid4().hex[:8], AMERS_PUBLIC_POINTS="true")
+    printed = {}
+    try:
+        assert until(service.is_ready), service.log.read_text()
+        activation, *lines, serving = lines_of_readme("## First run", "bash").splitlines()
+        assert activation == ". .venv/bin/activate"
+        assert serving.split("#")[0].strip() == "amers serve"
+        for line in lines:
+            command = line.split("#")[0].split()
+            assert command[0] == "amers"
+            printed[command[2]] = run(
+                [sys.executable, "-m", "app.cli.main", *command[1:]], service, folder
+            )
+        yield service, folder, printed
+    finally:
+        service.end()
+
+
+def test_the_first_run_of_the_readme_registers_the_scene_of_the_demo(first_run):
+    _, folder, printed = first_run
+    assert re.search(r"^extent +[-\d.,]+$", printed["show"], re.MULTILINE)
+    assert "good" in printed["register"]
+    assert (folder / "registered" / "report.html").is_file()
+
+
+def test_the_python_of_the_readme_prints_the_verdict(first_run):
+    service, folder, _ = first_run
+    program = lines_of_readme("**In Python**", "python")
+    assert run([sys.executable, "-c", program], service, folder).strip() == "good"
+
+
+@pytest.mark.skipif(shutil.which("ogr2ogr") is None, reason="Debian's gdal-bin is not installed")
+def test_gdal_reads_what_the_readme_makes(first_run):
+    service, folder, _ = first_run
+    lines = lines_of_readme("**In GDAL**", "bash").replace("http://127.0.0.1:8000", service.url)
+    printed = run(["bash", "-ec", lines], service, folder)
+    assert "LINE_OFF" in printed
+    assert (folder / "map.tif").is_file()
+    assert (folder / "points.gpkg").is_file()

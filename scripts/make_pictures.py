@@ -1,0 +1,96 @@
+"""Make the pictures of the README from a folder of `make demo`: the head of its report, and the map.
+
+    python scripts/make_pictures.py FOLDER
+
+Chromium draws them (`scripts/ensure-chromium`); the map needs the page (`make page`).
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+from playwright.sync_api import Page, sync_playwright
+
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+SIZE = {"width": 1120, "height": 700}
+QUALITY = 80
+PATIENCE_S = 120.0
+DRAWING_MS = 10_000.0
+"""Time for the map to move and to draw, without a graphics card."""
+
+
+def main(folder: Path) -> None:
+    """Write both pictures into docs/pictures."""
+    PICTURES.mkdir(exist_ok=True)
+    with sync_playwright() as driver, service_of(folder / "block") as address:
+        software_drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=software_drawing)
+        page = browser.new_page(viewport=SIZE, color_scheme="light")
+        page.goto((folder / "registered" / "report.html").absolute().as_uri())
+        keep(page, "report.jpg")
+        points = httpx.get(f"{address}/collections/points/items", params={"limit": 1}).json()
+        page.goto(f"{address}/map#/points")
+        page.get_by_role("link", name=str(points["features"][0]["id"])).click()
+        page.wait_for_load_state("networkidle")
+        page.wait_for_timeout(DRAWING_MS)
+        keep(page, "map.jpg")
+        browser.close()
+
+
+def keep(page: Page, name: str) -> None:
+    """Write what a page shows as a small picture."""
+    page.screenshot(path=PICTURES / name, type="jpeg", quality=QUALITY)
+    print(f"{name}: {(PICTURES / name).stat().st_size / 1024.0:.0f} KiB")
+
+
+@contextmanager
+def service_of(block: Path) -> Iterator[str]:
+    """The address of a service with public points whose store has one block, for the `with`."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    amers = [sys.executable, "-m", "app.cli.main"]
+    with tempfile.TemporaryDirectory() as data:
+        # Started by root, the database server runs as another user, who has to enter the folder.
+        Path(data).chmod(0o711)
+        environment = {**os.environ, "AMERS_DATA_FOLDER": data, "AMERS_PUBLIC_POINTS": "true"}
+        subprocess.run([*amers, "block", "ingest", str(block), "--publish"], env=environment, check=True)
+        service = subprocess.Popen([*amers, "serve", "--port", str(port)], env=environment)
+        try:
+            address = f"http://127.0.0.1:{port}"
+            wait_for(address)
+            yield address
+        finally:
+            service.terminate()
+            service.wait()
+
+
+def wait_for(address: str) -> None:
+    """Wait until a service answers.
+
+    Raises:
+        TimeoutError: it does not.
+    """
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        try:
+            if httpx.get(f"{address}/readyz", timeout=30.0).status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.5)
+    raise TimeoutError(f"{address} is not ready after {PATIENCE_S:g} s")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    main(Path(sys.argv[1]))
