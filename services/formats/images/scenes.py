@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,8 @@ _SENSOR_IN_NAME = (
 )
 """Patterns of the file names of ortho-images, with the name of the sensor."""
 
+_FIRST_LINE_TIME = re.compile(r"\bfirstLineTime\s*=\s*\"?([\d-]+)T([\d:.]+)Z")
+_TIME_OF_DIGITS = re.compile(r"(\d{4})(\d{2})(\d{2})(\d{2})(\d{2})(\d{2})")
 _TIME_IN_NAME = re.compile(r"_(\d{4})(\d{2})(\d{2})T(\d{2})(\d{2})(\d{2})")
 
 UNKNOWN_SIGMA_M = 50.0
@@ -182,7 +185,8 @@ def _acquisition(image: RasterImage, delivered: DeliveredModel) -> Acquisition:
     if delivered.convention == "dimap":
         acquisition = _dimap_acquisition(delivered.path, image_id)
     elif delivered.convention == "rpb":
-        acquisition = Acquisition(image_id, sensor=rpb_satellite(read_text(delivered.path)))
+        sensor = rpb_satellite(read_text(delivered.path))
+        acquisition = Acquisition(image_id, sensor, _imd_time(delivered.path))
     elif delivered.convention == "geom":
         acquisition = parse_geom_acquisition(read_text(delivered.path), image_id, delivered.path.name)
     if not acquisition.sensor:
@@ -190,8 +194,25 @@ def _acquisition(image: RasterImage, delivered: DeliveredModel) -> Acquisition:
         sensor = tags.get("MISSION", "") + tags.get("MISSION_INDEX", "")
         time = parse_imaging_time(tags.get("IMAGING_DATE", ""), tags.get("IMAGING_TIME", ""))
         acquisition = replace(acquisition, sensor=sensor, acquired_at=time)
+    if acquisition.acquired_at is None:
+        acquisition = replace(acquisition, acquired_at=_nitf_time(image))
     incidence_deg, azimuth_deg = _central_view(delivered.model, image.shape)
     return replace(acquisition, incidence_deg=incidence_deg, azimuth_deg=azimuth_deg)
+
+
+def _imd_time(model: FilePlace) -> datetime | None:
+    """The time of the first line in the `.IMD` beside a `.RPB`; None when there is none."""
+    path = model.with_name(f"{model.stem}.IMD")
+    match = _FIRST_LINE_TIME.search(read_text(path)) if path.is_file() else None
+    return None if match is None else parse_imaging_time(*match.groups())
+
+
+def _nitf_time(image: RasterImage) -> datetime | None:
+    """The time in the image header of a NITF file; unknown digits are hyphens, and then it is None."""
+    match = _TIME_OF_DIGITS.fullmatch(image.dataset.tags().get("NITF_IDATIM", ""))
+    if match is None:
+        return None
+    return parse_imaging_time("-".join(match.group(1, 2, 3)), ":".join(match.group(4, 5, 6)))
 
 
 def _ortho_acquisition(image: RasterImage) -> Acquisition:

@@ -199,6 +199,21 @@ def test_sensor_and_time_are_read_from_the_tags_of_the_image(tmp_path: Path) -> 
     assert scene.acquisition.acquired_at == datetime(2013, 2, 8, 8, 36, 9, 100_000, tzinfo=UTC)
 
 
+def test_the_time_is_read_from_the_metadata_beside_a_worldview_image(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "a.tif")
+    (tmp_path / "a.RPB").write_text(format_rpb(CROP, "WV02"))
+    assert read_scene(path).acquisition.acquired_at is None
+    (tmp_path / "a.IMD").write_text(
+        'version = "28.3";\nBEGIN_GROUP = IMAGE_1\n\tsatId = "WV02";\n'
+        "\tfirstLineTime = 2012-05-17T10:42:31.123456Z;\nEND_GROUP = IMAGE_1\nEND;\n"
+    )
+    acquisition = read_scene(path).acquisition
+    assert (acquisition.sensor, acquisition.acquired_at) == (
+        "WV02",
+        datetime(2012, 5, 17, 10, 42, 31, 123_456, tzinfo=UTC),
+    )
+
+
 def test_the_sensor_is_read_from_the_product_document_beside_the_rpc(tmp_path: Path) -> None:
     path = write_image(tmp_path / "IMG_a.tif")
     (tmp_path / "RPC_a.XML").write_text(format_dimap_rpc(V2, CROP))

@@ -1,6 +1,7 @@
 """RPC00B and RPC00A in NITF files, made from the standard; GDAL reads the same pixels and positions."""
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from rasterio.transform import RPCTransformer
 
 from services.errors import FormatError
 from services.formats.images.raster import open_raster
+from services.formats.images.scenes import read_scene
 from services.formats.sensor_models.rpc_files import read_rpc
 from services.imagery.source import Window
 from services.sensors.rpc import RpcModel
@@ -64,3 +66,19 @@ def test_a_record_with_letters_for_numbers_is_a_format_error(tmp_path: Path) -> 
     (tmp_path / "a.ntf").write_bytes(whole[:start] + b"+x.yzuvwE+1" + whole[start + 11 :])
     with pytest.raises(FormatError):
         read_rpc(tmp_path / "a.ntf")
+
+
+@pytest.mark.parametrize(
+    ("header", "time"),
+    [
+        ("20240101120000", datetime(2024, 1, 1, 12, tzinfo=UTC)),
+        ("20240101------", None),
+        ("20241301120000", None),
+    ],
+)
+def test_the_time_of_a_scene_is_that_of_the_image_header(
+    tmp_path: Path, header: str, time: datetime | None
+) -> None:
+    content = (GOLDEN / "invented_rpc00b.ntf").read_bytes()
+    (tmp_path / "scene.ntf").write_bytes(content.replace(b"20240101120000", header.encode()))
+    assert read_scene(tmp_path / "scene.ntf").acquisition.acquired_at == time
