@@ -1,7 +1,7 @@
 """The ledger of the storage beside the storage itself, for tests of quotas."""
 
 from collections.abc import Callable
-from uuid import UUID
+from uuid import UUID, uuid4
 
 from fastapi.testclient import TestClient
 
@@ -29,7 +29,7 @@ def bytes_in_ledger(connection: Connection) -> int:
 
 def make_token(client: TestClient, admin: dict[str, str], **quotas: object) -> dict[str, str]:
     """The headers of a new caller who may read and register."""
-    body = {"name": "small", "scopes": ["register"], **quotas}
+    body = {"name": f"caller {uuid4()}", "scopes": ["register"], **quotas}
     made = client.post("/tokens", json=body, headers=admin)
     assert made.status_code == 201, made.text
     return {"Authorization": f"Bearer {made.json()['secret']}"}
