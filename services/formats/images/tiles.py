@@ -68,12 +68,12 @@ def write_tiles(image: ImageSource, path: Path, progress: Progress = no_progress
         progress: receives the fraction done and a message.
     """
     lines, samples = image.shape
-    black, white = _stretch(image)
+    black, white = grey_range(image)
     with path.open("wb") as file:
         pyramid = _Pyramid(file, lines, samples)
         for line in range(0, lines, TILE_PX):
             window = Window(line, 0, min(TILE_PX, lines - line), samples)
-            pyramid.add(0, _grey(image.read(window), black, white))
+            pyramid.add(0, grey_values(image.read(window), black, white))
             progress((line + window.lines) / lines, "drawing the tiles")
     return TileIndex(lines, samples, TILE_PX, pyramid.levels)
 
@@ -114,7 +114,7 @@ class _Pyramid:
             self.file.write(content)
 
 
-def _stretch(image: ImageSource) -> tuple[float, float]:
+def grey_range(image: ImageSource) -> tuple[float, float]:
     """The values that become black and white, from windows all over the image."""
     lines, samples = image.shape
     side = _SAMPLE_PX
@@ -131,7 +131,7 @@ def _stretch(image: ImageSource) -> tuple[float, float]:
     return float(black), float(max(white, black + 1.0))
 
 
-def _grey(pixels: FloatImage, black: float, white: float) -> Grey:
+def grey_values(pixels: FloatImage, black: float, white: float) -> Grey:
     scaled = np.nan_to_num((pixels - black) * (255.0 / (white - black)), nan=0.0, posinf=255.0)
     return np.clip(scaled, 0.0, 255.0).astype(np.uint8)
 
