@@ -46,7 +46,7 @@ def tile_matrix_sets(*, request: Request) -> TileMatrixSets:
 @router.get("/tileMatrixSets/{matrix_set}", dependencies=[Public])
 def tile_matrix_set(*, matrix_set: str) -> TileMatrixSet:
     """Return the tile matrix set WebMercatorQuad: the square of web maps, halved with each zoom."""
-    _refuse_other(matrix_set)
+    refuse_other_matrix_set(matrix_set)
     matrices = [
         TileMatrix(
             id=str(z),
@@ -85,7 +85,7 @@ def tileset(
 ) -> TileSet:
     """Return one tile set of a collection."""
     tiles.refuse_untiled(collection.id)
-    _refuse_other(matrix_set)
+    refuse_other_matrix_set(matrix_set)
     tileset = _tileset(request, collection)
     dimension = GEOMETRY_DIMENSION[collection.geometry_type]
     tileset.layers = [TileLayer(id=collection.id, data_type="vector", geometry_dimension=dimension)]
@@ -109,7 +109,7 @@ def tile(
     database: DatabaseDep,
 ) -> Response:
     """Return a vector tile; z, y and x are tile matrix, row and column."""
-    _refuse_other(matrix_set)
+    refuse_other_matrix_set(matrix_set)
     with database.reading() as connection:
         state = f"{tiles.version(connection)} {collection.id} {z} {y} {x} {viewer.is_admin}"
         tag = f'"{hashlib.sha256(state.encode()).hexdigest()[:20]}"'
@@ -138,6 +138,11 @@ def _tileset(request: Request, collection: Collection) -> TileSet:
     )
 
 
-def _refuse_other(matrix_set: str) -> None:
+def refuse_other_matrix_set(matrix_set: str) -> None:
+    """Refuse a tile matrix set that tiles do not have.
+
+    Raises:
+        NotFound: it is another one.
+    """
     if matrix_set != MATRIX_SET:
         raise NotFound(f"no tile matrix set {matrix_set:.60}: there is {MATRIX_SET}")

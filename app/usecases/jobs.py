@@ -36,6 +36,7 @@ from app.usecases.orthorectification import ORTHORECTIFY
 from app.usecases.processes import Process, Work, WorkFailed
 from app.usecases.registration.job import REGISTER_SCENE
 from app.usecases.registration.joint_job import REGISTER_SCENES
+from app.usecases.scene_map import MAP_SCENE
 from app.usecases.scene_view import VIEW_SCENE
 from app.usecases.vector_job import CORRECT_VECTORS, PROJECT_VECTORS
 
@@ -45,6 +46,7 @@ PROCESSES: dict[str, Process] = {
         REGISTER_SCENE,
         REGISTER_SCENES,
         VIEW_SCENE,
+        MAP_SCENE,
         ORTHORECTIFY,
         CORRECT_VECTORS,
         PROJECT_VECTORS,

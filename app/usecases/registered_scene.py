@@ -43,22 +43,33 @@ def read_registered_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy 
     delivered model with the correction.
 
     Raises:
-        InputError: the scene or its registration cannot be used, or the scene is an ortho-image.
+        InputError: the scene or its registration cannot be used.
     """
     folder = files.registration
     accuracy = None if folder is None else _read_accuracy(folder)
     refined = None if folder is None or files.model is not None else folder / REFINED_NAME
     uses_refined = refined is not None and refined.is_file()
     scene = read_scene(files.image, refined if uses_refined else files.model, sigma_m=1.0)
-    if isinstance(scene.model, OrthoModel):
-        raise InputError(
-            f"{files.image}: has a map grid, a raw image with a sensor model is expected; what is drawn "
-            "on it is on the map already"
-        )
     if folder is not None:
         _check_size(folder, scene)
     if accuracy is not None and not uses_refined:
         scene = replace(scene, model=CorrectedModel(scene.model, accuracy.correction))
+    return scene, accuracy
+
+
+def read_raw_scene(files: SceneModel) -> tuple[Scene, CorrectionAccuracy | None]:
+    """See `read_registered_scene`; an ortho-image is refused.
+
+    Raises:
+        InputError: the scene or its registration cannot be used, or the scene is an ortho-image.
+    """
+    scene, accuracy = read_registered_scene(files)
+    model = scene.model.base if isinstance(scene.model, CorrectedModel) else scene.model
+    if isinstance(model, OrthoModel):
+        raise InputError(
+            f"{files.image}: has a map grid, a raw image with a sensor model is expected; what is drawn "
+            "on it is on the map already"
+        )
     return scene, accuracy
 
 

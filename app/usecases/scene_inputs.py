@@ -10,7 +10,9 @@ from app.db.engine import Connection
 from app.db.scenes import SceneRow
 from app.db.tokens import Token
 from app.errors import Conflict, InputError
+from app.usecases.registered_scene import REFINED_NAME
 from app.usecases.scenes import clean_name, visible_scene
+from services.formats.sensor_models.refined_model import CORRECTION_JSON
 
 
 def check_scene(connection: Connection, caller: Token, scene_id: UUID) -> None:
@@ -65,6 +67,19 @@ def registration_files(connection: Connection, scene_id: UUID, job_id: UUID) -> 
             f"registration: the results of job {job_id} were removed; register scene {scene_id} again"
         )
     return registration.files
+
+
+def registered_model_keys(connection: Connection, scene_id: UUID, job_id: UUID) -> list[str]:
+    """The storage keys of the correction and the refined model that a job made of a scene.
+
+    Raises:
+        InputError: the job did not register the scene, or made no correction.
+        Conflict: its results were removed.
+    """
+    files = registration_files(connection, scene_id, job_id)
+    if CORRECTION_JSON not in files:
+        raise InputError(f"registration: job {job_id} made no {CORRECTION_JSON}")
+    return [files[name] for name in (CORRECTION_JSON, REFINED_NAME) if name in files]
 
 
 def present_scene(connection: Connection, scene_id: UUID) -> SceneRow:

@@ -14,14 +14,14 @@ from app.db.tokens import Token
 from app.errors import InputError
 from app.usecases.damage import named_by_row, suspecting_damage
 from app.usecases.processes import Commit, Process, Work
-from app.usecases.registered_scene import REFINED_NAME, SceneModel
+from app.usecases.registered_scene import SceneModel
 from app.usecases.results import store_results
 from app.usecases.scene_inputs import (
     check_file_names,
     check_scene,
     naming,
     present_scene,
-    registration_files,
+    registered_model_keys,
 )
 from app.usecases.scenes import local_image, stored_keys
 from app.usecases.terrain_file import TerrainFile
@@ -34,7 +34,6 @@ from app.usecases.vector_files import (
 )
 from app.usecases.vectors import correct_file, project_file
 from services.formats.elevation.geoid import vertical_crs
-from services.formats.sensor_models.refined_model import CORRECTION_JSON
 from services.map_grid import check_map_code
 from services.quality.accuracy_statement import AccuracyStatement, accuracy_document
 
@@ -128,7 +127,7 @@ def _check(connection: Connection, caller: Token, inputs: VectorInputs, options:
         with naming("vertical"):
             vertical_crs(inputs.vertical)
     if inputs.registration is not None:
-        _registration_keys(connection, inputs.scene, inputs.registration)
+        registered_model_keys(connection, inputs.scene, inputs.registration)
 
 
 def _check_correction(connection: Connection, caller: Token, inputs: CorrectVectors) -> None:
@@ -144,19 +143,6 @@ def _check_projection(connection: Connection, caller: Token, inputs: ProjectVect
     _check(connection, caller, inputs, inputs.options)
 
 
-def _registration_keys(connection: Connection, scene_id: UUID, job_id: UUID) -> list[str]:
-    """The storage keys of the correction and the refined model that a job made of a scene.
-
-    Raises:
-        InputError: the job did not register the scene, or made no correction.
-        Conflict: its results were removed.
-    """
-    files = registration_files(connection, scene_id, job_id)
-    if CORRECTION_JSON not in files:
-        raise InputError(f"registration: job {job_id} made no {CORRECTION_JSON}")
-    return [files[name] for name in (CORRECTION_JSON, REFINED_NAME) if name in files]
-
-
 @contextmanager
 def _files(work: Work, sigma_m: float | None = None) -> Iterator[_Files]:
     """The files of a job, until the context closes; damage of stored ones is looked for on an error."""
@@ -165,7 +151,7 @@ def _files(work: Work, sigma_m: float | None = None) -> Iterator[_Files]:
         scene = present_scene(connection, inputs.scene)
         keys = []
         if inputs.registration is not None:
-            keys = _registration_keys(connection, inputs.scene, inputs.registration)
+            keys = registered_model_keys(connection, inputs.scene, inputs.registration)
     with TemporaryDirectory(prefix="amers-") as scratch, TemporaryDirectory(prefix="amers-") as folder:
         image = local_image(work.storage, work.settings, scene, Path(scratch))
         registration = None

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from app.errors import InputError
-from app.usecases.registered_scene import SceneModel, read_registered_scene
+from app.usecases.registered_scene import SceneModel, read_raw_scene
 from app.usecases.terrain_file import HEIGHT_SIGMA_POSTINGS, TerrainFile, read_terrain
 from app.usecases.vector_files import (
     CorrectionOptions,
@@ -122,7 +122,7 @@ def correct_file(
     refuse_overwriting(vectors.path, output, vertices)
     if crs is not None:
         check_map_code(crs)
-    scene, registration = read_registered_scene(scene_model)
+    scene, registration = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
     layer = read_layer(vectors.path, vectors.layer)
     shapes = shapes_of(shapely.force_2d(layer.geometries))
@@ -199,7 +199,7 @@ def project_file(
     """
     check_options(options)
     refuse_overwriting(vectors.path, output, vertices)
-    scene, _ = read_registered_scene(scene_model)
+    scene, _ = read_raw_scene(scene_model)
     ground = read_terrain(terrain)
     layer = read_layer(vectors.path, vectors.layer)
     if layer.crs is None:

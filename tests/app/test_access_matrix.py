@@ -49,6 +49,7 @@ SHARED = {
     "feature_id": "1",
     "reference": "<staged>",
     "view": "1",
+    "layer": "raw",
     "matrix_set": "WebMercatorQuad",
     "z": "0",
     "y": "0",

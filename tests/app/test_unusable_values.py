@@ -53,6 +53,7 @@ def inputs(client: TestClient, admin: dict[str, str]) -> dict[str, dict[str, Any
         "register-scene": {"scene": scene},
         "register-scenes": {"scenes": [scene, other]},
         "view-scene": {"scene": scene},
+        "map-scene": {"scene": scene, "registration": scene},
         "orthorectify": {"scene": scene, "dem": "dem.tif"},
         "correct-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},
         "project-vectors": {"scene": scene, "vectors": "a.geojson", "dem": "dem.tif"},

@@ -1,0 +1,56 @@
+"""Tiles of registered scenes on the map, in the form of OGC API - Tiles, for their owners."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request, Response
+
+from app.api.deps import DatabaseDep, Reader, StorageDep
+from app.api.jobs import JobId
+from app.api.routes import CallerRoute
+from app.api.tiles import refuse_other_matrix_set
+from app.usecases import jobs
+from app.usecases.scene_map import Layer, scene_tile
+from services.formats.images.map_tiles import tile_media_type
+from services.orthorectification.tile_limits import TilePlace
+
+
+async def _place(matrix_set: str, z: int, y: int, x: int) -> TilePlace:
+    refuse_other_matrix_set(matrix_set)
+    return TilePlace(z, y, x)
+
+
+TilePlaceDep = Annotated[TilePlace, Depends(_place)]
+
+router = APIRouter(tags=["tiles"], route_class=CallerRoute)
+
+
+@router.get(
+    "/jobs/{job_id}/map/{layer}/tiles/{matrix_set}/{z}/{y}/{x}",
+    response_class=Response,
+    responses={
+        200: {"description": "An image.", "content": {"image/jpeg": {}, "image/png": {}}},
+    },
+)
+def map_tile(
+    *,
+    job_id: JobId,
+    layer: Layer,
+    place: TilePlaceDep,
+    request: Request,
+    database: DatabaseDep,
+    storage: StorageDep,
+    caller: Reader,
+) -> Response:
+    """Return a tile of a scene through its raw or its registered model, from a job `map-scene`.
+
+    z, y and x are tile matrix, row and column. At the border of the scene a tile is transparent.
+    """
+    with database.reading() as connection:
+        job = jobs.visible_job(connection, caller, job_id)
+    tile = scene_tile(storage, job, layer, place)
+    # Results never change; browsers ask again each time, so that the token is checked for every tile.
+    tag = f'"{job.id}-{job.attempt}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    return Response(tile, media_type=tile_media_type(tile), headers=headers)
