@@ -17,6 +17,7 @@ from matplotlib.image import imread
 from playwright.sync_api import (
     Browser,
     ConsoleMessage,
+    Locator,
     Page,
     Request,
     Route,
@@ -47,6 +48,9 @@ vector_colour = np.array([0xB3, 0x26, 0x1E])
 enough_px = 50
 a_third_of_a_pixel_m = GSD_M / 3.0
 a_hundredth_px = 0.01
+a_visible_difference = 5.0
+as_good_as_equal = 1.0
+"""Mean differences of grey values from 0 to 255."""
 most_stops = 80
 poll_ms = 100
 
@@ -268,6 +272,60 @@ def registered(service: Service, secret: str, world: FlatWorld, name: str = "dra
         job: str = asked.raise_for_status().json()["jobID"]
         assert until(lambda: client.get(f"/jobs/{job}").json()["status"] == "successful")
     return job
+
+
+def test_an_image_is_compared_on_the_map_before_and_after_its_registration(
+    visit, world, secret, service
+):
+    """Either model, or both beside a divider that keys move; residual vectors stay on top."""
+    page = visit(f"#/job/{registered(service, secret, world, 'on-the-map.tif')}", secret, WIDE)
+    tab_to(page, "Show the image on the map")
+    page.keyboard.press("Enter")
+    section = page.get_by_role("region", name="Image on the map")
+    expect(section.get_by_label("Both, with a divider")).to_be_focused()
+    expect(section).to_contain_text("The registration moved the middle of the image by 8.3")
+    expect(section).to_contain_text("CE90")
+    expect(section).to_contain_text("interpolated between")
+    assert until(lambda: vectors_drawn_px(page) >= enough_px)
+    assert_readable(page, "image-on-map")
+    page.set_viewport_size(WIDE)
+    page.emulate_media(color_scheme="light")
+
+    both = grey_map(page)
+    raw, after = (shown_alone(page, section, name) for name in ("Raw", "Registered"))
+    assert np.abs(raw - after).mean() > a_visible_difference
+    left, right = np.s_[120:-120, 100:500], np.s_[120:-120, -500:-100]
+    assert np.abs(both[left] - raw[left]).mean() < as_good_as_equal
+    assert np.abs(both[right] - after[right]).mean() < as_good_as_equal
+
+    section.get_by_label("Both, with a divider").check()
+    divider = page.get_by_role("slider", name="Divider")
+    divider.focus()
+    page.keyboard.press("Home")
+    assert np.abs(grey_map(page)[left] - after[left]).mean() < as_good_as_equal
+    page.keyboard.press("End")
+    assert np.abs(grey_map(page)[right] - raw[right]).mean() < as_good_as_equal
+    page.screenshot(path=ARTEFACTS / "image-on-map-end.png")
+
+    section.get_by_label("Opacity").fill("0")
+    blank = grey_map(page)
+    assert np.abs(blank[right] - raw[right]).mean() > a_visible_difference
+    page.goto(f"{service.url}/map#/scenes")
+    expect(divider).to_have_count(0)
+
+
+def shown_alone(page: Page, section: Locator, name: str) -> np.ndarray:
+    """The map with the image through one of its models."""
+    section.get_by_label(name, exact=True).check()
+    return grey_map(page)
+
+
+def grey_map(page: Page) -> np.ndarray:
+    """What the map shows, as grey values from 0 to 255."""
+    page.wait_for_timeout(poll_ms)
+    until_drawn(page)
+    picture = imread(io.BytesIO(page.locator("#map").screenshot()))
+    return picture[:, :, :3].mean(axis=2) * 255.0
 
 
 def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(

@@ -11,6 +11,7 @@ import {
   VectorTileSource,
 } from "maplibre-gl";
 import { authorization, BASE } from "./api";
+import { Comparison, type Pyramids } from "./comparison";
 import { mapStyle } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
@@ -20,6 +21,8 @@ type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
 
 const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
+/** Paths below which tiles are for some callers only. */
+const PROTECTED = ["collections/", "jobs/"];
 
 /** The map and its layers; without WebGL the rest of the page works. */
 export class Atlas {
@@ -88,6 +91,15 @@ export class Atlas {
     if (layer instanceof GeoJSONSource) layer.setData({ type: "FeatureCollection", features } as FeatureCollection);
   }
 
+  /** Show a scene through two models below its outline, until the signal aborts; null without a map. */
+  async compare(pyramids: Pyramids, signal: AbortSignal): Promise<Comparison | null> {
+    await this.ready;
+    if (!this.map || signal.aborted) return null;
+    const comparison = new Comparison(this.map, pyramids, "scenes-inside");
+    signal.addEventListener("abort", () => comparison.remove());
+    return comparison;
+  }
+
   /** Load points and densities again, after a block was published or withdrawn. */
   refresh(): void {
     for (const name of ["points", "density"]) {
@@ -116,7 +128,7 @@ function opened(container: HTMLElement): MapLibre | null {
       dragRotate: false,
       pitchWithRotate: false,
       touchPitch: false,
-      transformRequest: (url) => ({ url, headers: url.startsWith(`${BASE}collections/`) ? authorization() : {} }),
+      transformRequest: (url) => ({ url, headers: PROTECTED.some((path) => url.startsWith(BASE + path)) ? authorization() : {} }),
     });
     map.touchZoomRotate.disableRotation();
     map.keyboard.disableRotation();

@@ -6,6 +6,7 @@ import type { ResultFile, StatusInfo } from "./api_types";
 import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
 import type { Criterion, Report } from "./report_types";
+import { imageOnMap } from "./image_on_map";
 import { type PointResultProperties, residualVectors } from "./residuals";
 
 const POLL_MS = 1000;
@@ -93,7 +94,8 @@ async function failureReport(job: StatusInfo, signal: AbortSignal): Promise<HTML
   return h("p", {}, link, " ", h("span", { class: "quiet" }, "what was tried, and what to try next"));
 }
 
-async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: HTMLElement, body: HTMLElement): Promise<void> {
+async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, body: HTMLElement): Promise<void> {
+  const { atlas, signal } = place;
   const results = await get<Results>(`jobs/${job.jobID}/results`, signal);
   const reportFile = results["report.json"];
   const pointsFile = results["control_points.geojson"];
@@ -109,7 +111,7 @@ async function showResults({ atlas, signal }: Place, job: StatusInfo, heading: H
   const footprint: Polygon = { type: "Polygon", coordinates: [[...ring, ring[0]!]] };
   const { features, exaggeration } = residualVectors(points);
   heading.textContent = report.scene.name;
-  fill(body, ...summary(report, exaggeration), drawingLink(job), await downloads(results, signal));
+  fill(body, ...summary(report, exaggeration), drawingLink(job), imageOnMap(place, job, report), ...criteria(report), await downloads(results, signal));
   await atlas.show("scenes", [{ type: "Feature", properties: {}, geometry: footprint }]);
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
@@ -148,12 +150,17 @@ function summary(report: Report, exaggeration: number): (HTMLElement | null)[] {
       "Predicted CE90 relative to the control points, worst place": figure(predicted.worst_px, "px"),
     }),
     h("p", { class: "legend-line" }, h("span", { class: "swatch vector", "aria-hidden": "true" }), `Residuals on the map, drawn ${figure(exaggeration)} times longer; grey: not used.`),
+  ];
+}
+
+function criteria({ criteria }: Report): HTMLElement[] {
+  return [
     h("h2", {}, "Criteria"),
     h(
       "table",
       {},
       h("thead", {}, h("tr", {}, ...["Criterion", "Value", "Limit", "Met"].map((name) => h("th", { scope: "col" }, name)))),
-      h("tbody", {}, ...report.criteria.map(criterion)),
+      h("tbody", {}, ...criteria.map(criterion)),
     ),
   ];
 }

@@ -60,22 +60,31 @@ export class Tiles {
 
 /** The tiles of a scene: of an earlier job, or of a new one, whose state `report` gets. */
 export async function tilesOf(scene: string, signal: AbortSignal, report: (job: StatusInfo) => void): Promise<Tiles> {
-  const { jobs } = await get<Jobs>(`jobs?processID=${PROCESS}&status=successful&limit=100`, signal);
-  const earlier = jobs.find(({ inputs }) => inputs["scene"] === scene);
+  const { results } = await drawn(PROCESS, { scene }, signal, report);
+  const { href } = results["tiles.json"] as ResultFile;
+  return new Tiles(await get<TileIndex>(href, signal), (results["tiles.bin"] as ResultFile).href, signal);
+}
+
+/** A job with some inputs and its results: an earlier one, or a new one, whose state `report` gets. */
+export async function drawn(
+  process: string,
+  inputs: Record<string, unknown>,
+  signal: AbortSignal,
+  report: (job: StatusInfo) => void,
+): Promise<{ job: StatusInfo; results: Record<string, unknown> }> {
+  const resultsOf = (job: StatusInfo): Promise<Record<string, unknown>> => get(`jobs/${job.jobID}/results`, signal);
+  const { jobs } = await get<Jobs>(`jobs?processID=${process}&status=successful&limit=100`, signal);
+  const earlier = jobs.find((job) => Object.entries(inputs).every(([name, value]) => (job.inputs[name] ?? null) === value));
   if (earlier) {
     try {
-      return await opened(earlier, signal);
+      return { job: earlier, results: await resultsOf(earlier) };
     } catch (error) {
+      // Its results were removed.
       if (!(error instanceof Refused)) throw error;
     }
   }
-  return opened(await run(PROCESS, { scene }, signal, report), signal);
-}
-
-async function opened(job: StatusInfo, signal: AbortSignal): Promise<Tiles> {
-  const results = await get<Record<string, ResultFile>>(`jobs/${job.jobID}/results`, signal);
-  const index = await get<TileIndex>(results["tiles.json"]!.href, signal);
-  return new Tiles(index, results["tiles.bin"]!.href, signal);
+  const job = await run(process, inputs, signal, report);
+  return { job, results: await resultsOf(job) };
 }
 
 /** Run a process to its end; an unsuccessful one is thrown in the words of the service. */
