@@ -52,6 +52,6 @@ def terrain_of_points(lon_lat_h: Array, around: Array) -> Terrain:
         np.array([[0.0, step[0]], [-step[1], 0.0]]),
         (_NODES, _NODES),
     )
-    return Terrain(
-        grid, ArrayImage(pixels), None, f"interpolated between {len(lon_lat_h)} control points"
-    )
+    count = len(lon_lat_h)
+    origin = f"interpolated between {count} control points" if count > 1 else "that of one control point"
+    return Terrain(grid, ArrayImage(pixels), None, origin)

@@ -1,19 +1,28 @@
 """A registered scene on the map, before and after, as tiles for its owner."""
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from uuid import UUID
 
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from fastapi.testclient import TestClient
+from rasterio.transform import from_origin
 
 from app.config import Settings
 from app.db.engine import Database
 from app.storage import Storage
+from app.usecases.registered_scene import SceneModel
+from app.usecases.scene_map import LAYERS, MappedScene, map_scene
+from app.usecases.terrain_file import TerrainFile
+from services.formats.sensor_models.correction_json import format_correction
 from services.orthorectification.tile_limits import TILE_PX, TileLimits
+from services.sensors.correction import no_correction
 from services.types import Array
 from tests.app.flat_world import (
     CENTRE,
@@ -24,6 +33,7 @@ from tests.app.flat_world import (
     publish_world,
 )
 from tests.app.ledger import job_runner, make_token
+from tests.app.test_orthorectification import MODEL, write_inputs
 
 MERCATOR_M = 40_075_016.68557849
 """Width of the map of the web."""
@@ -236,3 +246,54 @@ def test_a_map_is_refused_without_a_registration_of_the_scene(
         body = {"inputs": {**known, **more}}
         reply = client.post("/processes/map-scene/execution", json=body, headers=headers)
         assert reply.status_code == status, reply.text
+
+
+def drawn_on(terrain: TerrainFile | None, image: Path, folder: Path) -> tuple[MappedScene, list[bytes]]:
+    """The map of a scene whose registration moved it by a line, and both files of tiles."""
+    shape = (300, 400)
+    moved = replace(no_correction(shape), parameters=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    registration = folder / "registration"
+    registration.mkdir(exist_ok=True)
+    text = format_correction(
+        moved, "shift", np.zeros((6, 6)), np.zeros(2), applies_to="tags", carried="tags"
+    )
+    (registration / "correction.json").write_text(text)
+    lon, lat, height_m = (float(number) for number in MODEL.ground_offset)
+    point = {"type": "Point", "coordinates": [lon, lat, height_m]}
+    features = [{"type": "Feature", "geometry": point, "properties": {}}]
+    document = {"type": "FeatureCollection", "features": features}
+    (registration / "control_points.geojson").write_text(json.dumps(document))
+    outputs = {layer: folder / f"{layer}.tiles" for layer in LAYERS}
+    mapped = map_scene(SceneModel(image, registration=registration), terrain, outputs)
+    return mapped, [path.read_bytes() for path in outputs.values()]
+
+
+def test_a_terrain_as_high_as_the_points_gives_the_same_tiles(tmp_path: Path) -> None:
+    image, dem = write_inputs(tmp_path)
+    on_points, tiles = drawn_on(None, image, tmp_path)
+    on_terrain, same = drawn_on(TerrainFile(dem, "ellipsoid"), image, tmp_path)
+    assert on_points.heights == "that of one control point"
+    assert on_terrain.heights != on_points.heights
+    assert on_terrain.limits == on_points.limits
+    raw, registered = tiles
+    assert raw != registered
+    assert [len(one) for one in same] == pytest.approx([len(one) for one in tiles], rel=0.02)
+
+
+def test_an_ortho_image_is_drawn_where_its_grid_and_its_correction_put_it(tmp_path: Path) -> None:
+    lon, lat, _ = MODEL.ground_offset
+    step = 1.0 / 111_320.0
+    pixels = np.arange(300 * 400, dtype=np.uint16).reshape(300, 400) // 2 + 1
+    profile = {"driver": "GTiff", "height": 300, "width": 400, "count": 1, "dtype": "uint16"}
+    transform = from_origin(lon - 200 * step, lat + 150 * step, step, step)
+    with rasterio.open(
+        tmp_path / "ortho.tif", "w", crs="EPSG:4326", transform=transform, **profile
+    ) as file:
+        file.write(pixels, 1)
+    mapped, (raw, registered) = drawn_on(None, tmp_path / "ortho.tif", tmp_path)
+    west, south, east, north = mapped.bounds
+    assert west == pytest.approx(lon - 200 * step, abs=step)
+    assert east == pytest.approx(lon + 200 * step, abs=step)
+    assert north == pytest.approx(lat + 151 * step, abs=step / 2.0)
+    assert north - south == pytest.approx(300 * step, abs=step / 2.0)
+    assert raw != registered
