@@ -48,6 +48,7 @@ vector_colour = np.array([0xB3, 0x26, 0x1E])
 enough_px = 50
 a_third_of_a_pixel_m = GSD_M / 3.0
 a_hundredth_px = 0.01
+a_scene_deg = 0.005
 a_visible_difference = 5.0
 as_good_as_equal = 1.0
 """Mean differences of grey values from 0 to 255."""
@@ -306,6 +307,12 @@ def test_an_image_is_compared_on_the_map_before_and_after_its_registration(
     page.keyboard.press("End")
     assert np.abs(grey_map(page)[right] - raw[right]).mean() < as_good_as_equal
     page.screenshot(path=ARTEFACTS / "image-on-map-end.png")
+
+    box = page.locator("#map").bounding_box()
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
+    lat, _, lon, _ = page.locator(".pointer").inner_text().replace("°", "").split()
+    assert np.hypot(*(np.array([float(lon), float(lat)]) - CENTRE)) < a_scene_deg
+    page.screenshot(path=ARTEFACTS / "image-on-map-pointer.png")
 
     section.get_by_label("Opacity").fill("0")
     blank = grey_map(page)

@@ -12,6 +12,7 @@ import {
 } from "maplibre-gl";
 import { authorization, BASE } from "./api";
 import { Comparison, type Pyramids } from "./comparison";
+import { h } from "./elements";
 import { mapStyle } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
@@ -50,6 +51,10 @@ export class Atlas {
       );
       if (point) onPoint(Number(point.properties["id"]));
     });
+    const pointer = h("p", { class: "pointer", "aria-hidden": "true" });
+    container.append(pointer);
+    map.on("mousemove", ({ lngLat }) => (pointer.textContent = place(wrapped(lngLat.lng), lngLat.lat)));
+    map.on("mouseout", () => (pointer.textContent = ""));
     map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
     map.on("mouseleave", "points", () => (map.getCanvas().style.cursor = ""));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", (scheme) => this.repaint(scheme.matches));
@@ -140,6 +145,15 @@ function opened(container: HTMLElement): MapLibre | null {
     container.append(`The map cannot be shown: ${error instanceof Error ? error.message : "no WebGL"}`);
     return null;
   }
+}
+
+/** A place in degrees, to about 0.1 m. */
+function place(longitude: number, latitude: number): string {
+  return `${degrees(latitude, "N", "S")}  ${degrees(longitude, "E", "W")}`;
+}
+
+function degrees(angle: number, positive: string, negative: string): string {
+  return `${Math.abs(angle).toFixed(6)}° ${angle < 0 ? negative : positive}`;
 }
 
 function wrapped(longitude: number): number {
