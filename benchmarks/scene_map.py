@@ -1,7 +1,7 @@
 """A registered scene on the map: what drawing its tiles costs, and how fast one service sends them.
 
 The worker's part is measured in this process: CPU time and highest memory, beside those of a scene with
-a quarter of the lines and samples, so that memory is seen not to grow with the number of pixels. The
+a quarter of the lines and samples, so that memory is seen to grow less than the number of pixels. The
 service is one process, as it is run; a client asks for tiles of the finest zoom in the middle, one after
 the other, as a page does that opens there. *first* is the first request to a service that has just
 started. The image is noise with the correlation of natural ground, whose tiles are large.
@@ -11,7 +11,6 @@ Run: python -m benchmarks.scene_map
 import argparse
 import http.client
 import json
-import os
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -74,16 +73,12 @@ class Service:
     Attributes:
         first_s: from the first request to its tile.
         next_s: of all the next tiles together.
-        next_cpu_s: CPU time of the service for them.
         tiles: how many these are.
-        grown_mib: memory of the service after them, less that before.
     """
 
     first_s: float
     next_s: float
-    next_cpu_s: float
     tiles: int
-    grown_mib: float
 
 
 def main() -> None:
@@ -106,8 +101,7 @@ def main() -> None:
         table.add_row(str(one.size), f"{one.cpu_s:.0f}", f"{one.highest_mib:.0f}", f"{one.file_mib:.0f}")
     console.print(table)
     console.print(
-        f"first tile {service.first_s:.3f} s; the next {service.tiles} in {service.next_s:.3f} s, "
-        f"{service.next_cpu_s:.2f} s of CPU; memory of the service + {service.grown_mib:.1f} MiB"
+        f"first tile {service.first_s:.3f} s; the next {service.tiles} in {service.next_s:.3f} s"
     )
     keep("scene_map", {"drawings": [asdict(one) for one in drawings], "service": asdict(service)})
 
@@ -203,13 +197,11 @@ def serve(folder: Path, mapped: MappedScene) -> Service:
             start = time.perf_counter()
             fetch(connection_kept, paths[0], headers)
             first_s = time.perf_counter() - start
-            cpu_s, memory = spent_s(server.process.pid), resident_mib(server.process.pid)
             start = time.perf_counter()
             for path in paths[1:]:
                 fetch(connection_kept, path, headers)
             next_s = time.perf_counter() - start
-            cpu_s = spent_s(server.process.pid) - cpu_s
-            return Service(first_s, next_s, cpu_s, TILES, resident_mib(server.process.pid) - memory)
+            return Service(first_s, next_s, TILES)
 
 
 def fetch(connection: http.client.HTTPConnection, path: str, headers: dict[str, str]) -> None:
@@ -218,32 +210,6 @@ def fetch(connection: http.client.HTTPConnection, path: str, headers: dict[str, 
     reply = connection.getresponse()
     content = reply.read()
     assert reply.status == 200, content
-
-
-def spent_s(pid: int) -> float:
-    """CPU time of a process and those that it started, seconds."""
-    ticks = 0
-    for one in family(pid):
-        fields = Path(f"/proc/{one}/stat").read_text().rsplit(")", 1)[1].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def resident_mib(pid: int) -> float:
-    """Resident memory of a process and those that it started."""
-    lines = [
-        line
-        for one in family(pid)
-        for line in Path(f"/proc/{one}/status").read_text().splitlines()
-        if line.startswith("VmRSS:")
-    ]
-    return sum(int(line.split()[1]) for line in lines) / 1024.0
-
-
-def family(pid: int) -> list[int]:
-    """A process and those that it started."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [pid, *(other for child in children for other in family(int(child)))]
 
 
 if __name__ == "__main__":
