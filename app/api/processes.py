@@ -75,7 +75,7 @@ class Execute(BaseModel):
 def list_processes(
     *,
     request: Request,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Number of processes on a page.")] = 10,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Number of processes on a page.")] = 100,
     offset: Annotated[int, Query(ge=0, le=1000, description="From the link `next`.")] = 0,
 ) -> Processes:
     """List the processes."""

@@ -79,11 +79,13 @@ def test_all_of_many_more_requests_than_threads_and_connections_are_answered(
         ("POST", "http://localhost/tokens", 201),
     ]
     headers = bearer("admin")
-    body = {"name": "one of many", "scopes": ["read"]}
+    body = {"scopes": ["read"]}
     many = TIMES_MORE * deps.threads_for(Settings(pool_size=CONNECTIONS))
     requests = [
-        httpx.Request(how, url, headers=headers, json=body if how == "POST" else None)
-        for how, url, _ in islice(cycle(kinds), many)
+        httpx.Request(
+            how, url, headers=headers, json={"name": f"{k} of many", **body} if how == "POST" else None
+        )
+        for k, (how, url, _) in enumerate(islice(cycle(kinds), many))
     ]
     replies = anyio.run(answered, app, requests)
     assert len(replies) == many

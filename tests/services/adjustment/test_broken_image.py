@@ -11,7 +11,8 @@ from services.adjustment.image_correction import (
     SceneAdjustment,
     adjust_scene,
 )
-from services.quality.accuracy import normal_ce90, normalised_error
+from services.quality.accuracy import normalised_error
+from services.quality.normal_law import normal_ce90
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, IntArray
 from tests.services.conftest import FlatModel
