@@ -68,8 +68,8 @@ def line_breaks(image: ImageSource) -> IntArray:
     contrast = np.zeros(len(parts))
     contrast[told] = np.nanmedian(excess[told], axis=1)
     beside = np.maximum(np.append(contrast[1:], 0.0), np.insert(contrast[:-1], 0, 0.0))
-    votes = np.maximum(largest.sum(axis=1), 1)
-    false_alarms = len(parts) * bdtrc(votes - 1, np.maximum(parts, 1), 1.0 / width)
+    agreeing = np.maximum(largest.sum(axis=1), 1)
+    false_alarms = len(parts) * bdtrc(agreeing - 1, np.maximum(parts, 1), 1.0 / width)
     broken = contrast >= max(_LEAST_CONTRAST, _TIMES * np.percentile(contrast[told], _ORDINARY))
     broken &= (beside < _BESIDE * contrast) & (false_alarms <= _MAX_FALSE_ALARMS)
     broken[:_NEAR] = broken[-_NEAR:] = False
