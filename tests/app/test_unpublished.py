@@ -1,0 +1,134 @@
+"""What belongs to a block that is not published is served in no way; once it is published, it is."""
+
+from collections.abc import Callable
+
+import pytest
+
+from app.db.blocks import ID_BITS
+from app.usecases import history
+from app.usecases.blocks import lifecycle
+from tests.factories import make_block
+
+pytestmark = pytest.mark.security
+
+READ, ADMIN = "read", "admin"
+POINTS, CHIPS, HISTORY = (
+    f"/collections/{name}" for name in ("points/items", "points/chips", "point-history/items")
+)
+OF_A_POINT = (
+    f"{POINTS}/<served>",
+    f"{POINTS}/<served>?f=html",
+    f"{POINTS}/<served>/chips",
+    f"{POINTS}/<served>/chips?f=png",
+    f"{POINTS}/<served>/chips/0",
+    f"{POINTS}/<served>/chips/0?f=tif",
+    f"{CHIPS}?ids=<served>",
+    f"{CHIPS}?ids=<served>&f=tif",
+    f"{HISTORY}/<suspended>",
+)
+OF_ALL = (
+    f"{POINTS}?bbox=5,43,6,44",
+    f"{POINTS}?bbox=5,43,6,44&f=csv",
+    f"{CHIPS}?bbox=5,43,6,44",
+    HISTORY,
+    f"{HISTORY}?filter=state='suspended'",
+    "/collections/points/tiles/WebMercatorQuad/8/93/131",
+    "/collections/density/items",
+    "/collections/blocks/items",
+)
+
+
+@pytest.fixture
+def staged(connection, storage, tmp_path) -> dict[str, str]:
+    """Ids of points of a staged block beside a published one: one to be served, one suspended."""
+    for count, name in ((12, "shown"), (9, "staged")):
+        folder = make_block(tmp_path / name, count=count, seed=count, name=name).folder
+        number = lifecycle.ingest_block(connection, storage, folder).block.number
+        first = number << ID_BITS
+        history.suspend_point(connection, first + 1, "a house was built")
+    lifecycle.publish_block(connection, "shown")
+    connection.commit()
+    return {"served": str(first), "suspended": str(first + 1)}
+
+
+@pytest.fixture
+def published(connection) -> Callable[[bool], None]:
+    """Publishes the staged block, or withdraws it."""
+
+    def publish(wanted: bool) -> None:
+        (lifecycle.publish_block if wanted else lifecycle.withdraw_block)(connection, "staged")
+        connection.commit()
+
+    return publish
+
+
+@pytest.mark.parametrize("way", OF_A_POINT)
+@pytest.mark.parametrize("role", [READ, ADMIN])
+def test_a_point_is_served_by_its_id_while_its_block_is_published(
+    staged, published, client, bearer, way, role
+):
+    for name, value in staged.items():
+        way = way.replace(f"<{name}>", value)
+    headers = bearer(role)
+    statuses = [client.get(way, headers=headers).status_code]
+    for wanted in (True, False):
+        published(wanted)
+        statuses.append(client.get(way, headers=headers).status_code)
+    assert statuses == [404, 200, 404]
+
+
+def test_chips_are_sent_by_post_while_their_block_is_published(staged, published, client, bearer):
+    headers, body = bearer(READ), {"ids": [int(staged["served"])]}
+    statuses = [client.post(CHIPS, json=body, headers=headers).status_code]
+    for wanted in (True, False):
+        published(wanted)
+        statuses.append(client.post(CHIPS, json=body, headers=headers).status_code)
+    assert statuses == [404, 200, 404]
+
+
+@pytest.mark.parametrize("way", OF_ALL)
+def test_what_is_told_of_all_points_changes_with_a_publication_alone(
+    staged, published, client, bearer, way
+):
+    """A staged block leaves no trace in what is listed, counted, drawn or archived, a withdrawn one none
+    that stays."""
+    headers = bearer(READ)
+
+    def told() -> object:
+        reply = client.get(way, headers=headers)
+        assert reply.status_code == 200, reply.text
+        if "json" not in reply.headers["content-type"]:
+            return reply.content
+        return {name: value for name, value in reply.json().items() if name != "timeStamp"}
+
+    before = told()
+    published(True)
+    assert told() != before
+    published(False)
+    assert told() == before
+
+
+def test_histories_on_the_command_line_are_those_of_published_blocks(staged, published, connection):
+    def suspended() -> set[int]:
+        return {one.id for one in history.list_histories(connection, "suspended")}
+
+    hidden = int(staged["suspended"])
+    assert len(suspended()) == 1
+    assert hidden not in suspended()
+    published(True)
+    assert hidden in suspended()
+
+
+@pytest.mark.parametrize("way", [*OF_A_POINT[:-1], *OF_ALL])
+def test_nothing_that_a_token_opens_may_stay_in_a_cache_that_people_share(
+    staged, published, client, bearer, way
+):
+    published(True)
+    for name, value in staged.items():
+        way = way.replace(f"<{name}>", value)
+    assert client.get(way).status_code == 401
+    reply = client.get(way, headers=bearer(READ))
+    assert reply.status_code == 200
+    directives = {one.strip() for one in reply.headers["cache-control"].split(",")}
+    assert directives & {"no-store", "private"}
+    assert not any(one.startswith(("public", "s-maxage")) for one in directives)
