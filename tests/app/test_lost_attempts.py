@@ -1,0 +1,241 @@
+"""An attempt that has lost its job does not begin, stores nothing, and goes no further."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from uuid import UUID
+
+import psycopg
+import pytest
+from psycopg import sql
+from psycopg.conninfo import conninfo_to_dict
+
+from app.auth import Scope
+from app.config import Settings
+from app.db.cluster.embedded import SUPERUSER, Cluster
+from app.db.engine import Connection, Database
+from app.db.jobs import attempts, jobs
+from app.db.jobs.attempts import LostJob
+from app.db.jobs.jobs import Job
+from app.db.scenes import begin_upload
+from app.errors import InputError
+from app.usecases.jobs import PROCESSES, do_attempt
+from app.usecases.processes import Commit, Process, Work
+from app.worker.attempt import Attempts
+from tests.app.job_queue import claimed, let_lease_lapse, new_job, state_of
+from tests.statements import run_sql
+
+Event = Callable[[Database, Job], None]
+
+
+@dataclass(frozen=True)
+class SceneOnly:
+    """Inputs of a process that stores a row and does nothing else."""
+
+    scene: UUID
+
+
+def dismissed(database: Database, job: Job) -> None:
+    with database.transaction() as connection:
+        jobs.dismiss(connection, job.id)
+
+
+def removed(database: Database, job: Job) -> None:
+    dismissed(database, job)
+    with database.transaction() as connection:
+        jobs.delete_ended(connection, [job.id])
+
+
+def given_back(database: Database, job: Job) -> None:
+    with database.transaction() as connection:
+        attempts.give_back(connection, job.id, job.attempt)
+
+
+def taken_back(database: Database, job: Job) -> None:
+    let_lease_lapse(database, job.id)
+    with database.transaction() as connection:
+        attempts.take_back(connection, failures_allowed=3)
+
+
+def taken_over(database: Database, job: Job) -> None:
+    taken_back(database, job)
+    claimed(database, job.id, "heir")
+
+
+def ended(database: Database, job: Job) -> None:
+    with database.transaction() as connection:
+        attempts.succeed(connection, job.id, job.attempt, {})
+
+
+EVENTS = (dismissed, removed, given_back, taken_back, taken_over, ended)
+
+
+@pytest.fixture
+def job(database: Database) -> Job:
+    """A job at which the first attempt has been claimed."""
+    return claimed(database, new_job(database).id)
+
+
+@pytest.fixture
+def process(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Work], None]], None]:
+    """Makes the job's process one that works as told, then stores a scene."""
+
+    def install(work_as_told: Callable[[Work], None]) -> None:
+        def commit(connection: Connection) -> dict[str, object]:
+            begin_upload(connection, None, "stored by the attempt", "a.tif", sigma_m=None)
+            return {}
+
+        def run(work: Work) -> Commit:
+            work_as_told(work)
+            return commit
+
+        own = Process("register-scene", "", "", Scope.REGISTER, SceneOnly, {}, lambda *_: None, run)
+        monkeypatch.setitem(PROCESSES, "register-scene", own)
+
+    return install
+
+
+def stored(database: Database) -> int:
+    with database.transaction() as connection:
+        row = run_sql(connection, "select count(*) as n from scene").fetchone()
+    assert row is not None
+    return int(row["n"])
+
+
+def rows_of_jobs(database: Database) -> list[dict[str, object]]:
+    with database.transaction() as connection:
+        return run_sql(connection, "select * from job").fetchall()
+
+
+def test_an_attempt_that_keeps_its_job_stores_its_outcome(database, settings, job, process):
+    process(lambda work: work.progress(0.5, "half done"))
+    do_attempt(database, settings, job.id, job.attempt)
+    assert (state_of(database, job.id).state, stored(database)) == ("successful", 1)
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_an_attempt_at_a_job_that_went_on_without_it_does_not_begin(
+    database, settings, job, process, event: Event
+):
+    begun = []
+    process(begun.append)
+    event(database, job)
+    before = rows_of_jobs(database)
+    with pytest.raises(LostJob):
+        do_attempt(database, settings, job.id, job.attempt)
+    assert (begun, stored(database), rows_of_jobs(database)) == ([], 0, before)
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_what_an_attempt_made_is_stored_with_its_job_or_not_at_all(
+    database, settings, job, process, event: Event
+):
+    process(lambda work: event(database, job))
+    with pytest.raises(LostJob):
+        do_attempt(database, settings, job.id, job.attempt)
+    assert stored(database) == 0
+    assert all(row["results"] is None or event is ended for row in rows_of_jobs(database))
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_the_error_of_an_attempt_that_lost_its_job_ends_nothing(
+    database, settings, job, process, event: Event
+):
+    def fail(work: Work) -> None:
+        event(database, job)
+        raise InputError("too late")
+
+    process(fail)
+    with pytest.raises(LostJob):
+        do_attempt(database, settings, job.id, job.attempt)
+    assert all(row["error"] is None for row in rows_of_jobs(database))
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_an_attempt_learns_by_its_progress_that_it_lost_its_job(
+    database, settings, job, process, event: Event
+):
+    reached = []
+
+    def work_on(work: Work) -> None:
+        event(database, job)
+        work.progress(0.5, "half done")
+        reached.append("the other half")
+
+    process(work_on)
+    with pytest.raises(LostJob):
+        do_attempt(database, settings, job.id, job.attempt)
+    assert reached == []
+
+
+LEASE_S = 0.6
+
+
+class Endless:
+    """Processes of attempts of which none ends by itself before many leases have passed.
+
+    Attributes:
+        killed_after: number of times that a worker waited before it ended the process; None: it did not.
+    """
+
+    def __init__(self, begin: Callable[[], None]) -> None:
+        self.killed_after: int | None = None
+        self._begin, self._waits, self._most = begin, 0, 60
+
+    def start(
+        self, function: str, arguments: Sequence[str], environment: Mapping[str, str]
+    ) -> "Endless":
+        self._begin()
+        return self
+
+    def wait(self, timeout_s: float) -> int | None:
+        self._waits += 1
+        time.sleep(timeout_s)
+        return 0 if self._waits >= self._most else None
+
+    def close(self) -> None:
+        self.killed_after = self._waits if self._waits < self._most else None
+
+
+def test_a_worker_that_cannot_renew_its_lease_ends_the_process_of_its_attempt(
+    cluster: Cluster, database: Database, settings: Settings, dsn: str
+):
+    """By then another worker may have begun; the one that is cut off cannot ask."""
+    name = conninfo_to_dict(dsn)["dbname"]
+
+    def cut_off() -> None:
+        with psycopg.connect(cluster.dsn("postgres", SUPERUSER), autocommit=True) as connection:
+            refuse = sql.SQL("alter database {} allow_connections false").format(sql.Identifier(name))
+            connection.execute(refuse)
+            connection.execute(
+                "select pg_terminate_backend(pid) from pg_stat_activity where datname = %s", [name]
+            )
+
+    new_job(database)
+    endless = Endless(cut_off)
+    short = settings.model_copy(update={"lease_seconds": LEASE_S})
+    Attempts(database, endless, short, "w", lambda: False).do_next_job()
+    assert endless.killed_after is not None
+
+
+def test_a_worker_that_renews_its_lease_keeps_its_job_for_many_leases(
+    database: Database, settings: Settings
+):
+    job = new_job(database)
+    endless = Endless(lambda: None)
+    short = settings.model_copy(update={"lease_seconds": LEASE_S})
+    Attempts(database, endless, short, "w", lambda: False).do_next_job()
+    with database.transaction() as connection:
+        assert attempts.take_back(connection, failures_allowed=3) == []
+    assert (endless.killed_after, state_of(database, job.id).state) == (None, "running")
+
+
+@pytest.mark.parametrize("event", [dismissed, taken_over, removed])
+def test_a_worker_whose_job_went_on_without_it_ends_the_process_of_its_attempt(
+    database: Database, settings: Settings, event: Event
+):
+    job = new_job(database)
+    endless = Endless(lambda: event(database, state_of(database, job.id)))
+    short = settings.model_copy(update={"lease_seconds": LEASE_S})
+    Attempts(database, endless, short, "w", lambda: False).do_next_job()
+    assert endless.killed_after is not None
