@@ -1,5 +1,6 @@
 """Several blocks at one place: which point is served, independent of the order of events."""
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import permutations
@@ -7,10 +8,18 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from app.db import engine, superseding
+from app.db import engine, points, superseding
+from app.db.density import DENSITY, points_in_box
+from app.db.features import pages
+from app.db.features.bbox import Box
+from app.db.points import POINTS
 from app.db.superseding import SAME_PLACE_M
 from app.errors import Conflict, InputError
+from app.usecases import history
 from app.usecases.blocks import lifecycle
+from app.usecases.features.items import everything_in
+from app.usecases.features.points import points_of_filter
+from app.usecases.features.query import FeatureQuery
 from services.formats.block.document import AccuracyFigure
 from services.formats.block.writer import write_block
 from services.types import Array
@@ -24,13 +33,13 @@ def made(
     folder, name: str, lon_lat: Array, frame_sigma_m: float | None = None, version: str = "1", box=BOX
 ):
     """A block with points at these positions."""
-    points = control_points(len(lon_lat), np.random.default_rng(5), box)
-    points = replace(points, lon_lat_h=np.column_stack([lon_lat, points.lon_lat_h[:, 2]]))
+    contents = control_points(len(lon_lat), np.random.default_rng(5), box)
+    contents = replace(contents, lon_lat_h=np.column_stack([lon_lat, contents.lon_lat_h[:, 2]]))
     block_metadata = metadata(name, version, box)
     if frame_sigma_m is not None:
         frame = AccuracyFigure("absolute", "frame_sigma_m", frame_sigma_m, 30, "survey")
         block_metadata = replace(block_metadata, accuracy=(*block_metadata.accuracy, frame))
-    write_block(folder, block_metadata, points, noise_chips(points), {})
+    write_block(folder, block_metadata, contents, noise_chips(contents), {})
     return folder
 
 
@@ -144,6 +153,80 @@ def test_what_is_served_does_not_depend_on_the_order_of_publication(connection, 
         assert left["n"] == 0
     assert all(one == served_counts[0] for one in served_counts)
     assert any(superseded for _, superseded in served_counts[0])
+
+
+def decided_one_by_one(connection) -> dict[int, int | None]:
+    """Which point supersedes each point of published blocks: all distances, block after block."""
+    rows = run_sql(
+        connection,
+        """select p.id, p.block_number, st_x(p.geom) as lon, st_y(p.geom) as lat, b.priority
+           from point p join block b on b.number = p.block_number where b.state = 'published'""",
+    ).fetchall()
+    ids, blocks, priority = (
+        np.array([row[n] for row in rows]) for n in ("id", "block_number", "priority")
+    )
+    lon, lat = (np.radians([row[n] for row in rows]) for n in ("lon", "lat"))
+    decided: dict[int, int | None] = {}
+    for i in range(len(rows)):
+        half = np.sin((lat - lat[i]) / 2.0) ** 2
+        half += np.cos(lat) * np.cos(lat[i]) * np.sin((lon - lon[i]) / 2.0) ** 2
+        metres = 2.0 * 6_371_008.8 * np.arcsin(np.sqrt(half))
+        rivals = (metres <= SAME_PLACE_M) & (priority > priority[i]) & (blocks != blocks[i])
+        best = rivals & (priority == priority[rivals].max(initial=-1))
+        decided[int(ids[i])] = int(ids[best][metres[best].argmin()]) if best.any() else None
+    return decided
+
+
+def shown_everywhere(connection) -> list[set[int]]:
+    """Ids of the points that registrations, lists and filters get."""
+    outline = np.array([[5.0, 43.0], [6.0, 43.0], [6.0, 44.0], [5.0, 44.0]])
+    everything = everything_in(POINTS, "5,43,6,44")
+    return [
+        set(points.control_points(connection, outline).points.id.tolist()),
+        set(points.control_points(connection, outline, limit=10_000).points.id.tolist()),
+        set(pages.keys(connection, everything, 10_000)),
+        set(points_of_filter(connection, FeatureQuery(bbox="5,43,6,44")).id.tolist()),
+    ]
+
+
+def test_every_way_to_the_points_shows_those_that_no_better_block_has(connection, ingest, places):
+    """Four blocks whose points lie so close that several could win, published, withdrawn and ranked."""
+    rng = np.random.default_rng(11)
+    names = ("a", "b", "c", "d")
+    for priority, name in enumerate(names):
+        jitter = rng.uniform(-9.0, 9.0, places.shape) * metre_of_latitude_deg
+        # Two points of each block at most places: the nearer one wins.
+        twice = np.concatenate([places + jitter, places + jitter[::-1]])
+        ingest(name, twice, priority=10 * priority)
+    steps = [(lifecycle.publish_block, name) for name in ("c", "a", "d", "b")]
+    steps += [(lifecycle.withdraw_block, name) for name in ("d", "b")]
+    steps += [(lifecycle.publish_block, "b"), (lifecycle.publish_block, "d")]
+    steps += [(lambda c, name: lifecycle.prioritise_block(c, name, 25), "a")]
+    steps += [(lambda c, name: lifecycle.prioritise_block(c, name, 5), "d")]
+    steps += [(lifecycle.withdraw_block, "a")]
+    box, suspended = Box(5.0, 43.0, 6.0, 44.0), set()
+    for number, (step, name) in enumerate(steps):
+        step(connection, name)
+        decided = decided_one_by_one(connection)
+        rows = run_sql(
+            connection,
+            """select p.id, superseded_by from point p join block b on b.number = p.block_number
+               where state = 'published'""",
+        ).fetchall()
+        assert {row["id"]: row["superseded_by"] for row in rows} == decided, (number, name)
+        expected = {point for point, winner in decided.items() if winner is None}
+        if number in (2, 6):
+            chosen = min(expected - suspended)
+            history.suspend_point(connection, chosen, "a house was built")
+            suspended.add(chosen)
+        expected -= suspended
+        assert all(shown == expected for shown in shown_everywhere(connection)), (number, name)
+        assert points_in_box(connection, box) == len(expected), (number, name)
+        cells = pages.page(connection, everything_in(DENSITY, "5,43,6,44"), "geojson", None, 1000)
+        counted = [one["properties"]["n_points"] for one in json.loads(f"[{cells.body.decode()}]")]
+        assert sum(counted) == len(expected), (number, name)
+    history.reinstate_point(connection, suspended.pop())
+    assert points_in_box(connection, box) == len(shown_everywhere(connection)[0])
 
 
 def test_a_new_version_takes_the_places_of_the_old_one(connection, ingest, places):
