@@ -221,6 +221,42 @@ def test_the_scale_of_the_residuals_is_the_noise(five: list[ViewGeometry], noise
     assert block.sigma_px * NOISE_PX == pytest.approx(noise_px, rel=0.15)
 
 
+def test_points_are_as_good_as_they_say_whatever_the_observations_state(
+    five: list[ViewGeometry],
+) -> None:
+    """Sigmas that are all too small by the same factor are made good; the points and theirs stay."""
+    ties = make_ties(five, np.random.default_rng(7), 300, 3.0 * NOISE_PX)
+    true, small = (
+        adjusted(five, replace(ties.observations, sigma_px=np.full(len(ties.observations), sigma_px)))
+        for sigma_px in (3.0 * NOISE_PX, NOISE_PX)
+    )
+    held = np.isfinite(true.lon_lat_h[:, 0]) & np.isfinite(small.lon_lat_h[:, 0])
+    apart_m = difference_m(small.lon_lat_h[held], true.lon_lat_h[held])
+    error_m = difference_m(small.lon_lat_h[held], ties.lon_lat_h[held])
+    square = whitened_square(error_m - np.median(error_m, axis=0), small.point_covariance_m2[held])
+    assert held.sum() > 250
+    assert np.abs(apart_m).max() < a_centimetre
+    assert square.mean() == pytest.approx(1.0, abs=0.2)
+    np.testing.assert_allclose(
+        small.point_covariance_m2[held], true.point_covariance_m2[held], rtol=0.02, atol=1e-3
+    )
+
+
+def test_no_order_of_the_images_changes_the_block(five: list[ViewGeometry]) -> None:
+    rng = np.random.default_rng(8)
+    shift_px = rng.normal(0.0, PRIOR_PX, (5, 2))
+    ties = make_ties(five, rng, 300, NOISE_PX, 0.0, shift_px, 0.8).observations
+    order = np.array([3, 0, 4, 1, 2])
+    renamed = replace(ties, image=np.argsort(order)[ties.image])
+    one = adjusted(five, ties)
+    other = adjusted([five[i] for i in order], renamed.take(np.lexsort((renamed.image, renamed.point))))
+    held = np.isfinite(one.lon_lat_h[:, 0])
+    assert np.abs(difference_m(other.lon_lat_h[held], one.lon_lat_h[held])).max() < a_centimetre
+    np.testing.assert_allclose(
+        other.point_covariance_m2[held], one.point_covariance_m2[held], rtol=1e-3, atol=1e-4
+    )
+
+
 def test_the_observations_that_leave_are_the_wrong_ones(trials: list[Trial]) -> None:
     wrong = np.concatenate([t.ties.wrong for t in trials])
     active = np.concatenate([t.block.active for t in trials])
