@@ -64,6 +64,60 @@ def test_the_stated_false_alarms_are_not_too_small(count: int) -> None:
     assert np.mean(stated < 0.1) < 0.1 + a_fiftieth
 
 
+@pytest.mark.parametrize("agreeing", [2, 3, 4])
+def test_false_alarms_are_the_number_of_such_sets_in_random_displacements(agreeing: int) -> None:
+    """From both sides: on a torus no window cuts a set off, and the statement is exact."""
+    tolerance_m, count = 15.0, 6
+    rng = np.random.default_rng(agreeing)
+    random = rng.uniform(-REACH_M, REACH_M, (40_000, count, 2))
+    apart = random[:, :, None] - random[:, None]
+    apart -= 2.0 * REACH_M * np.round(apart / (2.0 * REACH_M))
+    members = (np.hypot(apart[..., 0], apart[..., 1]) <= tolerance_m).sum(axis=2)
+    simulated = (members >= agreeing).sum() / len(random)
+    corners = np.array([[-50, -50], [-50, 50], [50, -50], [50, 50], [0, -50], [-50, 0]], dtype=float)
+    displacement = corners.copy()
+    displacement[:agreeing] = corners[0] + rng.uniform(-1.0, 1.0, (agreeing, 2))
+    consensus = a_contrario_consensus(displacement, tolerance_m, REACH_M)
+    assert consensus.inliers.sum() == agreeing
+    assert consensus.false_alarms == pytest.approx(simulated, rel=0.1)
+
+
+def test_a_search_given_by_its_limits_is_the_search_given_by_its_half_side() -> None:
+    rng = np.random.default_rng(4)
+    displacement = random_displacements(rng, 30)
+    displacement[:8] = [10.0, -20.0] + rng.normal(0.0, NOISE_M, (8, 2))
+    limits = np.broadcast_to(np.array([[-REACH_M] * 2, [REACH_M] * 2]), (30, 2, 2)).copy()
+    by_side, by_limits = (
+        a_contrario_consensus(displacement, TOLERANCE_M, search) for search in (REACH_M, limits)
+    )
+    assert by_limits.false_alarms == pytest.approx(by_side.false_alarms, rel=1e-9)
+
+
+@pytest.mark.parametrize("apart_m", [None, 80.0])
+def test_no_choice_of_axes_order_or_unit_changes_a_consensus(apart_m: float | None) -> None:
+    rng = np.random.default_rng(5)
+    displacement = random_displacements(rng, 24)
+    displacement[:9] = [10.0, -20.0] + rng.normal(0.0, NOISE_M, (9, 2))
+    limits = np.stack([np.full((24, 2), -REACH_M), np.column_stack([np.full(24, 30.0)] * 2)], axis=1)
+    limits[:, 1, 1] = 70.0
+    place = rng.uniform(0.0, 2000.0, (24, 2))
+    order = rng.permutation(24)
+
+    def false_alarms(shown: Array, search: Array, at: Array, unit: float) -> float:
+        voters = None if apart_m is None else Voters(at * unit, apart_m * unit)
+        return a_contrario_consensus(
+            shown * unit, TOLERANCE_M * unit, search * unit, voters
+        ).false_alarms
+
+    plain = false_alarms(displacement, limits, place, 1.0)
+    swapped = false_alarms(displacement[:, ::-1], limits[:, :, ::-1], place[:, ::-1], 1.0)
+    mirrored = false_alarms(-displacement, -limits[:, ::-1], place, 1.0)
+    moved = false_alarms(displacement + 1000.0, limits + 1000.0, place, 1.0)
+    in_feet = false_alarms(displacement, limits, place, 3.28)
+    permuted = false_alarms(displacement[order], limits[order], place[order], 1.0)
+    np.testing.assert_allclose([swapped, mirrored, moved, in_feet, permuted], plain, rtol=1e-6)
+
+
 def test_a_larger_consensus_is_more_significant() -> None:
     rng = np.random.default_rng(0)
     noise = random_displacements(rng, 30)

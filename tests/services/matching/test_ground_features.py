@@ -135,3 +135,17 @@ def test_an_image_without_pixels_has_no_features() -> None:
     scene = block_views()[0].as_scene(BLOCK_SIGMA_M)
     empty = replace(scene, image=ArrayImage(np.full(scene.image.shape, np.nan, dtype=np.float32)))
     assert len(find_features(empty, scene_gsd_m(scene))) == 0
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf])
+def test_no_feature_lies_within_four_pixels_of_an_area_without_data(lost: float) -> None:
+    """The edge of such an area is a strong detail that no other image shows."""
+    view = block_views()[0].as_scene(BLOCK_SIGMA_M)
+    pixels = view.image.pixels.copy()  # type: ignore[attr-defined]
+    centre, radius = np.array([330.0, 350.0]), 120.0
+    away = np.hypot(*(np.indices(pixels.shape).transpose(1, 2, 0) - centre).transpose(2, 0, 1)) - radius
+    pixels[away < 0.0] = lost
+    holed = find_features(replace(view, image=ArrayImage(pixels)), scene_gsd_m(view))
+    distance = np.hypot(*(holed.line_sample - centre).T) - radius
+    assert (distance < 30.0).sum() > 20
+    assert distance.min() > 3.0

@@ -8,7 +8,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from services.matching.correlate import FOUND, CorrelationOptions, find_chip
-from services.matching.shadows import CASTER_M, shadow_shift, shadow_vector, shadow_weights
+from services.matching.shadows import (
+    CASTER_M,
+    ShadowShift,
+    shadow_shift,
+    shadow_vector,
+    shadow_weights,
+)
 from services.types import Acquisition, Array, FloatImage
 from tests.services.textures import texture
 
@@ -99,3 +105,33 @@ def test_an_unknown_sun_gives_no_shadow_shift() -> None:
     unknown = replace(JUNE, sun_elevation_deg=float("nan"))
     assert shadow_shift(unknown, OCTOBER, GSD_M) is None
     assert shadow_shift(JUNE, unknown, GSD_M) is None
+
+
+@pytest.mark.parametrize("shift_px", [(0.3, 0.0), (1.2, -0.7), (2.5, 4.0)])
+def test_the_noise_of_a_shadow_is_the_change_of_grey_values_under_its_shift(
+    shift_px: tuple[float, float],
+) -> None:
+    """Of a plane, which a shift changes by the same amount everywhere; the other noise is white."""
+    score, slope = 0.8, np.array([3.0, -2.0])
+    rows, columns = np.indices((21, 21), dtype=np.float64)
+    plane = slope[0] * rows + slope[1] * columns
+    moved = slope[0] * (rows - shift_px[0]) + slope[1] * (columns - shift_px[1])
+    of_shadows, of_all = (moved - plane)[0, 0] ** 2, (1.0 - score**2) * plane.var()
+    shadows = ShadowShift(slope, np.array(shift_px))
+    weights = shadow_weights(plane.astype(np.float32), score, shadows)
+    np.testing.assert_allclose(weights, of_all / (of_all + of_shadows), rtol=1e-4)
+
+
+def test_rows_and_columns_of_a_chip_are_alike_to_shadows() -> None:
+    chip, shadows = village(1, JUNE), shadow_shift(JUNE, EVENING, GSD_M)
+    assert shadows is not None
+    swapped = ShadowShift(shadows.away[::-1].copy(), shadows.shift_px[::-1].copy())
+    turned = shadow_weights(np.ascontiguousarray(chip.T), 0.9, swapped).T
+    np.testing.assert_allclose(turned, shadow_weights(chip, 0.9, shadows), rtol=1e-4)
+
+
+def test_finer_chips_show_shadows_that_move_by_as_many_metres() -> None:
+    fine, coarse = (shadow_shift(JUNE, EVENING, gsd_m) for gsd_m in (0.5, 2.0))
+    assert fine is not None
+    assert coarse is not None
+    np.testing.assert_allclose(fine.shift_px * 0.5, coarse.shift_px * 2.0)

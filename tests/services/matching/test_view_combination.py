@@ -7,7 +7,12 @@ import pytest
 
 from services.matching.correlate import FOUND, Peak, rejected, sigma_per_coordinate
 from services.matching.least_squares import covariance_from_influence
-from services.matching.view_combination import ViewCombination, combine_views, combined_sigmas_px
+from services.matching.view_combination import (
+    ViewCombination,
+    combine_views,
+    combined_sigmas_px,
+    no_measure,
+)
 from services.types import Array, IntArray
 
 CELLS = 25
@@ -65,6 +70,40 @@ def test_the_sigma_of_a_single_view_grows_with_the_scatter_of_other_points() -> 
     )
     assert with_calm_px == pytest.approx(alone_px, rel=0.1)
     assert with_restless_px == pytest.approx(np.hypot(alone_px, 0.2), rel=0.15)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
+def test_the_scatter_of_views_is_found_whatever_their_weights_are(share: float) -> None:
+    """Two views of errors of their own alone: what is stated is the root mean square of their mean."""
+    rng = np.random.default_rng(6)
+    weight, tau_px = np.array([share, 1.0 - share]), 0.2
+    views = tau_px * rng.standard_normal((4000, 2, 2))
+    means = np.einsum("v,nvc->nc", weight, views)
+    squares = ((views - means[:, None]) ** 2).sum(axis=(1, 2))
+    lost = no_measure(2, "flat")
+    points = [replace(lost, sigma_px=0.0, excess_px2=float(s), weight=weight) for s in squares]
+    stated_px = combined_sigmas_px(points)
+    assert stated_px[0] == pytest.approx(np.sqrt((means**2).mean()), rel=0.05)
+
+
+def test_no_order_of_views_and_no_choice_of_axes_changes_a_measure() -> None:
+    peaks = peaks_of_a_point(np.random.default_rng(7), 4, 0.1)
+    swapped = [
+        replace(
+            peak,
+            row_col=peak.row_col[::-1],
+            influence=np.ascontiguousarray(peak.influence.transpose(1, 0, 2)[..., ::-1]),
+            leverage=np.ascontiguousarray(peak.leverage.transpose(1, 0, 2, 3)[..., ::-1, ::-1]),
+        )
+        for peak in peaks
+    ]
+    plain, permuted, turned = (combine_views(p, 1.0) for p in (peaks, peaks[::-1], swapped))
+    np.testing.assert_allclose(permuted.row_col, plain.row_col)
+    np.testing.assert_allclose(permuted.weight[::-1], plain.weight)
+    np.testing.assert_allclose(turned.row_col[::-1], plain.row_col)
+    for other in (permuted, turned):
+        assert other.sigma_px == pytest.approx(plain.sigma_px, rel=1e-6)
+        assert other.excess_px2 == pytest.approx(plain.excess_px2, rel=1e-6)
 
 
 def test_a_point_without_a_measure_has_no_sigma_and_does_not_count() -> None:

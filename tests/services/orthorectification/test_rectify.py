@@ -236,6 +236,23 @@ def test_occluded_ground_is_ground_that_no_line_of_sight_meets_first() -> None:
     assert hidden[inside & (np.abs(above_m) < 0.05)].mean() < 0.01
 
 
+@pytest.mark.parametrize("undulation_m", [-60.0, 80.0])
+def test_the_same_ground_is_hidden_whatever_its_heights_refer_to(undulation_m: float) -> None:
+    ground = terrain(300.0)
+    heights = ground.heights.read(Window(0, 0, *DEM.shape))
+    above_geoid = Terrain(
+        DEM, ArrayImage(heights - np.float32(undulation_m)), lambda at: np.full(len(at), undulation_m)
+    )
+    grid, window = choose_grid(scene(), ground), Window(150, 150, 120, 120)
+    hidden = []
+    for one in (ground, above_geoid):
+        mapping = map_into_image(scene().model, one, grid, window, the_tolerance_px)
+        assert mapping is not None
+        hidden.append(occluded_ground(scene().model, one, grid, window, mapping.height_m))
+    assert 500 < hidden[0].sum() < 0.9 * hidden[0].size
+    assert (hidden[0] != hidden[1]).sum() < 0.01 * hidden[0].sum()
+
+
 def test_flat_ground_occludes_nothing() -> None:
     ground = terrain(0.0)
     grid = choose_grid(scene(), ground)

@@ -311,3 +311,24 @@ def test_links_are_refused_even_to_the_right_file(block):
 def test_chips_beyond_the_end_of_a_file_are_refused(block, row, count):
     with FolderChips(block.folder) as chips, pytest.raises(FormatError, match="the file has 240 chips"):
         chips.read("chips/0000.npy", row, count)
+
+
+SINGULAR = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (-0.5, -0.5, -0.5)]
+"""Correlations east-north, east-up, north-up of errors in a plane or on a line."""
+
+
+@pytest.mark.parametrize("correlations", SINGULAR)
+def test_a_covariance_without_volume_is_refused_and_one_that_has_nearly_none_is_not(
+    block: MadeBlock, correlations: tuple[float, float, float]
+) -> None:
+    """The exact ones are singular whatever the sigmas are; the others have a determinant above zero."""
+    for shrunk in (1.0, 0.999):
+        for name, value in zip(CORRELATIONS, correlations, strict=True):
+            edit_column(block.folder, "points", name, 3, shrunk * value)
+        if shrunk < 1.0:
+            check_block(block.folder)
+        else:
+            assert "positive definite" in str(problems_of(block.folder))
+
+
+CORRELATIONS = ("corr_east_north", "corr_east_up", "corr_north_up")
