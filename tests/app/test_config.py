@@ -1,5 +1,7 @@
 """Settings come from the environment, and the error of a wrong value names its variable."""
 
+import json
+import re
 from pathlib import Path
 
 import pytest
@@ -58,3 +60,112 @@ def test_an_ordinary_user_keeps_data_below_his_home_and_root_below_var(monkeypat
     assert Settings().data_folder == tmp_path / "xdg" / "amers"
     monkeypatch.setattr("os.geteuid", lambda: 0)
     assert Settings().data_folder == Path("/var/lib/amers")
+
+
+DOCUMENTED = dict(
+    re.findall(
+        r"^\| `AMERS_(\w+)` \| ([^|]+) \|",
+        (Path(__file__).parents[2] / "docs" / "operations.md").read_text(),
+        re.MULTILINE,
+    )
+)
+"""What the page of operations gives as the default of each setting."""
+TOLD_IN_WORDS = {"data_folder", "oidc_scopes"}
+
+
+def told(default: object) -> str:
+    """A default as the page writes it."""
+    if default is None or default == ():
+        return "none"
+    if isinstance(default, bool):
+        return f"`{str(default).lower()}`"
+    return f"`{default}`" if isinstance(default, str) else f"{default:.15g}"
+
+
+@pytest.mark.parametrize("name", sorted(set(Settings.model_fields) - TOLD_IN_WORDS))
+def test_a_setting_has_the_default_that_operators_read(name):
+    documented = re.sub(r" \(.*\)", "", DOCUMENTED[name.upper()].strip())
+    assert told(getattr(read_settings(), name)) in (documented, documented.strip("`"))
+
+
+def test_a_default_in_bytes_is_the_round_number_beside_it():
+    units = {"MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+    written = [re.fullmatch(r"(\d+) \((\d+) (\w+)\)", text.strip()) for text in DOCUMENTED.values()]
+    found = [match for match in written if match]
+    assert len(found) >= 6
+    assert all(int(m[1]) == int(m[2]) * units[m[3]] for m in found)
+
+
+def test_rights_of_an_issuer_have_the_names_of_the_scopes_that_they_grant():
+    granted = read_settings().oidc_scopes
+    assert {f"amers:{scope}": scope for scope in granted.values()} == granted
+    assert set(granted.values()) == {"read", "register", "monitor", "admin"}
+
+
+@pytest.mark.parametrize(
+    ("name", "accepted", "refused"),
+    [
+        ("PORT", ("1", "65535"), ("0", "65536")),
+        ("POOL_SIZE", ("1", "100"), ("0", "101")),
+        ("UPLOAD_LIMIT_BYTES", ("1",), ("0", "1.5")),
+        ("BODY_LIMIT_BYTES", ("1",), ("0",)),
+        ("HEAD_SECONDS", ("0.001",), ("0", "-1")),
+        ("BODY_SECONDS", ("0.001",), ("0",)),
+        ("RATE_SECONDS", ("0.001",), ("0",)),
+        ("READ_TIMEOUT_SECONDS", ("0.001",), ("0",)),
+        ("LEASE_SECONDS", ("0.001",), ("0",)),
+        ("JOB_SECONDS", ("0.001",), ("0",)),
+        ("LEAST_RATE_BYTES", ("1",), ("0",)),
+        ("CONNECTIONS", ("1",), ("0",)),
+        ("CONNECTIONS_PER_ADDRESS", ("1",), ("0",)),
+        ("JOB_MEMORY_BYTES", (str(2**26),), (str(2**26 - 1),)),
+        ("JOB_FILE_BYTES", (str(2**20),), (str(2**20 - 1),)),
+        ("MIN_FREE_BYTES", ("0",), ("-1",)),
+        ("TRASH_DAYS", ("0",), ("-0.1",)),
+        ("RESULT_DAYS", ("0.1", "never"), ("0", "ever")),
+        ("JOB_RECORD_DAYS", ("0.1", " Never "), ("0",)),
+        ("AUDIT_DAYS", ("30", "never"), ("29.9",)),
+        ("QUOTA_STORAGE_BYTES", ("0",), ("-1",)),
+        ("QUOTA_OPEN_UPLOADS", ("0",), ("-1",)),
+        ("QUOTA_JOBS", ("0",), ("-1",)),
+        ("QUOTA_KEPT_JOBS", ("0",), ("-1",)),
+        ("JOBS_RUNNING_PER_OWNER", ("1",), ("0",)),
+        (
+            "STORAGE_URL",
+            ("s3://chips", "s3://chips/of/amers/"),
+            ("s3://", "https://chips", "s3://a/../b c"),
+        ),
+        ("TRUSTED_PROXIES", ("10.0.0.5,10.1.0.0/24", ""), ("10.1.0.1/24", "proxy")),
+        ("LOG_FORMAT", ("text", "json"), ("xml",)),
+        ("LOG_LEVEL", ("debug", "error"), ("loud",)),
+    ],
+)
+def test_a_setting_is_accepted_up_to_its_limits_and_refused_beyond(monkeypatch, name, accepted, refused):
+    for value in accepted:
+        monkeypatch.setenv(f"AMERS_{name}", value)
+        read_settings()
+    for value in refused:
+        monkeypatch.setenv(f"AMERS_{name}", value)
+        with pytest.raises(InputError, match=f"AMERS_{name}"):
+            read_settings()
+
+
+@pytest.mark.parametrize("name", ["RESULT_DAYS", "JOB_RECORD_DAYS", "AUDIT_DAYS"])
+def test_what_is_never_removed_has_no_number_of_days(monkeypatch, name):
+    monkeypatch.setenv(f"AMERS_{name}", "Never")
+    assert getattr(read_settings(), name.lower()) is None
+
+
+@pytest.mark.parametrize("name", ["CORS_ORIGINS", "TRUSTED_HOSTS"])
+def test_lists_are_separated_by_commas_and_blanks_do_not_count(monkeypatch, name):
+    monkeypatch.setenv(f"AMERS_{name}", " https://a.example , ,https://b.example,")
+    assert getattr(read_settings(), name.lower()) == ("https://a.example", "https://b.example")
+
+
+def test_a_right_that_grants_no_scope_is_refused(monkeypatch):
+    monkeypatch.setenv("AMERS_OIDC_SCOPES", json.dumps({"gcp:all": "admin"}))
+    assert read_settings().oidc_scopes == {"gcp:all": "admin"}
+    for value in ('{"gcp:all": "root"}', "{"):
+        monkeypatch.setenv("AMERS_OIDC_SCOPES", value)
+        with pytest.raises(InputError, match="AMERS_OIDC_SCOPES"):
+            read_settings()
