@@ -7,7 +7,16 @@ import sys
 
 import pytest
 
-from app.auth import Scope, allows, authenticate, require
+from app.auth import (
+    Scope,
+    allows,
+    authenticate,
+    authenticate_session,
+    is_administrator,
+    may_access,
+    owner_filter,
+    require,
+)
 from app.db import engine
 from app.errors import Conflict, InputError, NotAllowed, NotFound
 from app.usecases.tokens import create_token, list_tokens, revoke_token
@@ -100,6 +109,94 @@ def test_a_token_with_unusable_properties_is_refused(connection, name, scopes, d
     with pytest.raises(InputError):
         create_token(connection, name, scopes, days)
     assert list_tokens(connection) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "beyond"),
+    [
+        ({"name": "x"}, {"name": " "}),
+        ({"name": "x" * 200}, {"name": "x" * 201}),
+        ({"days": 1}, {"days": 0}),
+        ({"days": 36_500}, {"days": 36_501}),
+        ({"storage_quota_bytes": 0}, {"storage_quota_bytes": -1}),
+        ({"storage_quota_bytes": 2**62}, {"storage_quota_bytes": 2**62 + 1}),
+        ({"job_quota": 0}, {"job_quota": -1}),
+        ({"job_quota": 1_000_000}, {"job_quota": 1_000_001}),
+    ],
+)
+def test_a_token_may_have_what_is_in_range_and_nothing_beyond(connection, changes, beyond):
+    usual = {"name": "survey office", "scopes": ["read"]}
+    with pytest.raises(InputError):
+        create_token(connection, **usual | beyond)
+    token = create_token(connection, **usual | changes).token
+    kept = {"days": None if token.expires_at is None else (token.expires_at - token.created_at).days}
+    assert all((vars(token) | kept)[name] == value for name, value in changes.items())
+    assert authenticate(connection, create_token(connection, "other", ["read"]).secret) != token
+
+
+def test_scopes_are_kept_once_each_in_the_order_of_their_power(connection):
+    token = create_token(connection, " survey office ", ["admin", "read", "admin"]).token
+    assert (token.name, token.scopes) == ("survey office", ("read", "admin"))
+
+
+@pytest.mark.parametrize("end", ["revoked_at = now()", "expires_at = now() - interval '1 s'"])
+def test_a_name_is_taken_as_long_as_its_token_is_valid(connection, end):
+    first = create_token(connection, "survey office", ["read"], days=1)
+    with pytest.raises(Conflict, match=str(first.token.id)):
+        create_token(connection, " survey office", ["read"])
+    run_sql(connection, f"update token set {end}")
+    second = create_token(connection, "survey office", ["read"])
+    assert authenticate(connection, second.secret) == second.token
+
+
+@pytest.mark.parametrize(
+    ("change", "valid"),
+    [
+        ("expires_at = now() + interval '1 hour'", True),
+        ("expires_at = now()", False),
+        ("expires_at = now() + interval '1 hour', revoked_at = now() - interval '1 hour'", False),
+        ("subject = 'somebody', secret_hash = null", None),
+    ],
+)
+def test_a_secret_and_a_session_open_a_valid_token_of_a_secret_alone(connection, change, valid):
+    new = create_token(connection, "survey office", ["read"])
+    run_sql(connection, f"update token set {change}")
+    for opened in (
+        lambda: authenticate(connection, new.secret),
+        lambda: authenticate_session(connection, new.token.id),
+    ):
+        if valid:
+            assert opened().id == new.token.id
+        else:
+            with pytest.raises(NotAllowed) as refused:
+                opened()
+            assert not refused.value.authenticated
+
+
+def test_owners_and_administrators_alone_may_access_and_list_what_is_owned(connection):
+    callers = {
+        scope: create_token(connection, f"a token to {scope}", [scope]).token for scope in ALLOWED
+    }
+    for scope, caller in callers.items():
+        assert may_access(caller, caller.id)
+        assert may_access(caller, None) == (scope == "admin")
+        assert owner_filter(caller) == (None if scope == "admin" else caller.id)
+        assert is_administrator(caller) == (scope == "admin")
+        for other in callers.values():
+            assert may_access(caller, other.id) == (scope == "admin" or other is caller)
+    assert not is_administrator(None)
+
+
+@pytest.mark.parametrize("own", ALLOWED)
+def test_a_scope_that_is_missing_is_named_to_the_caller_who_lacks_it(connection, own):
+    token = create_token(connection, "survey office", [own]).token
+    for scope in Scope:
+        if scope in ALLOWED[own]:
+            assert require(token, scope) is token
+        else:
+            with pytest.raises(NotAllowed, match=f"needs scope {scope}") as refused:
+                require(token, scope)
+            assert refused.value.authenticated
 
 
 def test_a_request_without_a_token_is_refused(connection):
