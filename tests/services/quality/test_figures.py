@@ -1,0 +1,181 @@
+"""Figures of a qualification against simulated draws and other algebra, and criteria at their limits."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from services.quality.criteria import (
+    VERDICT_EXPLANATIONS,
+    at_least,
+    at_most,
+    verdict_of,
+    verdict_scope,
+)
+from services.quality.predicted import predict_accuracy
+from services.quality.qualification import second_consensus_share, unexplained_px
+from services.types import Array, Frame
+from tests.services.conftest import METRE_DEG, FlatModel
+
+DRAWS = 200_000
+two_percent = 0.02
+
+
+@dataclass(frozen=True)
+class ObliqueModel(FlatModel):
+    """A plane seen from the side: pixels of 0.5 m by 0.8 m, turned, and moved by heights."""
+
+    per_metre: tuple[tuple[float, ...], ...] = ((-0.3, -1.2, 0.4), (1.9, -0.5, 0.9))
+
+    def project(self, lon_lat_h: Array) -> Array:
+        east_north = lon_lat_h[:, :2] / METRE_DEG
+        return np.asarray(np.column_stack([east_north, lon_lat_h[:, 2]]) @ np.array(self.per_metre).T)
+
+    def project_derivative(self, lon_lat_h: Array) -> Array:
+        return np.broadcast_to(np.array(self.per_metre), (len(lon_lat_h), 2, 3))
+
+    def locate(self, line_sample: Array, height_m: Array) -> Array:
+        j = np.array(self.per_metre)
+        east_north = np.linalg.solve(j[:, :2], (line_sample - np.outer(height_m, j[:, 2])).T).T
+        return np.column_stack([east_north * METRE_DEG, height_m])
+
+
+def radius_of_ninety_percent(errors: Array) -> float:
+    return float(np.quantile(np.hypot(*errors.T), 0.9))
+
+
+@pytest.mark.monte_carlo
+@pytest.mark.parametrize("seed", [0, 1])
+def test_accuracy_in_metres_is_that_of_errors_drawn_in_the_image_and_in_the_frame(registered, seed):
+    rng = np.random.default_rng(seed)
+    scene = registered()
+    factor = rng.normal(0.0, 0.3, (2, 2))
+    shift_px2 = factor @ factor.T + 0.01 * np.eye(2)
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_([0, 3], [0, 3])] = shift_px2
+    adjustment = replace(scene.adjustment, covariance=covariance)
+    factor = rng.normal(0.0, 0.5, (3, 3))
+    frame_m2 = factor @ factor.T
+    adjusted = replace(
+        replace(scene, adjustment=adjustment).adjusted(), model=ObliqueModel(), frame=Frame(frame_m2)
+    )
+    result = predict_accuracy(adjusted, 3)
+    j = np.array(ObliqueModel().per_metre)
+    shift = rng.multivariate_normal(np.zeros(2), shift_px2, DRAWS)
+    of_frame = rng.multivariate_normal(np.zeros(3), frame_m2, DRAWS) @ j.T
+    to_ground = np.linalg.inv(j[:, :2]).T
+    assert result.worst_px == pytest.approx(radius_of_ninety_percent(shift), rel=two_percent)
+    relative_m = radius_of_ninety_percent(shift @ to_ground)
+    on_the_earth_m = radius_of_ninety_percent((shift + of_frame) @ to_ground)
+    for found, expected in (
+        (result.worst_m, relative_m),
+        (result.median_m, relative_m),
+        (result.on_the_earth_worst_m, on_the_earth_m),
+        (result.on_the_earth_median_m, on_the_earth_m),
+    ):
+        assert found == pytest.approx(expected, rel=two_percent)
+
+
+def test_the_worst_place_of_a_drift_is_at_the_edge_and_the_median_is_not(registered):
+    scene = registered()
+    adjustment = replace(scene.adjustment, covariance=np.diag([0.01, 0.2, 0.0, 0.01, 0.0, 0.0]))
+    result = predict_accuracy(replace(scene, adjustment=adjustment).adjusted(), 7)
+    lines = result.ce90_px.max(axis=1)
+    assert result.worst_px == lines.max() == max(lines[0], lines[-1])
+    assert result.median_px == np.sort(result.ce90_px.ravel())[24]
+    assert result.median_m < 0.8 * result.worst_m
+
+
+def shown(measures, residual_px, line_sample):
+    """Measures with other residuals at other places; all are active."""
+    n = len(residual_px)
+    return replace(
+        measures,
+        residual_px=residual_px,
+        line_sample=line_sample,
+        active=np.ones(n, bool),
+        matched=np.ones(n, bool),
+    )
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_points_explain_is_taken_off_the_worse_coordinate(registered, axis):
+    """Errors of points of 0.8 px beside those of the scene, 0.6 px in one coordinate."""
+    rng = np.random.default_rng(1)
+    own, n = np.array([0.0, 0.0]), 20_000
+    own[axis] = 0.6
+    residual = rng.standard_normal((n, 2)) * np.hypot(0.8, own)
+    measures = shown(registered().measures, residual, rng.uniform(0.0, 4000.0, (n, 2)))
+    left = unexplained_px(measures, np.full(2, 0.8))
+    assert left == pytest.approx(0.6, rel=0.07)
+    assert unexplained_px(measures, np.zeros(2)) == pytest.approx(1.0, rel=two_percent)
+
+
+def test_points_explain_no_more_than_what_separates_neighbours(registered):
+    """A bend of 1 px beside independent errors of 0.7 px, of points that state 5 px."""
+    rng = np.random.default_rng(2)
+    place = rng.uniform(0.0, 4000.0, (20_000, 2))
+    bend = np.sqrt(2.0) * np.sin(2.0 * np.pi * place / 4000.0)
+    measures = shown(registered().measures, bend + 0.7 * rng.standard_normal(bend.shape), place)
+    assert unexplained_px(measures, np.full(2, 5.0)) == pytest.approx(1.0, rel=0.03)
+
+
+@pytest.mark.monte_carlo
+@pytest.mark.parametrize("n", [10, 40])
+def test_chance_alone_seldom_leaves_anything_unexplained(registered, n):
+    rng = np.random.default_rng(n)
+    measures, one = registered().measures, np.ones(2)
+    left = []
+    for _ in range(300):
+        place = rng.uniform(0.0, 4000.0, (n, 2))
+        left.append(unexplained_px(shown(measures, rng.standard_normal((n, 2)), place), one))
+    # Two standard deviations of each of two variances, beside that of the neighbours.
+    assert 0.0 < np.mean(np.array(left) > 0.0) < 0.4
+    assert np.quantile(left, 0.9) < 0.9
+
+
+def test_a_second_consensus_is_that_of_another_order_and_of_swapped_axes(registered):
+    rng = np.random.default_rng(3)
+    residual = 0.2 * rng.standard_normal((60, 2))
+    residual[40:52] += [9.0, -6.0]
+    residual[52:] += rng.uniform(-14.0, 14.0, (8, 2))
+    measures = shown(registered().measures, residual, rng.uniform(0.0, 4000.0, (60, 2)))
+    measures = replace(measures, active=np.arange(60) < 40)
+    order = rng.permutation(60)
+    permuted = replace(measures, residual_px=residual[order], active=measures.active[order])
+    swapped = replace(measures, residual_px=residual[:, ::-1])
+    shares = [second_consensus_share(one) for one in (measures, permuted, swapped)]
+    assert shares == [12 / 40] * 3
+
+
+@pytest.mark.parametrize("needed_for", ["good", "usable"])
+def test_a_criterion_is_met_at_its_limit_and_not_beyond(needed_for):
+    for value, least, most in ((2.0, True, True), (2.0 + 1e-9, True, False), (2.0 - 1e-9, False, True)):
+        assert at_least("active_points", value, 2.0, needed_for).met == least
+        assert at_most("displacement_px", value, 2.0, needed_for).met == most
+    for criterion in (at_least, at_most):
+        assert not criterion("active_points", np.nan, 2.0, needed_for).met
+
+
+@pytest.mark.parametrize(
+    ("unmet", "verdict"),
+    [
+        ((), "good"),
+        (("good",), "usable"),
+        (("usable",), "failed"),
+        (("good", "usable"), "failed"),
+        (("usable", "good"), "failed"),
+    ],
+)
+def test_the_worst_criterion_decides_whatever_the_order(unmet, verdict):
+    met = [at_most("displacement_px", 1.0, 2.0, grade) for grade in ("good", "usable")]
+    criteria = [*met, *(at_most("displacement_px", 3.0, 2.0, grade) for grade in unmet)]
+    assert verdict_of(tuple(criteria)) == verdict_of(tuple(criteria[::-1])) == verdict
+    assert verdict in VERDICT_EXPLANATIONS
+
+
+def test_a_verdict_speaks_of_the_earth_where_a_limit_there_was_set():
+    relative = at_most("predicted_ce90_px", 1.0, 2.0, "good")
+    on_earth = at_most("ce90_on_earth_m", 1.0, 2.0, "usable")
+    assert verdict_scope((relative,)) == "relative to the control points"
+    assert verdict_scope((relative, on_earth)) == "relative to the control points and on the Earth"
