@@ -247,6 +247,30 @@ def test_inliers_are_candidates() -> None:
     assert not (inliers & ~candidates).any()
 
 
+@pytest.mark.parametrize("agreeing", [12, 11])
+def test_a_block_has_an_offset_when_half_of_its_points_agree_on_it(agreeing: int) -> None:
+    """Half of 24 points lie 10 px off the other block, the rest elsewhere; 11 of them are too few."""
+    rng = np.random.default_rng(9)
+    position = rng.uniform(0.0, 700.0, (64, 2))
+    measured = rng.normal(0.0, 0.1, (64, 2))
+    measured[40:] += [10.0, 0.0]
+    scattered = slice(40 + agreeing, 64)
+    direction = np.linspace(0.0, 2.0 * np.pi, 64 - 40 - agreeing, endpoint=False)
+    measured[scattered] += 9.0 * np.column_stack([np.cos(direction), np.sin(direction)])
+    block = np.repeat([0, 1], [40, 24])
+    inliers, _ = robust_affine_inliers(position, measured, np.ones(64, dtype=bool), 0.1, block)
+    assert inliers[:40].all()
+    assert inliers[40 : 40 + agreeing].mean() == (agreeing == 12)
+
+
+def test_of_six_candidates_a_wrong_one_is_told_from_the_others() -> None:
+    position = np.array([[0, 0], [0, 500], [500, 0], [500, 500], [250, 250], [100, 400]], dtype=float)
+    measured = np.zeros((6, 2))
+    measured[4] = [30.0, -20.0]
+    inliers = affine_inliers(position, measured, np.ones(6, dtype=bool), 1.0)
+    assert inliers.tolist() == [True, True, True, True, False, True]
+
+
 def test_five_candidates_are_returned_unchanged() -> None:
     position, measured, _ = field(np.random.default_rng(0), 10, 0)
     candidates = np.arange(10) < 5

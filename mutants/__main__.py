@@ -1,0 +1,104 @@
+"""`python -m mutants [MODULE ...]`: try mutants of the modules, and print the table and the survivors.
+
+What was tried is kept in `.mutants/trials.jsonl`: a run that was broken off goes on, and a mutant is
+tried again when its file has changed, or when it survived and tests have changed.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from mutants.changes import Mutant, mutants_of
+from mutants.covering import Coverage, digest, recorded_coverage
+from mutants.modules import Module, chosen_modules
+from mutants.report import Trial, equivalent_keys, survivors, table
+from mutants.trials import Workplace, copied_project
+
+ROOT = Path(__file__).parent.parent
+KEPT = ROOT / ".mutants"
+TRIALS = KEPT / "trials.jsonl"
+
+
+def main() -> None:
+    """Try a sample of the mutants of each module."""
+    parser = argparse.ArgumentParser(prog="python -m mutants", description=__doc__)
+    parser.add_argument(
+        "module", nargs="*", help="such as services/quality, or a file of one; all if none"
+    )
+    parser.add_argument("--sample", type=int, default=50, help="mutants of each module (default: 50)")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=60.0,
+        help="of tests for each mutant, the fastest first (default: 60)",
+    )
+    options = parser.parse_args()
+    trials: dict[str, Sequence[Trial]] = {}
+    totals: dict[str, int] = {}
+    for module in chosen_modules(options.module):
+        with copied_project(ROOT) as copy:
+            mutants = [one for path in module.mutated_files(copy) for one in mutants_of(copy, path)]
+            chosen = sorted(mutants, key=lambda one: one.key)[: options.sample]
+            totals[module.name] = len(mutants)
+            trials[module.name] = _tried(copy, module, chosen, options.seconds)
+        print(table(trials, totals), survivors(trials[module.name]), sep="\n\n", flush=True)
+
+
+def _tried(copy: Path, module: Module, mutants: Sequence[Mutant], limit_s: float) -> list[Trial]:
+    """The trials of mutants, of which those that still hold are not repeated."""
+    earlier, equivalent = {trial.key: trial for trial in _kept()}, equivalent_keys()
+    tests = digest(copy, module.test_files(copy))
+    trials: list[Trial] = []
+    coverage: Coverage | None = None
+    for mutant in mutants:
+        code = digest(copy, [mutant.path])
+        trial = earlier.get(mutant.key)
+        if trial is None or not (trial.holds(code, tests) or mutant.key in equivalent):
+            coverage = coverage or recorded_coverage(copy, KEPT, module)
+            trial = _try(coverage, module, mutant, limit_s, (code, tests))
+            print(f"{trial.state:9} {mutant.path}:{mutant.lines[0]} {trial.seconds:.0f} s", flush=True)
+            with TRIALS.open("a") as file:
+                file.write(json.dumps(trial.document()) + "\n")
+        trials.append(trial)
+    return trials
+
+
+def _try(
+    coverage: Coverage, module: Module, mutant: Mutant, limit_s: float, digests: tuple[str, str]
+) -> Trial:
+    covering = coverage.tests_of(mutant)
+    chosen, expected_s = list[str](), 0.0
+    for test in covering:
+        expected_s += coverage.seconds[test]
+        if chosen and expected_s > limit_s:
+            break
+        chosen.append(test)
+    begun = time.monotonic()
+    state = Workplace(coverage.root).outcome(mutant, chosen, min(expected_s, limit_s))
+    return Trial(
+        module=module.name,
+        key=mutant.key,
+        path=mutant.path,
+        line=mutant.lines[0],
+        definition=mutant.definition,
+        before=mutant.before,
+        after=mutant.after,
+        state=state,
+        tests=len(chosen),
+        covering=len(covering),
+        seconds=time.monotonic() - begun,
+        code=digests[0],
+        test_code=digests[1],
+    )
+
+
+def _kept() -> list[Trial]:
+    KEPT.mkdir(exist_ok=True)
+    lines = TRIALS.read_text().splitlines() if TRIALS.exists() else []
+    return [Trial(**json.loads(line)) for line in lines]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""The modules in which a fault would hurt most, each with the tests that are about it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Module:
+    """A part of the code that gets a score of its own.
+
+    Attributes:
+        name: as the user gives it.
+        sources: files and folders of the code.
+        tests: files and folders of the tests that are tried.
+        part: file or folder whose mutants are tried; empty for all.
+    """
+
+    name: str
+    sources: tuple[str, ...]
+    tests: tuple[str, ...]
+    part: str = ""
+
+    def mutated_files(self, root: Path) -> list[str]:
+        """Paths of the modules of the code whose mutants are tried."""
+        return [path for path in self.source_files(root) if Path(path).is_relative_to(self.part)]
+
+    def source_files(self, root: Path) -> list[str]:
+        """Paths of the modules of the code, relative to the root."""
+        return [path for path in _python_files(root, self.sources) if not path.endswith("__init__.py")]
+
+    def test_files(self, root: Path) -> list[str]:
+        """Paths of the modules of tests, relative to the root."""
+        return [path for path in _python_files(root, self.tests) if "/test_" in path]
+
+
+def _of_science(name: str, *more_tests: str) -> Module:
+    return Module(f"services/{name}", (f"services/{name}",), (f"tests/services/{name}", *more_tests))
+
+
+def _of_service(name: str, sources: str, tests: str) -> Module:
+    return Module(
+        f"app/{name}",
+        tuple(f"app/{path}" for path in sources.split()),
+        tuple(f"tests/app/test_{one}.py" for one in tests.split()),
+    )
+
+
+MODULES = (
+    _of_science("quality"),
+    _of_science("adjustment"),
+    _of_science("matching"),
+    _of_science("sensors"),
+    _of_science("registration"),
+    _of_science("production"),
+    _of_science("orthorectification"),
+    Module(
+        "services/geodesy",
+        tuple(f"services/{one}.py" for one in ("geodesy", "terrain", "lines_of_sight", "map_grid")),
+        tuple(f"tests/services/test_{one}.py" for one in ("geodesy", "terrain", "map_grid")),
+    ),
+    _of_service(
+        "auth",
+        "auth.py api/access.py api/credentials.py api/deps.py",
+        "basic_authentication sign_in tokens access_matrix",
+    ),
+    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens"),
+    _of_service("quotas", "usecases/quotas.py db/usage.py", "storage_quota jobs"),
+    _of_service(
+        "jobs",
+        "usecases/jobs.py db/jobs worker/attempt.py",
+        "lost_attempts job_leases jobs job_progress fair_queue",
+    ),
+    _of_service("superseding", "db/superseding.py db/density.py", "superseding renewal_density"),
+    _of_service(
+        "points",
+        "db/points.py db/point_detail.py db/history.py usecases/history.py usecases/features/points.py",
+        "unpublished points history chips",
+    ),
+    _of_service("uploads", "usecases/uploads.py db/uploads.py", "uploads upload_faults"),
+    _of_service("storage", "storage", "storage storage_identity bucket"),
+    _of_service(
+        "cleaning",
+        "usecases/garbage_collection.py usecases/retention.py worker/sweep.py",
+        "sweep retention job_leases",
+    ),
+    _of_service("config", "config.py", "config"),
+)
+
+
+def chosen_modules(names: Sequence[str]) -> list[Module]:
+    """The modules of some names, all for none; a path inside a module chooses that part of it.
+
+    Raises:
+        SystemExit: a name means no module.
+    """
+    if not names:
+        return list(MODULES)
+    chosen = []
+    for name in names:
+        found = next((module for module in MODULES if _contains(module, name)), None)
+        if found is None:
+            known = ", ".join(module.name for module in MODULES)
+            raise SystemExit(f"{name}: no such module; expected a path inside one of {known}")
+        chosen.append(found if name == found.name else replace(found, name=name, part=name))
+    return chosen
+
+
+def _contains(module: Module, name: str) -> bool:
+    return name == module.name or any(Path(name).is_relative_to(source) for source in module.sources)
+
+
+def _python_files(root: Path, places: tuple[str, ...]) -> list[str]:
+    found = []
+    for place in places:
+        path = root / place
+        inside = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+        found += [str(one.relative_to(root)) for one in inside]
+    return found
