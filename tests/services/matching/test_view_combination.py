@@ -109,11 +109,39 @@ def test_no_order_of_views_and_no_choice_of_axes_changes_a_measure() -> None:
 def test_a_point_without_a_measure_has_no_sigma_and_does_not_count() -> None:
     points = combinations(np.full(5, 3), 0.1, 4)
     lost = combine_views([rejected("low_score", 0.3), rejected("flat")], AGREEMENT_PX)
-    assert lost.reason == "low_score"
+    turned = combine_views([rejected("flat"), rejected("low_score", 0.3)], AGREEMENT_PX)
+    assert lost.reason == turned.reason == "low_score"
     assert not lost.agreeing.any()
     sigma_px = combined_sigmas_px([*points, lost])
     assert np.isnan(sigma_px[-1])
     np.testing.assert_array_equal(sigma_px[:-1], combined_sigmas_px(points))
+
+
+def test_a_measure_is_the_least_squares_solution_of_its_views() -> None:
+    """One equation a view, divided by its sigma; the first is ten times as precise as the second."""
+    peaks = peaks_of_a_point(np.random.default_rng(8), 3, 0.1)
+    sigmas_px = np.array([0.02, 0.2, 0.1])
+    peaks = [replace(peak, sigma_px=float(s)) for peak, s in zip(peaks, sigmas_px, strict=True)]
+    shown = np.array([peak.row_col for peak in peaks])
+    expected, *_ = np.linalg.lstsq(1.0 / sigmas_px[:, None], shown / sigmas_px[:, None], rcond=None)
+    combined = combine_views(peaks, 1.0)
+    np.testing.assert_allclose(combined.row_col, expected[0])
+    assert combined.weight[0] == pytest.approx(100.0 * combined.weight[1])
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4, 5])
+def test_more_than_half_of_the_views_agree_or_there_is_no_measure(views: int) -> None:
+    peaks = peaks_of_a_point(np.random.default_rng(9), views, 0.0)
+    for agreeing in range(1, views + 1):
+        turned = 2.0 * np.pi * np.arange(views) / views
+        away = 5.0 * np.column_stack([np.cos(turned), np.sin(turned)])
+        away[:agreeing] = 0.0
+        shown = [replace(p, row_col=p.row_col + by) for p, by in zip(peaks, away, strict=True)]
+        combined = combine_views(shown, AGREEMENT_PX)
+        if 2 * agreeing > views:
+            assert combined.agreeing.tolist() == [True] * agreeing + [False] * (views - agreeing)
+        else:
+            assert combined.reason == "views_disagree"
 
 
 def test_views_that_disagree_give_no_measure_and_a_minority_no_weight() -> None:
