@@ -171,8 +171,8 @@ def decided_one_by_one(connection) -> dict[int, int | None]:
         half = np.sin((lat - lat[i]) / 2.0) ** 2
         half += np.cos(lat) * np.cos(lat[i]) * np.sin((lon - lon[i]) / 2.0) ** 2
         metres = 2.0 * 6_371_008.8 * np.arcsin(np.sqrt(half))
-        rivals = (metres <= SAME_PLACE_M) & (priority > priority[i]) & (blocks != blocks[i])
-        best = rivals & (priority == priority[rivals].max(initial=-1))
+        others = (metres <= SAME_PLACE_M) & (priority > priority[i]) & (blocks != blocks[i])
+        best = others & (priority == priority[others].max(initial=-1))
         decided[int(ids[i])] = int(ids[best][metres[best].argmin()]) if best.any() else None
     return decided
 
