@@ -130,3 +130,35 @@ def test_a_low_pass_bridges_gaps_and_keeps_areas_lost() -> None:
     assert abs(smooth[50, 50] - truth[50, 50]) < a_tenth_of_the_contrast * truth.std()
     assert np.isnan(smooth[102:118, 102:118]).all()
     assert np.isfinite(smooth[:98]).all()
+
+
+@pytest.mark.parametrize(("lost", "is_kind"), [(np.nan, np.isnan), (np.inf, np.isposinf)])
+def test_a_position_has_a_value_when_none_of_the_pixels_of_its_spline_is_lost(
+    lost: float, is_kind
+) -> None:
+    """Four by four pixels around it: those two beside the position count as those next to it do."""
+    pixels = ground(60)
+    pixels[20:32, 24:40] = lost
+    missing = ~np.isfinite(spline_coefficients(pixels))
+    axis = np.arange(8.25, 50.0, 0.5)
+    positions = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    first = np.floor(positions).astype(int) - 1
+    count = sum(missing[first[..., 0] + i, first[..., 1] + j] for i in range(4) for j in range(4))
+    sampled = resample(spline_coefficients(pixels), positions)
+    np.testing.assert_array_equal(np.isfinite(sampled), count == 0)
+    assert is_kind(sampled[count > 0]).all()
+    assert ((count > 0) & (count < 4)).any()
+
+
+def test_swapped_axes_and_whole_pixels_change_no_sample() -> None:
+    pixels = ground(80)
+    pixels[30:36, 40:50] = np.nan
+    axis = np.arange(20.0, 60.0, 0.37)
+    positions = np.stack(np.meshgrid(axis, axis + 0.11, indexing="ij"), axis=-1)
+    plain = resample(spline_coefficients(pixels), positions)
+    turned = resample(spline_coefficients(np.ascontiguousarray(pixels.T)), positions[..., ::-1])
+    padded = np.pad(pixels, ((7, 0), (0, 5)), mode="edge")
+    moved = resample(spline_coefficients(padded), positions + [7.0, 0.0])
+    for other in (turned, moved):
+        np.testing.assert_array_equal(np.isnan(other), np.isnan(plain))
+        np.testing.assert_allclose(other, plain, atol=0.5)
