@@ -109,10 +109,12 @@ def _changes(node: cst.CSTNode) -> Iterator[cst.CSTNode]:
         if operator is operator_arg_removal:
             if isinstance(node, cst.Call):
                 yield from _without_an_argument(node)
+        elif operator is operator_string:
+            # Of a name one change is enough, of its letters or their case. Texts are for people.
+            if isinstance(node, cst.SimpleString) and " " not in node.value:
+                yield from list(operator(node))[:1]
         elif isinstance(node, kind):
-            changed = list(operator(node))
-            # Of a text one change is enough; others change the case of its letters.
-            yield from changed[:1] if operator is operator_string else changed
+            yield from operator(node)
 
 
 def _without_an_argument(call: cst.Call) -> Iterator[cst.CSTNode]:

@@ -1,7 +1,7 @@
 """Which tests run a line: recorded once for each module of tests, again when it or the code changes.
 
-No line of a compiled kernel is seen to run, nor that of a constant by the tests that need its value:
-these have the tests of the lines that use them.
+No line of a compiled kernel is seen to run, nor that of a constant, or of a function that remembers
+what it returns, by all tests that need its value: these have the tests of the lines that use them.
 """
 
 import ast
@@ -39,7 +39,9 @@ class Coverage:
     def tests_of(self, mutant: Mutant) -> list[str]:
         """The tests that run what a mutant changes, the fastest first."""
         places = {(mutant.path, line) for line in range(mutant.lines[0], mutant.lines[1] + 1)}
-        named = self._tests_at(places) or self._tests_of_users(mutant.path, mutant.definition, set())
+        named = self._tests_at(places)
+        if not named or (mutant.path, mutant.definition) in self._remembered:
+            named = named | self._tests_of_users(mutant.path, mutant.definition, set())
         tests = {test for name in named for test in self._by_name[name]}
         return sorted(tests, key=lambda test: self.seconds[test])
 
@@ -68,14 +70,32 @@ class Coverage:
         return named
 
     @cached_property
+    def _remembered(self) -> set[tuple[str, str]]:
+        """File and name of the functions that remember what they return."""
+        return {
+            (path, statement.name)
+            for path, statement in self._statements
+            if isinstance(statement, ast.FunctionDef)
+            and any("cache" in ast.unparse(decorator) for decorator in statement.decorator_list)
+        }
+
+    @cached_property
+    def _statements(self) -> list[tuple[str, ast.stmt]]:
+        """The statements of all modules, each with its file."""
+        files = [*self.root.glob("services/**/*.py"), *self.root.glob("app/**/*.py")]
+        return [
+            (str(file.relative_to(self.root)), statement)
+            for file in files
+            for statement in ast.parse(file.read_text()).body
+        ]
+
+    @cached_property
     def _mentions(self) -> dict[str, list[tuple[str, int, str]]]:
         """File, line and enclosing definition of every use of a name."""
         found = defaultdict(list)
-        for file in [*self.root.glob("services/**/*.py"), *self.root.glob("app/**/*.py")]:
-            path = str(file.relative_to(self.root))
-            for statement in ast.parse(file.read_text()).body:
-                for name, line in _names(statement):
-                    found[name].append((path, line, _defined(statement)))
+        for path, statement in self._statements:
+            for name, line in _names(statement):
+                found[name].append((path, line, _defined(statement)))
         return found
 
 
