@@ -64,7 +64,7 @@ MODULES = (
         "auth.py api/access.py api/credentials.py api/deps.py",
         "basic_authentication sign_in tokens access_matrix",
     ),
-    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens"),
+    _of_service("tokens", "usecases/tokens.py db/tokens.py", "tokens oidc jobs"),
     _of_service("quotas", "usecases/quotas.py db/usage.py", "storage_quota jobs"),
     _of_service(
         "jobs",

@@ -17,7 +17,8 @@ from app.auth import (
     owner_filter,
     require,
 )
-from app.db import engine
+from app.db import engine, tokens
+from app.db.jobs import jobs
 from app.errors import Conflict, InputError, NotAllowed, NotFound
 from app.usecases.tokens import create_token, list_tokens, revoke_token
 from tests.statements import run_sql
@@ -171,6 +172,33 @@ def test_a_secret_and_a_session_open_a_valid_token_of_a_secret_alone(connection,
             with pytest.raises(NotAllowed) as refused:
                 opened()
             assert not refused.value.authenticated
+
+
+def test_open_jobs_are_the_own_ones_that_have_not_ended(connection):
+    mine, yours = (create_token(connection, name, ["register"]).token for name in ("mine", "yours"))
+    states = ("accepted", "running", "successful", "failed", "dismissed")
+    for owner in (mine, mine, yours):
+        for state in states:
+            job = jobs.create(connection, "register-scene", {}, owner=owner.id)
+            run_sql(connection, "update job set state = %s where id = %s", [state, job.id])
+    assert [tokens.open_jobs(connection, owner.id) for owner in (mine, yours)] == [4, 2]
+
+
+def test_an_identity_is_kept_once_as_it_first_came_and_takes_no_name(connection):
+    first = tokens.keep_subject(connection, "issuer|1", "survey office", ("read", "register"))
+    other = tokens.keep_subject(connection, "issuer|2", "survey office", ("read",))
+    again = tokens.keep_subject(connection, "issuer|1", "a new name", ("admin",))
+    assert (first.subject, first.name, first.scopes) == (
+        "issuer|1",
+        "survey office",
+        ("read", "register"),
+    )
+    assert again == first != other
+    found = [
+        tokens.find_subject(connection, subject) for subject in ("issuer|1", "issuer|2", "issuer|3")
+    ]
+    assert found == [first, other, None]
+    assert create_token(connection, "survey office", ["read"]).token.subject is None
 
 
 def test_owners_and_administrators_alone_may_access_and_list_what_is_owned(connection):

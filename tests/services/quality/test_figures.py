@@ -153,6 +153,8 @@ def test_a_criterion_is_met_at_its_limit_and_not_beyond(needed_for):
     for value, least, most in ((2.0, True, True), (2.0 + 1e-9, True, False), (2.0 - 1e-9, False, True)):
         assert at_least("active_points", value, 2.0, needed_for).met == least
         assert at_most("displacement_px", value, 2.0, needed_for).met == most
+    assert at_least("active_points", 2.0, 2.0, needed_for).comparison == "at least"
+    assert at_most("displacement_px", 2.0, 2.0, needed_for).comparison == "at most"
     for criterion in (at_least, at_most):
         assert not criterion("active_points", np.nan, 2.0, needed_for).met
 
