@@ -5,6 +5,8 @@ differ more than elsewhere, over the whole width of the image, and between these
 control point is needed to see it, and the line is known exactly. How many lines are missing is not.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import bdtrc
@@ -33,6 +35,10 @@ _ORDINARY, _TIMES = 98.0, 2.0
 compression or a sensor makes different are no breaks."""
 _BESIDE = 0.5
 """Contrast beside a break over its own, below: a bad line differs from both neighbours."""
+_LEAST_UNSHARED = 0.15
+"""The same of what a line does not share with the one before, whatever its gain and offset."""
+_LEAST_VARIANCE = 1e-9
+"""Of a line that has one grey value."""
 _MOST = 8
 """An image with more is one of bad lines."""
 _LEAST_DIFFERENCE = 1e-3
@@ -51,7 +57,8 @@ def line_breaks(image: ImageSource) -> IntArray:
 
     The mean difference of each line from the one before it is taken in 32 parts of the width. A break is
     where it is larger than at the eight lines on either side, in more parts than chance explains
-    (binomial, times the number of lines) and by a factor that other lines of the image do not reach.
+    (binomial, times the number of lines) and by a factor that other lines of the image do not reach, and
+    where it is no change of gain or offset.
     """
     none = np.zeros(0, dtype=np.int64)
     difference = np.log(np.maximum(_differences(image), _LEAST_DIFFERENCE))
@@ -74,36 +81,68 @@ def line_breaks(image: ImageSource) -> IntArray:
     broken &= (beside < _BESIDE * contrast) & (false_alarms <= _MAX_FALSE_ALARMS)
     broken[:_NEAR] = broken[-_NEAR:] = False
     found = np.flatnonzero(broken) + 1
-    return found if len(found) <= _MOST else none
+    if len(found) > _MOST:
+        return none
+    return found[[_shows_other_ground(image, line) for line in found.tolist()]]
 
 
 def _differences(image: ImageSource) -> Array:
     """Mean differences (lines - 1, parts) of each line from the one before; NaN with too few pixels."""
-    lines, samples = image.shape
-    count = _STRIPS if samples > _STRIPS * _STRIP_PX else 1
-    strip_px = _STRIP_PX if count > 1 else samples
-    starts = np.linspace(0, samples - strip_px, count).astype(int).tolist()
-    out = []
-    for first in range(0, lines - 1, _AT_ONCE):
-        windows = [
-            Window(first, start, min(_AT_ONCE, lines - 1 - first) + 1, strip_px) for start in starts
-        ]
-        out.append(np.hstack([_of_parts(image.read(window), _PARTS // count) for window in windows]))
-    return np.concatenate(out) if out else np.zeros((0, _PARTS))
+    lines = image.shape[0]
+    pieces = [(first, min(_AT_ONCE, lines - 1 - first) + 1) for first in range(0, lines - 1, _AT_ONCE)]
+    return np.concatenate([_of_strips(image, first, count, _mean_change) for first, count in pieces])
 
 
-def _of_parts(pixels: FloatImage, parts: int) -> Array:
-    """Mean differences (lines - 1, parts) of the lines of a window."""
-    width = pixels.shape[1] // parts
+def _shows_other_ground(image: ImageSource, line: int) -> bool:
+    """Whether a line has less in common with the one before than the lines beside it.
+
+    A sensor that changes its gain or offset makes all pixels of a line different, of the same ground.
+    """
+    unshared = _of_strips(image, line - _NEAR - 1, 2 * _NEAR + 2, _unshared)
+    logarithm = np.log(np.maximum(unshared, _LEAST_DIFFERENCE))
+    beside = np.median(np.delete(logarithm, _NEAR, axis=0), axis=0)
+    return bool(np.nanmedian(logarithm[_NEAR] - beside) >= _LEAST_UNSHARED)
+
+
+def _of_strips(
+    image: ImageSource, first: int, count: int, measure: Callable[[FloatImage], Array]
+) -> Array:
+    """What a measure says of each line and the one before (count - 1, parts), in strips of an image."""
+    samples = image.shape[1]
+    strips = _STRIPS if samples > _STRIPS * _STRIP_PX else 1
+    strip_px = _STRIP_PX if strips > 1 else samples
+    parts = _PARTS // strips
+    width = strip_px // parts
     if not width:
-        return np.full((len(pixels) - 1, parts), np.nan)
-    whole = pixels[:, : parts * width]
+        return np.full((count - 1, _PARTS), np.nan)
+    out = []
+    for start in np.linspace(0, samples - strip_px, strips).astype(int).tolist():
+        pixels = image.read(Window(first, start, count, strip_px))[:, : parts * width]
+        out.append(measure(pixels.reshape(count, parts, width)))
+    return np.hstack(out)
+
+
+def _mean_change(pixels: FloatImage) -> Array:
+    """Mean difference (lines - 1, parts) of lines (lines, parts, width) of which half is known."""
     with np.errstate(invalid="ignore"):
-        apart = np.abs(np.diff(whole, axis=0)).reshape(-1, parts, width)
+        apart = np.abs(np.diff(pixels, axis=0))
     mean = apart.mean(axis=2)
     if np.isfinite(mean).all():
         return np.asarray(mean, np.float64)
     known = np.isfinite(apart)
     number = known.sum(axis=2)
     mean = np.where(known, apart, 0.0).sum(axis=2) / np.maximum(number, 1)
-    return np.where(number >= width / 2, mean, np.nan)
+    return np.where(2 * number >= apart.shape[2], mean, np.nan)
+
+
+def _unshared(pixels: FloatImage) -> Array:
+    """What (lines - 1, parts) of lines (lines, parts, width) no gain and offset make of those before."""
+    known = np.isfinite(pixels)
+    number = known.sum(axis=2, keepdims=True)
+    mean = np.where(known, pixels, 0.0).sum(axis=2, keepdims=True) / np.maximum(number, 1)
+    centred = np.where(known, pixels - mean, 0.0)
+    variance = (centred**2).mean(axis=2)
+    shared = (centred[1:] * centred[:-1]).mean(axis=2) ** 2 / np.maximum(variance[:-1], _LEAST_VARIANCE)
+    enough = 2 * number[:, :, 0] >= pixels.shape[2]
+    left = np.sqrt(np.maximum(variance[1:] - shared, 0.0))
+    return np.where(enough[1:] & enough[:-1], left, np.nan)

@@ -90,14 +90,15 @@ class RegistrationContext:
         options: of all stages.
         progress: receives the fraction done and the work under way.
         stages: summaries of the searches so far, in order, also of one that was refused.
-        breaks: first lines behind breaks of the image, where lines are missing or repeated.
+        breaks: first lines behind breaks of the image, where lines are missing or repeated; None before
+            they are looked for.
     """
 
     scene: Scene
     options: RegistrationOptions
     progress: Progress
     stages: list[SearchStage]
-    breaks: IntArray
+    breaks: IntArray | None
 
     @cached_property
     def gsd_m(self) -> float:

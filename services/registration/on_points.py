@@ -149,7 +149,7 @@ def search_scene(
         options=options,
         progress=progress,
         stages=[] if stages is None else stages,
-        breaks=scene_breaks(scene),
+        breaks=None,
         points=points,
         chips=chips,
         image=CachedImage(scene.image),
@@ -157,6 +157,7 @@ def search_scene(
     )
     if needs_coarse_search(context, prediction):
         prediction = search_coarsely(context.part(0.0, 0.3), prediction)
+    context = replace(context, breaks=scene_breaks(scene))
     for part in context.parts(0.3, 0.6, options.fine_stages):
         rows = points_to_try(scene, points, prediction, options.max_points)
         search = _match(part, prediction, rows)

@@ -69,6 +69,21 @@ def test_bad_lines_are_no_breaks() -> None:
     assert not found(pixels)
 
 
+def test_a_sensor_that_changes_its_gain_or_its_offset_breaks_nothing() -> None:
+    across = np.linspace(-300.0, 300.0, SAMPLES, dtype=np.float32)
+    for seed in range(4):
+        for gain, offset in ((1.0, 60.0), (1.2, 0.0), (0.9, across)):
+            pixels = ground(seed)
+            pixels[450:] = gain * pixels[450:] + offset
+            assert not found(pixels)
+
+
+def test_a_break_is_seen_where_the_sensor_changes_its_gain() -> None:
+    pixels = broken(ground(5), 450, 12)
+    pixels[450:] = 1.2 * pixels[450:] + 60.0
+    assert found(pixels) == [450]
+
+
 def test_blocks_of_a_compression_are_no_breaks() -> None:
     pixels = ground(4)
     level = np.random.default_rng(4).normal(0.0, 60.0, (LINES // 8 + 1, SAMPLES // 8 + 1))
