@@ -59,7 +59,7 @@ def run_service(settings: Settings, folder: Path, seed: int) -> None:
         with engine.connect(dsn) as connection:
             made = make_block(folder / f"block-{seed}", count=5, seed=seed, version=f"1.{seed}")
             ingest_block(connection, storage, made.folder)
-            secret = create_token(connection, "a user", ["admin"]).secret
+            secret = create_token(connection, f"user {seed}", ["admin"]).secret
             finish_job(connection, storage)
         client.headers["Authorization"] = f"Bearer {secret}"
         scene = client.post("/scenes?name=a.tif", content=TIFF).raise_for_status().json()["id"]

@@ -401,5 +401,5 @@ def test_usage_is_shown_to_callers_administrators_and_operators(
         "no row": (1, stray.size_bytes),
     }
     table = CliRunner().invoke(app, ["store", "usage"]).stdout
-    assert "small\t2\t1\t0\t0 B\t1.6 KiB\t3.9 KiB\t40.0%" in table
+    assert f"{own['name']}\t2\t1\t0\t0 B\t1.6 KiB\t3.9 KiB\t40.0%" in table
     assert table.splitlines()[-1].startswith("total")
