@@ -131,7 +131,7 @@ def is_error(message: ConsoleMessage) -> bool:
 
 
 def tab_to(page: Page, name: str) -> None:
-    """Press the Tab key until the control with a name, which the page may still be getting, has the focus."""
+    """Press the Tab key until the control with a name, once it is there, has the focus."""
     expect(page.get_by_text(name).first).to_be_visible()
     for _ in range(most_stops):
         page.keyboard.press("Tab")
