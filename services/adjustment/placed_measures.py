@@ -16,6 +16,10 @@ from services.sensors.displacement import DisplacementGrid
 from services.sensors.ortho import OrthoModel
 from services.types import Array, BoolArray
 
+_OF_ITS_OWN = 1e-6
+"""Share of its variance that each measure has for itself: chips that are the same have the same errors,
+and no covariance of them could be inverted."""
+
 
 @dataclass(frozen=True)
 class PlacedMeasures:
@@ -83,6 +87,7 @@ class PlacedMeasures:
         correlation = self.overlapping[np.ix_(rows, rows)]
         if shared is not None:
             correlation = shared.covariance(self.position[rows], correlation)
+        correlation = correlation + _OF_ITS_OWN * np.eye(len(correlation))
         sigma = fit.sigma[rows].T
         return Residuals(
             self.position_px[rows],
