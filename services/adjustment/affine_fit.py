@@ -37,14 +37,14 @@ class AffineFit:
         t: (n, 2) positions, -1 to 1 over the image.
         misfit: (n, 2) pixels.
         variance: (n, 2) px^2.
-        member: (n, b) whether a point belongs to a block; b is 0 where all belong to one.
+        member: (n, b) 1 where a point belongs to a block, else 0; b is 0 where all belong to one.
         offset_px: (2, b) a priori standard deviation of the offsets.
     """
 
     t: Array
     misfit: Array
     variance: Array
-    member: BoolArray
+    member: Array
     offset_px: Array
 
     @cached_property

@@ -1,6 +1,8 @@
 """The least squares: the image correction of one scene from points on known ground."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtr
@@ -8,11 +10,12 @@ from scipy.special import ndtr
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
 from services.adjustment.broken_image import MOST_BEYOND, held_parts, on_one_side, part_of_line
 from services.adjustment.line_profile import Component, unit_variance, with_components
+from services.adjustment.moved_ground import MovedGround, moved_ground
 from services.adjustment.order_selection import choose_order
 from services.adjustment.placed_measures import PlacedMeasures
 from services.adjustment.profile_solution import joined, solve_profile
 from services.adjustment.robust import deactivate
-from services.adjustment.scene_motion import what_moves
+from services.adjustment.scene_motion import SceneMotion, what_moves
 from services.adjustment.shared_errors import (
     SharedErrors,
     likeliest_shared_errors,
@@ -22,7 +25,7 @@ from services.adjustment.short_motion import STILL, ChipStrips, ShortMotion, sho
 from services.adjustment.structure import Structure, unfollowed_variance_px2
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.base import SensorModel
-from services.sensors.correction import ImageCorrection, no_correction
+from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray, IntArray
 
@@ -134,6 +137,7 @@ class SceneAdjustment:
         components: of the displacement beyond the affine correction; none without one.
         structures: what the residuals of the correction still depend on, by family; none where it was
             not tested.
+        moved: ground that moved, of which no measure is active; None where none is seen.
     """
 
     correction: ImageCorrection
@@ -152,6 +156,7 @@ class SceneAdjustment:
     point_sigma_px: Array
     components: tuple[Component, ...] = ()
     structures: tuple[Structure, ...] = ()
+    moved: MovedGround | None = None
 
     def covariance_at(self, line_sample: Array) -> Array:
         """Covariance (n, 2, 2) of the corrected model at image positions (n, 2), px^2."""
@@ -166,6 +171,7 @@ def adjust_scene(
     *,
     min_points: int | None = None,
     like: SceneAdjustment | None = None,
+    ground_may_move: bool = False,
 ) -> SceneAdjustment:
     """The correction of a model that best explains where control points were seen.
 
@@ -190,12 +196,25 @@ def adjust_scene(
         min_points: smallest number of active measures; that of the options when None.
         like: an adjustment of these measures and others, whose prior of drift and skew, shared errors
             and motion hold; they are estimated when None.
+        ground_may_move: whether an area of the ground is left out that explains the measures better
+            than motion does. Only measures of a narrow search tell: in a wide one, areas are found at
+            wrong places together.
 
     Raises:
         NotEnoughPoints: fewer than `min_points` measures are usable.
         UndeterminedCorrection: the points lie on a line, which does not determine the order given.
     """
     min_points = options.min_points if min_points is None else min_points
+    again = partial(
+        adjust_scene,
+        model,
+        shape,
+        options=options,
+        min_points=min_points,
+        ground_may_move=ground_may_move,
+    )
+    if moved := like and like.moved:
+        return _beside(moved, partial(again, like=replace(like, moved=None)), model, observations)
     declared, seen, of_points = _declared_fit(model, shape, observations)
     usable = seen if observations.usable is None else seen & observations.usable
     if usable.sum() < min_points:
@@ -239,24 +258,22 @@ def adjust_scene(
         chip_side_px=observations.chip_side_px,
     )
     expected, limit = fit.expected(slope_px), options.tolerance
-    along_axes: tuple[Structure, ...] = ()
-    if like is None:
-        components, along_axes = (
-            what_moves(
-                measured,
-                fit,
-                start,
-                fit.clipped(start, 2.0 * limit * scale),
-                seen=seen,
-                active=active,
-                breaks=observations.breaks,
-                tolerance=limit,
-            )
-            if options.profile and options.order is None
-            else measured.components(fit, active, wanted=False)
+    clipped = fit.clipped(start, 2.0 * limit * scale)
+    motion = (
+        SceneMotion(like.components, (), active)
+        if like
+        else _motion(
+            measured, fit, start, clipped, options, seen=seen, active=active, breaks=observations.breaks
         )
-    else:
-        components = like.components
+    )
+    ground = (
+        moved_ground(measured, fit, clipped, motion, seen=seen, tolerance=limit)
+        if ground_may_move
+        else None
+    )
+    if ground:
+        return _beside(ground, again, model, observations)
+    components = motion.components
     shared_fit, of_shared = declared, agreeing
     if components:
         active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
@@ -302,9 +319,11 @@ def adjust_scene(
     correction = replace(no_correction(shape), parameters=parameters[:, :3], displacement=displacement)
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
-    deformation = np.zeros((6, 6))
-    if observations.deformation_px2 is not None:
-        deformation[:] = deformation_covariance(observations.deformation_px2, correction)
+    deformation = (
+        np.zeros((6, 6))
+        if observations.deformation_px2 is None
+        else deformation_covariance(observations.deformation_px2, correction)
+    )
     explained = measured.without(displacement, fit) if displacement else fit
     misfit_px = (
         explained.misfit - np.column_stack([np.ones(len(fit.t)), fit.t]) @ correction.parameters.T
@@ -313,7 +332,9 @@ def adjust_scene(
     local_px2 = shared.clear_share * of_image * np.mean(misfit_px[active] ** 2, axis=0)
     short = like.short_motion if like else _short_motion(measured, observations, active, displacement)
     tested = (
-        like.structures if like else measured.structures(fit, active, components, shared, along_axes)
+        like.structures
+        if like
+        else measured.structures(fit, active, components, shared, motion.along_axes)
     )
     unfollowed = unfollowed_variance_px2(tested, of_image)
     return SceneAdjustment(
@@ -334,6 +355,49 @@ def adjust_scene(
         components=components,
         structures=tested if like else (*tested, short.structure),
     )
+
+
+def _motion(
+    measured: PlacedMeasures,
+    fit: AffineFit,
+    start: Array,
+    clipped: AffineFit,
+    options: AdjustmentOptions,
+    *,
+    seen: BoolArray,
+    active: BoolArray,
+    breaks: IntArray | None,
+) -> SceneMotion:
+    """What no affine correction follows, as far as the options want it followed."""
+    if not options.profile or options.order is not None:
+        return SceneMotion(*measured.components(fit, active, wanted=False), active)
+    return what_moves(
+        measured,
+        fit,
+        start,
+        clipped,
+        seen=seen,
+        active=active,
+        breaks=breaks,
+        tolerance=options.tolerance,
+    )
+
+
+def _beside(
+    moved: MovedGround,
+    adjust: Callable[[ControlObservations], SceneAdjustment],
+    model: SensorModel,
+    observations: ControlObservations,
+) -> SceneAdjustment:
+    """The adjustment on measures beside ground that moved, with the residuals of all."""
+    on_it = moved.measures[:, None]
+    line_sample = np.where(on_it, np.nan, observations.line_sample)
+    beside = adjust(replace(observations, line_sample=line_sample))
+    computed = CorrectedModel(model, beside.correction).project(observations.lon_lat_h)
+    residual_px = np.where(on_it, observations.line_sample - computed, beside.residual_px)
+    if beside.moved:
+        moved = replace(beside.moved, measures=moved.measures | beside.moved.measures)
+    return replace(beside, residual_px=residual_px, moved=moved)
 
 
 def _short_motion(
@@ -382,22 +446,22 @@ def _declared_fit(
     of_points = np.diagonal(covariance_px2, 0, 1, 2)
     frame = no_correction(shape)
     t = np.nan_to_num((line_sample - misfit - frame.centre) / frame.half_size)
-    member = np.zeros((len(misfit), 0), dtype=bool)
+    member = np.zeros((len(misfit), 0))
     if observations.block is not None:
         blocks = np.unique(observations.block[usable])
         if len(blocks) > 1:
-            member = observations.block[:, None] == blocks
+            member = (observations.block[:, None] == blocks).astype(np.float64)
     offset_px = np.full((2, member.shape[1]), _LOOSE_PX)
     misfit = np.where(seen[:, None], misfit, 0.0)
     return AffineFit(t, misfit, own + of_points, member, offset_px), seen, of_points
 
 
-def _frame_sigma_px(model: SensorModel, observations: ControlObservations, member: BoolArray) -> Array:
+def _frame_sigma_px(model: SensorModel, observations: ControlObservations, member: Array) -> Array:
     """Standard deviation (2, b) of the frames of the blocks in the image; NaN where unknown."""
     if observations.frame_covariance_m2 is None or observations.block is None:
         return np.full((2, member.shape[1]), np.nan)
     sigma_px = []
-    for of_block in member.T:
+    for of_block in member.T.astype(bool):
         derivative = np.nanmean(model.project_derivative(observations.lon_lat_h[of_block]), axis=0)
         frame_m2 = observations.frame_covariance_m2[observations.block[of_block][0]]
         sigma_px.append(np.sqrt(np.diagonal(derivative @ frame_m2 @ derivative.T)))

@@ -1,6 +1,6 @@
 """What moves the lines and samples of a scene, as its measures and the breaks of its image show."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,21 @@ _LEFT_OUT = 5
 """Measures that disagree with an affine correction, from which on a profile is looked for in all."""
 
 
+@dataclass(frozen=True)
+class SceneMotion:
+    """What no affine correction follows.
+
+    Attributes:
+        components: of lines and samples that moved, which a displacement follows.
+        along_axes: what is left along the axes.
+        agreeing: (n,) measures that agree with the components.
+    """
+
+    components: tuple[Component, ...]
+    along_axes: tuple[Structure, ...]
+    agreeing: BoolArray
+
+
 def what_moves(
     measured: PlacedMeasures,
     fit: AffineFit,
@@ -27,8 +42,8 @@ def what_moves(
     active: BoolArray,
     breaks: IntArray | None,
     tolerance: float,
-) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
-    """What the measures show that no affine correction follows, and what it leaves along the axes.
+) -> SceneMotion:
+    """What the measures show that no affine correction follows.
 
     Args:
         measured: the measures.
@@ -50,14 +65,15 @@ def what_moves(
     if not components and (seen & ~active).sum() >= _LEFT_OUT:
         # What lies beside a step agrees with itself, and was left out.
         components, _ = measured.components(clipped, seen)
-    if not components:
-        return (), along_axes
-    # Measures that an affine correction keeps may be wrong beside what moves, and right that it leaves.
-    agreeing = measured.agreeing(fit, seen, components, expected, tolerance)
-    again, left = measured.components(fit, agreeing, known)
-    if not again and first:
-        return first, along_axes
-    return again or components, left
+    agreeing = active
+    if components:
+        # An affine correction may keep measures that are wrong beside what moves, and leave right ones.
+        agreeing = measured.agreeing(fit, seen, components, expected, tolerance)
+        again, left = measured.components(fit, agreeing, known)
+        if again or not first:
+            components, along_axes = again or components, left
+            agreeing = measured.agreeing(fit, seen, components, expected, tolerance)
+    return SceneMotion(components, along_axes, agreeing)
 
 
 def _known_steps(

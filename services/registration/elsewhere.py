@@ -18,7 +18,7 @@ from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_w
 from services.quality.missed_lines import UNFOUND
 from services.registration.context import PointContext, Prediction
 from services.registration.search import FIRST_TOLERANCE_PX, Search
-from services.types import BoolArray, IntArray
+from services.types import Array, BoolArray, IntArray
 
 _FEWEST = 5
 """Points that were not found, from which on they are searched again."""
@@ -55,7 +55,8 @@ def search_elsewhere(
         search: the last one.
         adjustment: on it.
     """
-    beside = _lines_beside(prediction, search, adjustment)
+    beside = _on_moved_ground(prediction, search, adjustment)
+    beside = beside or _lines_beside(prediction, search, adjustment)
     if beside is not None:
         return beside
     missed = _missed(search)
@@ -70,6 +71,30 @@ def search_elsewhere(
     again = _Again(rows, matches)
     beside = _as_heights_move(context, prediction, search, adjustment, again)
     return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
+
+
+def _on_moved_ground(
+    prediction: Prediction, search: Search, adjustment: SceneAdjustment
+) -> Elsewhere | None:
+    """Points that were found on ground that moved."""
+    if not adjustment.moved:
+        return None
+    members = np.flatnonzero(adjustment.moved.measures)
+    displacement_px = np.median(adjustment.residual_px[members], axis=0)
+    return Elsewhere(
+        rows=search.rows[members],
+        displacement_px=displacement_px,
+        displacement_m=_on_ground_m(prediction, search, members, displacement_px),
+        false_alarms=float(np.exp(-adjustment.moved.log_evidence)),
+    )
+
+
+def _on_ground_m(
+    prediction: Prediction, search: Search, members: IntArray, displacement_px: Array
+) -> float:
+    """Length of a displacement (2,) of points of a search."""
+    derivative = prediction.model.project_derivative(search.points.lon_lat_h[members]).mean(axis=0)
+    return float(np.hypot(*np.linalg.solve(derivative[:, :2], displacement_px)))
 
 
 def _lines_beside(
@@ -96,12 +121,10 @@ def _lines_beside(
     false_alarms = group.false_alarms * chance_of_whole_lines(line, others)
     if false_alarms > _MAX_FALSE_ALARMS:
         return None
-    derivative = prediction.model.project_derivative(search.points.lon_lat_h[members]).mean(axis=0)
-    moved_m = np.linalg.solve(derivative[:, :2], group.displacement)
     return Elsewhere(
         rows=search.rows[members],
         displacement_px=group.displacement,
-        displacement_m=float(np.hypot(*moved_m)),
+        displacement_m=_on_ground_m(prediction, search, members, group.displacement),
         false_alarms=false_alarms,
     )
 

@@ -103,7 +103,7 @@ def register_scene(
             turned.
     """
     try:
-        context, search, adjustment = search_scene(
+        context, search, _ = search_scene(
             scene, points, chips, options, progress=progress, stages=stages
         )
     except (NoConsensus, NotEnoughPoints) as error:
@@ -111,6 +111,7 @@ def register_scene(
         if not turned:
             raise
         raise NoConsensus(f"the image is {turned} ({error})") from error
+    adjustment = adjust_search(scene, search, options.adjustment, ground_may_move=True)
     prediction = predict(scene, context.points, adjustment)
     elsewhere = search_elsewhere(context, prediction, search, adjustment)
     return build_registration(context, context.points, search, adjustment, elsewhere)

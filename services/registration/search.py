@@ -82,6 +82,7 @@ def adjust_search(
     usable: BoolArray | None = None,
     min_points: int | None = None,
     like: SceneAdjustment | None = None,
+    ground_may_move: bool = False,
 ) -> SceneAdjustment:
     """The correction of a scene from the matches of a search; see `adjust_scene`.
 
@@ -92,10 +93,17 @@ def adjust_search(
         usable: (k,) matches that may be used; the inliers when None.
         min_points: smallest number of active measures; that of the options when None.
         like: an adjustment of these matches and others, whose prior and shared errors hold.
+        ground_may_move: whether an area of the ground may be left out.
     """
     observations = control_observations(scene, search, search.inliers if usable is None else usable)
     return adjust_scene(
-        scene.model, scene.image.shape, observations, options, min_points=min_points, like=like
+        scene.model,
+        scene.image.shape,
+        observations,
+        options,
+        min_points=min_points,
+        like=like,
+        ground_may_move=ground_may_move,
     )
 
 
