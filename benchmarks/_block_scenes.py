@@ -4,7 +4,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from services.adjustment.bundle import BlockAdjustment
-from services.adjustment.image_correction import ControlObservations, adjust_scene
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import adjust_scene
 from services.geodesy import move_metres
 from services.quality.stability import image_places
 from services.sensors.correction import ImageCorrection

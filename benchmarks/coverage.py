@@ -32,12 +32,8 @@ from rich.table import Table
 from scipy.stats import binom
 
 from benchmarks._measuring import keep
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.errors import ComputationError
 from services.quality.normal_law import normal_ce90
 from services.quality.stability import image_places

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.image_correction import ControlObservations, SceneAdjustment
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene
 from services.matching.control_points import PointMatches
 from services.registration.context import SearchStage

@@ -7,12 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.conventions import MAX_ERROR_SIGMAS
 from services.errors import NoConsensus, NotEnoughPoints
 from services.geodesy import continuous, ecef_from_east_north_up

@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.quality.stability import AdjustedScene
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.types import UNKNOWN_FRAME, Array, BoolArray, Frame, Measures

@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from services.adjustment.affine_fit import Order
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray

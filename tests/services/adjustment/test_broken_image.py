@@ -5,12 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.quality.accuracy import normalised_error
 from services.quality.normal_law import normal_ce90
 from services.sensors.correction import ImageCorrection, no_correction

@@ -6,12 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import (
-    AdjustmentOptions,
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family
 from services.quality.accuracy import normalised_error

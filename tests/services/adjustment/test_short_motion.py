@@ -7,11 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.adjustment.image_correction import (
-    ControlObservations,
-    SceneAdjustment,
-    adjust_scene,
-)
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import SceneAdjustment, adjust_scene
 from services.adjustment.short_motion import MAX_CHANCE, STRIPS, ChipStrips, ShortMotion, short_motion
 from services.quality.accuracy import normalised_error
 from services.sensors.correction import no_correction

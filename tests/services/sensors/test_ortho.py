@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from services.adjustment.image_correction import AdjustmentOptions, ControlObservations, adjust_scene
+from services.adjustment.control_observations import ControlObservations
+from services.adjustment.image_correction import AdjustmentOptions, adjust_scene
 from services.geodesy import ecef_from_lon_lat_h, metres_per_degree_at
 from services.imagery.scene import view_direction
 from services.map_grid import MapGrid
