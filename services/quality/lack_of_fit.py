@@ -213,7 +213,7 @@ def elsewhere_criterion(
     whole_lines = _belong_to_whole_lines(line, line_sample[active, 0], elsewhere.displacement_px)
     moved = (
         f"{len(line)} points of lines {first:.0f} to {last:.0f} agree on a place "
-        f"{np.hypot(*elsewhere.displacement_px):.0f} px ({elsewhere.displacement_m:.1f} m) away "
+        f"{np.hypot(*elsewhere.displacement_px):.1f} px ({elsewhere.displacement_m:.1f} m) away "
         f"({elsewhere.displacement_px[0]:+.1f} lines, {elsewhere.displacement_px[1]:+.1f} samples), "
         f"of which chance makes {elsewhere.false_alarms:.1g}"
     )
