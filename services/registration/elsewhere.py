@@ -4,20 +4,20 @@ The last search is narrow. A part of a scene that lies elsewhere (lines that wer
 ground that moved) is beyond it: its points count as not found, and nothing else speaks of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from services.adjustment.image_correction import SceneAdjustment
 from services.conventions import CHIP_SIZE
 from services.matching.consensus import Voters, a_contrario_consensus, consensus_tolerance_px
-from services.matching.control_points import ChipSearch, PointMatches, match_points
+from services.matching.control_points import ChipSearch, PointMatches, match_points, with_matches
 from services.matching.height_consensus import height_consensus
 from services.matching.predict import spread_over_image
 from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_whole_lines
 from services.quality.missed_lines import UNFOUND
 from services.registration.context import PointContext, Prediction
-from services.registration.search import FIRST_TOLERANCE_PX, Search
+from services.registration.search import FIRST_TOLERANCE_PX, Search, adjust_search, select_inliers
 from services.types import Array, BoolArray, IntArray
 
 _FEWEST = 5
@@ -63,14 +63,43 @@ def search_elsewhere(
     rows = _spread(context, prediction, search.rows[missed])
     if len(rows) < _FEWEST:
         return None
+    again = _Again(rows, _search_again(context, prediction, rows))
+    beside = _as_heights_move(context, prediction, search, adjustment, again)
+    return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
+
+
+def search_moved_ground(
+    context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
+) -> tuple[Search, SceneAdjustment]:
+    """The search with all missed points in a wide window, where it shows two places; else as it was.
+
+    A narrow search follows the place that the points found first agree on, which may be the ground that
+    moved. Measures of both places tell which of them has the larger part of the image.
+
+    Args:
+        context: of the registration.
+        prediction: of all its points, by the registered model.
+        search: the last one.
+        adjustment: on it.
+    """
+    rows = np.flatnonzero(_missed(search))
+    if len(rows) < _FEWEST:
+        return search, adjustment
+    again = _search_again(context, prediction, search.rows[rows])
+    matches = with_matches(search.matches, rows, again)
+    inliers, _ = select_inliers(prediction.model, search.points, matches)
+    wider = replace(search, matches=matches, inliers=inliers)
+    told = adjust_search(context.scene, wider, context.options.adjustment, ground_may_move=True)
+    return (wider, told) if told.moved else (search, adjustment)
+
+
+def _search_again(context: PointContext, prediction: Prediction, rows: IntArray) -> PointMatches:
+    """Matches of points in a wide window."""
     chip_search = ChipSearch(
         context.image, prediction.model, context.scene.acquisition, context.fine_gsd_m, _RADIUS_PX
     )
     points = context.points.take(rows)
-    matches = match_points(chip_search, points, context.chips, context.options.matching)
-    again = _Again(rows, matches)
-    beside = _as_heights_move(context, prediction, search, adjustment, again)
-    return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
+    return match_points(chip_search, points, context.chips, context.options.matching)
 
 
 def _on_moved_ground(
