@@ -48,16 +48,19 @@ class Importers:
             self.first[name] = f"{frame.f_code.co_filename}:{frame.f_lineno}" if frame else ""
 
 sys.meta_path.insert(0, Importers())
-from app.cli.main import main
 atexit.register(lambda: print(json.dumps(Importers.first)))
-main()
 """
+COMMAND = "from app.cli.main import main; main()"
 
 
-def imported_by(words: str) -> dict[str, str]:
-    """The modules that `amers` with these words imports, each with the line that imported it first."""
+def imported_by(statement: str, words: str = "") -> dict[str, str]:
+    """The modules that a statement imports, each with the line that imported it first.
+
+    Args:
+        words: arguments of the program.
+    """
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *words.split()],
+        [sys.executable, "-c", PROGRAM + statement, *words.split()],
         cwd=ROOT,
         env=os.environ,
         capture_output=True,
@@ -70,11 +73,17 @@ def imported_by(words: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("words", BUDGETS)
 def test_a_command_imports_no_more_than_its_budget(words):
-    imported = imported_by(words)
+    imported = imported_by(COMMAND, words)
     beyond = {
         name: line for name, line in imported.items() if name in PACKAGES and name not in BUDGETS[words]
     }
     assert beyond == {}, f"amers {words} imports what it does not need; see who asks for it first"
+
+
+def test_the_python_client_imports_nothing_of_weight_but_httpx():
+    imported = imported_by("import app.client")
+    assert {name: line for name, line in imported.items() if name in PACKAGES - {"httpx"}} == {}
+    assert "httpx" in imported
 
 
 def test_rows_on_a_pipe_are_printed_without_the_tables_of_terminals():

@@ -16,7 +16,8 @@ import typer
 
 from app.cli.exit_status import FAILURE, NO_RESULT, SUCCESS, exit_status
 from app.cli.progress import shown_progress
-from app.cli.remote import NothingDone, Service, ServiceFailure
+from app.cli.remote import register
+from app.client import Client, RequestRefused, ServiceFailure
 from app.config import Settings, read_settings
 from app.db import engine
 from app.db.engine import Database
@@ -161,8 +162,8 @@ def _register_accepted(
         return []
     try:
         if remote is not None:
-            with Service(remote.url, remote.token) as service:
-                return [outcome_of(_on_service(service), request) for request in requests]
+            with Client(remote.url, remote.token) as client:
+                return [outcome_of(_on_service(client), request) for request in requests]
         if len(requests) == 1:
             with registrar(control) as register_one:
                 return [outcome_of(register_one, requests[0])]
@@ -182,7 +183,7 @@ def outcome_of(
             try:
                 outcome = registered_outcome(request, register_one(request, new, receiver))
             except (InputError, ComputationError) as error:
-                if isinstance(error, NothingDone):
+                if isinstance(error, RequestRefused):
                     raise
                 _keep_only_failure(request, new, error)
                 outcome = {**failed_outcome(request, error), "output": request.folder}
@@ -325,9 +326,10 @@ def _on_store(database: Database, settings: Settings) -> Register:
     return register_one
 
 
-def _on_service(service: Service) -> Register:
+def _on_service(client: Client) -> Register:
     """A function that lets a service register scenes."""
-    return lambda request, folder, progress: service.register(
+    return lambda request, folder, progress: register(
+        client,
         request.files,
         folder,
         progress,
