@@ -8,34 +8,26 @@ The token is read from the environment variable AMERS_TOKEN; a service with publ
 
 import os
 import sys
-from io import BytesIO
 
 import geopandas
-import httpx
 import matplotlib.pyplot as plt
 
+from app.client import Client
 
-def query_points(bbox: str, url: str, token: str | None) -> geopandas.GeoDataFrame:
+
+def query_points(bbox: str, url: str, token: str) -> geopandas.GeoDataFrame:
     """The published points of a box whose chips are easy to locate, as a table.
 
     Args:
         bbox: west, south, east, north in degrees, separated by commas.
         url: of the service.
-        token: secret with the scope `read`; None for a service with public points.
+        token: secret with the scope `read`; "" for a service with public points.
     """
-    response = httpx.get(
-        f"{url}/collections/points/items",
-        params={
-            "bbox": bbox,
-            "filter": "saliency > 0.1",  # any property of /collections/points/queryables, in CQL2
-            "limit": 10_000,
-            "f": "parquet",  # GeoParquet; GeoJSON, FlatGeobuf, GeoPackage and CSV are there too
-        },
-        headers={"Authorization": f"Bearer {token}"} if token else {},
-        timeout=60.0,
-    )
-    response.raise_for_status()
-    return geopandas.read_parquet(BytesIO(response.content))
+    west, south, east, north = map(float, bbox.split(","))
+    with Client(url, token) as client:
+        # The condition is CQL2, on any property of /collections/points/queryables.
+        points = list(client.points((west, south, east, north), where="saliency > 0.1"))
+    return geopandas.GeoDataFrame.from_features(points, crs="EPSG:4979")
 
 
 def draw(points: geopandas.GeoDataFrame, picture: str) -> None:
@@ -61,6 +53,6 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     box, output = sys.argv[1], sys.argv[2]
     service = sys.argv[3] if len(sys.argv) > 3 else "http://127.0.0.1:8000"
-    table = query_points(box, service, os.environ.get("AMERS_TOKEN"))
+    table = query_points(box, service, os.environ.get("AMERS_TOKEN", ""))
     print(f"{len(table)} control points, columns: {', '.join(table.columns)}")
     draw(table, output)

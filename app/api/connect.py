@@ -135,6 +135,26 @@ print(points[["saliency", "n_views", "geometry"]])
         ),
     ),
     Recipe(
+        "Python client of Amers",
+        "Points and blocks, uploads, registrations and their results. It comes with Amers, and asks for "
+        "page after page by itself.",
+        (
+            Lines(
+                "python",
+                """
+from os import environ
+
+from app.client import Client
+
+with Client("BASE", environ["TOKEN"]) as client:
+    points = list(client.points((5.22, 43.21, 5.27, 43.26)))
+    blocks = client.blocks()
+print(len(points), "points;", *[block["properties"]["title"] for block in blocks])
+""",
+            ),
+        ),
+    ),
+    Recipe(
         "OWSLib",
         "Collections and features; `owslib.ogcapi.processes` starts registrations the same way.",
         (

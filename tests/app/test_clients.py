@@ -201,6 +201,7 @@ SHOWN = {
     "curl": '"numberMatched": {}',
     "GDAL 3.6 and 3.12": "Feature Count: 60",
     "geopandas 1": "saliency  n_views",
+    "Python client of Amers": "{} points; Test block calanques",
     "OWSLib": "{} [",
     "pystac-client": "",
 }
