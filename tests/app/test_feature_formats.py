@@ -2,6 +2,11 @@
 
 import io
 import json
+import re
+import sqlite3
+from contextlib import closing
+from itertools import pairwise
+from xml.etree import ElementTree as ET
 
 import geopandas
 import numpy as np
@@ -51,6 +56,35 @@ def test_a_file_of_points_opens_with_heights_reference_system_and_properties(get
     assert_allclose(frame["saliency"], made.points.saliency, rtol=1e-7)
     assert frame["typology"].isna().sum() == 15
     assert str(frame["first_view"][0])[:10] == "2023-03-01"
+
+
+def test_a_geopackage_of_points_has_styles_that_qgis_finds_by_layer_and_geometry_column(get, tmp_path):
+    path = tmp_path / "points.gpkg"
+    path.write_bytes(get(ITEMS, f="gpkg").content)
+    with closing(sqlite3.connect(path)) as database:
+        database.row_factory = sqlite3.Row
+        styles = [dict(row) for row in database.execute("select * from layer_styles order by id")]
+        ((table, column),) = database.execute(
+            "select table_name, column_name from gpkg_geometry_columns"
+        )
+        assert database.execute("pragma integrity_check").fetchone()[0] == "ok"
+    assert {(row["f_table_name"], row["f_geometry_column"]) for row in styles} == {(table, column)}
+    assert [(row["styleName"], row["useAsDefault"]) for row in styles] == [
+        ("Horizontal sigma", 1),
+        ("Number of views", 0),
+    ]
+    properties = set(geopandas.read_file(path, layer="points").columns)
+    for row in styles:
+        renderer = ET.fromstring(row["styleQML"]).find("renderer-v2")
+        assert renderer.get("type") == "graduatedSymbol"
+        assert set(re.findall(r'"(\w+)"', renderer.get("attr"))) <= properties
+        ranges = renderer.findall("ranges/range")
+        symbols = {symbol.get("name"): symbol for symbol in renderer.findall("symbols/symbol")}
+        assert [one.get("symbol") for one in ranges] == list(symbols)
+        colours = {symbol.find("layer/prop[@k='color']").get("v") for symbol in symbols.values()}
+        assert len(colours) == len(ranges)
+        limits = [(float(one.get("lower")), float(one.get("upper"))) for one in ranges]
+        assert all(before[1] == after[0] for before, after in pairwise(limits))
 
 
 @pytest.mark.parametrize("form", ["fgb", "parquet", "gpkg", "csv"])

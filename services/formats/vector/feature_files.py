@@ -15,6 +15,8 @@ import pyarrow.parquet as pq
 import pyproj
 import shapely
 
+from services.formats.vector.qgis_styles import LAYER_STYLES, add_styles
+
 KEYS = "keys"
 """Column of a CSV with the paging key of each row."""
 ARROW_TYPES = {
@@ -124,7 +126,7 @@ def format_parquet(features: FeatureTable, layer: str) -> bytes:
 
 
 def format_geopackage(features: FeatureTable, layer: str) -> bytes:
-    """The bytes of a GeoPackage with one layer of features."""
+    """The bytes of a GeoPackage with one layer of features; control points have styles for QGIS."""
     return _file_bytes(features, layer, "GPKG", "features.gpkg")
 
 
@@ -148,4 +150,6 @@ def _file_bytes(features: FeatureTable, layer: str, driver: str, name: str, **op
             crs=f"EPSG:{features.srid}",
             **options,
         )
+        if driver == "GPKG" and layer in LAYER_STYLES:
+            add_styles(path, layer, LAYER_STYLES[layer])
         return path.read_bytes()
