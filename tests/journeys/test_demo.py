@@ -18,6 +18,7 @@ from tests.service_process import Service, until
 pytestmark = pytest.mark.long
 
 README = Path(__file__).parents[2] / "README.md"
+GUIDE = README.parent / "docs" / "guide.md"
 half_a_pixel = 0.5
 injected_m = 50.0
 
@@ -101,8 +102,13 @@ def test_a_block_that_is_there_is_not_written_over(tmp_path):
 
 
 def lines_of_readme(heading: str, language: str) -> str:
-    """The first lines to copy below a heading, or below a paragraph that begins in bold."""
-    below = README.read_text(encoding="utf-8").partition(heading)[2]
+    """The first lines of the README to copy below a heading or below a paragraph that begins in bold."""
+    return lines_of(README, heading, language)
+
+
+def lines_of(document: Path, heading: str, language: str) -> str:
+    """The first lines of a document to copy below some text."""
+    below = document.read_text(encoding="utf-8").partition(heading)[2]
     match = re.search(rf"```{language}\n(.*?)```", below, re.DOTALL)
     assert match is not None
     return match[1]
@@ -150,6 +156,19 @@ def test_the_first_run_of_the_readme_registers_the_scene_of_the_demo(first_run):
 def test_the_python_of_the_readme_prints_the_verdict(first_run):
     service, folder, _ = first_run
     program = lines_of_readme("**In Python**", "python")
+    assert run([sys.executable, "-c", program], service, folder).strip() == "good"
+
+
+@pytest.mark.parametrize("heading", ["One command does the same", "## The library"])
+def test_the_python_of_the_guide_runs_as_it_is(first_run, heading):
+    service, folder, _ = first_run
+    for name, place in (("scene.tif", "images/scene.tif"), ("my-block", "block")):
+        if not (folder / name).exists():
+            (folder / name).symlink_to(folder / "demo-output" / place)
+    token = ["token", "create", uuid4().hex, "--scope", "register"]
+    secret = run([sys.executable, "-m", "app.cli.main", *token], service, folder).strip()
+    program = lines_of(GUIDE, heading, "python").replace("http://127.0.0.1:8000", service.url)
+    service.environment["TOKEN"] = secret
     assert run([sys.executable, "-c", program], service, folder).strip() == "good"
 
 
