@@ -232,7 +232,7 @@ def adjust_scene(
         if ground_may_move
         else None
     )
-    if ground:
+    if ground and (usable & ~ground.measures).sum() >= min_points:
         return _beside(ground, again, model, observations)
     components = motion.components
     shared_fit, of_shared = declared, agreeing

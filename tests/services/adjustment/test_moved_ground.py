@@ -113,6 +113,18 @@ def test_the_larger_area_is_the_scene_even_where_the_smaller_has_more_points():
     assert beside(adjustment, truth, THIRD)[0] < WRONG
 
 
+def test_ground_that_holds_nearly_all_usable_points_stays_the_scene():
+    """Beside it, too few measures would be left; what agrees elsewhere is told by other means."""
+    observations, _ = draw(THIRD, np.random.default_rng(3), wrong=0.0)
+    on_it = THIRD.holds(FlatModel().project(observations.lon_lat_h))
+    usable = on_it | (np.cumsum(~on_it) <= 3)
+    adjustment = adjust_scene(
+        FlatModel(), SHAPE, replace(observations, usable=usable), ground_may_move=True
+    )
+    assert adjustment.moved is None
+    assert adjustment.active[on_it].mean() > 0.9
+
+
 def test_chips_that_are_the_same_can_be_compared():
     observations, truth = draw(THIRD, np.random.default_rng(3), wrong=0.0)
     twice = replace(
