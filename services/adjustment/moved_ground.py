@@ -94,14 +94,14 @@ class _Explained:
         """Standard deviation of unit weight beside shapes (n, k)."""
         return self._displaced(shapes)[2]
 
-    def by(self, shapes: Array, sides: BoolArray | None = None) -> float:
+    def by(self, shapes: Array, area: BoolArray | None = None) -> float:
         """Logarithm of the likelihood, with shapes (n, k) of any size.
 
-        It is that of nothing where too few measures agree on one of two sides (n,).
+        Where an area (n,) is given, too few measures that agree inside or outside it make it -inf.
         """
         both, parameters, scale = self._displaced(shapes)
         agrees = self.seen & (both.magnitude(parameters) <= self.tolerance * scale)
-        if sides is not None and not _shared(sides, agrees):
+        if area is not None and not _on_both_sides(area, agrees):
             return -np.inf
         told = _log_likelihood(self.measured.residuals(both, self.seen), agrees[self.seen])
         # Schwarz (1978): half of the logarithm of the measures for each parameter of each coordinate.
@@ -152,7 +152,7 @@ def moved_ground(
     """
     rows = measured.residuals(clipped, seen)
     circles = _inside(_CIRCLES, fit.t)
-    circles = circles[_shared(circles, seen)]
+    circles = circles[_on_both_sides(circles, seen)]
     if not len(circles):
         return None
     gain, _ = rows.gains(circles[:, seen, None].astype(np.float64))
@@ -165,7 +165,7 @@ def moved_ground(
     unit = max(1.0, explained.scale(_column(moved))) ** 2
     explained = replace(explained, fit=fit.scaled(unit))
     bands = np.array(list(_bands(fit.t)))
-    bands = bands[_shared(bands, seen)]
+    bands = bands[_on_both_sides(bands, seen)]
     gain, _ = rows.gains(bands[:, seen, None].astype(np.float64))
     others = [
         explained.by_motion(tuple(one.scaled(unit) for one in motion.components), motion.agreeing),
@@ -184,7 +184,7 @@ def moved_ground(
 def _likeliest_ellipse(explained: _Explained, rows: Residuals) -> Array:
     """The ellipse (5,) whose points are displaced most likely by one vector."""
     t, seen = explained.fit.t, explained.seen
-    tried = _ELLIPSES[_shared(_inside(_ELLIPSES, t), seen)]
+    tried = _ELLIPSES[_on_both_sides(_inside(_ELLIPSES, t), seen)]
 
     def likelihood(ellipse: Array) -> float:
         inside = _inside(ellipse, t)
@@ -202,8 +202,8 @@ def _likeliest_ellipse(explained: _Explained, rows: Residuals) -> Array:
     return best
 
 
-def _shared(inside: BoolArray, seen: BoolArray) -> BoolArray:
-    """Which areas (..., n) have enough of the measures on both sides."""
+def _on_both_sides(inside: BoolArray, seen: BoolArray) -> BoolArray:
+    """Which areas (..., n) have enough of the measures inside and outside."""
     count = (inside & seen).sum(axis=-1)
     return np.asarray((count >= _FEWEST) & (count <= seen.sum() - _FEWEST))
 
