@@ -1,4 +1,4 @@
-// Builds the page: one script, the worker of MapLibre, one style sheet, the outline of the land; nothing from other sites.
+// Builds the page: one script, the worker of MapLibre, one style sheet, land and countries; nothing from other sites.
 import { build } from "esbuild";
 import { mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
@@ -24,6 +24,7 @@ await build({
 });
 writeFileSync(new URL("worker.js", built), withoutMap(readFileSync(`${maplibre}/maplibre-gl-worker.mjs`, "utf8")));
 writeFileSync(new URL("land.json", built), land());
+writeFileSync(new URL("countries.json", built), countries());
 writeFileSync(new URL("index.html", built), readFileSync("source/index.html"));
 for (const name of readdirSync(built)) {
   writeFileSync(new URL(`${name}.gz`, built), gzipSync(readFileSync(new URL(name, built)), { level: 9 }));
@@ -43,7 +44,39 @@ function land() {
     { type: "MultiPolygon", coordinates: polygons.map((rings) => rings.map((ring) => closedAtPole(unrolled(ring)))) },
     { type: "MultiLineString", coordinates: borders.coordinates.map(unrolled) },
   ];
-  const features = geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry }));
+  return collection(geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry })));
+}
+
+/** Names of countries of Natural Earth, each in the middle of its largest part, with the box and the area of that part. */
+function countries() {
+  const world = JSON.parse(readFileSync("node_modules/world-atlas/countries-50m.json", "utf8"));
+  return collection(
+    feature(world, world.objects.countries).features.map(({ properties: { name }, geometry }) => {
+      const polygons = geometry.type === "Polygon" ? [geometry.coordinates] : geometry.coordinates;
+      const parts = polygons.map(([outside]) => part(closedAtPole(unrolled(outside))));
+      const { middle, box, area } = parts.reduce((one, other) => (other.area > one.area ? other : one));
+      return { type: "Feature", properties: { name, box, area }, geometry: { type: "Point", coordinates: middle } };
+    }),
+  );
+}
+
+/** Centre of gravity, box and area (square degrees) of a ring. */
+function part(ring) {
+  let [area, x, y] = [0, 0, 0];
+  const [[x0, y0]] = ring;
+  ring.forEach(([x1, y1], at) => {
+    const [x2, y2] = ring[(at + 1) % ring.length];
+    const twice = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0);
+    area += twice / 2;
+    x += (twice * (x1 + x2 - 2 * x0)) / 6;
+    y += (twice * (y1 + y2 - 2 * y0)) / 6;
+  });
+  const [lons, lats] = [ring.map(([lon]) => lon), ring.map(([, lat]) => lat)];
+  const box = [Math.min(...lons), Math.min(...lats), Math.max(...lons), Math.max(...lats)];
+  return { middle: [x0 + x / area, y0 + y / area], box, area: Math.abs(area) };
+}
+
+function collection(features) {
   const rounded = (key, value) => (typeof value === "number" ? Math.round(value * 100) / 100 : value);
   return JSON.stringify({ type: "FeatureCollection", features }, rounded);
 }

@@ -45,6 +45,10 @@ piece_bytes = 8 * 1024 * 1024
 """Size of a piece of an upload in web/source/upload.ts."""
 points_of_the_block = 40
 vector_colour = np.array([0xB3, 0x26, 0x1E])
+class_colours = np.array(
+    [[0x0B, 0x4F, 0x5E], [0x2F, 0x8F, 0xB0], [0xC0, 0x7A, 0x00], [0xA3, 0x19, 0x5B]]
+)
+"""Of points in light, from the best class to the worst, as in web/source/style.ts."""
 enough_px = 50
 a_third_of_a_pixel_m = GSD_M / 3.0
 a_hundredth_px = 0.01
@@ -148,10 +152,15 @@ def until_drawn(page: Page) -> None:
     expect(page.locator("#map")).to_have_attribute("aria-busy", "false")
 
 
+def pixels_drawn(page: Page, colour: np.ndarray) -> int:
+    """Pixels of the map in a colour."""
+    picture = imread(io.BytesIO(page.locator("#map").screenshot()))[:, :, :3]
+    return int((np.abs(picture * 255 - colour) < 2).all(axis=2).sum())
+
+
 def vectors_drawn_px(page: Page) -> int:
     """Pixels of the map in the colour of the residuals."""
-    picture = imread(io.BytesIO(page.locator("#map").screenshot()))[:, :, :3]
-    return int((np.abs(picture * 255 - vector_colour) < 2).all(axis=2).sum())
+    return pixels_drawn(page, vector_colour)
 
 
 def test_a_scene_goes_from_upload_to_report_with_the_keyboard_alone(visit, world, secret, service):
@@ -570,6 +579,55 @@ def test_a_point_shows_all_its_chips(visit, secret):
         expect(chip).to_have_js_property("naturalWidth", chip_px)
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "point.png")
+
+
+def test_the_map_goes_to_a_country_or_a_coordinate_with_the_keyboard(visit, secret):
+    """The map moves, the message names where it is; a wrong text is refused and moves nothing."""
+    page = visit("#/points", secret, WIDE)
+    count, status, field = page.locator(".count"), page.locator("#status"), page.get_by_label("Go to")
+    expect(count).to_have_text(f"{points_of_the_block} points")
+    tab_to(page, "Go to")
+    page.keyboard.type("norw")
+    page.keyboard.press("Enter")
+    expect(status).to_have_text("The map shows Norway.")
+    expect(count).to_have_text("0 points")
+    assert_readable(page, "map-country")
+
+    field.fill(f"{CENTRE[1]:.5f}, {CENTRE[0]:.5f}")
+    field.press("Enter")
+    expect(status).to_contain_text("The map shows")
+    expect(count).to_have_text(f"{points_of_the_block} points")
+    until_drawn(page)
+    before = grey_map(page)
+    for wrong in ("nowhere at all", "91, 0", "10 N, 20 S"):
+        field.fill(wrong)
+        field.press("Enter")
+        expect(page.get_by_role("alert")).to_contain_text(f"“{wrong}” is no country")
+    page.screenshot(path=ARTEFACTS / "map-go-to-refused.png")
+    below_the_field = np.s_[WIDE["height"] // 4 :]
+    moved = np.abs(grey_map(page) - before)[below_the_field]
+    assert moved.mean() < as_good_as_equal
+
+
+def test_points_are_coloured_by_their_accuracy_or_their_views(visit, secret):
+    """All points of the block have few views and one accuracy: each choice draws its class alone."""
+    page = visit("#/points", secret, WIDE)
+    expect(page.locator(".count")).to_have_text(f"{points_of_the_block} points")
+    classes = page.get_by_role("list", name="Colours of the points")
+    expect(classes).to_have_count(0)
+    for choice, words in (("number of views", "1 or 2"), ("horizontal standard deviation", "1 m")):
+        page.get_by_label("Points coloured by").select_option(label=choice)
+        expect(classes.get_by_role("listitem")).to_have_count(4)
+        expect(classes).to_contain_text(words)
+        page.wait_for_timeout(poll_ms)
+        until_drawn(page)
+        drawn = [pixels_drawn(page, colour) >= enough_px for colour in class_colours]
+        assert drawn.count(True) == 1, (choice, drawn)
+        if choice == "number of views":
+            assert drawn[3], drawn
+        assert_readable(page, f"points-by-{choice.split()[0]}")
+        page.emulate_media(color_scheme="light")
+        page.set_viewport_size(WIDE)
 
 
 def test_an_invalid_token_is_refused_with_the_message_of_the_service(visit):

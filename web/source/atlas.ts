@@ -1,4 +1,4 @@
-// The map: land, density, blocks, points, scenes and the residuals of a registration.
+// The map: land, graticule, density, blocks, points, scenes and the residuals of a registration.
 
 import type { Feature, FeatureCollection, Geometry, Position } from "geojson";
 import {
@@ -13,7 +13,9 @@ import {
 import { authorization, BASE } from "./api";
 import { Comparison, type Pyramids } from "./comparison";
 import { h } from "./elements";
-import { mapStyle } from "./style";
+import { goToField } from "./go_to";
+import { degrees, graticule, wrapped } from "./graticule";
+import { type Colouring, mapStyle } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
 
@@ -22,6 +24,11 @@ type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
 
 const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
+/** Distance of the degrees of the graticule from the left and lower edges. */
+const LABELS_PX = { left: 6, bottom: 34 };
+/** Zoom at which a coordinate is shown, if the map is not closer. */
+const COORDINATE_ZOOM = 11;
+const PLACE_DECIMALS = 6;
 /** Paths below which tiles are for some callers only. */
 const PROTECTED = ["collections/", "jobs/"];
 
@@ -29,6 +36,7 @@ const PROTECTED = ["collections/", "jobs/"];
 export class Atlas {
   private readonly map: MapLibre | null;
   private readonly ready: Promise<void>;
+  private colouring: Colouring = "none";
 
   constructor(container: HTMLElement, onPoint: (id: number) => void) {
     this.map = opened(container);
@@ -38,6 +46,7 @@ export class Atlas {
       return;
     }
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
+    void this.ready.then(() => this.whileMoving(() => this.drawGraticule(map), new AbortController().signal));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
@@ -52,7 +61,11 @@ export class Atlas {
       if (point) onPoint(Number(point.properties["id"]));
     });
     const pointer = h("p", { class: "pointer", "aria-hidden": "true" });
-    container.append(pointer);
+    const field = goToField(
+      (position) => void this.goTo(position),
+      (coordinates) => this.fit({ type: "MultiPoint", coordinates }),
+    );
+    container.append(pointer, field);
     map.on("mousemove", ({ lngLat }) => (pointer.textContent = place(wrapped(lngLat.lng), lngLat.lat)));
     map.on("mouseout", () => (pointer.textContent = ""));
     map.on("mouseenter", "points", () => (map.getCanvas().style.cursor = "pointer"));
@@ -84,13 +97,23 @@ export class Atlas {
     this.map.fitBounds(box, { padding, maxZoom: closest, animate: !matchMedia("(prefers-reduced-motion: reduce)").matches });
   }
 
+  /** The property that colours the points; it stays for all views of the page. */
+  get pointColouring(): Colouring {
+    return this.colouring;
+  }
+
+  set pointColouring(colouring: Colouring) {
+    this.colouring = colouring;
+    void this.ready.then(() => this.repaint(matchMedia("(prefers-color-scheme: dark)").matches));
+  }
+
   async choose(id: number | null): Promise<void> {
     await this.ready;
     this.map?.setFilter("chosen", ["==", ["get", "id"], id ?? -1]);
   }
 
   /** Replace the features of a layer that the page fills itself. */
-  async show(source: "blocks" | "scenes" | "vectors", features: Outlined[]): Promise<void> {
+  async show(source: "blocks" | "scenes" | "vectors" | "graticule" | "target", features: Outlined[]): Promise<void> {
     await this.ready;
     const layer = this.map?.getSource(source);
     if (layer instanceof GeoJSONSource) layer.setData({ type: "FeatureCollection", features } as FeatureCollection);
@@ -113,8 +136,23 @@ export class Atlas {
     }
   }
 
+  /** Mark a position, and show its surroundings. */
+  private async goTo(position: Position): Promise<void> {
+    await this.show("target", [{ type: "Feature", properties: {}, geometry: { type: "Point", coordinates: position } }]);
+    const [longitude, latitude] = position as [number, number];
+    this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), COORDINATE_ZOOM) });
+  }
+
+  private drawGraticule(map: MapLibre): void {
+    const seen = map.getBounds();
+    const corner = map.unproject([LABELS_PX.left, map.getContainer().clientHeight - LABELS_PX.bottom]);
+    const labels = { longitude: corner.lng, latitude: corner.lat };
+    const [west, south, east, north] = [seen.getWest(), seen.getSouth(), seen.getEast(), seen.getNorth()];
+    void this.show("graticule", graticule({ west, south, east, north, labels }));
+  }
+
   private repaint(dark: boolean): void {
-    for (const layer of mapStyle(dark).layers) {
+    for (const layer of mapStyle(dark, this.colouring).layers) {
       const paint = Object.entries(layer.paint ?? {}) as [Parameters<MapLibre["setPaintProperty"]>[1], unknown][];
       for (const [name, value] of paint) this.map?.setPaintProperty(layer.id, name, value as never);
     }
@@ -126,7 +164,8 @@ function opened(container: HTMLElement): MapLibre | null {
   try {
     const map = new MapLibre({
       container,
-      style: mapStyle(matchMedia("(prefers-color-scheme: dark)").matches),
+      style: mapStyle(matchMedia("(prefers-color-scheme: dark)").matches, "none"),
+      fadeDuration: 0,
       center: [10, 25],
       zoom: 1.2,
       attributionControl: false,
@@ -149,15 +188,7 @@ function opened(container: HTMLElement): MapLibre | null {
 
 /** A place in degrees, to about 0.1 m. */
 function place(longitude: number, latitude: number): string {
-  return `${degrees(latitude, "N", "S")}  ${degrees(longitude, "E", "W")}`;
-}
-
-function degrees(angle: number, positive: string, negative: string): string {
-  return `${Math.abs(angle).toFixed(6)}° ${angle < 0 ? negative : positive}`;
-}
-
-function wrapped(longitude: number): number {
-  return ((((longitude + 180) % 360) + 360) % 360) - 180;
+  return `${degrees(latitude, "N", "S", PLACE_DECIMALS)}  ${degrees(longitude, "E", "W", PLACE_DECIMALS)}`;
 }
 
 /** Positions with longitudes beyond 180 degrees where that keeps an outline together that was cut there. */

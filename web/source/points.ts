@@ -3,7 +3,9 @@
 import { blobUrl, type FeaturePage, get, type PointOfPage } from "./api";
 import type { PointViewProperties, PointWithViews } from "./api_types";
 import { facts, figure, fill, h, plural, problem } from "./elements";
+import type { Atlas } from "./atlas";
 import type { ShowView } from "./place";
+import { type Colouring, COLOURINGS } from "./style";
 
 const LISTED = 50;
 const SETTLED_MS = 250;
@@ -16,7 +18,9 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
     panel,
     h("h1", { tabindex: -1 }, "Control points"),
     h("p", {}, "Ground positions in three dimensions, each with image chips. Select one on the map or in the list."),
+    h("p", { class: "legend-title" }, "Density of the points, when seen from afar"),
     legend(),
+    colouringField(atlas),
     h("h2", {}, "In view"),
     count,
     list,
@@ -100,4 +104,25 @@ function legend(): HTMLElement {
   const names = ["fewer than 1 for 4 km²", "1 for 4 km² or more", "1 for 2 km² or more"];
   const row = (name: string, step: number) => h("li", {}, h("span", { class: `swatch density-${step}`, "aria-hidden": "true" }), name);
   return h("ul", { class: "legend", "aria-label": "Colours of the density" }, ...names.map(row));
+}
+
+/** The choice of what colours the points, with the legend of the classes. */
+function colouringField(atlas: Atlas): HTMLElement {
+  const classes = h("ul", { class: "legend", "aria-label": "Colours of the points" });
+  const select = h(
+    "select",
+    { id: "colouring", onchange: () => choose(select.value as Colouring) },
+    ...Object.entries(COLOURINGS).map(([name, { label }]) => h("option", { value: name, selected: name === atlas.pointColouring }, label)),
+  );
+  const choose = (colouring: Colouring): void => {
+    atlas.pointColouring = colouring;
+    explain(colouring);
+  };
+  const explain = (colouring: Colouring): void => {
+    const { words } = COLOURINGS[colouring];
+    classes.hidden = words.length === 0;
+    fill(classes, ...words.map((name, at) => h("li", {}, h("span", { class: `swatch class-${at}`, "aria-hidden": "true" }), name)));
+  };
+  explain(atlas.pointColouring);
+  return h("div", { class: "colouring" }, h("label", { for: "colouring" }, "Points coloured by"), select, classes);
 }

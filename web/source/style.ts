@@ -1,7 +1,8 @@
 // The style of the map in light and dark; the density colours are those of the legend.
 
-import type { GeoJSONSourceSpecification, LayerSpecification, StyleSpecification } from "maplibre-gl";
+import type { ExpressionSpecification, GeoJSONSourceSpecification, LayerSpecification, StyleSpecification } from "maplibre-gl";
 import { BASE } from "./api";
+import { COUNTRIES } from "./go_to";
 
 const TILES = "tiles/WebMercatorQuad/{z}/{y}/{x}";
 /** Densities that the specification of a block requires, points per km². */
@@ -10,12 +11,32 @@ export const QUARTER_PER_KM2 = 0.25;
 /** Lowest zoom whose tiles hold single points. */
 export const POINTS_ZOOM = 8;
 const TILES_ZOOM = 14;
+/** From this zoom a cell fills the view and its colour means nothing: points stand for themselves. */
+const LAST_DENSITY_ZOOM = 11;
+/** Countries smaller than this, in square degrees, have no name on a map of the world. */
+const SMALL_DEG2 = 10;
+const FONT = ["system-ui", "sans-serif"];
+
+/** What colours the points: classes from the best to the worst, as their tiles have the property. */
+export const COLOURINGS = {
+  none: { label: "one colour", property: "", limits: [], words: [] },
+  sigma: {
+    label: "horizontal standard deviation",
+    property: "sigma_horizontal_m",
+    limits: [1, 2, 4],
+    words: ["less than 1 m", "1 m to 2 m", "2 m to 4 m", "4 m or more"],
+  },
+  views: { label: "number of views", property: "n_views", limits: [3, 5, 8], words: ["8 or more", "5 to 7", "3 or 4", "1 or 2"] },
+} as const;
+export type Colouring = keyof typeof COLOURINGS;
 
 const LIGHT = {
   sea: "#d6e2e7",
   land: "#f5f3ee",
   line: "#b9c3c4",
+  text: "#3c474c",
   densities: ["#f0d3a3", "#8fc3bd", "#2f8f8b"],
+  classes: ["#0b4f5e", "#2f8fb0", "#c07a00", "#a3195b"],
   block: "#0b6477",
   scene: "#8a4b08",
   point: "#0b4f5e",
@@ -27,7 +48,9 @@ const DARK: typeof LIGHT = {
   sea: "#0f171c",
   land: "#1d272c",
   line: "#3a474d",
+  text: "#b4c0c4",
   densities: ["#6d5630", "#2d6b69", "#3fa9a2"],
+  classes: ["#d3f2f8", "#5fb8d6", "#e9a63a", "#ff7fb2"],
   block: "#6cc5d9",
   scene: "#e3a35c",
   point: "#a5e0ee",
@@ -40,12 +63,15 @@ export function colours(dark: boolean): typeof LIGHT {
   return dark ? DARK : LIGHT;
 }
 
-export function mapStyle(dark: boolean): StyleSpecification {
+export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecification {
   const empty = (): GeoJSONSourceSpecification => ({ type: "geojson", data: { type: "FeatureCollection", features: [] } });
   return {
     version: 8,
     sources: {
       land: { type: "geojson", data: `${BASE}map/land.json` },
+      countries: { type: "geojson", data: BASE + COUNTRIES },
+      graticule: empty(),
+      target: empty(),
       density: { type: "vector", tiles: [`${BASE}collections/density/${TILES}`], maxzoom: TILES_ZOOM },
       points: {
         type: "vector",
@@ -58,11 +84,20 @@ export function mapStyle(dark: boolean): StyleSpecification {
       scenes: empty(),
       vectors: empty(),
     },
-    layers: layers(dark),
+    layers: layers(dark, colouring),
   };
 }
 
-function layers(dark: boolean): LayerSpecification[] {
+/** The colour of a point: of its class, or one for all. */
+function pointColour(dark: boolean, colouring: Colouring): string | ExpressionSpecification {
+  const { point, classes } = colours(dark);
+  const { property, limits } = COLOURINGS[colouring];
+  if (!property) return point;
+  const [first, ...rest] = colouring === "views" ? classes.toReversed() : classes;
+  return ["step", ["get", property], first!, ...limits.flatMap((limit, at) => [limit, rest[at]!])] as ExpressionSpecification;
+}
+
+function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
   const c = colours(dark);
   const [sparse, enough, dense] = c.densities as [string, string, string];
   return [
@@ -74,11 +109,27 @@ function layers(dark: boolean): LayerSpecification[] {
       type: "fill",
       source: "density",
       "source-layer": "density",
+      maxzoom: LAST_DENSITY_ZOOM,
       paint: {
         "fill-color": ["step", ["get", "points_per_km2"], sparse, QUARTER_PER_KM2, enough, HALF_PER_KM2, dense],
         "fill-opacity": ["interpolate", ["linear"], ["zoom"], 6, 0.75, 11, 0.25],
         "fill-antialias": false,
       },
+    },
+    { id: "graticule", type: "line", source: "graticule", paint: { "line-color": c.quiet, "line-opacity": 0.35, "line-width": 0.7 } },
+    {
+      id: "countries",
+      type: "symbol",
+      source: "countries",
+      filter: [">=", ["get", "area"], ["step", ["zoom"], SMALL_DEG2, 3, SMALL_DEG2 / 10, 5, 0]],
+      layout: {
+        "text-field": ["get", "name"],
+        "text-font": FONT,
+        "text-size": 12,
+        "text-padding": 6,
+        "symbol-sort-key": ["-", ["get", "area"]],
+      },
+      paint: { "text-color": c.text, "text-halo-color": c.land, "text-halo-width": 1.2 },
     },
     {
       id: "blocks",
@@ -106,7 +157,7 @@ function layers(dark: boolean): LayerSpecification[] {
       filter: ["has", "id"],
       paint: {
         "circle-radius": ["interpolate", ["linear"], ["zoom"], 8, 1.2, 12, 3.2, 16, 5.5],
-        "circle-color": c.point,
+        "circle-color": pointColour(dark, colouring),
         "circle-stroke-color": c.halo,
         "circle-stroke-width": ["interpolate", ["linear"], ["zoom"], 10, 0, 13, 1],
       },
@@ -145,6 +196,20 @@ function layers(dark: boolean): LayerSpecification[] {
         "circle-stroke-color": c.halo,
         "circle-stroke-width": 1,
       },
+    },
+    {
+      id: "target",
+      type: "circle",
+      source: "target",
+      paint: { "circle-radius": 7, "circle-color": "transparent", "circle-stroke-color": c.scene, "circle-stroke-width": 2.5 },
+    },
+    {
+      id: "degrees",
+      type: "symbol",
+      source: "graticule",
+      filter: ["==", ["geometry-type"], "Point"],
+      layout: { "text-field": ["get", "label"], "text-font": FONT, "text-size": 11, "text-anchor": ["get", "anchor"], "text-allow-overlap": true },
+      paint: { "text-color": c.text, "text-halo-color": c.halo, "text-halo-width": 1.5 },
     },
   ];
 }

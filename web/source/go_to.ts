@@ -1,0 +1,88 @@
+// Go to a coordinate or to a country: one field on the map.
+
+import type { Feature, FeatureCollection, Point, Position } from "geojson";
+import { get } from "./api";
+import { h, problem } from "./elements";
+import { degrees } from "./graticule";
+import { announce } from "./place";
+
+/** A country: its name, and the box of its largest part. */
+type Country = Feature<Point, { name: string; box: [west: number, south: number, east: number, north: number] }>;
+
+export const COUNTRIES = "map/countries.json";
+const NUMBER = "([+-]?\\d+(?:\\.\\d+)?)\\s*°?\\s*([NSEW]?)";
+const COORDINATE = new RegExp(`^${NUMBER}[\\s,;]+${NUMBER}$`);
+
+/** The field; it moves the map to a position, or to a box with its corners. */
+export function goToField(toPosition: (position: Position) => void, toBox: (corners: Position[]) => void): HTMLElement {
+  const names = h("datalist", { id: "countries" });
+  const message = h("div");
+  const input = h("input", {
+    type: "search",
+    id: "go-to",
+    list: "countries",
+    placeholder: "48.85, 2.35 or a country",
+    enterkeyhint: "go",
+    autocomplete: "off",
+    onfocus: () => void countries().then(offer, () => undefined),
+  });
+  return h("form", { class: "go-to", role: "search", onsubmit: (event) => void submit(event) }, h("label", { for: "go-to" }, "Go to"), input, names, message);
+
+  function offer(found: Country[]): void {
+    if (!names.children.length) names.append(...found.map(({ properties: { name } }) => h("option", { value: name })));
+  }
+
+  async function submit(event: Event): Promise<void> {
+    event.preventDefault();
+    const text = input.value.trim();
+    message.replaceChildren();
+    const position = coordinate(text);
+    if (position) {
+      toPosition(position);
+      announce(`The map shows ${degrees(position[1]!, "N", "S", 4)}, ${degrees(position[0]!, "E", "W", 4)}.`);
+      return;
+    }
+    const country = text ? find(await countries().catch(() => []), text) : undefined;
+    if (!country) {
+      message.append(problem(`“${text}” is no country and no coordinate. Write latitude, then longitude, in degrees, as in 48.85, 2.35.`));
+      return;
+    }
+    const { box, name } = country.properties;
+    toBox([box.slice(0, 2), box.slice(2)]);
+    announce(`The map shows ${name}.`);
+  }
+}
+
+/** Longitude and latitude of a text; latitude comes first where no letter tells them apart. Null if it is none. */
+function coordinate(text: string): Position | null {
+  const [, first = "", one = "", second = "", other = ""] = COORDINATE.exec(text.toUpperCase()) ?? [];
+  const longitudeFirst = /[EW]/.test(one) || /[NS]/.test(other);
+  if (!first || (longitudeFirst && (/[NS]/.test(one) || /[EW]/.test(other)))) return null;
+  const angles = [signed(first, one), signed(second, other)];
+  const [longitude, latitude] = (longitudeFirst ? angles : angles.reverse()) as [number, number];
+  return Math.abs(longitude) <= 180 && Math.abs(latitude) <= 90 ? [longitude, latitude] : null;
+}
+
+function signed(number: string, letter: string): number {
+  return /[SW]/.test(letter) ? -Number(number) : Number(number);
+}
+
+async function countries(): Promise<Country[]> {
+  return (await get<FeatureCollection & { features: Country[] }>(COUNTRIES)).features;
+}
+
+/** The country of a name, or the first whose name begins with the text, or contains it. */
+function find(countries: Country[], text: string): Country | undefined {
+  const wanted = plain(text);
+  const matches: ((name: string) => boolean)[] = [(name) => name === wanted, (name) => name.startsWith(wanted), (name) => name.includes(wanted)];
+  for (const match of matches) {
+    const country = countries.find(({ properties: { name } }) => match(plain(name)));
+    if (country) return country;
+  }
+  return undefined;
+}
+
+/** A name without accents and capitals. */
+function plain(name: string): string {
+  return name.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
+}
