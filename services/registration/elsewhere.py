@@ -113,16 +113,14 @@ def _on_moved_ground(
     return Elsewhere(
         rows=search.rows[members],
         displacement_px=displacement_px,
-        displacement_m=_on_ground_m(prediction, search, members, displacement_px),
+        displacement_m=_on_ground_m(prediction, search.points.lon_lat_h[members], displacement_px),
         false_alarms=float(np.exp(-adjustment.moved.log_evidence)),
     )
 
 
-def _on_ground_m(
-    prediction: Prediction, search: Search, members: IntArray, displacement_px: Array
-) -> float:
-    """Length of a displacement (2,) of points of a search."""
-    derivative = prediction.model.project_derivative(search.points.lon_lat_h[members]).mean(axis=0)
+def _on_ground_m(prediction: Prediction, lon_lat_h: Array, displacement_px: Array) -> float:
+    """Length on the ground of a displacement (2,), line and sample, of points (k, 3)."""
+    derivative = prediction.model.project_derivative(lon_lat_h).mean(axis=0)
     return float(np.hypot(*np.linalg.solve(derivative[:, :2], displacement_px)))
 
 
@@ -153,7 +151,7 @@ def _lines_beside(
     return Elsewhere(
         rows=search.rows[members],
         displacement_px=group.displacement,
-        displacement_m=_on_ground_m(prediction, search, members, group.displacement),
+        displacement_m=_on_ground_m(prediction, search.points.lon_lat_h[members], group.displacement),
         false_alarms=false_alarms,
     )
 
@@ -193,12 +191,11 @@ def _as_heights_move(
         left_px = misfit_px[others] - above_m[others, None] * group.displacement
         if np.median(np.hypot(*left_px.T)) > _EXPLAINED * without:
             return None
-    derivative = prediction.model.project_derivative(lon_lat_h[members]).mean(axis=0)
     displacement_px = np.median(misfit_px[members], axis=0)
     return Elsewhere(
         rows=place[members],
         displacement_px=displacement_px,
-        displacement_m=float(np.hypot(*np.linalg.solve(derivative[:, :2], displacement_px))),
+        displacement_m=_on_ground_m(prediction, lon_lat_h[members], displacement_px),
         false_alarms=group.false_alarms,
         slope_px=group.displacement,
         farthest_px=float(np.hypot(*misfit_px[members].T).max()),
