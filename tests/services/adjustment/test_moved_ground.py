@@ -56,7 +56,9 @@ def drawn_landslide(rng: np.random.Generator) -> Landslide:
     return landslide(rng.uniform(0.3, 0.42), moved, where, rng.uniform(1.0, 1.8))
 
 
-def beside(adjustment: SceneAdjustment, truth: ImageCorrection, moved: Landslide) -> tuple[float, float]:
+def beside(
+    adjustment: SceneAdjustment, truth: ImageCorrection, moved: "Landslide | OtherArea"
+) -> tuple[float, float]:
     """True over predicted CE90, and normalised error, where the ground did not move."""
     places = np.random.default_rng(0).random((400, 2)) * (np.array(SHAPE) - 1.0)
     places = places[~moved.holds(places)]
@@ -153,6 +155,40 @@ def test_ground_that_moved_by_a_few_times_the_scatter_makes_no_scene_wrong():
         normalised.append(mean_square)
     assert np.max(ratios) < WRONG
     assert 0.3 < np.mean(normalised) < 1.5
+
+
+@dataclass(frozen=True)
+class OtherArea:
+    """An area of another shape; one that moves unevenly does so by up to 1.7 times a vector."""
+
+    shape: str
+    moved: Array
+
+    def holds(self, place: Array) -> BoolArray:
+        line, sample = (place / SHAPE).T
+        if self.shape == "corner":
+            return np.asarray(line + sample < 0.75)
+        if self.shape == "angle":
+            return np.asarray((line < 0.3) & (sample < 0.8) | (sample < 0.3) & (line < 0.7))
+        return THIRD.holds(place)
+
+    def __call__(self, place: Array) -> Array:
+        uneven = 0.3 + 1.4 * place[:, :1] / SHAPE[0] if self.shape == "uneven" else 1.0
+        return self.holds(place)[:, None] * self.moved * uneven
+
+
+@pytest.mark.monte_carlo
+@pytest.mark.parametrize("shape", ["corner", "angle", "uneven"])
+def test_areas_that_are_no_ellipse_make_no_scene_wrong(shape: str):
+    ratios = []
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 6])
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        moved = OtherArea(shape, rng.uniform(3.0, 5.0) * np.array([np.cos(angle), np.sin(angle)]))
+        observations, truth = draw(moved, rng, sigma_px=SIGMA_PX, averaged=True)
+        adjustment = adjust_scene(FlatModel(), SHAPE, observations, ground_may_move=True)
+        ratios.append(beside(adjustment, truth, moved)[0])
+    assert np.max(ratios) < WRONG
 
 
 @pytest.mark.monte_carlo
