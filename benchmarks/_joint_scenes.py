@@ -40,7 +40,8 @@ class ImagePlan:
         shape, gsd_m: lines and samples, ground sampling.
         sigma_m: one standard deviation of the shift of the delivered model, as stated too.
         slope_px: largest drift and skew of the delivered model.
-        bend_px: (line, sample) amplitude of what no affine correction follows: one wave along the lines.
+        swing_px: (line, sample) amplitude of a sensor that swings: one wave along the lines.
+        bend_px: (line, sample) amplitude of what no correction follows: one wave along the diagonal.
         control_noise_px, tie_noise_px: of the measures, as stated too.
         found: share of the control points in the image that are found.
         wrong: share of these that are found in a wrong place, up to 15 px off.
@@ -55,6 +56,7 @@ class ImagePlan:
     gsd_m: float
     sigma_m: float = 5.0
     slope_px: float = 1.0
+    swing_px: tuple[float, float] = (0.0, 0.0)
     bend_px: tuple[float, float] = (0.0, 0.0)
     control_noise_px: float = 0.3
     tie_noise_px: float = 0.2
@@ -85,8 +87,10 @@ class SceneTruth:
     def position(self, lon_lat_h: Array) -> Array:
         """Where the image truly shows ground points (n, 3)."""
         position = self.error.apply(self.geometry.rpc.project(lon_lat_h))
-        wave = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
-        return np.asarray(position + wave * np.array(self.plan.bend_px))
+        along_lines = np.sin(2.0 * np.pi * position[:, :1] / self.shape[0])
+        diagonal = np.sin(2.0 * np.pi * position.sum(axis=1, keepdims=True) / sum(self.shape))
+        swing_px, bend_px = np.array(self.plan.swing_px), np.array(self.plan.bend_px)
+        return np.asarray(position + along_lines * swing_px + diagonal * bend_px)
 
     def shows(self, lon_lat_h: Array) -> BoolArray:
         """Which ground points lie inside."""
@@ -209,8 +213,7 @@ def measured_scene(
     )
     search = Search(points, np.arange(n), matches, found, 0.0)
     enough = found.sum() >= options.adjustment.min_points
-    affine = replace(options.adjustment, profile=False)
-    alone = adjust_search(scene, search, affine) if enough else None
+    alone = adjust_search(scene, search, options.adjustment) if enough else None
     return MeasuredScene(scene, points, search, alone)
 
 

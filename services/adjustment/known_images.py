@@ -8,6 +8,7 @@ from scipy import sparse
 
 from services.adjustment.parameters import AdjustableImage, BlockPriors
 from services.errors import InputError
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray, Frame, IntArray
 
 _SAME_PX = 0.01
@@ -29,6 +30,7 @@ class KnownImages:
         frame: of the block on the Earth, which its images share.
         ground, line_sample: (n, q, 3) and (n, q, 2), places and where the delivered models show them,
             of which the parameters are.
+        displacements: (n,) of each beyond its parameters; None for none.
     """
 
     names: tuple[str, ...]
@@ -38,6 +40,7 @@ class KnownImages:
     frame: Frame
     ground: Array
     line_sample: Array
+    displacements: tuple[DisplacementGrid | None, ...]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -55,7 +58,12 @@ class KnownImages:
             relative=self.relative[np.ix_(inside, inside)],
             ground=self.ground[rows],
             line_sample=self.line_sample[rows],
+            displacements=tuple(self.displacements[row] for row in rows.tolist()),
         )
+
+    def displacement(self, name: str) -> DisplacementGrid | None:
+        """That of an image beyond its parameters; None for none, and for other images."""
+        return dict(zip(self.names, self.displacements, strict=True)).get(name)
 
 
 def known_images(
@@ -72,6 +80,7 @@ def known_images(
         frame,
         ground,
         np.stack([seen for _, seen in places]),
+        tuple(image.displacement for image in images),
     )
 
 
@@ -162,6 +171,11 @@ def tie(images: Sequence[AdjustableImage], known: KnownImages) -> Tie:
             raise InputError(
                 f"{image.name}: its model is not the one that the neighbour has adjusted; give both "
                 "blocks the image with the same model, as delivered"
+            )
+        if (image.displacement is None) != (common.displacements[number] is None):
+            raise InputError(
+                f"{image.name}: its lines or samples were followed in one block and not in the other; "
+                "register the scenes of both together"
             )
         here, before = [own.name for own in image.parameters], common.parameters[number]
         if tuple(here) != before:

@@ -11,6 +11,7 @@ from scipy import sparse
 from services.adjustment.affine_fit import FREE, Order
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, BoolArray, IntArray
 
 PASS_SHARE = 0.5
@@ -101,6 +102,11 @@ class AdjustableImage(Protocol):
         ...
 
     @property
+    def displacement(self) -> DisplacementGrid | None:
+        """Of positions beyond the parameters, known; None for none."""
+        ...
+
+    @property
     def credible_px(self) -> float:
         """How far positions may be off, at most; infinite where what is stated is a guess."""
         ...
@@ -128,7 +134,7 @@ class ImageParameters:
     Attributes:
         name: of the image, for messages.
         model: as delivered.
-        zero: the correction whose parameters are free, all zero.
+        zero: the correction whose parameters are free, all zero; its displacement is known.
         prior_px: (2, 3) a priori standard deviation of `ImageCorrection.parameters`; 0 where fixed.
     """
 
@@ -177,6 +183,11 @@ class ImageParameters:
         return bool(self.free.all())
 
     @property
+    def displacement(self) -> DisplacementGrid | None:
+        """What moves lines and samples, as it was found before; None for nothing."""
+        return self.zero.displacement
+
+    @property
     def credible_px(self) -> float:
         """Infinite: users state the accuracy of RPCs as they guess it."""
         return np.inf
@@ -198,8 +209,10 @@ class ImageParameters:
     def computed(self, values: Array, lon_lat_h: Array) -> Computed:
         """Where the corrected model shows ground points (m, 3), with parameters (k,)."""
         delivered = self.model.project(lon_lat_h)
-        design = self.design(delivered)
-        return Computed(delivered + design @ values, self.model.project_derivative(lon_lat_h), design)
+        design, by_ground = self.design(delivered), self.model.project_derivative(lon_lat_h)
+        if self.zero.displacement is not None:
+            by_ground = self.zero.derivative_at(delivered) @ by_ground
+        return Computed(self.zero.apply(delivered) + design @ values, by_ground, design)
 
     def corrected(self, values: Array) -> CorrectedModel:
         """The model with parameters of the given values (k,)."""
@@ -227,6 +240,7 @@ def image_parameters(
     shift_px: float,
     slope_px: float = 0.0,
     order: Order = "affine",
+    displacement: DisplacementGrid | None = None,
 ) -> ImageParameters:
     """The parameters of an image correction.
 
@@ -237,10 +251,12 @@ def image_parameters(
         shift_px: a priori standard deviation of the shift of each coordinate, pixels.
         slope_px: of drift and skew, pixels at the edge of the image; 0 for a shift alone.
         order: which parameters are free.
+        displacement: beyond them, known; None for none.
     """
     prior_px = np.full((2, 3), slope_px)
     prior_px[:, 0] = shift_px
-    return ImageParameters(name, model, no_correction(shape), prior_px * FREE[order])
+    zero = replace(no_correction(shape), displacement=displacement)
+    return ImageParameters(name, model, zero, prior_px * FREE[order])
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ class PlacedMeasures:
         active: BoolArray,
         components: tuple[Component, ...],
         shared: SharedErrors,
-        along_axes: tuple[Structure, ...],
+        along_axes: tuple[Structure, ...] = (),
     ) -> tuple[Structure, ...]:
         """What the residuals still depend on, beside errors that neighbours clearly share.
 
@@ -153,10 +153,11 @@ class PlacedMeasures:
             active: (n,) those that are used.
             components: of the profile.
             shared: errors that neighbours share.
-            along_axes: what the components leave, where neighbours share nothing.
+            along_axes: what the components leave, where neighbours share nothing; it is tested here
+                where it is not given.
         """
         clear = shared.clear_share > 0.0
         residuals = beyond(self.residuals(fit, active, shared if clear else None), components)
-        if clear or components:
+        if clear or components or not along_axes:
             along_axes = structures(residuals, ALONG_AXES)
         return along_axes + structures(residuals, OTHERWISE)

@@ -73,6 +73,11 @@ class RigorousParameters:
         """No: a satellite holds the shape of the ground, within what its parameters are known to."""
         return False
 
+    @property
+    def displacement(self) -> None:
+        """None: parameters of the sensor are all that moves."""
+        return None
+
     @cached_property
     def credible_px(self) -> float:
         """Six standard deviations of a position as the delivered model shows it."""

@@ -1,15 +1,19 @@
 """The adjusted images of a block in a file, for blocks that are made beside it later."""
 
 import zipfile
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from services.adjustment.known_images import KnownImages
 from services.errors import FormatError
+from services.sensors.displacement import DisplacementGrid
 from services.types import Frame
 
-FORMAT = "amers-images/2"
+FORMAT = "amers-images/3"
+_WITHOUT_DISPLACEMENTS = "amers-images/2"
+_OF_A_GRID = tuple(field.name for field in fields(DisplacementGrid))
 _SEPARATOR = "\n"
 
 
@@ -32,6 +36,12 @@ def write_adjusted_images(path: Path, block: str, known: KnownImages) -> None:
         frame_m2=known.frame.covariance_m2,
         ground=known.ground,
         line_sample=known.line_sample,
+        **{
+            f"displacement_{number}_{name}": getattr(displacement, name)
+            for number, displacement in enumerate(known.displacements)
+            if displacement is not None
+            for name in _OF_A_GRID
+        },
     )
 
 
@@ -43,7 +53,7 @@ def read_adjusted_images(path: Path) -> tuple[str, KnownImages]:
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            if str(file["format"]) != FORMAT:
+            if str(file["format"]) not in (FORMAT, _WITHOUT_DISPLACEMENTS):
                 raise FormatError(f"{path}: format {str(file['format'])!r:.60}, {FORMAT!r} expected")
             names = tuple(str(name) for name in file["names"])
             known = KnownImages(
@@ -54,6 +64,7 @@ def read_adjusted_images(path: Path) -> tuple[str, KnownImages]:
                 Frame(file["frame_m2"]),
                 file["ground"],
                 file["line_sample"],
+                tuple(_displacement(file, number) for number in range(len(names))),
             )
             block = str(file["block"])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -73,7 +84,20 @@ def read_adjusted_images(path: Path) -> tuple[str, KnownImages]:
         or known.ground.shape != (n, places[-1], 3)
     ):
         raise FormatError(f"{path}: the arrays do not fit each other: {n} names, {shapes}")
-    numbers = (known.values, known.relative, known.frame.covariance_m2)
+    grids = [getattr(one, name) for one in known.displacements if one for name in _OF_A_GRID]
+    numbers = (known.values, known.relative, known.frame.covariance_m2, *grids)
     if not all(np.isfinite(array).all() for array in numbers):
         raise FormatError(f"{path}: unknown numbers found, finite ones expected")
     return block, known
+
+
+def _displacement(file: "np.lib.npyio.NpzFile", number: int) -> DisplacementGrid | None:
+    """The displacement of an image; None where it has none."""
+    names = [f"displacement_{number}_{name}" for name in _OF_A_GRID]
+    if names[0] not in file:
+        return None
+    grid = DisplacementGrid(*(file[name] for name in names))
+    shape = (len(grid.line), len(grid.sample), 2)
+    if grid.displacement_px.shape != shape or grid.variance_px2.shape != shape or min(shape) < 2:
+        raise ValueError(f"the displacement of image {number + 1} does not fit its nodes")
+    return grid

@@ -16,6 +16,7 @@ from services.joint.measured import MeasuredScene
 from services.quality.frames import why_unknown
 from services.registration.options import RegistrationOptions
 from services.sensors.base import SensorModel
+from services.sensors.displacement import DisplacementGrid
 from services.sensors.pushbroom import PushbroomModel
 from services.types import (
     Array,
@@ -108,9 +109,12 @@ def adjust_together(
     Raises:
         ComputationError: the observations do not allow a solution.
     """
-    images = tuple(_image(measured, options) for measured in scenes)
+    known = [neighbour.displacement(one.name) if neighbour else None for one in scenes]
+    moved = [one.displacement or before for one, before in zip(scenes, known, strict=True)]
+    images = tuple(_image(*one, options) for one in zip(scenes, moved, strict=True))
     rows = [np.flatnonzero(measured.usable) for measured in scenes]
-    shared = np.array([_shared_factor(one, _correction(one, options)) for one in scenes])
+    shared = np.array([_shared_factor(one, _correction(one, None, options)) for one in scenes])
+    ties = _with_displacements(moved, ties)
     block = _adjusted(scenes, images, shared, ties, neighbour, rows=rows)
     if not len(ties):
         return block
@@ -170,16 +174,20 @@ def _adjusted(
     )
 
 
-def _image(measured: MeasuredScene, options: RegistrationOptions) -> AdjustableImage:
+def _image(
+    measured: MeasuredScene, displacement: DisplacementGrid | None, options: RegistrationOptions
+) -> AdjustableImage:
     """What may move in a scene: by what it is stated to be off, and by what its own points show."""
-    scene, correction = measured.scene, _correction(measured, options)
+    scene, correction = measured.scene, _correction(measured, displacement, options)
     if scene.parameter_set is None or not isinstance(scene.model, PushbroomModel):
         return correction
     sigma_m = float(correction.prior_px[0, 0]) * scene_gsd_m(scene)
     return rigorous_parameters(measured.name, scene.model, scene.parameter_set, sigma_m=sigma_m)
 
 
-def _correction(measured: MeasuredScene, options: RegistrationOptions) -> ImageParameters:
+def _correction(
+    measured: MeasuredScene, displacement: DisplacementGrid | None, options: RegistrationOptions
+) -> ImageParameters:
     """What may move in a scene that has a correction in the image."""
     scene, alone = measured.scene, measured.alone
     shift_px, slope_px = scene.sigma_m / scene_gsd_m(scene), options.adjustment.prior_slope_sigma_px
@@ -194,7 +202,20 @@ def _correction(measured: MeasuredScene, options: RegistrationOptions) -> ImageP
         shift_px=shift_px,
         slope_px=_FREE_SLOPE_PX if order else slope_px,
         order=order or "affine",
+        displacement=displacement,
     )
+
+
+def _with_displacements(
+    displacements: Sequence[DisplacementGrid | None], ties: Observations
+) -> Observations:
+    """Tie points, as uncertain as the displacements of their scenes make them."""
+    variance_px2 = ties.sigma_px**2
+    for number, displacement in enumerate(displacements):
+        if displacement is not None:
+            own = ties.image == number
+            variance_px2[own] += displacement.variance_at(ties.line_sample[own]).mean(axis=1)
+    return replace(ties, sigma_px=np.sqrt(variance_px2))
 
 
 def _control(
@@ -213,9 +234,7 @@ def _control(
     image = np.repeat(np.arange(len(scenes)), [len(own) for own in rows])
     counts = np.bincount(place, minlength=len(index))
     of_point = np.bincount(place, factor[image], len(index)) / np.maximum(counts, 1)
-    line_sample = np.concatenate(
-        [m.search.matches.line_sample[own] for m, own in zip(scenes, rows, strict=True)]
-    )
+    line_sample = np.concatenate([m.line_sample()[own] for m, own in zip(scenes, rows, strict=True)])
     sigma_px = np.concatenate(
         [m.search.matches.sigma_px[own] for m, own in zip(scenes, rows, strict=True)]
     )

@@ -1,6 +1,6 @@
 """What a scene shows of the control points, before it is adjusted together with others."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,9 +8,11 @@ from services.adjustment.control_observations import ControlObservations
 from services.adjustment.image_correction import SceneAdjustment
 from services.imagery.scene import Scene
 from services.matching.control_points import PointMatches
+from services.quality.lack_of_fit import Elsewhere
 from services.registration.context import SearchStage
 from services.registration.search import Search, control_observations
-from services.types import BoolArray, ControlPoints, ViewMeasures
+from services.sensors.displacement import DisplacementGrid
+from services.types import Array, BoolArray, ControlPoints, ViewMeasures
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class MeasuredScene:
         search: the last search of a part of them.
         alone: the adjustment of this scene on its own control points; None where they do not allow one.
         stages: summaries of the searches.
+        elsewhere: points that agree on another place; None without any.
     """
 
     scene: Scene
@@ -30,6 +33,7 @@ class MeasuredScene:
     search: Search
     alone: SceneAdjustment | None
     stages: tuple[SearchStage, ...] = ()
+    elsewhere: Elsewhere | None = None
 
     @property
     def name(self) -> str:
@@ -38,17 +42,43 @@ class MeasuredScene:
 
     @property
     def usable(self) -> BoolArray:
-        """Points (k,) of the search whose measures agree with each other."""
-        matches = self.search.matches
-        return np.asarray(
-            self.search.inliers
-            & np.isfinite(matches.line_sample).all(axis=1)
-            & np.isfinite(matches.sigma_px)
-        )
+        """Points (k,) of the search whose measures agree with each other, or with what moves lines."""
+        matches, alone = self.search.matches, self.alone
+        usable = self.search.inliers & np.isfinite(matches.line_sample).all(axis=1)
+        usable &= np.isfinite(matches.sigma_px)
+        if alone and alone.components:
+            usable |= alone.active
+            if any(one.kind == "break" for one in alone.components):
+                # Breaks cut chips, and leave parts that too few points hold.
+                usable = alone.active
+        if alone and alone.moved:
+            usable &= ~alone.moved.measures
+        return np.asarray(usable)
+
+    @property
+    def displacement(self) -> DisplacementGrid | None:
+        """What moves lines and samples beyond an affine correction, as the scene alone shows it.
+
+        Its variance is without the covariance with the parameters, which the block estimates again.
+        """
+        grid = self.alone.correction.displacement if self.alone else None
+        return grid and replace(grid, variance_px2=np.maximum(grid.variance_px2, 0.0))
 
     def observations(self) -> ControlObservations:
         """What the scene shows of the points of its search."""
         return control_observations(self.scene, self.search, self.usable)
+
+    def line_sample(self) -> Array:
+        """Where the scene shows the points (k, 2) of its search.
+
+        Chips average a displacement over their pixels, which is taken back.
+        """
+        seen, displacement = self.observations(), self.displacement
+        if displacement is None:
+            return seen.line_sample
+        place = self.scene.model.project(seen.lon_lat_h)
+        shown = displacement.averaged(place, seen.chip_side_px)
+        return np.asarray(seen.line_sample + displacement.at(place) - shown)
 
 
 def nothing_found(scene: Scene, points: ControlPoints) -> MeasuredScene:

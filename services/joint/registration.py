@@ -1,6 +1,7 @@
 """SCENES IN -> REGISTERED TOGETHER: control points in each, tie points between them, one solution."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -28,10 +29,10 @@ from services.production.point_views import check_image_names
 from services.production.tie_points import find_tie_points
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.context import PointContext, Prediction, SearchStage
+from services.registration.elsewhere import adjust_with_places
 from services.registration.on_points import Registration, search_near, search_scene
 from services.registration.options import RegistrationOptions
 from services.registration.point_selection import initial_prediction, points_to_try, visible_points
-from services.registration.search import adjust_search
 from services.sensors.correction import CorrectedModel, no_correction
 from services.sensors.pushbroom import PushbroomModel
 from services.tasks import Work
@@ -112,8 +113,6 @@ def register_together(
         ComputationError: no scene shows control points that agree, or no scene fits.
     """
     before = joined.scenes if joined else ()
-    # The corrections of a block are affine: what a scene does beyond shows as its lack of fit.
-    options = replace(options, adjustment=replace(options.adjustment, profile=False))
     scenes = [_on_known_ground(scene, points) for scene in scenes]
     together = [*before, *scenes]
     check_image_names(together)
@@ -182,16 +181,23 @@ def _measure_all(
 def measure_scene(
     scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions
 ) -> MeasuredScene:
-    """A scene with its control points, found as those of a scene alone; with none where that fails."""
+    """A scene with its control points, found as those of a scene alone; with none where that fails.
+
+    What moves lines and samples is followed beside an affine correction, not beside a rigorous model:
+    there it is tested.
+    """
+    if scene.parameter_set is not None and isinstance(scene.model, PushbroomModel):
+        options = replace(options, adjustment=replace(options.adjustment, profile=False))
     stages: list[SearchStage] = []
     try:
-        context, search, alone = search_scene(scene, points, chips, options, stages=stages)
+        context, search, _ = search_scene(scene, points, chips, options, stages=stages)
+        search, alone, elsewhere = adjust_with_places(context, search)
     except CoverageError:
         return nothing_found(scene, points.take(np.zeros(0, dtype=np.int64)))
     except ComputationError:
         shown = points.take(visible_points(scene, points))
         return replace(nothing_found(scene, shown), stages=tuple(stages))
-    return MeasuredScene(scene, context.points, search, alone, tuple(stages))
+    return MeasuredScene(scene, context.points, search, alone, tuple(stages), elsewhere)
 
 
 def _ties(measured: Sequence[MeasuredScene], work: Work, progress: Progress) -> Observations:
@@ -238,11 +244,12 @@ def _searched_again(
         prediction = Prediction(unmoved, _uncertainty_m(block, number, shown))
         rows = points_to_try(scene, shown, prediction, options.max_points)
         search, _ = search_near(context, prediction, rows)
-        try:
-            alone = adjust_search(scene, search, options.adjustment)
-        except ComputationError:
-            alone = None
-        again[measured.name] = MeasuredScene(scene, shown, search, alone, tuple(context.stages))
+        alone, elsewhere = None, None
+        with suppress(ComputationError):
+            search, alone, elsewhere = adjust_with_places(context, search)
+        again[measured.name] = MeasuredScene(
+            scene, shown, search, alone, tuple(context.stages), elsewhere
+        )
     return again
 
 

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from services.adjustment.control_observations import declared_fit
 from services.adjustment.image_correction import SceneAdjustment, deformation_covariance
 from services.adjustment.parameter_figures import (
     ParameterFigure,
     held_parameters,
     parameter_figures,
 )
+from services.adjustment.placed_measures import PlacedMeasures
 from services.adjustment.shared_errors import SharedErrors
 from services.adjustment.short_motion import STILL
 from services.conventions import CHIP_SIZE
@@ -49,7 +51,7 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
     deformation = np.zeros((6, 6))
     if active.any() and seen.deformation_px2 is not None:
         deformation = deformation_covariance(seen.deformation_px2, correction)
-    residual_px = seen.line_sample - corrected.project(seen.lon_lat_h)
+    residual_px = measured.line_sample() - corrected.project(seen.lon_lat_h)
     derivative = measured.scene.model.project_derivative(seen.lon_lat_h)
     projected = derivative @ seen.covariance_m2 @ derivative.transpose(0, 2, 1)
     of_points = np.diagonal(projected, 0, 1, 2)
@@ -69,7 +71,30 @@ def scene_adjustment(block: JointBlock, number: int, options: RegistrationOption
         active=active,
         sigma0=float(np.sqrt(normalised[active].mean())) if active.any() else 1.0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)) if active.any() else np.zeros(2),
+        components=alone.components if alone else (),
     )
+
+
+def _with_structures(block: JointBlock, number: int, adjustment: SceneAdjustment) -> SceneAdjustment:
+    """The adjustment of a scene, with what the residuals of its control points still depend on."""
+    measured, adjusted = block.scenes[number], block.model(number)
+    if not adjustment.active.any():
+        return adjustment
+    # Residuals of an affine correction depend on what those of the delivered model do beyond it.
+    model = adjusted if isinstance(adjusted, PushbroomModel) else measured.scene.model
+    seen, shape = measured.observations(), measured.scene.image.shape
+    fit, _, of_points = declared_fit(model, shape, seen)
+    placed = PlacedMeasures.of(
+        model,
+        shape,
+        seen.lon_lat_h,
+        seen.covariance_m2,
+        fit=fit,
+        of_points=of_points,
+        chip_side_px=seen.chip_side_px,
+    )
+    tested = placed.structures(fit, adjustment.active, adjustment.components, adjustment.shared)
+    return replace(adjustment, structures=(*tested, adjustment.short_motion.structure))
 
 
 @dataclass(frozen=True)
@@ -156,7 +181,7 @@ def registered_scene(
             there was no solution.
     """
     measured = block.scenes[number]
-    adjustment = scene_adjustment(block, number, options)
+    adjustment = _with_structures(block, number, scene_adjustment(block, number, options))
     measures = point_results(measured.scene, measured.points, measured.search, adjustment)
     frame = shared_frame(measured.points, measures.active)
     if not measures.active.any():
@@ -172,6 +197,7 @@ def registered_scene(
         measured.scene.image.shape,
         scene_gsd_m(measured.scene),
         frame,
+        elsewhere=measured.elsewhere,
         control_gsd_m=measured.search.chip_side_m / CHIP_SIZE,
         breaks=measured.search.breaks,
     )

@@ -17,7 +17,13 @@ from services.matching.predict import spread_over_image
 from services.quality.lack_of_fit import Elsewhere, are_whole_lines, chance_of_whole_lines
 from services.quality.missed_lines import UNFOUND
 from services.registration.context import PointContext, Prediction
-from services.registration.search import FIRST_TOLERANCE_PX, Search, adjust_search, select_inliers
+from services.registration.search import (
+    FIRST_TOLERANCE_PX,
+    Search,
+    adjust_search,
+    predict,
+    select_inliers,
+)
 from services.types import Array, BoolArray, IntArray
 
 _FEWEST = 5
@@ -44,7 +50,31 @@ class _Again:
     matches: PointMatches
 
 
-def search_elsewhere(
+def adjust_with_places(
+    context: PointContext, search: Search
+) -> tuple[Search, SceneAdjustment, Elsewhere | None]:
+    """The adjustment on the last search, and the points that agree on another place of the scene.
+
+    Args:
+        context: of the registration.
+        search: the last one.
+
+    Returns:
+        The search, with the points of both places where ground has moved; the adjustment on it; the
+        points that agree elsewhere, None without any.
+    """
+    adjustment = adjust_search(context.scene, search, context.options.adjustment, ground_may_move=True)
+    prediction = predict(context.scene, context.points, adjustment)
+    elsewhere = _search_elsewhere(context, prediction, search, adjustment)
+    if elsewhere and elsewhere.slope_px is None and not adjustment.moved:
+        search, adjustment = _search_moved_ground(context, prediction, search, adjustment)
+        if adjustment.moved:
+            prediction = predict(context.scene, context.points, adjustment)
+            elsewhere = _search_elsewhere(context, prediction, search, adjustment)
+    return search, adjustment, elsewhere
+
+
+def _search_elsewhere(
     context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
 ) -> Elsewhere | None:
     """The largest group of points that agree on another displacement beyond chance; None without any.
@@ -68,7 +98,7 @@ def search_elsewhere(
     return beside or _far_away(context, prediction, again, _scatter_m(context, adjustment))
 
 
-def search_moved_ground(
+def _search_moved_ground(
     context: PointContext, prediction: Prediction, search: Search, adjustment: SceneAdjustment
 ) -> tuple[Search, SceneAdjustment]:
     """The search with all missed points in a wide window, where it shows two places; else as it was.

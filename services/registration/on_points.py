@@ -19,7 +19,7 @@ from services.quality.stability import AdjustedScene
 from services.registration.chip_selection import fine_gsd_m
 from services.registration.coarse import needs_coarse_search, search_coarsely
 from services.registration.context import PointContext, Prediction, RegistrationContext, SearchStage
-from services.registration.elsewhere import search_elsewhere, search_moved_ground
+from services.registration.elsewhere import adjust_with_places
 from services.registration.missed_lines import search_missed_lines
 from services.registration.options import RegistrationOptions
 from services.registration.point_results import point_results
@@ -111,14 +111,7 @@ def register_scene(
         if not turned:
             raise
         raise NoConsensus(f"the image is {turned} ({error})") from error
-    adjustment = adjust_search(scene, search, options.adjustment, ground_may_move=True)
-    prediction = predict(scene, context.points, adjustment)
-    elsewhere = search_elsewhere(context, prediction, search, adjustment)
-    if elsewhere and elsewhere.slope_px is None and not adjustment.moved:
-        search, adjustment = search_moved_ground(context, prediction, search, adjustment)
-        if adjustment.moved:
-            prediction = predict(scene, context.points, adjustment)
-            elsewhere = search_elsewhere(context, prediction, search, adjustment)
+    search, adjustment, elsewhere = adjust_with_places(context, search)
     return build_registration(context, context.points, search, adjustment, elsewhere)
 
 

@@ -16,12 +16,14 @@ from services.errors import FormatError
 from services.formats.adjusted_images import read_adjusted_images, write_adjusted_images
 from services.formats.images.raster import write_raster
 from services.production.from_images import Production
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, Frame
 from tests.command_line import amers_here
 from tests.services.simulated import BLOCK_SIGMA_M, OPTIONS, block_views
 from tests.services.ties import difference_m
 
 NO_CONTROL = ControlFiles()
+MOVED = DisplacementGrid(np.arange(5.0), np.array([0.0, 9.0]), np.ones((5, 2, 2)), np.ones((5, 2, 2)))
 KNOWN = KnownImages(
     ("a", "b é"),
     (("line shift", "sample shift"), ("roll", "pitch", "yaw", "roll drift", "radial", "focal length")),
@@ -30,6 +32,7 @@ KNOWN = KnownImages(
     Frame.from_sigmas(0.5, 1.0),
     np.ones((2, 18, 3)),
     np.ones((2, 18, 2)),
+    (None, MOVED),
 )
 
 
@@ -40,6 +43,13 @@ def test_adjusted_images_come_back_as_they_were_written(tmp_path) -> None:
     for name in ("values", "relative", "ground", "line_sample"):
         np.testing.assert_array_equal(getattr(known, name), getattr(KNOWN, name))
     np.testing.assert_array_equal(known.frame.covariance_m2, KNOWN.frame.covariance_m2)
+    place = np.random.default_rng(0).uniform(0.0, 9.0, (5, 2))
+    moved, expected = known.displacement("b é"), KNOWN.displacements[1]
+    assert known.displacement("a") is None
+    assert moved is not None
+    assert expected is not None
+    np.testing.assert_array_equal(moved.at(place), expected.at(place))
+    np.testing.assert_array_equal(moved.variance_at(place), expected.variance_at(place))
 
 
 @pytest.mark.parametrize(
@@ -48,6 +58,8 @@ def test_adjusted_images_come_back_as_they_were_written(tmp_path) -> None:
         ({"relative": np.eye(11)}, "do not fit each other"),
         ({"parameters": (("roll",), ("roll", "pitch"))}, "do not fit each other"),
         ({"relative": np.eye(12) * np.nan}, "finite ones expected"),
+        ({"displacements": (None, replace(MOVED, line=np.arange(4.0)))}, "does not fit its nodes"),
+        ({"displacements": (None, replace(MOVED, line=np.full(5, np.nan)))}, "finite ones expected"),
         ({"frame": Frame.from_sigmas(0.5, np.nan)}, "finite ones expected"),
         ({"values": np.array([[object()] * 6] * 2)}, "adjusted images of a block expected"),
     ],

@@ -138,6 +138,28 @@ def test_a_single_scene_is_adjusted_as_it_is_alone() -> None:
         assert 0.6 < np.median(stated / sigma_px) < 1.5
 
 
+@pytest.mark.monte_carlo
+@pytest.mark.parametrize("swing_px", [(5.0, 3.0), (0.0, 6.0)])
+def test_a_scene_that_swings_is_followed_with_the_stated_accuracy(swing_px: tuple[float, float]) -> None:
+    squares, errors = [], []
+    side = np.linspace(0.03, 0.97, 9) * SHAPE[0]
+    at = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([5, trial])
+        truth = truth_of(rng, swing_px=swing_px)
+        scenes, ties = observed(truth, rng)
+        block, left = adjust_fitting(scenes, ties, OPTIONS)
+        assert not left
+        error, _ = errors_px(truth, 2, block.model(2), at)
+        stated = scene_adjustment(block, 2, OPTIONS).covariance_at(at)
+        square = (error * np.linalg.solve(stated, error[:, :, None])[:, :, 0]).sum(axis=1) / 2.0
+        squares.append(float(square.mean()))
+        errors.append(float(np.quantile(np.hypot(*error.T), 0.9)))
+        assert max(normalised(truth, block, number)[0] for number in range(2)) < 4.0
+    assert 0.5 < np.mean(squares) < 1.7
+    assert np.median(errors) < 0.35 * np.hypot(*swing_px)
+
+
 @pytest.mark.parametrize("bend_px", [(8.0, 0.0), (6.0, 6.0)])
 def test_a_bent_scene_is_named_and_does_not_spoil_the_others(bend_px: tuple[float, float]) -> None:
     rng = np.random.default_rng(4)
@@ -216,6 +238,27 @@ def test_a_scene_that_joins_agrees_with_one_adjustment_of_all_scenes() -> None:
         accurate.append(normalised(truth, joined, 2)[0])
     assert np.mean(squares) < 0.5
     assert 0.1 < np.mean(accurate) < 2.5
+
+
+def test_a_scene_that_joins_a_swinging_one_is_tied_to_what_that_scene_truly_shows() -> None:
+    squares = []
+    for trial in range(3):
+        rng = np.random.default_rng([12, trial])
+        truth = truth_of(rng, swing_px=(8.0, 5.0))
+        scenes, ties = observed(truth, rng)
+        redone, _ = adjust_fitting(scenes, ties, OPTIONS)
+        first, _ = adjust_fitting(scenes[1:], ties_between(ties, [1, 2]), OPTIONS)
+        known = first.adjustment.known
+        before = [nothing_found(one.scene, one.points.take(np.zeros(0, np.int64))) for one in scenes[1:]]
+        joined, left = adjust_fitting([scenes[0], *before], ties, OPTIONS, known)
+        assert not left
+        assert joined.adjustment.active[joined.of_ties(2)].mean() > 0.9
+        at = image_places(SHAPE)
+        one, other = (scene_adjustment(each, 0, OPTIONS) for each in (joined, redone))
+        moved_px = one.correction.apply(at) - other.correction.apply(at)
+        stated = one.covariance_at(at)
+        squares.append((moved_px * np.linalg.solve(stated, moved_px[:, :, None])[:, :, 0]).sum() / 10.0)
+    assert np.mean(squares) < 0.5
 
 
 def test_an_ortho_image_joins_images_with_rpcs() -> None:
