@@ -1,14 +1,15 @@
-"""A displacement along lines and samples: what scanners and optics do that no affine correction follows.
+"""A displacement beyond an affine correction: what scanners, optics and rectification do.
 
-The displacement of each coordinate is a sum of Gaussian processes of the line or the sample, the
-components: smooth ones (bow, slow attitude, distortion of the optics), narrow bands (jitter) and steps
-(lost or repeated lines). A component is added as long as the residuals show one
+The displacement of each coordinate is a sum of Gaussian processes, the components. Those of images that
+were scanned depend on the line or the sample: smooth ones (bow, slow attitude, distortion of the
+optics), narrow bands (jitter) and steps (lost or repeated lines). Those of ortho-images depend on both,
+and are smooth (terrain, seams of a mosaic). A component is added as long as the residuals show one
 that chance does not explain and that predicts blocks of lines or samples which were held out. Kernels
 and variances are those of the largest restricted likelihood (Patterson and Thompson, 1971); estimate and
 covariance are those of universal kriging. Where the pixels show a break, there is a step of any size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,11 +19,12 @@ from scipy.linalg import null_space, solve_triangular
 from services.adjustment.structure import ALONG_AXES, Family, Residuals, Structure, structures
 from services.types import Array, IntArray
 
-Along = Literal["lines", "samples"]
-"""Of which a displacement is a function."""
-_AXIS: dict[Along, int] = {"lines": 0, "samples": 1}
-_FOLLOWED_BY: dict[Along, tuple[Family, ...]] = {"lines": ("lines", "steps"), "samples": ("samples",)}
-"""Structures that components along lines and samples may explain."""
+Along = Literal["lines", "samples", "image"]
+"""Of which a displacement is a function: of the line, of the sample, of both."""
+_AXES: dict[Along, slice] = {"lines": slice(0, 1), "samples": slice(1, 2), "image": slice(0, 2)}
+_OF_SCANNED: dict[Along, tuple[Family, ...]] = {"lines": ("lines", "steps"), "samples": ("samples",)}
+_OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": ("lines", "steps", "samples", "image")}
+"""Structures that components of images that were scanned, and of ortho-images, may explain."""
 
 MAX_CHANCE = 0.002
 """Structure that chance explains with a larger probability is not looked into."""
@@ -44,6 +46,7 @@ _RATIOS = np.concatenate([[0.0], np.geomspace(0.03, 3000.0, 21)])
 _LENGTHS: dict[Along, tuple[float, ...]] = {
     "lines": (0.04, 0.08, 0.15, 0.3, 0.6, 1.2),
     "samples": (0.6, 1.2),
+    "image": (0.08, 0.15, 0.3, 0.6, 1.2),
 }
 """Correlation lengths of smooth components, extents of the points along the axis.
 
@@ -54,6 +57,8 @@ _LEAST_SEEN = 0.4
 """Share of its amplitude that chips show of a jitter that can be followed."""
 _FINE = 8
 """Periods tried around a peak, for each that independent residuals tell apart."""
+_OF_POINTS = 2.0
+"""Mean square of what displaces an ortho-image over the variance of its points, more than is theirs."""
 _ISOTROPIC = (0.05, 0.1, 0.2)
 """Lengths of errors that neighbours share in all directions, sides of the image: what else may be."""
 
@@ -69,7 +74,7 @@ class Component:
         variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
             are true: what these are off by, it is off by, too.
         seen: share of the amplitude that chips show, which average over their pixels.
-        along: lines or samples.
+        along: lines, samples, or both.
     """
 
     kind: Literal["smooth", "period", "step", "break"]
@@ -80,9 +85,9 @@ class Component:
     along: Along = "lines"
 
     @property
-    def axis(self) -> int:
-        """Of the positions that it depends on: 0 along lines, 1 along samples."""
-        return _AXIS[self.along]
+    def axes(self) -> slice:
+        """Of the positions that it depends on: line, sample, or both."""
+        return _AXES[self.along]
 
     @property
     def is_step(self) -> bool:
@@ -91,20 +96,19 @@ class Component:
 
     def share(self, line_sample: Array) -> Array:
         """Share (...) of its variance at positions (..., 2): before a step there is none."""
-        position = line_sample[..., self.axis]
         if self.is_step:
-            return np.clip((position - self.at_px) / self.length_px, 0.0, 1.0)
-        return np.ones_like(position)
+            return np.clip((line_sample[..., 0] - self.at_px) / self.length_px, 0.0, 1.0)
+        return np.ones(line_sample.shape[:-1])
 
     def correlation(self, first: Array, second: Array) -> Array:
         """Correlation (m, n) of the displacements at positions (m, 2) and (n, 2)."""
         if self.is_step:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
-        apart = first[:, self.axis][:, None] - second[:, self.axis][None, :]
-        smooth = np.exp(-0.5 * (apart / self.length_px) ** 2)
+        apart = first[:, None, self.axes] - second[None, :, self.axes]
+        smooth = np.exp(-0.5 * (apart**2).sum(axis=2) / self.length_px**2)
         if self.kind == "smooth":
             return np.asarray(smooth)
-        return np.asarray(smooth * np.cos(2.0 * np.pi * apart / self.at_px))
+        return np.asarray(smooth * np.cos(2.0 * np.pi * apart[:, :, 0] / self.at_px))
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Covariance (2, m, n) of what chips show at positions (m, 2) and (n, 2), of line and sample."""
@@ -129,7 +133,12 @@ class _Judged:
 
 
 def likeliest_components(
-    residuals: Residuals, extent_px: float, known: Sequence[Component] = ()
+    residuals: Residuals,
+    extent_px: float,
+    known: Sequence[Component] = (),
+    *,
+    scanned: bool = True,
+    points_px2: float = 0.0,
 ) -> tuple[tuple[Component, ...], tuple[Structure, ...]]:
     """The components that residuals of an affine correction show, and what they leave along the axes.
 
@@ -137,18 +146,24 @@ def likeliest_components(
         residuals: of the active measures.
         extent_px: side of the image, to which errors that neighbours share are compared.
         known: steps at breaks of the image, which there are whatever the residuals show.
+        scanned: whether the image was scanned line by line. Of an ortho-image, what depends on line and
+            sample together is followed, unless the points explain it: they may err together, by as
+            much as they state.
+        points_px2: variance of a coordinate of a measure by its point.
     """
     residuals = beside_breaks(residuals, known)
+    followed_by = _OF_SCANNED if scanned else _OF_ORTHO
+    families = ALONG_AXES if scanned else _OF_ORTHO["image"]
     components: list[Component] = []
     told = 0.0
-    affine = found = structures(residuals, ALONG_AXES)
+    affine = found = structures(residuals, families)
     while True:
         clearest = min(found, key=lambda one: one.chance)
         if clearest.chance > MAX_CHANCE or len(components) == _MOST_COMPONENTS:
             break
         followed = with_components(residuals, components)
         thinned = _thinned(followed)
-        best = _System.of(thinned).best(_candidates(thinned, found))
+        best = _System.of(thinned).best(_candidates(thinned, found, followed_by))
         if best.component is None or best.log_evidence <= _LEAST_EVIDENCE:
             break
         richer = with_components(followed, [best.component])
@@ -157,10 +172,16 @@ def likeliest_components(
             break
         told += best.log_evidence
         components = _again(residuals, [*components, best.component])
-        found = structures(beyond(residuals, components), ALONG_AXES)
-    if components and told <= _LEAST_EVIDENCE + _of_shared_errors(residuals, extent_px):
-        return tuple(known), affine
-    return (*known, *components), found
+        found = structures(beyond(residuals, components), families)
+    if scanned:
+        explained = bool(components) and told <= _LEAST_EVIDENCE + _of_shared_errors(
+            residuals, extent_px
+        )
+    else:
+        explained = _displaced_px2(residuals, components) <= _OF_POINTS * points_px2
+    if explained:
+        components, found = [], affine
+    return (*known, *components), found[: len(ALONG_AXES)]
 
 
 def _again(residuals: Residuals, components: list[Component]) -> list[Component]:
@@ -207,12 +228,12 @@ def unit_variance(residuals: Residuals) -> float:
 
 
 def _blocks(residuals: Residuals, component: Component) -> IntArray:
-    """Number (n,) of the block of lines, or of samples, that each measure lies in."""
-    position = residuals.line_sample[:, component.axis]
-    length = max(residuals.chip_side_px, float(np.ptp(position)) / _BLOCKS)
-    return np.unique(np.floor((position - position.min()) / length), return_inverse=True)[1].astype(
-        np.int64
-    )
+    """Number (n,) of the block of lines, of samples or of both that each measure lies in."""
+    position = residuals.line_sample[:, component.axes]
+    blocks = _BLOCKS ** (1.0 / position.shape[1])
+    length = np.maximum(residuals.chip_side_px, np.ptp(position, axis=0) / blocks)
+    block = np.floor((position - position.min(axis=0)) / np.maximum(length, 1e-9))
+    return np.unique(block, axis=0, return_inverse=True)[1].astype(np.int64).ravel()
 
 
 def held_out_rms(residuals: Residuals, blocks: IntArray) -> float:
@@ -228,6 +249,20 @@ def held_out_rms(residuals: Residuals, blocks: IntArray) -> float:
             held[rows, k] = np.linalg.lstsq(projection[np.ix_(rows, rows)], pulled[rows], rcond=1e-9)[0]
     square = (held**2).sum(axis=1)
     return float(np.sqrt(np.mean(np.minimum(square, 9.0 * np.median(square)))))
+
+
+def _displaced_px2(residuals: Residuals, components: Sequence[Component]) -> float:
+    """Mean square of what components displace the measures by beyond affine, of the worse coordinate."""
+    full, place = with_components(residuals, components), residuals.line_sample
+    moved = np.zeros_like(residuals.misfit)
+    for k in range(2):
+        inverse = np.linalg.inv(full.covariance[k])
+        weighted = inverse @ full.design
+        normal = np.linalg.pinv(full.design.T @ weighted, hermitian=True)
+        pulled = inverse @ full.misfit[:, k] - weighted @ (normal @ (weighted.T @ full.misfit[:, k]))
+        moved[:, k] = sum(one.covariance(place, place)[k] @ pulled for one in components)
+    affine = np.linalg.lstsq(residuals.design, moved, rcond=None)[0]
+    return float(np.mean((moved - residuals.design @ affine) ** 2, axis=0).max())
 
 
 def _of_shared_errors(residuals: Residuals, extent_px: float) -> float:
@@ -254,10 +289,12 @@ def _thinned(residuals: Residuals) -> Residuals:
     )
 
 
-def _candidates(residuals: Residuals, found: Sequence[Structure]) -> list[Component]:
+def _candidates(
+    residuals: Residuals, found: Sequence[Structure], followed_by: Mapping[Along, Sequence[Family]]
+) -> list[Component]:
     """Components of unit variance that may explain a structure."""
     candidates = []
-    for along, families in _FOLLOWED_BY.items():
+    for along, families in followed_by.items():
         shown = [one for one in found if one.family in families]
         if min(one.chance for one in shown) <= MAX_CHANCE:
             candidates += _smooth(residuals, along)
@@ -269,9 +306,10 @@ def _candidates(residuals: Residuals, found: Sequence[Structure]) -> list[Compon
 def _smooth(residuals: Residuals, along: Along) -> list[Component]:
     """Smooth components of unit variance."""
     side = residuals.chip_side_px
-    extent = max(float(np.ptp(residuals.line_sample[:, _AXIS[along]])), 1e-9)
+    position = residuals.line_sample[:, _AXES[along]]
+    extent = max(float(np.ptp(position, axis=0).max()), 1e-9)
     lengths = [length * extent for length in _LENGTHS[along] if length * extent >= 0.5 * side]
-    seen = [(1.0 + (side / length) ** 2 / 12.0) ** -0.5 for length in lengths]
+    seen = [(1.0 + (side / length) ** 2 / 12.0) ** (-0.5 * position.shape[1]) for length in lengths]
     return [
         Component("smooth", length, np.nan, np.ones(2), part, along)
         for length, part in zip(lengths, seen, strict=True)
@@ -343,9 +381,12 @@ class _System:
         judged = [self.judge(one, one.correlation(self.place, self.place)) for one in candidates]
         return max(judged, key=lambda one: one.log_evidence, default=_Judged(None, 0.0))
 
-    def judge(self, component: Component | None, correlation: Array) -> _Judged:
-        """The likeliest variances of a component with this correlation (n, n), and its evidence."""
-        ratio = _RATIOS[:, None]
+    def judge(self, component: Component | None, correlation: Array, most: float = np.inf) -> _Judged:
+        """The likeliest variances of a component with this correlation (n, n), and its evidence.
+
+        Variances are `most` times the median variance of the measures, at most.
+        """
+        ratio = _RATIOS[most >= _RATIOS, None]
         quadratic, determinant = [], []
         for k in range(2):
             half = solve_triangular(self.lower[k], correlation, lower=True, check_finite=False)

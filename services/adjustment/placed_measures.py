@@ -29,6 +29,7 @@ class PlacedMeasures:
         position_px: (n, 2) by the model.
         height_m: (n,) of the points.
         height_pull: (2,) see `Residuals`.
+        points_px2: median variance of a measure by its point, of the worse coordinate.
         overlapping: (n, n) correlation by overlapping chips.
         chip_side_px: of a chip in the scene.
         shape: lines and samples of the image.
@@ -38,6 +39,7 @@ class PlacedMeasures:
     position_px: Array
     height_m: Array
     height_pull: Array
+    points_px2: float
     overlapping: Array
     chip_side_px: float
     shape: tuple[int, int]
@@ -64,6 +66,7 @@ class PlacedMeasures:
             position_px,
             lon_lat_h[:, 2],
             np.nanmean(derivative @ covariance_m2[:, :, 2:], axis=0)[:, 0],
+            float(np.median(of_points, axis=0).max()),
             overlap_correlation(position_px, chip_side_px, own_share),
             chip_side_px,
             shape,
@@ -116,9 +119,11 @@ class PlacedMeasures:
             wanted: whether it may be followed; else all is left.
         """
         residuals = self.residuals(fit, rows)
-        if not (wanted and self.scanned):
+        if not wanted:
             return (), structures(residuals, ALONG_AXES)
-        return likeliest_components(residuals, self.size_px, known)
+        return likeliest_components(
+            residuals, self.size_px, known, scanned=self.scanned, points_px2=self.points_px2
+        )
 
     def agreeing(
         self,

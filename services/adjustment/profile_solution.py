@@ -26,11 +26,14 @@ _NODES_OF_BROKEN = 513
 affine parameters have of it is taken out of the variance of the others, quadratic between nodes."""
 _MOST_NODES = 1025, 129
 """Along the lines, which shake, and along the samples."""
+_MOST_NODES_OF_BOTH = 65
+"""Along each axis, where a displacement depends on both."""
 _WHERE: dict[Along, tuple[slice, slice]] = {
     "lines": (slice(None), slice(1)),
     "samples": (slice(1), slice(None)),
+    "image": (slice(None), slice(None)),
 }
-"""Nodes that differ for components along the lines and along the samples."""
+"""Nodes that differ for components along the lines, along the samples, and along both."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +188,9 @@ def _nodes(
         last = shape[axis] - 1.0
         low = float(min(0.0, place.min(), -moved.max()))
         high = float(max(last, place.max(), last - moved.min()))
-        along = [one for one in components if one.axis == axis]
+        along = [one for one in components if axis in range(2)[one.axes]]
+        if any(one.along == "image" for one in along):
+            most = _MOST_NODES_OF_BOTH
         steps = [
             one.at_px / _NODES_A_PERIOD if one.kind == "period" else one.length_px / _NODES_A_LENGTH
             for one in along
