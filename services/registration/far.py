@@ -35,6 +35,7 @@ from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, no_correction
 from services.types import (
     Array,
+    BoolArray,
     ChipSource,
     ControlPoints,
     FloatImage,
@@ -51,6 +52,8 @@ _NODE_PX = 16
 """Pixels of the map between nodes that are projected through the model."""
 _MAX_MISSING = 0.1
 """Largest share of the map under a chip that may be without data."""
+_EVEN = 1e-4
+"""Standard deviation of even ground, by that of the map: below it, correlations are rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -265,34 +268,32 @@ def _find(
     plan: _Plan,
 ) -> tuple[Array, np.ndarray]:
     """Positions (n, 2) in the scene where chips correlate best, and why there is none (n,)."""
-    missing = ~np.isfinite(scene_map.pixels)
-    pixels = np.where(missing, np.float32(np.nanmean(scene_map.pixels)), scene_map.pixels)
-    count, size = cv2.integral(missing.astype(np.uint8)), len(pixels)
-    centres = scene_map.row_col(predicted)
+    side, size = max((len(chip) for chip in templates), default=0), len(scene_map.pixels)
     found = np.full((len(templates), 2), np.nan)
     reason = np.full(len(templates), "nodata", dtype="<U16")
+    if not 0 < side <= size:
+        return found, reason
+    missing = ~np.isfinite(scene_map.pixels)
+    pixels = scene_map.pixels - np.float32(np.nanmean(scene_map.pixels))
+    pixels[missing] = 0.0
+    contrast, unusable = _contrast(pixels, side), _gaps(missing, side) > _MAX_MISSING * side**2
+    centres = scene_map.row_col(predicted)
     for i, chip in enumerate(templates):
         if i % 64 == 0:
             context.progress(i / len(templates), f"searching {len(templates)} points in the whole scene")
-        side = chip.shape[0]
-        if side == 0 or not np.isfinite(centres[i]).all():
+        if len(chip) == 0 or not np.isfinite(centres[i]).all():
             continue
         wanted = np.round(centres[i]).astype(int) - side // 2
         top, left = (int(v) for v in np.maximum(wanted - plan.radius_px, 0))
         bottom, right = (int(v) for v in np.minimum(wanted + plan.radius_px, size - side) + 1)
         if bottom <= top or right <= left:
             continue
-        gaps = (
-            count[top + side : bottom + side, left + side : right + side]
-            - count[top:bottom, left + side : right + side]
-            - count[top + side : bottom + side, left:right]
-            + count[top:bottom, left:right]
-        )
-        usable = gaps <= _MAX_MISSING * side**2
-        if not usable.any():
+        places = slice(top, bottom), slice(left, right)
+        if unusable[places].all():
             continue
         patch = pixels[top : bottom + side - 1, left : right + side - 1]
-        scores = np.where(usable, cv2.matchTemplate(patch, chip, cv2.TM_CCOEFF_NORMED), -1.0)
+        scores = cv2.matchTemplate(patch, _standardised(chip), cv2.TM_CCORR) / contrast[places]
+        scores[unusable[places]] = -1.0
         best = np.array(np.unravel_index(int(scores.argmax()), scores.shape)) + (top, left)
         score = float(scores.max())
         if not context.options.coarse.min_score <= score <= 1.001:
@@ -302,6 +303,35 @@ def _find(
         else:
             reason[i], found[i] = "", best + side // 2
     return scene_map.line_sample(found), reason
+
+
+def _contrast(pixels: FloatImage, side: int) -> FloatImage:
+    """Root of the sum of squared deviations from their mean of the pixels under each chip of a side.
+
+    With `_standardised` chips it makes covariances normalised correlations, for all chips at once:
+    `cv2.TM_CCOEFF_NORMED` spends most of its time to compute it for each. Infinite on even ground.
+    """
+    size = len(pixels) - side + 1
+    chip, first = (side, side), (0, 0)
+    total = cv2.boxFilter(pixels, cv2.CV_64F, chip, anchor=first, normalize=False)[:size, :size]
+    squares = cv2.sqrBoxFilter(pixels, cv2.CV_64F, chip, anchor=first, normalize=False)[:size, :size]
+    contrast2 = squares - total**2 / side**2
+    even = contrast2 <= (_EVEN * side) ** 2 * np.mean(pixels**2, dtype=np.float64)
+    return np.asarray(np.sqrt(np.where(even, np.inf, contrast2)), dtype=np.float32)
+
+
+def _standardised(chip: FloatImage) -> FloatImage:
+    """A chip less its mean, of which the squares add up to 1; all zeros for an even chip."""
+    around_mean = chip - np.float32(chip.mean(dtype=np.float64))
+    norm = float(np.linalg.norm(around_mean))
+    return np.asarray(around_mean / np.float32(norm or 1.0))
+
+
+def _gaps(missing: BoolArray, side: int) -> IntArray:
+    """Number of missing pixels under each chip of a side."""
+    count = cv2.integral(missing.astype(np.uint8))
+    below = count[side:] - count[:-side]
+    return np.asarray(below[:, side:] - below[:, :-side])
 
 
 def _summary(scene: Scene, plan: _Plan, consensus: Consensus, reason: np.ndarray) -> SearchStage:
