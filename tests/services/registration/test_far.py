@@ -74,7 +74,7 @@ def test_a_small_crop_kilometres_off_is_found_also_by_chips_with_lost_pixels() -
 
 def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_searched() -> None:
     # 44 km, of which chips of 2 m, reduced four times, let the middle 20 km be searched.
-    points, chips = wide_points(4_000.0, 700.0, (2.0,))
+    points, chips = wide_points(4_000.0, 1_400.0, (2.0,))
     scene = wide_scene(44_000.0, 16.0, 2_750, (0.0, 0.0), seed=1)
     stages: list[SearchStage] = []
     with pytest.raises(NoConsensus, match=r"in the middle 20\.0 km of the scene only") as refused:
@@ -84,7 +84,7 @@ def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_se
 
 
 def test_a_crop_of_other_ground_is_refused_with_how_far_was_searched() -> None:
-    points, chips = wide_points(6_500.0, 220.0, (2.0,))
+    points, chips = wide_points(6_500.0, 440.0, (2.0,))
     with pytest.raises(NoConsensus, match=r"far search .* tried within 50\d\d m") as refused:
         register_scene(wide_scene(*CROP, (0.0, 0.0), seed=1), points, chips)
     assert "inf" not in str(refused.value)

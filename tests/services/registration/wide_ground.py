@@ -1,6 +1,6 @@
 """Flat ground of many kilometres that is computed where it is seen, its scenes and its points."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import cv2
@@ -9,7 +9,7 @@ import numpy as np
 from services.conventions import CHIP_SIZE
 from services.geodesy import east_north_up, lon_lat_h_from_east_north_up
 from services.imagery.scene import Scene
-from services.imagery.source import Window, chip_ground
+from services.imagery.source import ArrayImage, chip_ground
 from services.sensors.base import SensorModel
 from services.sensors.correction import CorrectedModel, no_correction
 from services.simulation.orbit import pushbroom_over
@@ -29,6 +29,7 @@ STEP_M = 2.0
 PERIODS_PX = (997, 1103, 1217, 1321)
 """Of four textures that repeat; their sum does so nowhere within 10 km."""
 _NODE_PX = 16
+_TILE_PX = 16 * _NODE_PX
 _CHIP_NODE_PX = 25
 
 
@@ -69,40 +70,6 @@ def _between_nodes(enu: Array, shape: tuple[int, int], step_px: int) -> tuple[Ar
     return rows @ enu[..., 0] @ columns.T, rows @ enu[..., 1] @ columns.T
 
 
-@dataclass(frozen=True)
-class WideImage:
-    """What a sensor sees of the ground, with noise of its own.
-
-    Attributes:
-        model: true.
-        shape: lines and samples.
-        seed: of the ground.
-    """
-
-    model: SensorModel
-    shape: tuple[int, int]
-    seed: int = 0
-
-    def read(self, window: Window) -> FloatImage:
-        """Pixels of a window; NaN beyond the image."""
-        shape = (window.lines, window.samples)
-        axes = [np.arange(-(-size // _NODE_PX) + 1) * float(_NODE_PX) for size in shape]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1) + (window.line, window.sample)
-        ground = self.model.locate(nodes.reshape(-1, 2), np.zeros(nodes.size // 2))
-        enu = east_north_up(ground, CENTRE)[:, :2].reshape(nodes.shape)
-        east, north = _between_nodes(enu, shape, _NODE_PX)
-        pixels = brightness(east, north, self.seed)
-        pixels += (
-            np.random.default_rng(10_000 + window.line)
-            .normal(0.0, 20.0, pixels.shape)
-            .astype(np.float32)
-        )
-        line, sample = window.line + np.arange(window.lines), window.sample + np.arange(window.samples)
-        pixels[(line < 0) | (line >= self.shape[0])] = np.nan
-        pixels[:, (sample < 0) | (sample >= self.shape[1])] = np.nan
-        return pixels
-
-
 @cache
 def true_model(size_m: float, gsd_m: float, side: int) -> SensorModel:
     """The model of the middle `side` x `side` pixels of a scene of `size_m`."""
@@ -113,6 +80,22 @@ def true_model(size_m: float, gsd_m: float, side: int) -> SensorModel:
     return CorrectedModel(model, crop)
 
 
+@cache
+def wide_image(size_m: float, gsd_m: float, side: int, seed: int) -> ArrayImage:
+    """What a sensor sees of the ground of a seed, with noise of its own; see `true_model`."""
+    model, rng = true_model(size_m, gsd_m, side), np.random.default_rng(10_000)
+    pixels = rng.normal(0.0, 20.0, (side, side)).astype(np.float32)
+    axis = np.arange(0, _TILE_PX + 1, _NODE_PX)
+    for first in np.ndindex(-(-side // _TILE_PX), -(-side // _TILE_PX)):
+        nodes = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1) + _TILE_PX * np.array(first)
+        ground = model.locate(nodes.reshape(-1, 2).astype(np.float64), np.zeros(nodes.size // 2))
+        enu = east_north_up(ground, CENTRE)[:, :2].reshape(nodes.shape)
+        line, sample = _TILE_PX * np.array(first)
+        tile = pixels[line : line + _TILE_PX, sample : sample + _TILE_PX]
+        tile += brightness(*_between_nodes(enu, tile.shape, _NODE_PX), seed)
+    return ArrayImage(pixels)
+
+
 def wide_scene(
     size_m: float, gsd_m: float, side: int, error_m: tuple[float, float], *, seed: int = 0
 ) -> Scene:
@@ -121,7 +104,7 @@ def wide_scene(
     error = no_correction((side, side))
     error.parameters[:, 0] = truth.project_derivative(CENTRE[None, :])[0, :, :2] @ np.array(error_m)
     return Scene(
-        WideImage(truth, (side, side), seed),
+        wide_image(size_m, gsd_m, side, seed),
         CorrectedModel(truth, error),
         Acquisition("wide", incidence_deg=8.0, azimuth_deg=100.0),
         5000.0 / 3.0,
@@ -130,20 +113,24 @@ def wide_scene(
 
 @dataclass(frozen=True)
 class WideChips:
-    """Chips that are cut from the ground when they are read.
+    """Chips that are cut from the ground when they are first read.
 
     Attributes:
         lon_lat_h: (n, 3) the points.
         gsds_m: of the chips of each point.
+        cut: the chips that were read, by the row of the point.
     """
 
     lon_lat_h: Array
     gsds_m: tuple[float, ...]
+    cut: dict[int, ChipArray] = field(default_factory=dict)
 
     def read(self, file: str, row: int, count: int) -> ChipArray:
         """The chips of the point whose first row is `row`."""
-        point = self.lon_lat_h[row // len(self.gsds_m)]
-        return np.stack([self._chip(point, gsd_m) for gsd_m in self.gsds_m])
+        if row not in self.cut:
+            point = self.lon_lat_h[row // len(self.gsds_m)]
+            self.cut[row] = np.stack([self._chip(point, gsd_m) for gsd_m in self.gsds_m])
+        return self.cut[row]
 
     def _chip(self, point: Array, gsd_m: float) -> ChipArray:
         nodes = CHIP_SIZE // _CHIP_NODE_PX + 1
