@@ -141,8 +141,10 @@ def _count_voters(rows: IntArray, voters: Voters | None) -> int:
         return len(rows)
     corner = np.round(voters.position[rows] / voters.side * _CELLS).astype(np.int64)
     of_chip = np.stack(np.meshgrid(np.arange(_CELLS), np.arange(_CELLS)), axis=-1).reshape(-1, 2)
-    covered = (corner[:, None] + of_chip).reshape(-1, 2)
-    return len(np.unique(covered, axis=0)) // _CELLS**2
+    covered = (corner - corner.min(axis=0))[:, None] + of_chip
+    # As one number each: unique rows take ten times as long.
+    width = int(covered[..., 1].max()) + 1
+    return len(np.unique(covered[..., 0] * width + covered[..., 1])) // _CELLS**2
 
 
 def consensus_tolerance_px(sigma_px: float) -> float:
