@@ -15,12 +15,13 @@ import pytest
 
 from app.errors import InputError
 from app.usecases.registration import result_folder
-from app.usecases.registration.deliverables import OUTPUTS
 from app.usecases.registration.result_folder import MANIFEST, older_result, replacing
 
 OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.listdir", "os.scandir")
 """Audit events before Python touches the file system: a kill at each of them meets every state."""
 LARGEST_NUMBER = 400
+FILES = ("report.json", "report.txt", "residuals.gpkg", "refined_RPC.TXT")
+"""Of a result, beside its model: what happens to one of them happens to any number."""
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +33,7 @@ def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 def write_result(folder: Path, run: str, verdict: str = "good") -> None:
     """Write all files of a result, the content of each naming the run."""
     with replacing(folder) as new:
-        for name in (*OUTPUTS, f"{run}_RPC.TXT"):
+        for name in (*FILES, f"{run}_RPC.TXT"):
             (new / name).write_text(f"{name} of the {run} run\n" * 50)
         report = {"verdict": verdict, "scene": {"name": run}}
         (new / "report.json").write_text(json.dumps(report))
@@ -42,7 +43,7 @@ def run_in(folder: Path) -> str:
     """The run whose result a folder holds, after a check that it is whole and has nothing else."""
     manifest = json.loads((folder / MANIFEST).read_text())
     run: str = manifest["scene"]
-    assert {path.name for path in folder.iterdir()} == {*OUTPUTS, f"{run}_RPC.TXT", MANIFEST}
+    assert {path.name for path in folder.iterdir()} == {*FILES, f"{run}_RPC.TXT", MANIFEST}
     for path in folder.iterdir():
         if path.name != MANIFEST:
             assert sha256(path.read_bytes()).hexdigest() == manifest["files"][path.name]["sha256"]
@@ -98,7 +99,7 @@ def test_a_result_is_whole_wherever_its_writer_is_killed(
     assert not was_killed
     assert seen[-1] == "new"
     assert {"older", "new"} == set(seen[:-2])
-    assert number > 2 * len(OUTPUTS)
+    assert number > 2 * len(FILES)
 
 
 def test_a_first_result_is_whole_or_absent_wherever_its_writer_is_killed(tmp_path: Path):
