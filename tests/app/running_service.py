@@ -94,15 +94,15 @@ def _answers(url: str) -> bool:
 
 
 @contextmanager
-def running_service(settings: Settings, log: Path) -> Iterator[str]:
-    """`amers serve` on the installation of a test; yields its address."""
+def running_service(settings: Settings, log: Path, *options: str) -> Iterator[str]:
+    """`amers serve` with options on the installation of a test; yields its address."""
     assert settings.database_url is not None
     port = free_port()
     environment = os.environ | {
         "AMERS_DATABASE_URL": settings.database_url.get_secret_value(),
         "AMERS_DATA_FOLDER": str(settings.data_folder),
     }
-    command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port)]
+    command = [sys.executable, "-m", "app.cli.main", "serve", "--port", str(port), *options]
     with log.open("wb") as output:
         service = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
     try:

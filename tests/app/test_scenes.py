@@ -269,7 +269,7 @@ def test_an_upload_survives_no_failure_of_the_database(settings: Settings, beare
 def test_an_upload_cut_off_by_its_sender_leaves_nothing(
     token: Callable[[str], str], settings: Settings, storage: Storage, tmp_path: Path, dsn: str
 ):
-    with running_service(settings, tmp_path / "serve.log") as url:
+    with running_service(settings, tmp_path / "serve.log", "--no-worker") as url:
         port = int(url.rsplit(":", 1)[1])
         head = (
             "POST /scenes?name=a.tif HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10000000\r\n"
