@@ -29,7 +29,7 @@ def free_port() -> int:
 
 
 class Service:
-    """A running `amers serve` with a data folder of its own.
+    """A running `amers serve` with options, and a data folder of its own.
 
     Attributes:
         folder: its data folder.
@@ -37,7 +37,7 @@ class Service:
         environment: in which commands reach its database.
     """
 
-    def __init__(self, folder: Path, **settings: str) -> None:
+    def __init__(self, folder: Path, *options: str, **settings: str) -> None:
         self.folder = folder
         self.port = free_port()
         self.cluster = Cluster(folder / "postgres")
@@ -46,7 +46,7 @@ class Service:
         self.log = folder.with_suffix(".log")
         with self.log.open("ab") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port)],
+                [sys.executable, "-m", "app.cli.main", "serve", "--port", str(self.port), *options],
                 env=self.environment,
                 stdout=output,
                 stderr=output,

@@ -72,7 +72,7 @@ def test_what_is_drawn_on_a_scene_is_where_the_truth_is(registered):
 
 
 def test_points_are_queried_from_a_service_and_drawn(made, open_folder, tmp_path):
-    service = Service(open_folder / uuid4().hex[:8], AMERS_PUBLIC_POINTS="true")
+    service = Service(open_folder / uuid4().hex[:8], "--no-worker", AMERS_PUBLIC_POINTS="true")
     try:
         assert until(service.is_ready), service.log.read_text()
         run("-m", "app.cli.main", "block", "ingest", made / "block", "--publish", **service.environment)
