@@ -14,6 +14,7 @@ from app.api.models.blocks import (
     BlockQuality,
     BlockRecord,
     ChangedBlock,
+    DeletedBlock,
     PublishedBlock,
     UploadedBlock,
 )
@@ -25,6 +26,7 @@ from app.db.engine import Connection
 from app.db.tokens import Token
 from app.usecases import jobs
 from app.usecases.blocks import lifecycle, uploads
+from app.usecases.blocks.deletion import delete_block
 from app.usecases.blocks.ingestion import INGEST_BLOCK
 from app.usecases.blocks.lifecycle import Published
 from app.usecases.jobs import JobRequest
@@ -134,6 +136,17 @@ def withdraw(*, reference: str, database: DatabaseDep, caller: Admin) -> Changed
     with database.transaction() as connection:
         block = lifecycle.withdraw_block(connection, reference)
     return ChangedBlock(block=BlockRecord.model_validate(block))
+
+
+@router.delete("/blocks/{reference}")
+def delete(*, reference: str, installation: InstallationDep, caller: Admin) -> DeletedBlock:
+    """Delete a block that is not published, named ID@VERSION, with its points and chips.
+
+    Its files of chips go into the trash, but for those that other blocks have too. The block cannot be
+    restored; what registrations measured at its points stays with them.
+    """
+    deleted = delete_block(installation, reference)
+    return DeletedBlock.model_validate(deleted)
 
 
 def _published(published: Published) -> PublishedBlock:

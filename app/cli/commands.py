@@ -4,7 +4,7 @@ from app.cli.on_demand import Command, Group, Tree
 
 COMMANDS: Tree = {
     "block": Group(
-        "Blocks of control points: ingest, publish, withdraw, export.",
+        "Blocks of control points: ingest, publish, withdraw, delete, export.",
         {
             "ingest": Command(
                 "block_ingestion:ingest",
@@ -27,6 +27,10 @@ COMMANDS: Tree = {
             ),
             "withdraw": Command(
                 "block_state:withdraw", "Withdraw a published block; it can be restored."
+            ),
+            "delete": Command(
+                "block_deletion:delete",
+                "Delete a block that is not published, for good; its chips go into the trash.",
             ),
             "export": Command(
                 "block_export:export",

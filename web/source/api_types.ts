@@ -129,6 +129,12 @@ export interface Conformance {
   conformsTo: string[];
 }
 
+export interface DeletedBlock {
+  block: BlockRecord;
+  n_files: number;
+  n_shared_files: number;
+}
+
 export interface DensityFeature {
   type: "Feature";
   id: number;

@@ -41,6 +41,17 @@ class PublishedBlock(ChangedBlock):
     superseded: BlockRecord | None
 
 
+class DeletedBlock(ChangedBlock):
+    """A block as it was before it was deleted.
+
+    `n_files` of its files of chips are in the trash; `n_shared_files` stay, because other blocks have
+    them too.
+    """
+
+    n_files: int
+    n_shared_files: int
+
+
 class UploadedBlock(Reply):
     """An uploaded archive of a block; `POST /blocks` names it by this id."""
 

@@ -147,6 +147,9 @@ point = Table(
     Index("point_superseded", "id", postgresql_where=text("superseded_by is not null")),
     Index("point_superseded_by", "superseded_by", postgresql_where=text("superseded_by is not null")),
     Index("point_suspended", "id", postgresql_where=text("suspended_at is not null")),
+    # A block is deleted with its points and files: its points are physically together.
+    Index("point_block", "block_number", postgresql_using="brin"),
+    Index("point_chip_file", "chip_file"),
 )
 
 # One chip of a point and the geometry of the image it was cut from.

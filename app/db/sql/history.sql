@@ -1,5 +1,5 @@
 -- Sums over registrations. Rows change in the order of their keys, so that of two registrations of one
--- place one waits and none deadlocks.
+-- place one waits and none deadlocks. A point whose block was deleted since it was tried has no sums.
 
 -- name: count_points
 -- Add the outcome of each point that a registration tried to the sums of the point.
@@ -15,7 +15,7 @@ insert into point_history as h (point_id, attempts, successes, expected, matched
 select point_id, 1, active::int, (select avg(active::int) from tried), matched::int,
     coalesce(residual_px, 0), coalesce(residual_east_m, 0), coalesce(residual_north_m, 0),
     now(), case when active then now() end
-from tried order by point_id
+from tried where exists (select from point where id = point_id) order by point_id
 on conflict (point_id) do update set attempts = h.attempts + 1,
     successes = h.successes + excluded.successes, expected = h.expected + excluded.expected,
     matched = h.matched + excluded.matched,
@@ -35,7 +35,7 @@ with tried as (
 )
 insert into view_history as h (point_id, view, attempts, successes, expected)
 select point_id, view, 1, agreed::int, (select avg(agreed::int) from tried)
-from tried order by point_id, view
+from tried where exists (select from point where id = point_id) order by point_id, view
 on conflict (point_id, view) do update set attempts = h.attempts + 1,
     successes = h.successes + excluded.successes, expected = h.expected + excluded.expected
 

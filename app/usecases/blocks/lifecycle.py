@@ -134,7 +134,7 @@ def publish_block(connection: Connection, reference: str) -> Published:
         NotFound: there is no such block.
         Conflict: it is already published, or the reference fits several versions.
     """
-    block, versions = _lock_block(connection, reference)
+    block, versions = lock_block(connection, reference)
     before = next((v for v in versions if v.state == "published" and v.number != block.number), None)
     _set_state(connection, block, "published")
     if before is not None:
@@ -154,7 +154,7 @@ def withdraw_block(connection: Connection, reference: str) -> Block:
         NotFound: there is no such block.
         Conflict: it is not published, or the reference fits several versions.
     """
-    block, _ = _lock_block(connection, reference)
+    block, _ = lock_block(connection, reference)
     _set_state(connection, block, "withdrawn")
     superseding.recompute(connection, block.number)
     return blocks.read_block_row(connection, block.number)
@@ -184,7 +184,7 @@ def prioritise_block(connection: Connection, reference: str, priority: int) -> B
         InputError: the priority is out of range.
     """
     _check_priority(priority)
-    block, _ = _lock_block(connection, reference)
+    block, _ = lock_block(connection, reference)
     blocks.set_priority(connection, block.number, priority)
     if block.state == "published":
         superseding.recompute(connection, block.number)
@@ -236,7 +236,7 @@ def folder_to_ingest(allowed: Path | None, name: str) -> Path:
     return folder
 
 
-def _lock_block(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
+def lock_block(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
     """Lock a block against changes by others; returns its present state, and all its versions."""
     superseding.lock_publications(connection)
     number = find_block(connection, reference).number

@@ -1,0 +1,25 @@
+"""`amers block delete`: a block that is no longer needed."""
+
+from typing import Annotated
+
+import typer
+
+from app.cli.block_listing import block_row
+from app.cli.output import AsJson, show_one
+from app.config import read_settings
+from app.db import engine
+from app.storage import open_storage
+from app.usecases.blocks.deletion import delete_block
+from app.usecases.installation import Installation
+
+
+def delete(
+    reference: Annotated[str, typer.Argument(help="ID@VERSION, written out.")],
+    as_json: AsJson = False,
+) -> None:
+    """Delete a block that is not published, for good; its chips go into the trash."""
+    settings = read_settings()
+    with engine.opened(settings) as database:
+        deleted = delete_block(Installation(database, open_storage(settings), settings), reference)
+    counts = {"files": deleted.n_files, "shared_files": deleted.n_shared_files}
+    show_one({**block_row(deleted.block), **counts}, as_json=as_json)
