@@ -1,4 +1,4 @@
-"""Operation of the service: metrics and the audit trail."""
+"""Operation of the service: metrics, status and the audit trail."""
 
 from collections.abc import Iterator
 from typing import Annotated
@@ -10,7 +10,7 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
 from app.api.deps import Admin, DatabaseDep, MetricsReader, SettingsDep
-from app.api.models.administration import ChangeRecord, ChangeRecords
+from app.api.models.administration import ChangeRecord, ChangeRecords, InstallationStatus
 from app.api.models.base import Link
 from app.api.negotiation import JSON
 from app.api.routes import CallerRoute
@@ -33,6 +33,26 @@ def metrics(
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
+@router.get("/status")
+def status(*, database: DatabaseDep, settings: SettingsDep, caller: Admin) -> InstallationStatus:
+    """Return what waits in the queue, who works, and what the installation takes of its disk."""
+    with database.reading() as connection:
+        figures = operations.installation_figures(connection, settings.data_folder)
+    store = figures.store
+    return InstallationStatus(
+        workers=figures.workers,
+        jobs_waiting=store.jobs_in("accepted"),
+        jobs_running=store.jobs_in("running"),
+        oldest_waiting_s=store.oldest_waiting_s,
+        points_served=store.points,
+        chip_bytes=store.chip_bytes,
+        database_bytes=store.database_bytes,
+        disk_free_bytes=figures.disk_free_bytes,
+        disk_total_bytes=figures.disk_total_bytes,
+        damaged_files=store.damaged_files,
+    )
+
+
 @router.get("/audit")
 def audit(
     *,
@@ -49,10 +69,16 @@ def audit(
     subject: Annotated[
         str | None, Query(max_length=300, description="Only changes of the thing with this id.")
     ] = None,
+    actor: Annotated[
+        str | None,
+        Query(max_length=300, description="Only changes by who has this name, such as that of a token."),
+    ] = None,
 ) -> ChangeRecords:
     """List the changes of tokens, blocks, scenes, jobs, points and references, newest first."""
     with database.reading() as connection:
-        changes = operations.list_changes(connection, limit, before=before, kind=kind, subject=subject)
+        changes = operations.list_changes(
+            connection, limit, before=before, kind=kind, subject=subject, actor=actor
+        )
     links = [Link(rel="self", href=str(request.url), type=JSON)]
     if len(changes) == limit:
         following = str(request.url.include_query_params(before=changes[-1].id))
@@ -93,6 +119,8 @@ class _InstallationCollector(Collector):
                 store.oldest_waiting_s,
             ),
             ("amers_points_published", "Points that are served.", store.points),
+            ("amers_chip_bytes", "Size of the files of chips of all blocks, bytes.", store.chip_bytes),
+            ("amers_workers", "Workers that are alive.", self._figures.workers),
             (
                 "amers_damaged_files",
                 "Stored files found damaged or missing, and not repaired since.",

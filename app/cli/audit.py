@@ -24,11 +24,14 @@ def audit(
     subject: Annotated[
         str | None, typer.Option(help="Only the thing with this id; ID@VERSION for a block.")
     ] = None,
+    actor: Annotated[
+        str | None, typer.Option(help="Only by who has this name: a token, a user of the command line.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show the last changes of tokens, blocks, scenes, jobs and points, the newest first."""
     with transaction() as connection:
-        changes = operations.list_changes(connection, limit, kind=kind, subject=subject)
+        changes = operations.list_changes(connection, limit, kind=kind, subject=subject, actor=actor)
     if as_json:
         show([vars(change) for change in changes], as_json=True)
         return

@@ -61,13 +61,19 @@ def remove_old(connection: Connection, older_than_s: float) -> int:
 
 
 def list_changes(
-    connection: Connection, limit: int, before: int | None, kind: str | None, subject: str | None
+    connection: Connection,
+    limit: int,
+    before: int | None,
+    kind: str | None,
+    subject: str | None,
+    *,
+    actor: str | None = None,
 ) -> list[Change]:
     """Changes, the newest first.
 
     Args:
         before: changes with smaller ids only.
-        kind, subject: None for all.
+        kind, subject, actor: None for all; an actor is a name.
     """
     statement = select(*COLUMNS).order_by(audit.c.id.desc()).limit(limit)
     if before is not None:
@@ -76,4 +82,6 @@ def list_changes(
         statement = statement.where(audit.c.kind == kind)
     if subject is not None:
         statement = statement.where(audit.c.subject == subject)
+    if actor is not None:
+        statement = statement.where(audit.c.actor_name == actor)
     return every(Change, connection.execute(statement))

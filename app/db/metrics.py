@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from sqlalchemy import func, select
 
 from app.db.engine import Connection
-from app.db.schema import block, job
+from app.db.schema import JobState, block, job
 from app.db.statements import named
+from services.conventions import CHIP_SIZE
 
 INSTALLATION = named("metrics.sql", "installation")
 
@@ -22,6 +23,7 @@ class Gauges:
         queue: entries of the queue that no worker has taken.
         blocks: state to number.
         points: that are served.
+        chip_bytes: size of the files of chips of all blocks, without their heads.
         damaged_files: files of the storage that were found damaged or missing, and not repaired since.
         database_bytes: size of the database.
     """
@@ -32,8 +34,13 @@ class Gauges:
     queue: int
     blocks: dict[str, int]
     points: int
+    chip_bytes: int
     damaged_files: int
     database_bytes: int
+
+    def jobs_in(self, state: JobState) -> int:
+        """The number of jobs in a state."""
+        return sum(number for (_, of), number in self.jobs.items() if of == state)
 
 
 def read_gauges(connection: Connection) -> Gauges:
@@ -46,5 +53,5 @@ def read_gauges(connection: Connection) -> Gauges:
         jobs={(row.kind, row.state): row.n for row in connection.execute(jobs)},
         registrations={row.verdict: row.n for row in connection.execute(verdicts)},
         blocks={row.state: row.n for row in connection.execute(blocks)},
-        **connection.execute(INSTALLATION).one()._mapping,
+        **connection.execute(INSTALLATION, {"chip_px": CHIP_SIZE**2}).one()._mapping,
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from app.db import audit, metrics
 from app.db.audit import Change
 from app.db.engine import Connection
+from app.db.jobs import progress
 from app.db.metrics import Gauges
 from app.errors import InputError
 
@@ -15,9 +16,14 @@ MOST_CHANGES = 1000
 
 @dataclass(frozen=True)
 class InstallationFigures:
-    """The figures of the store, and of the disk with the data folder."""
+    """The figures of the store, and of the disk with the data folder.
+
+    Attributes:
+        workers: that are alive.
+    """
 
     store: Gauges
+    workers: int
     disk_free_bytes: int
     disk_total_bytes: int
 
@@ -25,7 +31,8 @@ class InstallationFigures:
 def installation_figures(connection: Connection, data_folder: Path) -> InstallationFigures:
     """The present figures of an installation."""
     disk = shutil.disk_usage(existing_folder(data_folder))
-    return InstallationFigures(metrics.read_gauges(connection), disk.free, disk.total)
+    workers = progress.count_workers(connection)
+    return InstallationFigures(metrics.read_gauges(connection), workers, disk.free, disk.total)
 
 
 def existing_folder(data_folder: Path) -> Path:
@@ -40,6 +47,7 @@ def list_changes(
     before: int | None = None,
     kind: str | None = None,
     subject: str | None = None,
+    actor: str | None = None,
 ) -> list[Change]:
     """The recorded changes, the newest first.
 
@@ -49,6 +57,7 @@ def list_changes(
         kind: only changes of this kind: `token`, `block`, `scene`, `job`, `point`, `reference_image` or
             `audit`.
         subject: only changes of the thing with this id; ID@VERSION for a block.
+        actor: only changes by who has this name: a token, or a user of the command line.
 
     Raises:
         InputError: the limit is out of range, or the kind is unknown.
@@ -57,4 +66,4 @@ def list_changes(
         raise InputError(f"limit: {limit} found, 1 to {MOST_CHANGES} expected")
     if kind is not None and kind not in audit.KINDS:
         raise InputError(f"kind: {kind!r:.40} found, one of {', '.join(audit.KINDS)} expected")
-    return audit.list_changes(connection, limit, before, kind, subject)
+    return audit.list_changes(connection, limit, before, kind, subject, actor=actor)

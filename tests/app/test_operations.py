@@ -162,7 +162,8 @@ def families(text: str) -> dict:
 
 
 def test_metrics_report_requests_jobs_points_and_disk(client, connection, storage, bearer, tmp_path):
-    lifecycle.ingest_block(connection, storage, make_block(tmp_path / "block", 7).folder)
+    made = make_block(tmp_path / "block", 7)
+    lifecycle.ingest_block(connection, storage, made.folder)
     lifecycle.publish_block(connection, "calanques")
     jobs.create(connection, "register-scene", {})
     connection.commit()
@@ -173,6 +174,8 @@ def test_metrics_report_requests_jobs_points_and_disk(client, connection, storag
     value = {name: family.samples[0].value for name, family in metric_families.items() if family.samples}
     assert value["amers_points_published"] == 7
     assert value["amers_queue_length"] == 1
+    assert value["amers_workers"] == 0
+    assert value["amers_chip_bytes"] == sum(made.chips(row).nbytes for row in range(7))
     assert value["amers_oldest_waiting_job_seconds"] > 0
     assert 0 < value["amers_disk_free_bytes"] < value["amers_disk_total_bytes"]
     assert value["amers_database_bytes"] > 1_000_000
@@ -186,6 +189,44 @@ def test_metrics_report_requests_jobs_points_and_disk(client, connection, storag
     assert counts["GET", "/healthz", "200"] == 1
     assert counts["GET", "none", "404"] == 1
     assert not any(method == "ODD" for method, _, _ in counts)
+
+
+def test_the_status_has_the_queue_and_what_is_stored(client, connection, storage, bearer, tmp_path):
+    made = make_block(tmp_path / "block", 7)
+    lifecycle.ingest_block(connection, storage, made.folder)
+    lifecycle.publish_block(connection, "calanques")
+    jobs.create(connection, "register-scene", {})
+    connection.commit()
+    assert client.get("/status", headers=bearer("monitor")).status_code == 403
+    status = client.get("/status", headers=bearer("admin")).json()
+    assert (status["jobs_waiting"], status["jobs_running"], status["workers"]) == (1, 0, 0)
+    assert status["oldest_waiting_s"] > 0
+    assert status["points_served"] == 7
+    assert status["chip_bytes"] == sum(made.chips(row).nbytes for row in range(7))
+    assert status["damaged_files"] == 0
+
+
+def test_chips_that_two_blocks_share_are_stored_once(client, connection, storage, bearer, tmp_path):
+    administrator = bearer("admin")
+    sizes = []
+    for version in ("1", "2"):
+        made = make_block(tmp_path / version, 7, version=version)
+        lifecycle.ingest_block(connection, storage, made.folder)
+        connection.commit()
+        sizes.append(client.get("/status", headers=administrator).json()["chip_bytes"])
+    assert sizes[0] == sizes[1] > 0
+
+
+def test_the_audit_trail_is_filtered_by_who_made_the_changes(client, bearer):
+    administrator = bearer("admin")
+    for name in ("Ada", "Bob"):
+        body = {"name": name, "scopes": ["admin"]}
+        secret = client.post("/tokens", json=body, headers=administrator).json()["secret"]
+        made = {"name": f"of {name}", "scopes": ["read"]}
+        client.post("/tokens", json=made, headers={"Authorization": f"Bearer {secret}"})
+    changes = client.get("/audit?actor=Ada", headers=administrator).json()["changes"]
+    assert [change["after"]["name"] for change in changes] == ["of Ada"]
+    assert client.get("/audit?actor=nobody", headers=administrator).json()["changes"] == []
 
 
 def test_metrics_are_closed_until_a_setting_opens_them(client, settings, bearer):

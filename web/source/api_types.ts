@@ -184,6 +184,19 @@ export interface InputDescription {
   schema: Record<string, unknown>;
 }
 
+export interface InstallationStatus {
+  workers: number;
+  jobs_waiting: number;
+  jobs_running: number;
+  oldest_waiting_s: number;
+  points_served: number;
+  chip_bytes: number;
+  database_bytes: number;
+  disk_free_bytes: number;
+  disk_total_bytes: number;
+  damaged_files: number;
+}
+
 export interface JobError {
   type?: string;
   title: string;

@@ -82,6 +82,24 @@ class References(Reply):
     references: list[Reference]
 
 
+class InstallationStatus(Reply):
+    """The queue and the storage of an installation at this moment.
+
+    `oldest_waiting_s` is 0 when no job waits. The disk is that of the data folder of the API.
+    """
+
+    workers: int
+    jobs_waiting: int
+    jobs_running: int
+    oldest_waiting_s: float
+    points_served: int
+    chip_bytes: int
+    database_bytes: int
+    disk_free_bytes: int
+    disk_total_bytes: int
+    damaged_files: int
+
+
 class ChangeRecord(Reply):
     """A change in the audit trail; `before` or `after` is null where the row did not exist."""
 
