@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
@@ -14,32 +13,25 @@ import pytest
 import rasterio
 import shapely
 from matplotlib.image import imread
-from playwright.sync_api import (
-    Browser,
-    ConsoleMessage,
-    Locator,
-    Page,
-    Request,
-    Route,
-    expect,
-    sync_playwright,
-)
+from playwright.sync_api import Locator, Page, Request, Route, expect
 
 from services.geodesy import metres_per_degree
-from tests.app.flat_world import CENTRE, GROUND_H, GSD_M, FlatWorld, make_flat_world
+from tests.app.flat_world import CENTRE, GROUND_H, GSD_M, FlatWorld
 from tests.factories import make_block
+from tests.journeys.map_page import (
+    ARTEFACTS,
+    AXE,
+    PHONE,
+    WIDE,
+    assert_readable,
+    poll_ms,
+    tab_to,
+    until_drawn,
+)
 from tests.service_process import Service, until
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).parents[2]
-BUILT = ROOT / "app" / "web" / "built" / "index.html"
-AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
-ARTEFACTS = ROOT / "tests" / "artefacts"
-DESKTOP = {"width": 1280, "height": 800}
-WIDE = {"width": 1440, "height": 900}
-PHONE = {"width": 390, "height": 844}
-patience_ms = 90_000
 chip_px = 101
 piece_bytes = 8 * 1024 * 1024
 """Size of a piece of an upload in web/source/upload.ts."""
@@ -56,100 +48,6 @@ a_scene_deg = 0.005
 a_visible_difference = 5.0
 as_good_as_equal = 1.0
 """Mean differences of grey values from 0 to 255."""
-most_stops = 80
-poll_ms = 100
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """Debian's Chromium without a network beyond this machine."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("there is no chromium: the page cannot be looked at (make test installs it)")
-    if not BUILT.is_file():
-        pytest.skip("the page is not built: run `make page`")
-    ARTEFACTS.mkdir(exist_ok=True)
-    expect.set_options(timeout=patience_ms)
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(
-            executable_path=chromium,
-            args=[
-                "--use-angle=swiftshader",
-                "--enable-unsafe-swiftshader",
-                "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-            ],
-        )
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def world(amers, tmp_path_factory: pytest.TempPathFactory) -> FlatWorld:
-    """A scene and a published block to register it on."""
-    world = make_flat_world(tmp_path_factory.mktemp("world"))
-    amers("block", "ingest", world.block, "--publish")
-    return world
-
-
-@pytest.fixture(scope="module")
-def administrator(amers) -> str:
-    return str(amers("token", "create", "Ada", "--scope", "admin")["secret"])
-
-
-Visit = Callable[..., Page]
-
-
-@pytest.fixture
-def visit(browser: Browser, service: Service, world: FlatWorld) -> Iterator[Visit]:
-    """Opens the page; then checks that requests went to the service and no error was logged."""
-    requested_urls: list[str] = []
-    errors: list[str] = []
-    contexts = []
-
-    def open_page(where: str = "", secret: str | None = None, size=DESKTOP, scheme="light") -> Page:
-        context = browser.new_context(viewport=size, color_scheme=scheme, reduced_motion="reduce")
-        context.set_default_timeout(patience_ms)
-        contexts.append(context)
-        context.on("request", lambda request: requested_urls.append(request.url))
-        context.on("weberror", lambda error: errors.append(str(error.error)))
-        context.on("console", lambda message: errors.append(message.text) if is_error(message) else None)
-        if secret is not None:
-            keep = f"sessionStorage.setItem('amers-token', {json.dumps(secret)})"
-            context.add_init_script(f"if (location.protocol === 'http:') {keep}")
-        page = context.new_page()
-        page.goto(f"{service.url}/map{where}")
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    inside = (f"{service.url}/", f"blob:{service.url}/", "data:")
-    assert requested_urls
-    assert [url for url in requested_urls if not url.startswith(inside)] == []
-    assert errors == []
-
-
-def is_error(message: ConsoleMessage) -> bool:
-    """Whether a message is an error, a violation of the policy included; a reply 401 is none."""
-    return message.type == "error" and "status of 401" not in message.text
-
-
-def tab_to(page: Page, name: str) -> None:
-    """Press the Tab key until the control with a name, once it is there, has the focus."""
-    expect(page.get_by_text(name).first).to_be_visible()
-    for _ in range(most_stops):
-        page.keyboard.press("Tab")
-        focused = page.evaluate(
-            "(document.activeElement.labels?.[0] ?? document.activeElement).textContent"
-        )
-        if focused.startswith(name):
-            return
-    raise AssertionError(f"the Tab key does not lead to {name}")
-
-
-def until_drawn(page: Page) -> None:
-    """Wait until the map has drawn all of its data."""
-    expect(page.locator("#map")).to_have_attribute("aria-busy", "false")
 
 
 def pixels_drawn(page: Page, colour: np.ndarray) -> int:
@@ -389,22 +287,6 @@ def test_a_scene_tells_its_state_and_is_registered_again_with_other_options(
         expect(page.get_by_role("button", name="Register", exact=True)).to_be_visible()
         page.goto(f"{service.url}/map#/scene/{inputs['scene']}")
         expect(page.locator(".story li")).to_have_count(2)
-
-
-def assert_readable(page: Page, view: str) -> None:
-    """Check that a view is accessible and fits a phone; pictures of it are for people."""
-    until_drawn(page)
-    for size in (WIDE, PHONE):
-        page.set_viewport_size(size)
-        for scheme in ("light", "dark"):
-            page.emulate_media(color_scheme=scheme)
-            page.wait_for_timeout(poll_ms)
-            until_drawn(page)
-            page.screenshot(path=ARTEFACTS / f"{view}-{size['width']}-{scheme}.png")
-            page.evaluate(AXE.read_text(encoding="utf-8"))
-            findings = page.evaluate("axe.run().then((found) => found.violations)")
-            assert [(found["id"], found["nodes"][0]["html"]) for found in findings] == [], view
-        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"], view
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 // Requests of the page to the service: a bearer token kept for this tab only, errors in the service's own words.
 
-import type { BlockFeature, PointFeature, Problem } from "./api_types";
+import type { BlockFeature, PointFeature, PointHistoryFeature, Problem } from "./api_types";
 
 const TOKEN = "amers-token";
 
@@ -13,6 +13,7 @@ type Complete<Kind extends { properties: object }> = Omit<Kind, "properties"> & 
 /** Its `id` is the number of the version, that of its properties the name of the block. */
 export type Block = Complete<BlockFeature>;
 export type PointOfPage = Complete<PointFeature>;
+export type PointHistory = Complete<PointHistoryFeature>;
 
 export interface FeaturePage<Kind> {
   features: Kind[];
@@ -75,6 +76,11 @@ export async function get<Kind>(path: string, signal?: AbortSignal): Promise<Kin
 export async function post<Kind>(path: string, body?: unknown): Promise<Kind> {
   const content = body === undefined ? {} : { body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
   return (await call(path, { method: "POST", ...content })).json() as Promise<Kind>;
+}
+
+/** Remove what a path names. */
+export async function remove(path: string): Promise<void> {
+  await call(path, { method: "DELETE" });
 }
 
 /** A file of the service at an address for an image or a link, valid until the signal aborts. */

@@ -1,7 +1,8 @@
 // Blocks: the list, the quality of each, and ingestion and publication by administrators.
 
-import { type Block, type FeaturePage, get, post } from "./api";
+import { type Block, type FeaturePage, get, post, remove } from "./api";
 import type { BlockQuality, StatusInfo } from "./api_types";
+import { ask } from "./confirmation";
 import { accuracy, badge, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { announce, go, type Place, type ShowView } from "./place";
 import { send } from "./upload";
@@ -39,13 +40,15 @@ export const showBlock: ShowView = async (place, number) => {
   const { properties } = block;
   const published = properties.state === "published";
   const act = h("button", { type: "button", class: published ? "" : "strong", onclick: () => void change() }, published ? "Withdraw" : "Publish");
+  const name = `${properties.id}@${properties.version}`;
+  const erase = h("button", { type: "button", onclick: () => void removeForGood() }, "Delete");
   const message = h("div");
   fill(
     panel,
     h("p", {}, h("a", { href: "#/blocks" }, "← Blocks")),
     h("h1", { tabindex: -1 }, properties.title || properties.id),
     h("p", {}, badge(properties.state), " ", h("span", { class: "quiet" }, `since ${when(properties.state_changed_at)}`)),
-    scopes.includes("admin") ? h("p", {}, act) : null,
+    scopes.includes("admin") ? h("p", { class: "state" }, act, published ? null : erase) : null,
     scopes.includes("admin") ? assessmentForm(number) : null,
     message,
     accuracy(quality),
@@ -76,6 +79,21 @@ export const showBlock: ShowView = async (place, number) => {
       panel.querySelector("button")?.focus();
     } catch (error) {
       act.disabled = false;
+      if (!signal.aborted) message.replaceChildren(problem(error));
+    }
+  }
+
+  async function removeForGood(): Promise<void> {
+    const text = `Its ${plural(properties.n_points, "point")} and their histories are deleted, its chips go into the trash. This cannot be undone.`;
+    const field = { label: `To confirm, type ${name}`, mustBe: name };
+    if ((await ask({ title: `Delete ${name}?`, text, act: "Delete", field })) === null) return;
+    erase.disabled = act.disabled = true;
+    try {
+      await remove(`blocks/${encodeURIComponent(name)}`);
+      announce(`${name} is deleted.`);
+      go("#/blocks");
+    } catch (error) {
+      erase.disabled = act.disabled = false;
       if (!signal.aborted) message.replaceChildren(problem(error));
     }
   }

@@ -1,6 +1,7 @@
 // The start of the page: the caller, the map, and the view that the address names.
 
 import { type Caller, showAccess, whoCalls } from "./access";
+import { showAdministration } from "./administration";
 import { Refused } from "./api";
 import { Atlas } from "./atlas";
 import { blocks, showBlock, showBlocks } from "./blocks";
@@ -20,6 +21,7 @@ const VIEWS: Record<string, { show: ShowView; section: string }> = {
   job: { show: showJob, section: "scenes" },
   blocks: { show: showBlocks, section: "blocks" },
   block: { show: showBlock, section: "blocks" },
+  admin: { show: showAdministration, section: "admin" },
   access: { show: showAccess, section: "access" },
 };
 
@@ -31,6 +33,7 @@ async function start(): Promise<void> {
   const atlas = new Atlas(document.getElementById("map")!, (id) => go(`#/point/${id}`));
   const caller = await whoCalls().catch(() => null);
   if (caller) access.textContent = caller.name;
+  document.getElementById("admin")!.hidden = !caller?.scopes.includes("admin");
   addEventListener("hashchange", () => void route(atlas, caller, true));
   await Promise.all([route(atlas, caller, false), opening(atlas)]);
 }

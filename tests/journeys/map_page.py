@@ -1,0 +1,55 @@
+"""The map page in tests: sizes of windows, waiting, the keyboard, and what every view has to be."""
+
+from pathlib import Path
+
+from playwright.sync_api import ConsoleMessage, Page, ViewportSize, expect
+
+ROOT = Path(__file__).parents[2]
+BUILT = ROOT / "app" / "web" / "built" / "index.html"
+AXE = ROOT / "web" / "node_modules" / "axe-core" / "axe.min.js"
+ARTEFACTS = ROOT / "tests" / "artefacts"
+DESKTOP: ViewportSize = {"width": 1280, "height": 800}
+WIDE: ViewportSize = {"width": 1440, "height": 900}
+PHONE: ViewportSize = {"width": 390, "height": 844}
+patience_ms = 90_000
+most_stops = 80
+poll_ms = 100
+
+
+def is_error(message: ConsoleMessage, refused: int) -> bool:
+    """Whether a message is an error, violations of the policy included, but no reply of one status."""
+    return message.type == "error" and f"status of {refused}" not in message.text
+
+
+def tab_to(page: Page, name: str) -> None:
+    """Press the Tab key until the control with a name, once it is there, has the focus."""
+    expect(page.get_by_text(name).first).to_be_visible()
+    for _ in range(most_stops):
+        page.keyboard.press("Tab")
+        focused = page.evaluate(
+            "(document.activeElement.labels?.[0] ?? document.activeElement).textContent"
+        )
+        if focused.startswith(name):
+            return
+    raise AssertionError(f"the Tab key does not lead to {name}")
+
+
+def until_drawn(page: Page) -> None:
+    """Wait until the map has drawn all of its data."""
+    expect(page.locator("#map")).to_have_attribute("aria-busy", "false")
+
+
+def assert_readable(page: Page, view: str) -> None:
+    """Check that a view is accessible and fits a phone; pictures of it are for people."""
+    until_drawn(page)
+    for size in (WIDE, PHONE):
+        page.set_viewport_size(size)
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            page.wait_for_timeout(poll_ms)
+            until_drawn(page)
+            page.screenshot(path=ARTEFACTS / f"{view}-{size['width']}-{scheme}.png")
+            page.evaluate(AXE.read_text(encoding="utf-8"))
+            findings = page.evaluate("axe.run().then((found) => found.violations)")
+            assert [(found["id"], found["nodes"][0]["html"]) for found in findings] == [], view
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"], view
