@@ -26,7 +26,9 @@ def _sentence(error: Exception) -> str:
         return f"{error}: this process got no more memory; use smaller inputs or fewer --jobs"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; expected a place that this user can use"
-    if isinstance(error, ConnectionError | TimeoutError) or _is_of_database(error):
+    if _comes_from(error, "app.client.errors"):
+        return f"{error}; see that the service answers at this address, then run the command again"
+    if isinstance(error, ConnectionError | TimeoutError) or _comes_from(error, "psycopg"):
         return f"the database gave up: {error}; see its log and try the command again"
     return (
         f"an error that should not happen: {type(error).__name__}: {error}; set AMERS_LOG_LEVEL=debug "
@@ -39,9 +41,9 @@ def print_traceback(error: Exception) -> None:
     traceback.print_exception(error)
 
 
-def _is_of_database(error: Exception) -> bool:
-    """Whether the driver raised an error; its module is not imported for commands without database."""
-    return any(kind.__module__ == "psycopg" for kind in type(error).__mro__)
+def _comes_from(error: Exception, module: str) -> bool:
+    """Whether a module defines a kind of error; it is not imported for commands that do without it."""
+    return any(kind.__module__ == module for kind in type(error).__mro__)
 
 
 def _usage(error: typer.TyperException) -> str:

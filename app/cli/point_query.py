@@ -1,9 +1,12 @@
-"""`amers points query`: the served points of a box."""
+"""`amers points query`: the served points of a box, of the store or of a service."""
 
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, BinaryIO
 
@@ -12,6 +15,9 @@ import typer
 from app.cli.box_option import BoxText, box_of
 from app.cli.output import AsJson, print_json
 from app.cli.transaction import transaction
+from app.client import Client, Feature
+from app.db.features.bbox import Box
+from app.db.features.counts import Count
 from app.errors import InputError
 from app.usecases.features import points
 
@@ -32,24 +38,65 @@ def query(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="File to write; by default standard output.")
     ] = None,
+    server: Annotated[
+        str | None, typer.Option(help="Address of an Amers service whose points are asked for.")
+    ] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="AMERS_TOKEN", help="Token for the service; prefer the variable."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write all points of a box; --json without --output prints only their number."""
-    box_of(bbox)
-    with transaction() as connection:
+    box = box_of(bbox)
+    source = _of_store(bbox) if server is None else _of_service(server, token or "", box)
+    with source as answer:
         if as_json and output is None:
-            count = points.count_points(connection, bbox)
+            count = answer.count()
             print_json({"points": count.number, "exact": count.exact, "file": None})
             return
         with _output_file(output) as file:
-            pieces = (
-                points.geojson(connection, bbox)
-                if form is PointFormat.GEOJSON
-                else points.csv(connection, bbox)
-            )
-            size = sum(file.write(piece) for piece in pieces)
+            size = sum(file.write(piece) for piece in answer.pieces[form]())
     if as_json:
         print_json({"file": output, "size_bytes": size})
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """The points of a box; each function asks for them."""
+
+    count: Callable[[], Count]
+    pieces: Mapping[PointFormat, Callable[[], Iterator[bytes]]]
+
+
+@contextmanager
+def _of_store(bbox: str) -> Iterator[_Answer]:
+    with transaction() as connection:
+        geojson, csv = (partial(form, connection, bbox) for form in (points.geojson, points.csv))
+        pieces = {PointFormat.GEOJSON: geojson, PointFormat.CSV: csv}
+        yield _Answer(partial(points.count_points, connection, bbox), pieces)
+
+
+@contextmanager
+def _of_service(server: str, token: str, box: Box) -> Iterator[_Answer]:
+    if box.bounds_height:
+        raise InputError("--bbox: heights found, which no service is asked for: give W,S,E,N")
+    corners = (box.west, box.south, box.east, box.north)
+    with Client(server, token) as client:
+        pieces: dict[PointFormat, Callable[[], Iterator[bytes]]] = {
+            PointFormat.GEOJSON: lambda: _collection(client.points(corners)),
+            PointFormat.CSV: partial(client.csv, "points", corners),
+        }
+        yield _Answer(lambda: Count(*client.count("points", corners)), pieces)
+
+
+def _collection(features: Iterator[Feature]) -> Iterator[bytes]:
+    """A FeatureCollection in pieces, one line for each feature."""
+    yield b'{"type":"FeatureCollection","features":[\n'
+    for number, feature in enumerate(features):
+        line = json.dumps(feature, ensure_ascii=False, separators=(",", ":"))
+        yield (",\n" if number else "").encode() + line.encode()
+    yield b"\n]}\n"
 
 
 @contextmanager

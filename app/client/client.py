@@ -7,6 +7,8 @@ from types import TracebackType
 from typing import Any, Self
 from urllib.parse import quote
 
+import httpx
+
 from app.client.connection import Connection
 from app.client.errors import JobFailed, ServiceFailure
 from app.client.job import Job, Progress, no_progress
@@ -16,6 +18,8 @@ POLL_S = 0.5
 TIMEOUT_S = 60.0
 PAGE = 1000
 """Number of features on a page."""
+NEXT_TOKEN = "Amers-Next-Token"
+"""Header of a page that others follow."""
 
 Box = tuple[float, float, float, float]
 """West, south, east, north in degrees; a west greater than the east crosses the antimeridian."""
@@ -91,6 +95,29 @@ class Client:
             ).json()
             yield from page["features"]
             query = next((link["body"] for link in page["links"] if link["rel"] == "next"), None)
+
+    def count(self, collection: str, bbox: Box | None = None) -> tuple[int, bool]:
+        """The number of features of a collection, and whether it is exact: large ones are estimates."""
+        page = self._page(collection, "json", bbox, 1).json()
+        return page["numberMatched"], page["amers:numberMatchedIsExact"]
+
+    def csv(self, collection: str, bbox: Box | None = None) -> Iterator[bytes]:
+        """The features of a collection as one CSV with a header, in pieces."""
+        token, is_first = None, True
+        while is_first or token is not None:
+            page = self._page(collection, "csv", bbox, PAGE, token)
+            header, _, rows = page.content.partition(b"\r\n")
+            yield header + b"\r\n" + rows if is_first else rows
+            token, is_first = page.headers.get(NEXT_TOKEN), False
+
+    def _page(
+        self, collection: str, form: str, bbox: Box | None, limit: int, token: str | None = None
+    ) -> httpx.Response:
+        """A page of a collection, the first one without a token."""
+        corners = None if bbox is None else ",".join(map(str, bbox))
+        query = {"f": form, "limit": limit, "bbox": corners, "token": token}
+        present = {name: value for name, value in query.items() if value is not None}
+        return self._connection.request("GET", f"collections/{collection}/items", params=present)
 
     def upload_scene(
         self, image: Path, *, sigma_m: float | None = None, progress: Progress = no_progress
