@@ -16,7 +16,7 @@ from app import request_context
 from app.api.access import needs
 from app.api.body import body_of
 from app.api.credentials import BASIC, credentials_of, refuse_other_sites, session_of
-from app.api.session_cookie import parse_session
+from app.api.session_cookie import ENDED_SESSION, parse_session
 from app.api.turns import Turns
 from app.auth import (
     Scope,
@@ -29,6 +29,7 @@ from app.auth import (
 from app.config import Settings
 from app.db.engine import Database
 from app.db.tokens import Token
+from app.errors import NotAllowed
 from app.oidc import Issuer, looks_like_jwt
 from app.storage import Storage, StoredChips
 from app.usecases.features.items import page_secret
@@ -98,6 +99,8 @@ InstallationDep = Annotated[Installation, Depends(_installation)]
 async def identify(request: Request) -> Token | None:
     """The caller's token, None if the request has none; later dependencies get it from `caller_of`.
 
+    A session that has ended counts as none, so that a browser sees what is public; the reply removes it.
+
     Raises:
         NotAllowed: the token is invalid.
         HTTPException: a page of another site uses a password or a session that the browser has kept.
@@ -111,9 +114,7 @@ async def identify(request: Request) -> Token | None:
     if credentials is not None:
         caller = await run_in_threadpool(_token, state.issuer, state.database, credentials.secret)
     elif session is not None:
-        secret = await installation_secret(request, state.database)
-        token_id = parse_session(session, time.time(), secret)
-        caller = await run_in_threadpool(_session_token, state.database, token_id)
+        caller = await _session_caller(request, session)
     if caller is not None:
         here = request_context.current()
         here.actor, here.actor_name = caller.id, caller.name
@@ -126,6 +127,18 @@ def _token(issuer: Issuer | None, database: Database, secret: str) -> Token:
         return authenticate_identity(database, issuer.identify(secret))
     with database.reading() as connection:
         return authenticate(connection, secret)
+
+
+async def _session_caller(request: Request, session: str) -> Token | None:
+    """The token of a session; None for one that has ended or is not of this service."""
+    database: Database = request.app.state.database
+    secret = await installation_secret(request, database)
+    try:
+        token_id = parse_session(session, time.time(), secret)
+        return await run_in_threadpool(_session_token, database, token_id)
+    except NotAllowed:
+        request.scope[ENDED_SESSION] = True
+        return None
 
 
 def _session_token(database: Database, token_id: UUID) -> Token:

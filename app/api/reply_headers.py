@@ -1,9 +1,11 @@
 """Headers of all replies: whether they may be stored, and that browsers must not guess their type."""
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.credentials import browser_may_have_added
+from app.api.session_cookie import ENDED_SESSION, removal
 
 NO_STORE = "no-store"
 FIRST_ERROR = 400
@@ -14,7 +16,7 @@ class ReplyHeaders:
 
     A successful reply that states its own `Cache-Control` keeps it: tiles, chips and the map page. What
     is sent to a password or a session is not embedded by other sites:
-    `Cross-Origin-Resource-Policy: same-origin`.
+    `Cross-Origin-Resource-Policy: same-origin`. The cookie of a session that has ended is removed.
 
     Attributes:
         app: the application that gets the requests.
@@ -38,6 +40,8 @@ class ReplyHeaders:
                 if by_browser:
                     # A browser sends it with images that other sites embed, too.
                     headers["Cross-Origin-Resource-Policy"] = "same-origin"
+                if ENDED_SESSION in scope:
+                    headers.append("Set-Cookie", removal(Request(scope).base_url.path))
                 if message["status"] >= FIRST_ERROR or "Cache-Control" not in headers:
                     headers["Cache-Control"] = NO_STORE
             await send(message)

@@ -14,6 +14,8 @@ from app.errors import NotAllowed
 
 COOKIE = "amers_session"
 LIFETIME_S = 3600
+ENDED_SESSION = "amers.ended_session"
+"""In the scope of a request whose session serves no longer: the reply removes its cookie."""
 
 
 def format_session(token_id: UUID, now_s: float, secret: bytes) -> str:
@@ -40,6 +42,11 @@ def parse_session(value: str, now_s: float, secret: bytes) -> UUID:
     if now_s >= int(end_s):
         raise _ended("the session has ended")
     return UUID(token_id)
+
+
+def removal(path: str) -> str:
+    """The value of `Set-Cookie` that removes the cookie below a path."""
+    return f'{COOKIE}=""; HttpOnly; Max-Age=0; Path={path}; SameSite=lax'
 
 
 def _seal(content: str, secret: bytes) -> str:

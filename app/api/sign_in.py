@@ -11,7 +11,7 @@ from app.api.credentials import refuse_other_sites
 from app.api.deps import DatabaseDep, SecretDep
 from app.api.negotiation import refuse_unknown
 from app.api.pages import Page, document_page
-from app.api.session_cookie import COOKIE, LIFETIME_S, format_session
+from app.api.session_cookie import COOKIE, LIFETIME_S, format_session, removal
 from app.auth import authenticate
 from app.db.engine import Database
 from app.db.tokens import Token
@@ -61,7 +61,7 @@ async def sign_out(request: Request) -> Response:
     """End the session in this browser."""
     refuse_other_sites(request)
     reply = RedirectResponse(request.base_url, 303)
-    reply.delete_cookie(COOKIE, path=request.base_url.path, httponly=True, samesite="lax")
+    reply.headers["Set-Cookie"] = removal(request.base_url.path)
     return reply
 
 

@@ -128,6 +128,32 @@ def test_a_forged_session_is_refused(client, token, connection):
     assert client.get(MINE, headers={"Cookie": f"{COOKIE}={value}"}).status_code == 200
 
 
+def test_with_a_session_that_has_ended_a_browser_sees_what_is_public(
+    client, settings, token, connection
+):
+    """The reply removes the cookie, so that the next request comes without it."""
+    client.app.state.settings = settings.model_copy(update={"public_points": True})
+    assert client.post("/sign-in", data={"token": token("read")}).status_code == 200
+    value = client.cookies[COOKIE]
+    run_sql(connection, "update token set revoked_at = now()")
+    connection.commit()
+    ended = (value, format_session(uuid4(), time.time(), b"another installation"), "x")
+    for cookie in ended:
+        client.cookies.clear()
+        client.cookies.set(COOKIE, cookie, domain="testserver.local", path="/")
+        reply = client.get(PAGE)
+        assert reply.status_code == 200, cookie
+        assert COOKIE not in client.cookies
+        client.cookies.set(COOKIE, cookie, domain="testserver.local", path="/")
+        assert client.get("/tokens").status_code == 401
+        assert COOKIE not in client.cookies
+
+
+def test_a_session_that_lasts_keeps_its_cookie(signed_in):
+    assert "set-cookie" not in signed_in.get(PAGE).headers
+    assert COOKIE in signed_in.cookies
+
+
 def test_a_token_in_the_header_comes_before_the_session(signed_in, bearer):
     assert signed_in.get(MINE, headers=bearer("read")).json()["name"] == "a token to read"
     assert session_cookie.COOKIE in signed_in.cookies
