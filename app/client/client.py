@@ -10,12 +10,14 @@ from urllib.parse import quote
 import httpx
 
 from app.client.connection import Connection
-from app.client.errors import JobFailed, ServiceFailure
+from app.client.errors import JobFailed, RequestRefused, ServiceFailure, is_transient
 from app.client.job import Job, Progress, no_progress
 from app.client.upload import upload_image
 
 POLL_S = 0.5
 TIMEOUT_S = 60.0
+OUTAGE_S = 60.0
+"""Longest time without an answer about a job; a service starts again within seconds."""
 PAGE = 1000
 """Number of features on a page."""
 NEXT_TOKEN = "Amers-Next-Token"
@@ -159,6 +161,9 @@ class Client:
     def wait(self, job: Job, progress: Progress = no_progress, *, timeout_s: float | None = None) -> Job:
         """Wait until a job has ended; returns its last state.
 
+        A service that does not answer, because it starts again or has too much to do, is asked again for
+        as long as `OUTAGE_S`.
+
         Args:
             progress: receives the fraction done and the current step.
             timeout_s: longest time to wait; None for no limit.
@@ -168,11 +173,18 @@ class Client:
             TimeoutError: the job has not ended in this time; it goes on.
         """
         end = None if timeout_s is None else time.monotonic() + timeout_s
+        answered_at = time.monotonic()
         while not job.has_ended:
             if end is not None and time.monotonic() > end:
                 raise TimeoutError(f"job {job.id}: {job.status} after {timeout_s:g} s: {job.message}")
             time.sleep(POLL_S)
-            job = self.job(job.id)
+            try:
+                job = self.job(job.id)
+            except (ServiceFailure, RequestRefused) as error:
+                if not is_transient(error) or time.monotonic() - answered_at > OUTAGE_S:
+                    raise
+                continue
+            answered_at = time.monotonic()
             progress(job.progress / 100.0, job.message)
         if job.status != "successful":
             raise JobFailed(job)

@@ -3,6 +3,9 @@
 from app.client.job import Job
 from app.errors import InputError
 
+BUSY = (408, 429)
+"""Statuses of refusals that are about the moment: too slow, too many."""
+
 
 class ServiceError(Exception):
     """Every error of the client: what the service did with which request."""
@@ -36,3 +39,8 @@ class JobFailed(ServiceError):
     def __init__(self, job: Job) -> None:
         super().__init__(f"job {job.id}: {job.status}: {job.message}")
         self.job = job
+
+
+def is_transient(error: ServiceError) -> bool:
+    """Whether the same request may succeed later: no answer, an outage, or too many requests."""
+    return isinstance(error, ServiceFailure) or getattr(error, "status", None) in BUSY

@@ -1,0 +1,75 @@
+"""The Python client while a service does not answer, as when it starts again."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+import pytest
+
+from app.client import Client, Job, RequestRefused, ServiceFailure
+from app.client import client as client_module
+
+JOB = {"jobID": "7", "processID": "register-scene", "status": "running", "progress": 50, "message": ""}
+RUNNING = Job.of(JOB)
+ENDED = {**JOB, "status": "successful", "progress": 100}
+long_enough_s = 60.0
+
+
+@pytest.fixture(autouse=True)
+def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Polls follow each other at once."""
+    monkeypatch.setattr(client_module, "POLL_S", 0.0)
+
+
+@contextmanager
+def service(*statuses: int) -> Iterator[Client]:
+    """A client of a service that replies to each request with the next status, then that the job ended.
+
+    A status of 0 closes the connection without a reply.
+    """
+    left = list(statuses)
+
+    class Replies(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            status = left.pop(0) if left else 200
+            if status == 0:
+                self.close_connection = True
+                return
+            body = json.dumps(ENDED if status == 200 else {"detail": "not now"}).encode()
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        log_message: Callable[..., None] = lambda *_: None
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Replies)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        with Client(f"http://127.0.0.1:{server.server_port}") as client:
+            yield client
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+    assert left == []
+
+
+def test_a_job_is_waited_for_through_an_outage():
+    with service(0, 503, 500, 429, 408) as client:
+        assert client.wait(RUNNING, timeout_s=long_enough_s).status == "successful"
+
+
+@pytest.mark.parametrize("status", [401, 404])
+def test_a_refusal_that_will_stay_ends_the_waiting_at_once(status):
+    with service(status) as client, pytest.raises(RequestRefused):
+        client.wait(RUNNING, timeout_s=long_enough_s)
+
+
+def test_an_outage_that_lasts_ends_the_waiting(monkeypatch):
+    monkeypatch.setattr(client_module, "OUTAGE_S", 0.0)
+    with service(503) as client, pytest.raises(ServiceFailure, match="not now"):
+        client.wait(RUNNING, timeout_s=long_enough_s)
