@@ -15,7 +15,7 @@ from app.usecases.features.items import FeaturePage
 
 TEMPLATES = Environment(loader=PackageLoader("app.api", "templates"), autoescape=True)
 POLICY = (
-    "default-src 'none'; style-src 'unsafe-inline'; img-src 'self'; form-action 'self'; "
+    "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; form-action 'self'; "
     "frame-ancestors 'none'"
 )
 MARGIN = 0.05

@@ -262,3 +262,23 @@ def test_every_part_fits_a_phone_and_is_accessible(visit, administrator, doubtfu
         for closed in page.locator("details > summary").all():
             closed.click()
         assert_readable(page, f"admin-{part}")
+
+
+def test_the_pages_of_the_api_have_an_icon_and_ask_for_nothing_that_is_missing(browser, service, world):
+    """A browser asks for `/favicon.ico` where a page names no icon."""
+    with browser.new_context() as context:
+        page = context.new_page()
+        statuses: dict[str, int] = {}
+        page.on("response", lambda reply: statuses.update({reply.url: reply.status}))
+        for path in ("/", "/sign-in", "/connect"):
+            page.goto(f"{service.url}{path}")
+            icon = page.locator("link[rel=icon]").get_attribute("href")
+            assert icon is not None
+            loaded = """address => new Promise(resolve => {
+                const image = new Image();
+                image.onload = () => resolve(true);
+                image.onerror = () => resolve(false);
+                image.src = address;
+            })"""
+            assert page.evaluate(loaded, icon), path
+        assert set(statuses.values()) == {200}, statuses
