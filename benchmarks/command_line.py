@@ -31,6 +31,7 @@ COMMANDS = (
     "block --help",
     "serve --help",
     "block list",
+    "block publish --help",
     "token list",
     "audit",
     "db status",

@@ -7,21 +7,21 @@ import typer
 from app.cli.block_listing import Reference, block_row
 from app.cli.output import AsJson, Row, show_one
 from app.cli.transaction import transaction
-from app.usecases.blocks import lifecycle
-from app.usecases.blocks.lifecycle import Published
+from app.usecases.blocks import publication
+from app.usecases.blocks.publication import Published
 
 
 def publish(reference: Reference, as_json: AsJson = False) -> None:
     """Publish a block, and withdraw the version of it that was published before."""
     with transaction() as connection:
-        published = lifecycle.publish_block(connection, reference)
+        published = publication.publish_block(connection, reference)
     show_one(_published(published), as_json=as_json)
 
 
 def restore(reference: Reference, as_json: AsJson = False) -> None:
     """Publish a withdrawn or superseded block again, in place of its published version."""
     with transaction() as connection:
-        published = lifecycle.restore_block(connection, reference)
+        published = publication.restore_block(connection, reference)
     show_one(_published(published), as_json=as_json)
 
 
@@ -32,14 +32,14 @@ def prioritise(
 ) -> None:
     """Set which of overlapping blocks is served: points of the block with the greater priority."""
     with transaction() as connection:
-        block = lifecycle.prioritise_block(connection, reference, priority)
+        block = publication.prioritise_block(connection, reference, priority)
     show_one(block_row(block), as_json=as_json)
 
 
 def withdraw(reference: Reference, as_json: AsJson = False) -> None:
     """Withdraw a published block; it can be restored."""
     with transaction() as connection:
-        block = lifecycle.withdraw_block(connection, reference)
+        block = publication.withdraw_block(connection, reference)
     show_one(block_row(block), as_json=as_json)
 
 

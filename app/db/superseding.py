@@ -20,10 +20,11 @@ from app.db.features.antimeridian import on_the_map
 from app.db.schema import block
 from app.db.schema.base import Double
 from app.db.statements import HotStatement, hot, named
-from services.geodesy import metres_per_degree
 
 SAME_PLACE_M = 10.0
 """Horizontally: two fifths of what a chip of half a metre shows to either side of its centre."""
+SHORTEST_DEGREE_M = 110_574.0
+"""A degree of latitude at the equator, the shortest one, rounded down."""
 PUBLICATION_LOCK = 0x504F494E54
 MARGIN_DEG = 0.01
 """Around outlines: points of two blocks whose outlines do not quite touch may still be one place."""
@@ -122,13 +123,12 @@ def _release(connection: Connection, ranked: list[Ranked], number: int) -> None:
 
 
 def _supersede(connection: Connection, number: int, winners: list[int], **restrictions: Any) -> None:
-    _, metres_per_degree_lat = metres_per_degree(0.0, 0.0)  # the shortest degree of latitude
     parameters = {
         **_range(number),
         **restrictions,
         "winners": winners,
         "metres": SAME_PLACE_M,
-        "degrees": SAME_PLACE_M / metres_per_degree_lat,
+        "degrees": SAME_PLACE_M / SHORTEST_DEGREE_M,
     }
     statement = _supersede_statement()
     with driver(connection).cursor() as cursor:

@@ -13,7 +13,7 @@ from app.db.density import DENSITY, points_in_box
 from app.db.features import pages
 from app.db.features.bbox import Box
 from app.db.points import POINTS
-from app.db.superseding import SAME_PLACE_M
+from app.db.superseding import SAME_PLACE_M, SHORTEST_DEGREE_M
 from app.errors import Conflict, InputError
 from app.usecases import history
 from app.usecases.blocks import lifecycle
@@ -22,6 +22,7 @@ from app.usecases.features.points import points_of_filter
 from app.usecases.features.query import FeatureQuery
 from services.formats.block.document import AccuracyFigure
 from services.formats.block.writer import write_block
+from services.geodesy import metres_per_degree
 from services.types import Array
 from tests.factories import BOX, control_points, metadata, noise_chips
 from tests.statements import run_sql
@@ -318,3 +319,9 @@ def test_publications_wait_for_each_other(dsn):
         with pytest.raises(Exception, match="lock timeout"):
             superseding.lock_publications(other)
         other.rollback()
+
+
+def test_no_degree_of_latitude_is_shorter_than_the_one_of_the_search():
+    """So the box around a point has all places that are within the distance."""
+    lengths_m = [metres_per_degree(lat_deg, 0.0)[1] for lat_deg in range(-90, 91)]
+    assert SHORTEST_DEGREE_M <= min(lengths_m) < SHORTEST_DEGREE_M + 1.0

@@ -9,7 +9,7 @@ from app.db.blocks import Block
 from app.db.engine import Connection, limit_lock_wait
 from app.errors import Conflict
 from app.usecases import storage_identity
-from app.usecases.blocks.lifecycle import lock_block
+from app.usecases.blocks.publication import lock_block
 from app.usecases.garbage_collection import Bin, moment
 from app.usecases.installation import Installation
 

@@ -1,4 +1,4 @@
-"""The life of a block: check and ingest it (staged), publish, withdraw, restore and prioritise it."""
+"""The life of a block: check and ingest it, report its quality; its publication is in `publication`."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -7,15 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from app.db import block_documents, blocks, superseding
+from app.db import block_documents, blocks
 from app.db.blocks import Block
 from app.db.engine import Connection
 from app.db.ingestion import StoredChipFile, load_contents
-from app.db.schema import BlockState
-from app.errors import Conflict, InputError, NotFound
+from app.errors import Conflict, InputError
 from app.storage import Storage, StoredFile
 from app.usecases.blocks.listing import find_block as find_block
 from app.usecases.blocks.listing import list_blocks as list_blocks
+from app.usecases.blocks.publication import Published as Published
+from app.usecases.blocks.publication import check_priority
+from app.usecases.blocks.publication import find_published as find_published
+from app.usecases.blocks.publication import prioritise_block as prioritise_block
+from app.usecases.blocks.publication import publish_block as publish_block
+from app.usecases.blocks.publication import restore_block as restore_block
+from app.usecases.blocks.publication import withdraw_block as withdraw_block
 from services.errors import FormatError
 from services.formats.block.check import check_block, check_checksums
 from services.formats.block.document import AccuracyFigure
@@ -27,12 +33,6 @@ from services.quality.accuracy_statement import AccuracyStatement
 from services.quality.block import BlockQuality, block_accuracy, block_quality
 from services.types import Progress, no_progress, part_of
 
-MAY_BECOME: dict[BlockState, tuple[BlockState, ...]] = {
-    "staged": ("published",),
-    "published": ("withdrawn",),
-    "withdrawn": ("published",),
-}
-LARGEST_PRIORITY = 1000
 PARALLEL_COPIES = 4
 
 
@@ -58,19 +58,6 @@ class BlockReport:
     quality: BlockQuality
     stated: AccuracyStatement
     accuracy: tuple[AccuracyFigure, ...]
-
-
-@dataclass(frozen=True)
-class Published:
-    """A block that was published.
-
-    Attributes:
-        block: the published version.
-        superseded: the version of the same block that was published before; None when there was none.
-    """
-
-    block: Block
-    superseded: Block | None
 
 
 def ingest_block(
@@ -99,7 +86,7 @@ def ingest_block(
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected the folder of a block with {BLOCK_JSON}")
-    _check_priority(priority)
+    check_priority(priority)
     contents = check_block(folder, part_of(progress, 0.0, 0.1), chip_checksums=False)
     document = (folder / BLOCK_JSON).read_bytes()
     metadata = contents.document.metadata
@@ -122,87 +109,6 @@ def ingest_block(
         files = _store_chips(storage, folder, contents, part_of(progress, 0.1, 0.5))
         load_contents(connection, block.number, contents, files, part_of(progress, 0.6, 0.4))
     return Ingested(block, quality, block_accuracy(quality, metadata.frame))
-
-
-def publish_block(connection: Connection, reference: str) -> Published:
-    """Publish a block and, in the same step, withdraw the version of it that was published before.
-
-    Where several blocks have a point at one place, the point of the better block is served: see
-    `app.db.superseding`.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: it is already published, or the reference fits several versions.
-    """
-    block, versions = lock_block(connection, reference)
-    before = next((v for v in versions if v.state == "published" and v.number != block.number), None)
-    _set_state(connection, block, "published")
-    if before is not None:
-        _set_state(connection, before, "withdrawn")
-        superseding.recompute(connection, before.number)
-    superseding.recompute(connection, block.number)
-    return Published(
-        blocks.read_block_row(connection, block.number),
-        None if before is None else blocks.read_block_row(connection, before.number),
-    )
-
-
-def withdraw_block(connection: Connection, reference: str) -> Block:
-    """Withdraw a published block; it can be restored.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: it is not published, or the reference fits several versions.
-    """
-    block, _ = lock_block(connection, reference)
-    _set_state(connection, block, "withdrawn")
-    superseding.recompute(connection, block.number)
-    return blocks.read_block_row(connection, block.number)
-
-
-def restore_block(connection: Connection, reference: str) -> Published:
-    """Publish a withdrawn or superseded block again, in place of its published version.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: it was never published or is published, or the reference fits several versions.
-    """
-    block = find_block(connection, reference)
-    if block.state == "staged":
-        raise Conflict(
-            f"block {block.id}@{block.version} was never published: publish it instead of restoring it"
-        )
-    return publish_block(connection, str(block.number))
-
-
-def prioritise_block(connection: Connection, reference: str, priority: int) -> Block:
-    """Set the priority of a block among overlapping blocks; it takes effect at once if it is published.
-
-    Raises:
-        NotFound: there is no such block.
-        Conflict: the reference fits several versions.
-        InputError: the priority is out of range.
-    """
-    _check_priority(priority)
-    block, _ = lock_block(connection, reference)
-    blocks.set_priority(connection, block.number, priority)
-    if block.state == "published":
-        superseding.recompute(connection, block.number)
-    return blocks.read_block_row(connection, block.number)
-
-
-def find_published(connection: Connection, reference: str) -> Block:
-    """The published block with this number, ID or ID@VERSION; an ID has at most one published version.
-
-    Raises:
-        NotFound: there is no such block, or it is not published.
-    """
-    for block in blocks.find_blocks(connection, reference):
-        if block.state == "published":
-            return block
-    raise NotFound(
-        f"no published block {reference:.100}: expected the number, ID or ID@VERSION of one of the store"
-    )
 
 
 def block_report(connection: Connection, block: Block) -> BlockReport:
@@ -234,27 +140,6 @@ def folder_to_ingest(allowed: Path | None, name: str) -> Path:
     if not folder.is_dir():
         raise InputError(f"path: {name!r:.200}: no such folder below AMERS_INGEST_FOLDER")
     return folder
-
-
-def lock_block(connection: Connection, reference: str) -> tuple[Block, list[Block]]:
-    """Lock a block against changes by others; returns its present state, and all its versions."""
-    superseding.lock_publications(connection)
-    number = find_block(connection, reference).number
-    versions = blocks.lock_versions(connection, blocks.read_block_row(connection, number).id)
-    return next(version for version in versions if version.number == number), versions
-
-
-def _check_priority(priority: int) -> None:
-    if not -LARGEST_PRIORITY <= priority <= LARGEST_PRIORITY:
-        raise InputError(
-            f"priority: {priority} found, {-LARGEST_PRIORITY} to {LARGEST_PRIORITY} expected"
-        )
-
-
-def _set_state(connection: Connection, block: Block, state: BlockState) -> Block:
-    if state not in MAY_BECOME[block.state]:
-        raise Conflict(f"block {block.id}@{block.version} is {block.state}: it cannot become {state}")
-    return blocks.set_state(connection, block.number, state)
 
 
 def _store_chips(
