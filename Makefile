@@ -13,7 +13,7 @@ PAGE := app/web/built/index.html
 WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures
+.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
 
 demo: postgis
 	$(BIN)/amers demo
@@ -48,6 +48,10 @@ test-security: postgis
 # Repeated kills, cuts and floods, bombs, further cases and real views.
 test-endurance: postgis
 	$(BIN)/python -m pytest -m endurance -n auto --dist load
+
+# The QGIS plugin, as QGIS installs it.
+plugin: $(READY)
+	$(BIN)/python -m scripts.make_plugin build/amers-qgis.zip
 
 # Small faults, one at a time: MODULE=services/quality takes minutes, without a module all take hours.
 # What was broken off goes on; SAMPLE=200 tries more of each module.

@@ -32,7 +32,7 @@ TOUR = (
     "services/sensors/rpc.py",
 )
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("*/README.md")])
-FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web"
+FOLDERS = "app|services|migrations|tests|docs|examples|benchmarks|scripts|web|qgis_plugin"
 OLD_WORDS = (
     r"\bdoors?\b",
     r"homologous",

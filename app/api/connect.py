@@ -16,8 +16,8 @@ router = APIRouter(include_in_schema=False)
 
 TITLE = "Connect"
 INTRODUCTION = (
-    "Lines to copy for clients that people have. The tests of Amers run them against a service, all "
-    "but those for the forms of QGIS. Points need a token of scope `read`, scenes one of scope "
+    "Lines to copy for clients that people have. The tests of Amers run them against a service, and "
+    "fill in the forms of QGIS. Points need a token of scope `read`, scenes one of scope "
     "`register`; an administrator makes one with `amers token create`. Where points are public, leave "
     "the token out."
 )
@@ -111,6 +111,18 @@ ogr2ogr -spat 5.22 43.21 5.27 43.26 -where "saliency > 0.3" points.gpkg OAPIF:BA
         "overlapping the view extent* keeps requests small. Many points are faster as vector tiles: "
         "*Add Vector Tile Layer*, *New Generic Connection*, with the same authentication and "
         "`BASE/collections/points/tiles/WebMercatorQuad/{z}/{y}/{x}`.",
+    ),
+    Recipe(
+        "QGIS plugin of Amers",
+        "Points with their colours, and registration of the active raster. `make plugin` writes "
+        "`build/amers-qgis.zip`, which *Plugins*, *Manage and Install Plugins*, *Install from ZIP* "
+        "installs. *Raster*, *Amers*, *Service* asks for the address and for the authentication "
+        "configuration of above; registrations need scope `register`.",
+        (Lines("text", "Address  BASE"),),
+        "*Add points* adds the points as a layer. *Register the active raster* sends the file of the "
+        "layer with the files of its model, works in the background, and loads the image in its place, "
+        "the control points by their status and their residuals. The results are kept in a folder "
+        "beside the image.",
     ),
     Recipe(
         "geopandas 1",

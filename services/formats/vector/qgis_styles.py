@@ -81,11 +81,11 @@ def add_styles(path: Path, layer: str, styles: Sequence[Style]) -> None:
         database.execute(TABLE)
         database.execute(CONTENTS)
         for number, style in enumerate(styles):
-            values = (style.name, _qml(style), number == 0, style.description, layer)
+            values = (style.name, as_qml(style), number == 0, style.description, layer)
             database.execute(ROW, values)
 
 
-def _qml(style: Style) -> str:
+def as_qml(style: Style) -> str:
     """The style as QGIS writes it: a renderer with one marker for each class."""
     root = ET.Element("qgis", version="3.22", styleCategories="Symbology")
     renderer = ET.SubElement(
