@@ -13,7 +13,7 @@ PAGE := app/web/built/index.html
 WORKERS := $(shell expr $$(env -u OMP_NUM_THREADS nproc) \* 3 / 2)
 LONG := cape_verde continent distorted faults image_selection load stress throughput block_adjustment toutin
 
-.PHONY: demo test test-files test-operations test-fast test-security test-endurance check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
+.PHONY: demo test test-files test-operations test-fast test-security test-endurance test-qgis check kernels programs docs serve bench bench-registration bench-load bench-faults bench-throughput mutants postgis page chromium pictures plugin
 
 demo: postgis
 	$(BIN)/amers demo
@@ -30,7 +30,7 @@ programs: $(READY)
 	$(MAKE) chromium
 
 test-files: $(READY)
-	$(BIN)/python -m pytest -m "not endurance" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
+	$(BIN)/python -m pytest -m "not endurance and not qgis" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
 		--ignore tests/app/test_openapi.py
 
 # All operations have one name, of which files handed out as a whole run only the first.
@@ -48,6 +48,11 @@ test-security: postgis
 # Repeated kills, cuts and floods, bombs, further cases and real views.
 test-endurance: postgis
 	$(BIN)/python -m pytest -m endurance -n auto --dist load
+
+# QGIS of the distribution on a virtual screen: layers, styles and the plugin. Not in `make test` for its size.
+test-qgis: postgis
+	scripts/ensure-qgis
+	$(BIN)/python -m pytest -m qgis -n0 tests/journeys/test_qgis.py
 
 # The QGIS plugin, as QGIS installs it.
 plugin: $(READY)
