@@ -200,6 +200,17 @@ def load_again(url: str, secret: str, image: str) -> dict[str, Any]:
     return {"loaded": loaded, "messages": messages()}
 
 
+def cancel_a_registration(url: str, secret: str, image: str) -> dict[str, Any]:
+    set_service(url, store_token(secret))
+    plugin = plugins["amers"]
+    plugin.register(Path(image), None)
+    (task,) = plugin.tasks
+    wait_until(lambda: task.progress() > 0)
+    task.cancel()
+    wait_until(lambda: not plugin.tasks)
+    return {"messages": messages(), "layers": len(QgsProject.instance().mapLayers())}
+
+
 def sentences_of_errors(url: str, secret: str, closed: str, image: str, text: str) -> dict[str, Any]:
     """The newest message after each thing that goes wrong."""
     authcfg, wrong = store_token(secret), store_token("wrong")

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -171,6 +172,22 @@ def test_the_plugin_registers_the_active_raster_and_loads_it_where_it_lies(
     again = in_qgis("load_again", url=url, secret=secret, image=str(image))
     assert again["loaded"] == list(loaded), again["messages"]
     assert again["messages"][0].startswith("scene.tif is registered")
+
+
+def test_cancelling_the_task_dismisses_the_job(in_qgis, service, url, secret, world, tmp_path):
+    image = image_with_model(world, tmp_path / "images")
+    workers = service.workers()
+    for worker in workers:
+        os.kill(worker, signal.SIGSTOP)
+    try:
+        seen = in_qgis("cancel_a_registration", url=url, secret=secret, image=str(image))
+    finally:
+        for worker in workers:
+            os.kill(worker, signal.SIGCONT)
+    assert seen == {"messages": [], "layers": 0}
+    headers = {"Authorization": f"Bearer {secret}"}
+    jobs = httpx.get(f"{url}/jobs?limit=1", headers=headers).raise_for_status().json()["jobs"]
+    assert [job["status"] for job in jobs] == ["dismissed"]
 
 
 def test_the_plugin_says_what_went_wrong_in_one_sentence(in_qgis, url, secret, world, tmp_path):
