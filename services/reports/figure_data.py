@@ -13,8 +13,8 @@ from services.sensors.displacement import DisplacementGrid
 from services.types import Array, ChipArray, ChipSource, ControlPoints, FloatImage, Measures, point_chips
 
 QUICKLOOK_PX = 1200
-PAIRS_EACH = 6
-"""Chip pairs of the best, of the middle and of the worst scores."""
+COMPARED_EACH = 6
+"""Points compared of the best, of the middle and of the worst scores."""
 _NODES_OF_NO_CHANGE = 2
 """Of a displacement along an axis that it does not change along."""
 
@@ -33,14 +33,15 @@ class Quicklook:
 
 
 @dataclass(frozen=True)
-class ChipPair:
-    """A chip and the scene at the same place, both in the geometry of the chip.
+class ChipComparison:
+    """A chip and the scene at the same place before and after, all in the geometry of the chip.
 
     Attributes:
         point_id: of the control point.
         gsd_m: ground sampling of the chip.
         chip: (101, 101) as stored.
-        scene: (101, 101) the scene through the refined model, on the grid of the chip.
+        raw: (101, 101) the scene through the delivered model, on the grid of the chip.
+        registered: (101, 101) the same through the refined model.
         score: correlation; NaN when none was computed.
         residual_px: (2,) line and sample; NaN when the point was not found.
         status: "active", "deactivated" or "not matched".
@@ -49,7 +50,8 @@ class ChipPair:
     point_id: int
     gsd_m: float
     chip: ChipArray
-    scene: ChipArray
+    raw: ChipArray
+    registered: ChipArray
     score: float
     residual_px: Array
     status: str
@@ -91,7 +93,7 @@ class FigureData:
 
     measures: Measures
     quicklook: Quicklook | None
-    gallery: tuple[ChipPair, ...]
+    gallery: tuple[ChipComparison, ...]
     displacement: DisplacementGrid | None = None
     sections: tuple[Section, ...] = ()
 
@@ -139,28 +141,35 @@ def _quicklook(scene: Scene) -> Quicklook:
 
 def _gallery(
     scene: Scene, points: ControlPoints, chips: ChipSource, registration: Registration
-) -> tuple[ChipPair, ...]:
+) -> tuple[ChipComparison, ...]:
     """Chips beside the scene: best, middle and worst of the scores."""
     measures = registration.measures
     scored = np.flatnonzero(np.isfinite(measures.score))
     ranked = scored[np.argsort(-measures.score[scored], kind="stable")]
-    middle = max((len(ranked) - PAIRS_EACH) // 2, 0)
-    shown = np.concatenate([ranked[:PAIRS_EACH], ranked[middle:][:PAIRS_EACH], ranked[-PAIRS_EACH:]])
+    middle = max((len(ranked) - COMPARED_EACH) // 2, 0)
+    shown = np.concatenate(
+        [ranked[:COMPARED_EACH], ranked[middle:][:COMPARED_EACH], ranked[-COMPARED_EACH:]]
+    )
     row_of_id = {int(point_id): row for row, point_id in enumerate(points.id)}
-    pairs = []
+    comparisons = []
     for i in dict.fromkeys(shown.tolist()):
         point_id = int(measures.point_id[i])
         row = row_of_id[point_id]
         gsd_m = float(points.views.gsd_m[points.views.start[row]])
-        pairs.append(
-            ChipPair(
+        raw, registered = (
+            render_chip(scene.image, model, measures.lon_lat_h[i], gsd_m)
+            for model in (scene.model, registration.model)
+        )
+        comparisons.append(
+            ChipComparison(
                 point_id=point_id,
                 gsd_m=gsd_m,
                 chip=point_chips(points, chips, row)[0],
-                scene=render_chip(scene.image, registration.model, measures.lon_lat_h[i], gsd_m),
+                raw=raw,
+                registered=registered,
                 score=float(measures.score[i]),
                 residual_px=measures.residual_px[i],
                 status=measures.status(i),
             )
         )
-    return tuple(pairs)
+    return tuple(comparisons)

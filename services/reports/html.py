@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from services.reports.criteria_rows import criterion_rows, unmet_criteria
-from services.reports.figure_data import ChipPair
+from services.reports.figure_data import ChipComparison
 from services.reports.figures import FIGURES, figure_markup
 from services.reports.numbers import (
     ABSENT,
@@ -29,20 +29,20 @@ from services.reports.report import RegistrationReport
 from services.reports.stability_words import CELLS_EXPLANATION, cells_left_out_text, group_means_text
 from services.types import Array, ChipArray
 
-PAIRS_PER_GROUP = 4
+COMPARED_PER_GROUP = 4
 
 
 @dataclass(frozen=True)
 class GalleryGroup:
-    """Chip pairs that are shown together.
+    """Comparisons that are shown together.
 
     Attributes:
         title: of the group.
-        pairs: in order of falling score.
+        comparisons: in order of falling score.
     """
 
     title: str
-    pairs: tuple[ChipPair, ...]
+    comparisons: tuple[ChipComparison, ...]
 
 
 def format_html(report: RegistrationReport) -> str:
@@ -52,7 +52,7 @@ def format_html(report: RegistrationReport) -> str:
         unmet=unmet_criteria(report.criteria),
         criteria=criterion_rows(report.criteria),
         figures={draw.__name__: Markup(figure_markup(draw, report)) for draw in FIGURES},
-        gallery=choose_pairs(report.figure_data.gallery),
+        gallery=choose_comparisons(report.figure_data.gallery),
         published=published_tables(report),
         options=list(flat_options(report.run.options)),
         centre=centre_words(report.scene.footprint_lon_lat),
@@ -87,16 +87,16 @@ def page_template(name: str) -> Template:
     return environment.get_template(name)
 
 
-def choose_pairs(gallery: tuple[ChipPair, ...]) -> tuple[GalleryGroup, ...]:
-    """The pairs of the best, middle and worst scores of a gallery, no pair twice.
+def choose_comparisons(gallery: tuple[ChipComparison, ...]) -> tuple[GalleryGroup, ...]:
+    """The comparisons of the best, middle and worst scores of a gallery, none twice.
 
     Args:
-        gallery: any order; pairs without a score are the worst.
+        gallery: any order; comparisons without a score are the worst.
     """
-    count = PAIRS_PER_GROUP
-    ordered = sorted(gallery, key=lambda pair: -np.nan_to_num(pair.score, nan=-2.0))
+    count = COMPARED_PER_GROUP
+    ordered = sorted(gallery, key=lambda one: -np.nan_to_num(one.score, nan=-2.0))
     if len(ordered) <= 3 * count:
-        return (GalleryGroup("All pairs, best score first", tuple(ordered)),) if ordered else ()
+        return (GalleryGroup("All points, best score first", tuple(ordered)),) if ordered else ()
     middle = (len(ordered) - count) // 2
     return (
         GalleryGroup("Best scores", tuple(ordered[:count])),

@@ -13,7 +13,7 @@ from services.registration.context import SearchStage
 from services.registration.on_points import Registration
 from services.registration.options import RegistrationOptions
 from services.reports.build import build_report
-from services.reports.figure_data import ChipPair, FigureData, Quicklook
+from services.reports.figure_data import ChipComparison, FigureData, Quicklook
 from services.reports.report import (
     BlockUsed,
     Check,
@@ -73,15 +73,17 @@ def landscape(shape: tuple[int, int], seed: int) -> FloatImage:
     return (600.0 + 40.0 * image).astype(np.float32)
 
 
-def chip_pair(k: int) -> ChipPair:
-    """A chip and the same ground in another light."""
+def chip_comparison(k: int) -> ChipComparison:
+    """A chip and the same ground in another light, two pixels aside before the registration."""
     chip = landscape((101, 101), seed=k)
     noise = np.random.default_rng(k).normal(0.0, 4.0 * k, (101, 101))
-    return ChipPair(
+    registered = (1.4 * chip + noise).astype(np.float32)
+    return ChipComparison(
         point_id=k,
         gsd_m=0.5,
         chip=np.clip(chip, 1, 4000).astype(np.uint16),
-        scene=(1.4 * chip + noise).astype(np.float32),
+        raw=np.roll(registered, 2, axis=1),
+        registered=registered,
         score=0.98 - 0.02 * k,
         residual_px=np.array([0.1, -0.2]) if k < 12 else np.full(2, np.nan),
         status="active" if k < 12 else "score under 0.8",
@@ -93,7 +95,7 @@ def material(registered) -> Callable[..., Material]:
     """Makes what a report is built from; takes what `register` takes, and `name`."""
 
     def make(
-        name: str = "IMG_PHR1A_201201", pairs: int = 16, frame: Frame = FRAME, **of_registration
+        name: str = "IMG_PHR1A_201201", compared: int = 16, frame: Frame = FRAME, **of_registration
     ) -> Material:
         scene = replace(registered(**of_registration), frame=frame)
         lines, samples = scene.shape
@@ -138,7 +140,7 @@ def material(registered) -> Callable[..., Material]:
             figure_data=FigureData(
                 measures=scene.measures,
                 quicklook=Quicklook(landscape((400, 500), seed=9), 10.0),
-                gallery=tuple(chip_pair(k) for k in range(pairs)),
+                gallery=tuple(chip_comparison(k) for k in range(compared)),
             ),
             checks=(
                 Check("simulated truth", accuracy(np.random.default_rng(4).normal(0, 0.1, (25, 2)))),

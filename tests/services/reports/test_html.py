@@ -16,12 +16,13 @@ from services.reports.criteria_rows import margin_words
 from services.reports.drawing import ACTIVE, ARROW, round_number
 from services.reports.figure_data import Quicklook
 from services.reports.figures import FIGURES, figure_markup
-from services.reports.html import chip_uri, choose_pairs, flat_options, format_html
+from services.reports.html import chip_uri, choose_comparisons, flat_options, format_html
 from services.reports.maps import coverage_map, residual_map
 from services.reports.plot import tick_words, ticks
 from services.types import Acquisition
 
 HOSTILE = "<script>alert('x')</script>\"&$\\frac"
+most_characters_of_images = 700_000
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
@@ -132,7 +133,7 @@ def test_hostile_names_are_shown_and_not_run(material):
     made = material(name=HOSTILE)
     measures = made.measures
     reason = np.where(measures.active, "", HOSTILE)
-    pairs = tuple(replace(pair, status=HOSTILE) for pair in made.figure_data.gallery)
+    gallery = tuple(replace(one, status=HOSTILE) for one in made.figure_data.gallery)
     acquisition = replace(made.scene.acquisition, sensor=HOSTILE)
     checks = tuple(replace(check, against=HOSTILE) for check in made.checks)
     made = made.with_measures(replace(measures, reason=reason))
@@ -140,7 +141,7 @@ def test_hostile_names_are_shown_and_not_run(material):
         made,
         scene=replace(made.scene, acquisition=acquisition, model=HOSTILE),
         run=replace(made.run, software_version=HOSTILE),
-        figure_data=replace(made.figure_data, gallery=pairs),
+        figure_data=replace(made.figure_data, gallery=gallery),
         checks=checks,
     ).report()
     report = replace(report, correction=replace(report.correction, order_reason=HOSTILE))
@@ -228,23 +229,35 @@ def test_ticks_are_round_numbers_within_the_range(first, last, count, words):
     assert " ".join(tick_words(ticks(first, last, count))) == words
 
 
-def test_the_gallery_shows_best_middle_and_worst_and_no_pair_twice(material):
-    pairs = material(pairs=21).figure_data.gallery
-    groups = choose_pairs(pairs[::-1])
-    shown = [pair.point_id for group in groups for pair in group.pairs]
-    assert [len(group.pairs) for group in groups] == [4, 4, 4]
+def test_the_gallery_shows_best_middle_and_worst_and_no_point_twice(material):
+    gallery = material(compared=21).figure_data.gallery
+    groups = choose_comparisons(gallery[::-1])
+    shown = [one.point_id for group in groups for one in group.comparisons]
+    assert [len(group.comparisons) for group in groups] == [4, 4, 4]
     assert shown == [0, 1, 2, 3, 8, 9, 10, 11, 17, 18, 19, 20]
 
 
-def test_a_pair_without_a_score_is_the_worst(material):
-    pairs = material(pairs=20).figure_data.gallery
-    unknown = replace(pairs[0], score=float("nan"))
-    assert choose_pairs((unknown, *pairs[1:]))[-1].pairs[-1] is unknown
+def test_a_point_without_a_score_is_the_worst(material):
+    gallery = material(compared=20).figure_data.gallery
+    unknown = replace(gallery[0], score=float("nan"))
+    assert choose_comparisons((unknown, *gallery[1:]))[-1].comparisons[-1] is unknown
 
 
 def test_an_empty_gallery_takes_no_room(material):
-    assert choose_pairs(()) == ()
-    assert "Chips and the scene" not in page(material(pairs=0))
+    assert choose_comparisons(()) == ()
+    assert "Chips and the scene" not in page(material(compared=0))
+
+
+def test_a_page_of_many_points_shows_twelve_each_as_chip_raw_and_registered_scene(material):
+    """However many points a gallery has: the size of the page is bounded."""
+    parsed = Page(page(material(compared=30)))
+    images = [value for name, value in parsed.attributes if name == "alt"]
+    assert len(images) == 3 * 12
+    assert images[:3] == ["Chip, point 0", "Raw, point 0", "Registered, point 0"]
+    sources = [value for name, value in parsed.attributes if name == "src"]
+    assert sum(map(len, sources)) < most_characters_of_images
+    raw, registered = sources[1:3]
+    assert (shown(raw)[:, 2:] == shown(registered)[:, :-2]).mean() > 0.9
 
 
 @pytest.mark.parametrize(

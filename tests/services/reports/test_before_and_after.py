@@ -1,0 +1,55 @@
+"""The points of a report before and after: the raw scene is displaced, the registered one is not."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from services.registration.on_points import register_scene
+from services.reports.figure_data import ChipComparison, FigureData, figure_data
+from services.types import Array, ChipArray
+from tests.services.simulated import block, spoiled_view
+
+pytestmark = pytest.mark.long
+
+ERROR_M = np.array([5.0, -4.0])
+"""Of the delivered model on the ground, east and north; pixels of chips are of one metre."""
+SIGMA_M = 15.0
+half_a_pixel = 0.5
+
+
+@cache
+def drawn() -> FigureData:
+    """What the report of a scene draws whose model is off by a known distance, without skew."""
+    scene = spoiled_view((float(ERROR_M[0]), float(ERROR_M[1])), skew_px=0.0, seed=13).as_scene(SIGMA_M)
+    return figure_data(scene, *block(), register_scene(scene, *block()))
+
+
+def displacement_px(reference: ChipArray, image: ChipArray) -> Array:
+    """East and north displacement of an image against another, by phase correlation."""
+    window = cv2.createHanningWindow(reference.shape[::-1], cv2.CV_64F)
+    east, south = cv2.phaseCorrelate(
+        *(np.nan_to_num(one).astype(float) for one in (reference, image)), window
+    )[0]
+    return np.array([east, -south])
+
+
+def active() -> list[ChipComparison]:
+    return [one for one in drawn().gallery if one.status == "active"]
+
+
+def test_the_raw_scene_is_displaced_by_the_error_of_the_delivered_model() -> None:
+    moved_px = np.array([displacement_px(one.registered, one.raw) for one in active()])
+    np.testing.assert_allclose(np.median(moved_px, axis=0), -ERROR_M, atol=half_a_pixel)
+
+
+def test_the_registered_scene_shows_the_chip_in_its_place() -> None:
+    off_px = np.array([displacement_px(one.chip, one.registered) for one in active()])
+    assert np.hypot(*np.median(off_px, axis=0)) < half_a_pixel
+
+
+def test_every_compared_point_has_three_images_of_the_size_of_a_chip() -> None:
+    for one in drawn().gallery:
+        shapes = {image.shape for image in (one.chip, one.raw, one.registered)}
+        assert shapes == {one.chip.shape}
