@@ -258,7 +258,12 @@ def adjust_scene(
         # As much noise and motion as the sigmas state, in the proportion that the residuals show.
         stated = float(np.mean((declared.variance / fit.variance)[active]))
         told = measured.residuals(declared, active, shared)
-        moving = tuple(component.scaled(stated * shared.factor) for component in components)
+        # An ortho-image is displaced by what is seen, even if measures state to be worse than they are.
+        unit = min(1.0, unit_variance(with_components(measured.residuals(fit, active), components)))
+        moving = tuple(
+            one.scaled(stated * shared.factor * (unit if one.along == "image" else 1.0))
+            for one in components
+        )
         solution = solve_profile(told, moving, expected, shape)
         parameters, covariance, displacement = (
             solution.parameters,
