@@ -209,15 +209,7 @@ def adjust_scene(
         return np.asarray(fit.magnitude(parameters) / scale)
 
     active = deactivate(magnitude, agreeing, options.tolerance, min_points)
-    measured = PlacedMeasures.of(
-        model,
-        shape,
-        observations.lon_lat_h,
-        observations.covariance_m2,
-        fit=declared,
-        of_points=of_points,
-        chip_side_px=observations.chip_side_px,
-    )
+    measured = PlacedMeasures.of(model, shape, observations, fit=declared, of_points=of_points)
     expected, limit = fit.expected(slope_px), options.tolerance
     clipped = fit.clipped(start, 2.0 * limit * scale)
     motion = (

@@ -173,14 +173,13 @@ def likeliest_components(
         told += best.log_evidence
         components = _again(residuals, [*components, best.component])
         found = structures(beyond(residuals, components), families)
-    if scanned:
-        explained = bool(components) and told <= _LEAST_EVIDENCE + _of_shared_errors(
-            residuals, extent_px
-        )
-    else:
-        explained = _displaced_px2(residuals, components) <= _OF_POINTS * points_px2
-    if explained:
-        components, found = [], affine
+    if components:
+        if scanned:
+            explained = told <= _LEAST_EVIDENCE + _of_shared_errors(residuals, extent_px)
+        else:
+            explained = _displaced_px2(residuals, components) <= _OF_POINTS * points_px2
+        if explained:
+            components, found = [], affine
     return (*known, *components), found[: len(ALONG_AXES)]
 
 

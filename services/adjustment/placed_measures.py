@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 
 from services.adjustment.affine_fit import AffineFit
+from services.adjustment.control_observations import ControlObservations
 from services.adjustment.line_profile import Component, beyond, likeliest_components
 from services.adjustment.profile_solution import agreeing_with
 from services.adjustment.shared_errors import SharedErrors, overlap_correlation
@@ -50,14 +51,13 @@ class PlacedMeasures:
         cls,
         model: SensorModel,
         shape: tuple[int, int],
-        lon_lat_h: Array,
-        covariance_m2: Array,
+        observations: ControlObservations,
         *,
         fit: AffineFit,
         of_points: Array,
-        chip_side_px: float,
     ) -> Self:
-        """The measures of points (n, 3); `of_points` (n, 2) is their part of the variances of a fit."""
+        """The measures of points; `of_points` (n, 2) is their part of the variances of a fit of them."""
+        lon_lat_h, chip_side_px = observations.lon_lat_h, observations.chip_side_px
         frame = no_correction(shape)
         position_px = frame.centre + fit.t * frame.half_size
         own_share = (1.0 - of_points / fit.variance).mean(axis=1)
@@ -65,7 +65,7 @@ class PlacedMeasures:
         return cls(
             position_px,
             lon_lat_h[:, 2],
-            np.nanmean(derivative @ covariance_m2[:, :, 2:], axis=0)[:, 0],
+            np.nanmean(derivative @ observations.covariance_m2[:, :, 2:], axis=0)[:, 0],
             float(np.median(of_points, axis=0).max()),
             overlap_correlation(position_px, chip_side_px, own_share),
             chip_side_px,

@@ -80,19 +80,11 @@ def _with_structures(block: JointBlock, number: int, adjustment: SceneAdjustment
     measured, adjusted = block.scenes[number], block.model(number)
     if not adjustment.active.any():
         return adjustment
-    # Residuals of an affine correction depend on what those of the delivered model do beyond it.
+    # Components lie where the delivered model places the lines; the affine part is projected out.
     model = adjusted if isinstance(adjusted, PushbroomModel) else measured.scene.model
     seen, shape = measured.observations(), measured.scene.image.shape
     fit, _, of_points = declared_fit(model, shape, seen)
-    placed = PlacedMeasures.of(
-        model,
-        shape,
-        seen.lon_lat_h,
-        seen.covariance_m2,
-        fit=fit,
-        of_points=of_points,
-        chip_side_px=seen.chip_side_px,
-    )
+    placed = PlacedMeasures.of(model, shape, seen, fit=fit, of_points=of_points)
     tested = placed.structures(fit, adjustment.active, adjustment.components, adjustment.shared)
     return replace(adjustment, structures=(*tested, adjustment.short_motion.structure))
 
