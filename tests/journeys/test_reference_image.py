@@ -95,6 +95,6 @@ def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_
     assert len(difference) > 500
     assert np.abs(np.median(difference, axis=0)).max() < MEDIAN_ALLOWED_PX
     assert np.median(np.abs(difference), axis=0).max() < TYPICAL_ALLOWED_PX
-    # One shift cannot follow fields that moved separately, and the residuals show it.
+    # Neither a shift nor a smooth displacement follows fields that moved separately: it is refused.
     assert np.abs(registration.adjustment.correction.parameters[:, 0]).max() < LARGEST_LOCAL_SHIFT_PX
-    assert registration.adjustment.sigma0 > 2.0
+    assert registration.qualification.verdict == "failed"
