@@ -35,7 +35,7 @@ class Outcome:
         order: of the correction.
         ce90_before_m, ce90_m: against the truth in the frame of the block, over the whole image.
         ground_ce90_m: against the truth on the Earth.
-        predicted_m, predicted_worst_m: CE90 as stated, median and worst over the image.
+        predicted_m, predicted_worst_m: CE90 as stated, over the image and at its worst place.
         normalised: mean square of true errors over stated deviations, over the image.
         displacement_m: stability test, largest of the medians of the corners and the centre.
         cpu_s: of the registration, with the rendering of the pixels that it reads and no run kept.
@@ -170,12 +170,12 @@ def _judged(scene: Scene, registration: Registration, truth: Truth, cpu_s: float
         ce90_before_m=ce90_m(scene.model.project(shown) - line_sample),
         ce90_m=ce90_m(error),
         ground_ce90_m=ce90_m(on_earth),
-        predicted_m=quality.predicted.median_m,
+        predicted_m=quality.predicted.overall_m,
         predicted_worst_m=quality.predicted.worst_m,
         normalised=normalised_error(error, covariance).mean_square,
         displacement_m=max(moved_m, default=float("nan")),
         cpu_s=cpu_s,
-        ground_predicted_m=quality.predicted.on_the_earth_median_m,
+        ground_predicted_m=quality.predicted.on_the_earth_overall_m,
         ground_normalised=normalised_error(on_earth, both).mean_square,
         wrong_share=float(1.0 - right.mean()),
         judged_share=truth.judged_share,

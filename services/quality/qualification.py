@@ -238,7 +238,7 @@ def qualify_repeated(
     control_px = max(scene.control_gsd_m / scene.gsd_m, 1.0)
     criteria = (
         *_criteria(figures, options, scene.gsd_m, control_px),
-        *_of_fit(scene, predicted.median_px),
+        *_of_fit(scene, float(np.median(predicted.ce90_px))),
     )
     if options.max_ce90_on_earth_m is not None:
         criteria += (_on_earth(predicted, options.max_ce90_on_earth_m, scene.frame),)

@@ -23,7 +23,7 @@ from services.reports.figure_data import FigureData
 from services.reports.reasons import ReasonCount
 from services.types import Acquisition, Array
 
-REPORT_FORMAT = "amers-registration-report/3"
+REPORT_FORMAT = "amers-registration-report/4"
 NOT_IN_JSON = {"json": False}
 """Metadata of a field that report.json leaves out."""
 

@@ -193,11 +193,11 @@ export interface PredictedAccuracy {
   std_sample_px: Numbers[];
   ce90_px: Numbers[];
   worst_px: number | null;
-  median_px: number | null;
+  overall_px: number | null;
   worst_m: number | null;
-  median_m: number | null;
+  overall_m: number | null;
   on_the_earth_worst_m: number | null;
-  on_the_earth_median_m: number | null;
+  on_the_earth_overall_m: number | null;
 }
 
 export interface QualificationOptions {
@@ -275,7 +275,7 @@ export interface RegistrationOptions {
 }
 
 export interface Report {
-  format: "amers-registration-report/3";
+  format: "amers-registration-report/4";
   run: RunRecord;
   verdict: "good" | "usable" | "failed";
   verdict_scope: string;

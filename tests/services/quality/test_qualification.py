@@ -153,11 +153,11 @@ def test_the_prediction_of_a_shift_is_the_same_all_over_the_image(registered):
     frame = Frame.from_sigmas(2.0, 2.0)
     result = predict_accuracy(replace(scene, adjustment=adjustment, frame=frame).adjusted(), 5)
     assert result.std_line_px == pytest.approx(np.full((5, 5), 0.2))
-    assert result.worst_px == pytest.approx(result.median_px)
+    assert result.worst_px == pytest.approx(result.overall_px)
     assert result.worst_m == pytest.approx(0.5 * 0.2 * 2.1460, rel=1e-3)
     on_the_earth_m = np.hypot(2.0, 0.5 * 0.2) * 2.1460
     assert result.on_the_earth_worst_m == pytest.approx(on_the_earth_m, rel=1e-3)
-    assert result.on_the_earth_median_m == pytest.approx(on_the_earth_m, rel=1e-3)
+    assert result.on_the_earth_overall_m == pytest.approx(on_the_earth_m, rel=1e-3)
 
 
 def test_the_prediction_grows_towards_the_edge_along_a_drift(registered):
@@ -218,7 +218,7 @@ def test_what_points_of_three_metres_are_known_to_give_is_good(registered):
     result = qualified(registered(n=500, lost=0, wrong=0, points_px=points_px))
     assert result.image_residuals_px.x.std == pytest.approx(points_px, rel=0.2)
     assert max(place.median_m for place in result.stability.displacements) < 0.3
-    assert result.predicted.median_m < 0.4
+    assert result.predicted.overall_m < 0.4
     assert result.predicted.worst_m < 0.75
     assert result.verdict == "good"
 
@@ -267,7 +267,7 @@ def test_points_worse_than_stated_make_a_scene_usable_that_says_so(registered, s
     assert "times less accurate than they state" in note
     place = np.array([[500.0, 500.0]])
     error_px = scene.truth.apply(place) - scene.adjustment.correction.apply(place)
-    assert np.hypot(*error_px[0]) < 3.0 * result.predicted.median_px
+    assert np.hypot(*error_px[0]) < 3.0 * result.predicted.overall_px
 
 
 def test_worse_points_do_not_explain_a_bend_of_the_model(registered):
