@@ -10,7 +10,7 @@ from services.adjustment.parameters import image_parameters
 from services.geodesy import lon_lat_h_from_east_north_up, move_metres
 from services.imagery.scene import Scene
 from services.imagery.source import ArrayImage
-from services.joint.measured import MeasuredScene
+from services.joint.measured import MeasuredScene, options_in_block
 from services.matching.control_points import PointMatches
 from services.registration.options import RegistrationOptions
 from services.registration.search import Search, adjust_search
@@ -213,7 +213,7 @@ def measured_scene(
     )
     search = Search(points, np.arange(n), matches, found, 0.0)
     enough = found.sum() >= options.adjustment.min_points
-    alone = adjust_search(scene, search, options.adjustment) if enough else None
+    alone = adjust_search(scene, search, options_in_block(scene, options).adjustment) if enough else None
     return MeasuredScene(scene, points, search, alone)
 
 

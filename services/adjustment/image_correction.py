@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import ndtr
 
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
 from services.adjustment.broken_image import held_parts, on_one_side, part_of_line
 from services.adjustment.control_observations import ControlObservations, declared_fit, frame_sigma_px
-from services.adjustment.line_profile import Component, unit_variance, with_components
+from services.adjustment.line_profile import Component
 from services.adjustment.moved_ground import MovedGround, moved_ground
 from services.adjustment.order_selection import choose_order
 from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.profile_solution import joined, solve_profile
+from services.adjustment.profile_solution import solve_profile
 from services.adjustment.robust import deactivate
 from services.adjustment.scene_motion import SceneMotion, what_moves
+from services.adjustment.scene_solution import AgreeingMeasures
 from services.adjustment.shared_errors import (
     SharedErrors,
     likeliest_shared_errors,
@@ -60,6 +60,8 @@ class AdjustmentOptions:
             pixels; the measures may raise it, never lower it.
         profile: whether motion along lines and samples that the measures show is followed, where no
             order is given; what is not followed is tested in any case.
+        bends: whether bends that the measures leave open are followed beside it, as far as they show
+            them. Other images may tell of them.
     """
 
     order: Order | None = None
@@ -71,6 +73,7 @@ class AdjustmentOptions:
     folds: int = 5
     prior_slope_sigma_px: float = 1.0
     profile: bool = True
+    bends: bool = True
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,8 @@ class SceneAdjustment:
         sigma0: a posteriori standard deviation of unit weight.
         point_sigma_px: (2,) contribution of the points' own accuracy to the active residuals, one
             standard deviation of line and sample.
-        components: of the displacement beyond the affine correction; none without one.
+        components: of the displacement beyond the affine correction that residuals show.
+        bends: components of it that the points leave open, where they do not reach.
         structures: what the residuals of the correction still depend on, by family; none where it was
             not tested.
         moved: ground that moved, of which no measure is active; None where none is seen.
@@ -116,6 +120,7 @@ class SceneAdjustment:
     sigma0: float
     point_sigma_px: Array
     components: tuple[Component, ...] = ()
+    bends: tuple[Component, ...] = ()
     structures: tuple[Structure, ...] = ()
     moved: MovedGround | None = None
 
@@ -245,36 +250,16 @@ def adjust_scene(
             overlapping=measured.overlapping,
         )
     )
-    displacement: DisplacementGrid | None = None
-    if components:
-        # As much noise and motion as the sigmas state, in the proportion that the residuals show.
-        stated = float(np.mean((declared.variance / fit.variance)[active]))
-        told = measured.residuals(declared, active, shared)
-        # An ortho-image is displaced by what is seen, even if measures state to be worse than they are.
-        unit = min(1.0, unit_variance(with_components(measured.residuals(fit, active), components)))
-        moving = tuple(
-            one.scaled(stated * shared.factor * (unit if one.along == "image" else 1.0))
-            for one in components
-        )
-        solution = solve_profile(told, moving, expected, shape)
-        parameters, covariance, displacement = (
-            solution.parameters,
-            joined(solution.covariance),
-            solution.displacement,
-        )
-        moving = tuple(component.scaled(stated) for component in components)
-        chi2 = unit_variance(with_components(measured.residuals(declared, active), moving))
-        sigma0 = float(np.sqrt(chi2 / _kept_variance(limit)))
+    agreeing_measures = AgreeingMeasures(measured, fit, declared, active, shared, limit)
+    bent = _bends(agreeing_measures, expected, components, options, like)
+    if components or bent:
+        solution = agreeing_measures.displaced(expected, (*components, *bent))
     else:
-        parameters, _ = fit.scaled(shared.factor).solution(active, free, slope_px)
-        of_errors = shared.covariance(
-            measured.position[active], measured.overlapping[np.ix_(active, active)]
-        )
-        covariance = _covariance(
-            declared.scaled(shared.factor), active, free, slope_px, of_errors / shared.factor
-        )
-        sigma0 = _sigma0(declared, active, free, slope_px, _kept_variance(limit))
-    correction = replace(no_correction(shape), parameters=parameters[:, :3], displacement=displacement)
+        solution = agreeing_measures.affine(free, slope_px)
+    displacement, covariance = solution.displacement, solution.covariance
+    correction = replace(
+        no_correction(shape), parameters=solution.parameters[:, :3], displacement=displacement
+    )
     if observations.common_covariance_px2 is not None:
         covariance[np.ix_([0, 3], [0, 3])] += observations.common_covariance_px2
     deformation = (
@@ -308,9 +293,10 @@ def adjust_scene(
         apart_px=apart_px,
         residual_px=np.where((usable | active)[:, None], misfit_px, np.nan),
         active=active,
-        sigma0=sigma0,
+        sigma0=solution.sigma0,
         point_sigma_px=np.sqrt(of_points[active].mean(axis=0)),
         components=components,
+        bends=bent,
         structures=tested if like else (*tested, short.structure),
     )
 
@@ -339,6 +325,22 @@ def _motion(
         breaks=breaks,
         tolerance=options.tolerance,
     )
+
+
+def _bends(
+    measures: AgreeingMeasures,
+    expected: Array,
+    components: tuple[Component, ...],
+    options: AdjustmentOptions,
+    like: SceneAdjustment | None,
+) -> tuple[Component, ...]:
+    """The bends that the measures leave open, of a scanned image whose motion is followed."""
+    if like:
+        return like.bends
+    wanted = options.profile and options.bends and options.order is None
+    if not wanted or not measures.measured.scanned:
+        return ()
+    return measures.bends(expected, components)
 
 
 def _beside(
@@ -416,22 +418,6 @@ def _refuse_undetermined(fit: AffineFit, active: BoolArray, order: Order) -> Non
             )
 
 
-def _kept_variance(tolerance: float) -> float:
-    """Variance that a normal law of unit variance keeps within a tolerance on both sides."""
-    density = np.exp(-0.5 * tolerance**2) / np.sqrt(2.0 * np.pi)
-    return float(1.0 - 2.0 * tolerance * density / (2.0 * ndtr(tolerance) - 1.0))
-
-
-def _sigma0(
-    fit: AffineFit, active: BoolArray, free: BoolArray, slope_px: float, kept_variance: float
-) -> float:
-    """Standard deviation of unit weight; 1 without redundancy."""
-    parameters, covariance = fit.solution(active, free, slope_px)
-    chi2 = float((fit.residual(parameters)[active] ** 2 / fit.variance[active]).sum())
-    freedom = fit.freedom(active, free, slope_px, covariance)
-    return float(np.sqrt(chi2 / freedom / kept_variance)) if freedom > 0 else 1.0
-
-
 def deformation_covariance(deformation_px2: Array, correction: ImageCorrection) -> Array:
     """Covariance (6, 6) of a correction by what its points are deformed by, (2, 2) line and sample."""
     return np.asarray(np.kron(deformation_px2, _deformed_parameters(correction)), np.float64)
@@ -447,18 +433,3 @@ def _deformed_parameters(correction: ImageCorrection) -> Array:
     t = (correction.invert(centre[None, :])[0] - centre) / correction.half_size
     moves = np.array([[1.0, 0.0, 0.0], [-t[0], 1.0, 0.0], [-t[1], 0.0, 1.0]])
     return np.asarray(moves.T @ np.diag(_DEFORMED) @ moves)
-
-
-def _covariance(
-    fit: AffineFit, active: BoolArray, free: BoolArray, slope_px: float, correlation: Array
-) -> Array:
-    """Covariance (6, 6) of the parameters of a weighted solution whose errors are correlated."""
-    _, independent = fit.solution(active, free, slope_px)
-    covariance = np.zeros((6, 6))
-    for k, expected in enumerate(fit.expected(slope_px)):
-        weighted = fit.design[active] / fit.sigma[active, k, None]
-        spread = weighted.T @ correlation @ weighted + np.diag(expected)
-        covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = (independent[k] @ spread @ independent[k])[
-            :3, :3
-        ]
-    return covariance

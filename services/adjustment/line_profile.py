@@ -26,6 +26,10 @@ _OF_SCANNED: dict[Along, tuple[Family, ...]] = {"lines": ("lines", "steps"), "sa
 _OF_ORTHO: dict[Along, tuple[Family, ...]] = {"image": ("lines", "steps", "samples", "image")}
 """Structures that components of images that were scanned, and of ortho-images, may explain."""
 
+Kind = Literal["smooth", "period", "step", "break", "quadratic", "cubic"]
+BENDS: dict[Kind, int] = {"quadratic": 2, "cubic": 3}
+"""Degrees of the polynomials over the image that components may be."""
+
 MAX_CHANCE = 0.002
 """Structure that chance explains with a larger probability is not looked into."""
 _MOST_COMPONENTS = 3
@@ -68,16 +72,18 @@ class Component:
     """One component of a displacement.
 
     Attributes:
-        kind: "smooth", "period", "step" or "break", which is a step that the pixels show.
-        length_px: over which it is correlated; of a step, the width of the gap that holds it.
-        at_px: period; first line, or sample, of the gap that holds a step.
+        kind: "smooth", "period", "step" or "break", which is a step that the pixels show; bends over
+            the image are "quadratic" or "cubic".
+        length_px: over which it is correlated; of a step, the width of the gap that holds it; of a bend,
+            half the side of the image.
+        at_px: period; first line, or sample, of the gap that holds a step; middle of a bend.
         variance_px2: (2,) of line and sample, as chips show it, if the stated variances of the measures
             are true: what these are off by, it is off by, too.
         seen: share of the amplitude that chips show, which average over their pixels.
         along: lines, samples, or both.
     """
 
-    kind: Literal["smooth", "period", "step", "break"]
+    kind: Kind
     length_px: float
     at_px: float
     variance_px2: Array
@@ -94,14 +100,23 @@ class Component:
         """Whether it displaces all that lies behind a line alike."""
         return self.kind in ("step", "break")
 
+    def polynomial(self, line_sample: Array) -> Array:
+        """Value (...) of a bend at positions (..., 2), 1 at the last line or sample."""
+        unit = (line_sample[..., self.axes.start] - self.at_px) / self.length_px
+        return np.asarray(np.polynomial.legendre.Legendre.basis(BENDS[self.kind])(unit))
+
     def share(self, line_sample: Array) -> Array:
         """Share (...) of its variance at positions (..., 2): before a step there is none."""
+        if self.kind in BENDS:
+            return self.polynomial(line_sample) ** 2
         if self.is_step:
             return np.clip((line_sample[..., 0] - self.at_px) / self.length_px, 0.0, 1.0)
         return np.ones(line_sample.shape[:-1])
 
     def correlation(self, first: Array, second: Array) -> Array:
         """Correlation (m, n) of the displacements at positions (m, 2) and (n, 2)."""
+        if self.kind in BENDS:
+            return np.outer(self.polynomial(first), self.polynomial(second))
         if self.is_step:
             return np.minimum(self.share(first)[:, None], self.share(second)[None, :])
         apart = first[:, None, self.axes] - second[None, :, self.axes]
@@ -115,7 +130,9 @@ class Component:
         return np.asarray(self.variance_px2[:, None, None] * self.correlation(first, second))
 
     def scaled(self, factor: float) -> "Component":
-        """The same component with its variance multiplied by a factor."""
+        """The same component with its variance multiplied by a factor; bends are pixels in any case."""
+        if self.kind in BENDS:
+            return self
         return replace(self, variance_px2=self.variance_px2 * factor)
 
 

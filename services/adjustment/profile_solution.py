@@ -99,7 +99,7 @@ def solve_profile(
     line, sample = _nodes(components, residuals, shape)
     nodes = np.stack(np.meshgrid(line, sample, indexing="ij"), axis=-1)
     frame = no_correction(shape)
-    t = _by_affine(nodes, frame)
+    t = by_affine(nodes, frame)
     # What moves whole lines is the same at all nodes of a line: one column is enough.
     parts = [
         (nodes[_WHERE[along]], [one for one in components if one.along == along])
@@ -108,7 +108,7 @@ def solve_profile(
     full = with_components(residuals, components)
     axes = [np.linspace(nodes[0], nodes[-1], _OF_THE_AFFINE) for nodes in (line, sample)]
     evenly = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    t_evenly = _by_affine(evenly, frame)
+    t_evenly = by_affine(evenly, frame)
     fitted = np.linalg.pinv(t_evenly)
     parameters, covariance, displacement, variance = [], [], [], []
     for k in range(2):
@@ -123,14 +123,14 @@ def solve_profile(
         moved = sum(one @ full.design for one in gain)
         explained = sum(np.einsum("kmn,kmn->km", first, second) for first in gain for second in seen)
         unseen = sum(one.variance_px2[k] / one.seen**2 * one.share(nodes) for one in components)
-        left = _padded(t, own) - moved
+        left = padded(t, len(own)) - moved
         total = unseen - explained + (left @ own * left).sum(axis=-1)
         mean = np.broadcast_to(sum(one @ rest for one in gain), t.shape[:2])
         # Its affine part belongs to the parameters: both are uncertain by much more than their sum.
         seen_evenly = _seen(evenly[None], components, k, full.line_sample)[0]
         gain_evenly = seen_evenly @ inverse
         affine = fitted @ gain_evenly @ rest
-        left = _padded(t_evenly, own) - gain_evenly @ full.design
+        left = padded(t_evenly, len(own)) - gain_evenly @ full.design
         among = sum(
             one.variance_px2[k] / one.seen**2 * one.correlation(evenly, evenly) for one in components
         )
@@ -147,16 +147,16 @@ def solve_profile(
     return ProfileSolution(np.array(parameters), np.array(covariance), grid)
 
 
-def _by_affine(places: Array, frame: ImageCorrection) -> Array:
+def by_affine(places: Array, frame: ImageCorrection) -> Array:
     """Derivatives (..., 3) of a coordinate at places (..., 2) by the affine parameters."""
     return np.concatenate(
         [np.ones((*places.shape[:-1], 1)), (places - frame.centre) / frame.half_size], axis=-1
     )
 
 
-def _padded(t: Array, own: Array) -> Array:
-    """Derivatives (..., 3) by the affine parameters with zeros for the others of a covariance (k, k)."""
-    return np.concatenate([t, np.zeros((*t.shape[:-1], len(own) - 3))], axis=-1)
+def padded(t: Array, count: int) -> Array:
+    """Derivatives (..., 3) by the affine parameters with zeros for the others of `count`."""
+    return np.concatenate([t, np.zeros((*t.shape[:-1], count - 3))], axis=-1)
 
 
 def _seen(places: Array, components: Sequence[Component], k: int, line_sample: Array) -> Array:

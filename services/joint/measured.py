@@ -10,8 +10,10 @@ from services.imagery.scene import Scene
 from services.matching.control_points import PointMatches
 from services.quality.lack_of_fit import Elsewhere
 from services.registration.context import SearchStage
+from services.registration.options import RegistrationOptions
 from services.registration.search import Search, control_observations
 from services.sensors.displacement import DisplacementGrid
+from services.sensors.pushbroom import PushbroomModel
 from services.types import Array, BoolArray, ControlPoints, ViewMeasures
 
 
@@ -79,6 +81,17 @@ class MeasuredScene:
         place = self.scene.model.project(seen.lon_lat_h)
         shown = displacement.averaged(place, seen.chip_side_px)
         return np.asarray(seen.line_sample + displacement.at(place) - shown)
+
+
+def options_in_block(scene: Scene, options: RegistrationOptions) -> RegistrationOptions:
+    """The options of a scene that is adjusted with others.
+
+    What moves lines and samples is followed beside an affine correction, not beside a rigorous model:
+    there it is tested. Bends that the points of a scene leave open are left to the tie points.
+    """
+    rigorous = scene.parameter_set is not None and isinstance(scene.model, PushbroomModel)
+    profile = options.adjustment.profile and not rigorous
+    return replace(options, adjustment=replace(options.adjustment, profile=profile, bends=False))
 
 
 def nothing_found(scene: Scene, points: ControlPoints) -> MeasuredScene:

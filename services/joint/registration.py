@@ -14,7 +14,7 @@ from services.imagery.scene import Scene
 from services.imagery.source import CachedImage, image_gsds_m
 from services.joint.block import JointBlock, repeated
 from services.joint.fitting import Left, SceneFit, adjust_fitting, scene_fit, ties_between
-from services.joint.measured import MeasuredScene, nothing_found
+from services.joint.measured import MeasuredScene, nothing_found, options_in_block
 from services.joint.results import (
     RigorousScene,
     held_cells,
@@ -181,13 +181,8 @@ def _measure_all(
 def measure_scene(
     scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions
 ) -> MeasuredScene:
-    """A scene with its control points, found as those of a scene alone; with none where that fails.
-
-    What moves lines and samples is followed beside an affine correction, not beside a rigorous model:
-    there it is tested.
-    """
-    if scene.parameter_set is not None and isinstance(scene.model, PushbroomModel):
-        options = replace(options, adjustment=replace(options.adjustment, profile=False))
+    """A scene with its control points, found as those of a scene alone; with none where that fails."""
+    options = options_in_block(scene, options)
     stages: list[SearchStage] = []
     try:
         context, search, _ = search_scene(scene, points, chips, options, stages=stages)
@@ -231,7 +226,7 @@ def _searched_again(
         model = block.model(number)
         context = PointContext(
             scene=scene,
-            options=options,
+            options=options_in_block(scene, options),
             progress=progress,
             stages=list(measured.stages),
             breaks=scene_breaks(scene),

@@ -132,6 +132,8 @@ def register_on_reference(
         displacement_px = _largest_displacement_px(before, level.model.correction, scene.image.shape)
         if displacement_px <= options.reference.settled_px * context.finest_factor:
             break
+    if options.adjustment.bends:
+        adjustment = adjust_search(scene, search, options.adjustment)
     return build_registration(context, search.points, search, adjustment)
 
 
@@ -265,7 +267,8 @@ def _search(
         check_inliers(stage, tolerance_px, matches.reason, scene, options.adjustment.min_points)
     side_m, breaks = matching.window_px * level_m, None if level.is_first else context.breaks
     search = Search(points, np.arange(len(points)), matches, inliers, side_m, breaks=breaks)
-    return search, adjust_search(scene, search, options.adjustment)
+    # Bends that the places of a level leave open would only lead the next one astray.
+    return search, adjust_search(scene, search, replace(options.adjustment, bends=False))
 
 
 def _largest_displacement_px(

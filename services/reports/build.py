@@ -161,10 +161,12 @@ def correction_in_words(adjustment: SceneAdjustment, gsd_m: float) -> tuple[str,
     displacement = adjustment.correction.displacement
     if displacement is not None:
         line, sample = np.ptp(displacement.displacement_px, axis=(0, 1))
-        kinds = ", ".join(_component_in_words(one, adjustment) for one in adjustment.components)
+        kinds = [_component_in_words(one, adjustment) for one in adjustment.components]
+        if adjustment.bends:
+            kinds.append("bends of the image, which points on a part of it leave open")
         sentences.append(
-            f"beyond the affine correction, {kinds}: within {line:.2f} px in line, {sample:.2f} px in "
-            "sample"
+            f"beyond the affine correction, {', '.join(kinds)}: within {line:.2f} px in line, "
+            f"{sample:.2f} px in sample"
         )
     return tuple(sentences)
 

@@ -73,10 +73,13 @@ class ImageCorrection:
         t = np.column_stack([np.ones(len(before)), (before - self.centre) / self.half_size])
         design = np.zeros((len(t), 2, 6))
         design[:, 0, :3] = design[:, 1, 3:] = t
-        covariance = design @ covariance_px2 @ design.transpose(0, 2, 1) + np.diag(local_sigma_px**2)
+        covariance = design @ covariance_px2 @ design.transpose(0, 2, 1)
         if self.displacement is not None:
-            covariance = covariance + self.displacement.variance_at(before)[:, :, None] * np.eye(2)
-        return np.asarray(covariance)
+            # Between nodes, what is taken from a variance may be a little more than there is.
+            own = np.diagonal(covariance, axis1=1, axis2=2)
+            added = np.maximum(self.displacement.variance_at(before), -own)
+            covariance = covariance + added[:, :, None] * np.eye(2)
+        return np.asarray(covariance + np.diag(local_sigma_px**2))
 
     @property
     def jacobian(self) -> Array:

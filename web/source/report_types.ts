@@ -29,6 +29,7 @@ export interface AdjustmentOptions {
   folds: number;
   prior_slope_sigma_px: number | null;
   profile: boolean;
+  bends: boolean;
 }
 
 export interface BlockUsed {

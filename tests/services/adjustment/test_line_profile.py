@@ -11,7 +11,7 @@ from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustm
 from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family
 from services.quality.accuracy import normalised_error
-from services.quality.normal_law import normal_ce90
+from services.quality.normal_law import normal_ce90, overall_ce90
 from services.sensors.correction import CorrectedModel, ImageCorrection, no_correction
 from services.sensors.displacement import DisplacementGrid
 from services.sensors.refined import LOUD_PX, refined_rpc
@@ -56,13 +56,17 @@ def draw(
     wrong: float = 0.06,
     averaged: bool = False,
     by_height_px: float = 0.0,
+    reach: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[ControlObservations, ImageCorrection]:
-    """Points of a scene that is shifted, skewed and moved line by line, with noise and some blunders."""
+    """Points of a scene that is shifted, skewed and moved line by line, with noise and some blunders.
+
+    They reach over a part of its lines and samples.
+    """
     frame = no_correction(SHAPE)
     truth = replace(
         frame, parameters=np.column_stack([rng.normal(0.0, 10.0, 2), rng.normal(0.0, 1.0, (2, 2))])
     )
-    predicted = rng.random((count, 2)) * (np.array(SHAPE) - 1.0)
+    predicted = rng.random((count, 2)) * reach * (np.array(SHAPE) - 1.0)
     height_m = rng.normal(0.0, 80.0, count)
     offsets = np.linspace(-0.5, 0.5, 65) * CHIP_PX if averaged else np.zeros(1)
     moved = np.mean([motion(predicted + [offset, 0.0]) for offset in offsets], axis=0)
@@ -77,7 +81,7 @@ def draw(
     ), truth
 
 
-def trial(motion: Motion, seed: int, **how: float) -> Trial:
+def trial(motion: Motion, seed: int, **how: object) -> Trial:
     """A drawn scene, adjusted, against its truth at places all over the image."""
     observations, truth = draw(motion, np.random.default_rng(seed), **how)  # type: ignore[arg-type]
     adjustment = adjust_scene(FlatModel(), SHAPE, observations, AdjustmentOptions())
@@ -85,8 +89,9 @@ def trial(motion: Motion, seed: int, **how: float) -> Trial:
     error = adjustment.correction.apply(places) - truth.apply(places) - motion(places)
     covariance = adjustment.covariance_at(adjustment.correction.apply(places))
     true_px = float(np.quantile(np.hypot(*error.T), 0.9))
-    predicted_px = float(np.median(normal_ce90(covariance)))
-    return Trial(adjustment, true_px / predicted_px, normalised_error(error, covariance).mean_square)
+    return Trial(
+        adjustment, true_px / overall_ce90(covariance), normalised_error(error, covariance).mean_square
+    )
 
 
 def beyond_affine(motion: Motion, places: Array) -> Array:
