@@ -31,6 +31,8 @@ BUDGETS = {
     "audit --help": STORE,
     "block list --help": STORE,
     "block publish --help": STORE,
+    # The jobs are done by other processes, which a warm server of the worker forks.
+    "worker --help": STORE | {"procrastinate"},
     # Without the statistics of scipy: a third of the time that its start takes.
     "scene register --help": PACKAGES - {"scipy.stats", "fastapi", "matplotlib", "pandas", "uvicorn"},
 }

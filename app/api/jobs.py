@@ -17,8 +17,8 @@ from app.db.schema import JobState
 from app.errors import NoSuchJob
 from app.usecases import jobs, results
 from app.usecases.features.query import parse_interval
+from app.usecases.media_types import media_type
 from app.usecases.processes import results_folder
-from app.usecases.registration.deliverables import media_type
 from app.usecases.results import delete_files
 
 router = APIRouter(tags=["jobs"], route_class=CallerRoute)

@@ -22,8 +22,8 @@ from app.api.routes import CallerRoute
 from app.errors import InputError
 from app.usecases import jobs
 from app.usecases.jobs import JobRequest
+from app.usecases.media_types import media_type
 from app.usecases.processes import Process
-from app.usecases.registration.deliverables import media_type
 
 router = APIRouter(tags=["processes"], route_class=CallerRoute)
 

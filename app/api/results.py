@@ -22,7 +22,7 @@ from app.db.jobs.jobs import Job
 from app.errors import AmersError
 from app.storage import Storage
 from app.usecases import jobs, results
-from app.usecases.registration.deliverables import media_type
+from app.usecases.media_types import media_type
 from services import errors as errors_of_science
 from services.reports import document
 

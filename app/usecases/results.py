@@ -16,8 +16,8 @@ from app.errors import NotFound
 from app.storage import Storage
 from app.usecases import quotas
 from app.usecases.damage import named_by_row
+from app.usecases.media_types import media_type
 from app.usecases.processes import Work, results_folder
-from app.usecases.registration.deliverables import media_type
 
 Transmission = Literal["value", "reference"]
 LARGEST_VALUE_BYTES = 16 << 20

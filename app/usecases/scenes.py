@@ -23,7 +23,7 @@ from app.usecases.damage import named_by_row
 from app.usecases.installation import Installation
 from app.usecases.server_files import file_below
 from services.errors import FormatError
-from services.formats.images.datasets import DRIVER_OF_SIGNATURE
+from services.formats.images.signatures import DRIVER_OF_SIGNATURE
 
 LONGEST_NAME = 120
 LONGEST_SIGNATURE = max(len(signature) for signature in DRIVER_OF_SIGNATURE)

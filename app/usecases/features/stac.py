@@ -10,8 +10,9 @@ from uuid import UUID
 
 from app.db.engine import Connection
 from app.db.scene_files import SceneFiles, read_scene_files
+from app.usecases.media_types import media_type
 from app.usecases.processes import result_name
-from app.usecases.registration.deliverables import OUTPUTS, media_type
+from app.usecases.registration.deliverables import OUTPUTS
 
 VERSION = "1.1.0"
 COLLECTION = "scenes"

@@ -33,23 +33,6 @@ OUTPUTS = {
 }
 """Outputs of a registration; the refined model in the format of the input comes in addition."""
 
-MEDIA_TYPES = {
-    ".json": "application/json",
-    ".geojson": "application/geo+json",
-    ".gcp": "text/plain",
-    ".points": "text/plain",
-    ".pts": "text/plain",
-    ".gpkg": "application/geopackage+sqlite3",
-    ".html": "text/html",
-    ".txt": "text/plain",
-    ".rpb": "text/plain",
-    ".geom": "text/plain",
-    ".xml": "application/xml",
-    ".tif": "image/tiff",
-    ".tiff": "image/tiff",
-    ".zip": "application/zip",
-}
-
 
 def write_outputs(
     folder: Path, report: RegistrationReport, image: str, points: ControlPoints
@@ -106,8 +89,3 @@ def _point_sigmas_m(points: ControlPoints, measures: Measures) -> Array:
     order = np.argsort(points.id)
     rows = order[np.searchsorted(points.id, measures.point_id, sorter=order)]
     return np.sqrt(np.diagonal(points.covariance_m2[rows], axis1=1, axis2=2))
-
-
-def media_type(name: str) -> str:
-    """The media type of an output."""
-    return MEDIA_TYPES.get(Path(name).suffix.lower(), "application/octet-stream")

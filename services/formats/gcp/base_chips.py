@@ -16,8 +16,8 @@ from services.formats.gcp.copernicus import COPERNICUS_KEY, copernicus_chips
 from services.formats.gcp.csv_points import PIXEL_ORIGINS
 from services.formats.gcp.gcplib import GcplibRecord, gcplib_records, is_gcplib
 from services.formats.images.bands import PixelCodes
-from services.formats.images.datasets import DRIVER_OF_SIGNATURE
 from services.formats.images.raster import map_grid_of, open_raster
+from services.formats.images.signatures import DRIVER_OF_SIGNATURE
 from services.formats.members import folder_member
 from services.formats.text_files import read_text
 from services.imagery.scene import Scene

@@ -13,18 +13,8 @@ from rasterio.errors import RasterioError
 
 from services.errors import FormatError
 from services.formats.addresses import Address, FilePlace, RangeFile
+from services.formats.images.signatures import DRIVER_OF_SIGNATURE
 
-DRIVER_OF_SIGNATURE = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
-    b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
-    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
-    b"NITF": "NITF",
-    b"NSIF": "NITF",
-}
-"""The GDAL driver of a file, by its first bytes; no other driver is used."""
 _SIGNATURE_BYTES = max(map(len, DRIVER_OF_SIGNATURE))
 
 # Outside of such an environment GDAL's cache grows to a twentieth of the machine's memory.
