@@ -28,6 +28,12 @@ def free_port() -> int:
     raise AssertionError("an endless row of ports has ended")
 
 
+def installed_at(folder: Path, **settings: str) -> dict[str, str]:
+    """The environment in which commands use the installation of a data folder, with other settings."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
+    return {**inherited, "AMERS_DATA_FOLDER": str(folder), **settings}
+
+
 class Service:
     """A running `amers serve` with options, and a data folder of its own.
 
@@ -41,8 +47,7 @@ class Service:
         self.folder = folder
         self.port = free_port()
         self.cluster = Cluster(folder / "postgres")
-        inherited = {name: value for name, value in os.environ.items() if not name.startswith("AMERS_")}
-        self.environment = {**inherited, "AMERS_DATA_FOLDER": str(folder), **settings}
+        self.environment = installed_at(folder, **settings)
         self.log = folder.with_suffix(".log")
         with self.log.open("ab") as output:
             self.process = subprocess.Popen(

@@ -17,38 +17,49 @@ from playwright.sync_api import (
     sync_playwright,
 )
 
+from app.db.cluster.embedded import Cluster
 from tests.app.flat_world import FlatWorld, make_flat_world
 from tests.command_line import amers_here
 from tests.journeys.map_page import ARTEFACTS, BUILT, DESKTOP, is_error, patience_ms
-from tests.service_process import Service, until
+from tests.service_process import Service, installed_at, until
 
 Amers = Callable[..., Any]
 Visit = Callable[..., Page]
 
 
 @pytest.fixture(scope="module")
-def service(open_folder: Path) -> Iterator[Service]:
-    """A running service with an empty store."""
+def installation(open_folder: Path) -> Iterator[Path]:
+    """The folder of an installation with an empty store, whose database runs also without a service."""
     folder = open_folder / uuid4().hex[:8]
-    references = folder / "references"
-    references.mkdir(parents=True)
+    (folder / "references").mkdir(parents=True)
     folder.chmod(0o755)
-    service = Service(folder / "data", AMERS_REFERENCE_FOLDER=str(references))
+    try:
+        with Cluster(folder / "data" / "postgres", durable=False).lease():
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def service(installation: Path) -> Iterator[Service]:
+    """A running service on the installation."""
+    references = str(installation / "references")
+    service = Service(installation / "data", AMERS_REFERENCE_FOLDER=references)
     try:
         assert until(service.is_ready), service.log.read_text()
         assert until(service.workers), service.log.read_text()
         yield service
     finally:
         service.end()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")
-def amers(service: Service) -> Amers:
-    """Runs a command on the service's installation; returns its JSON output."""
+def amers(installation: Path) -> Amers:
+    """Runs a command on the installation, beside the service where there is one; returns its JSON."""
+    environment = installed_at(installation / "data")
 
     def run(*words: str | Path) -> Any:
-        done = amers_here((*words, "--json"), service.environment)
+        done = amers_here((*words, "--json"), environment)
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)
 
