@@ -29,8 +29,9 @@ programs: $(READY)
 	$(MAKE) page
 	$(MAKE) chromium
 
+# The plugin of schemathesis takes two seconds to load, and only the tests of all operations need it.
 test-files: $(READY)
-	$(BIN)/python -m pytest -m "not endurance and not qgis" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
+	$(BIN)/python -m pytest -p no:schemathesis -m "not endurance and not qgis" -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 20 \
 		--ignore tests/app/test_openapi.py
 
 # All operations have one name, of which files handed out as a whole run only the first.

@@ -13,6 +13,9 @@ from hypothesis import settings
 
 from tests.run_folders import DISK, MEMORY, end_dead_runs, place_of_databases, run_folder
 
+# Until all tests are collected: it would look again and again through modules that live to the end.
+gc.disable()
+
 settings.register_profile("amers", deadline=None)
 settings.load_profile("amers")
 
@@ -51,6 +54,7 @@ def pytest_collection_finish() -> None:
     """Spare the garbage collector what lives to the end: all modules and tests."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
