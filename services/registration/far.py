@@ -45,8 +45,9 @@ from services.types import (
 
 MAX_MAP_SIDE = 2501
 """Largest side of the map of a scene, pixels: 20 km at 8 m. Of a larger scene the middle is searched."""
-MAX_CORRELATED_PX = 200_000_000
-"""Pixels in which chips are correlated, all together, beyond which chips and map are reduced."""
+MAX_CORRELATED_PX = 3_333_333
+"""Pixels in which chips are correlated, all together, for each point that the scene should show, beyond
+which chips and map are reduced."""
 _TILE_PX = 256
 _NODE_PX = 16
 """Pixels of the map between nodes that are projected through the model."""
@@ -198,7 +199,7 @@ def _plan(
         cut_px = cut * np.array(scene.image.shape)
         rows = points_expected(scene, points, prediction, gsd_m, count=options.points, cut_px=cut_px)
         side = min(2.0 * error_m / level_m + CHIP_SIZE / reduction, size)
-        if size == whole and len(rows) * side**2 <= MAX_CORRELATED_PX:
+        if size == whole and len(rows) * side**2 <= MAX_CORRELATED_PX * options.points:
             break
     return _Plan(gsd_m, reduction, error_m, size, whole, cut_px, rows)
 

@@ -49,9 +49,12 @@ from services.types import (
     no_progress,
 )
 
-_FEW_POINTS = 60
 _AGREEING = 12
 """Points that agree on an image that is turned, at least, and half of those found."""
+_FEW_POINTS = 60
+_FEW_COARSE_POINTS = 2 * _AGREEING
+"""Points that a coarse search for an image that is turned expects to see; chips that reach far are
+correlated in as many fewer pixels. Seven turns are searched, and few points agree by chance."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,8 @@ def _how_it_is_turned(
     scene: Scene, points: ControlPoints, chips: ChipSource, options: RegistrationOptions
 ) -> str:
     """How a scene that was not found is turned against its model; "" when it is not, as far as seen."""
-    few = replace(options, max_points=_FEW_POINTS, fine_stages=1)
+    coarse = replace(options.coarse, points=min(_FEW_COARSE_POINTS, options.coarse.points))
+    few = replace(options, max_points=_FEW_POINTS, fine_stages=1, coarse=coarse)
     for words, turned in turned_scenes(scene):
         try:
             _, search, adjustment = search_scene(turned, points, chips, few)

@@ -1,11 +1,12 @@
 """A scene kilometres off is found to its final accuracy, or refused with how far was searched."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from services.errors import NoConsensus
+from services.imagery.source import ArrayImage, Window
 from services.registration.context import SearchStage
 from services.registration.on_points import Registration, register_scene
 from services.types import ChipArray, ChipSource
@@ -70,6 +71,16 @@ def test_a_small_crop_kilometres_off_is_found_also_by_chips_with_lost_pixels() -
     assert registration.search_stages[0].name == "far"
     assert registration.search_stages[0].search_radius_m >= 5000.0
     assert largest_error_px(registration, CROP) < 4.0 * FINAL_PX
+
+
+def test_a_mirrored_scene_hundreds_of_metres_off_is_refused_as_mirrored() -> None:
+    points, chips = wide_points(2_500.0, 220.0, (2.0,))
+    scene = replace(wide_scene(*CROP, (1_000.0, -700.0)), sigma_m=500.0)
+    mirrored = ArrayImage(scene.image.read(Window(0, 0, *scene.image.shape))[:, ::-1])
+    stages: list[SearchStage] = []
+    with pytest.raises(NoConsensus, match=r"the image is mirrored.*by \d\d points that agree then"):
+        register_scene(replace(scene, image=mirrored), points, chips, stages=stages)
+    assert [stage.name for stage in stages] == ["far"]
 
 
 def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_searched() -> None:
