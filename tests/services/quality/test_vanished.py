@@ -111,6 +111,22 @@ def test_a_point_that_was_always_hard_to_find_needs_more_scenes(rng: np.random.G
     assert 1 not in vanished
 
 
+def test_the_probability_is_that_of_one_miss_a_quarter_beside_the_other_points(
+    rng: np.random.Generator,
+) -> None:
+    """Of fifteen points, all others are neighbours; of the scenes of a quarter, the strongest counts."""
+    before = ["2021-02-01", "2021-05-01", "2021-08-01", "2021-11-01"]
+    quarter = ["01-10", "03-20"], ["04-10", "06-20"]
+    since = [f"{year}-{day}" for year in (2022, 2023, 2024) for days in quarter for day in days]
+    found = rng.random((16, 15)) < 0.8
+    found[:, 0] = [True, False, False, True] + 12 * [False]
+    vanished = vanished_points(ground(rng, 15), searched(found, before + since))
+    share = (found[:, 1:].sum(axis=1) + 1.0) / (14 + 2.0)
+    health = min((2.0 + 5.0) / (share[:4].sum() + 5.0), 1.0)
+    missed = [1.0 - health * max(share[i], share[i + 1]) for i in range(4, 16, 2)]
+    assert vanished.probability[vanished.point == 0] == pytest.approx([np.prod(missed)])
+
+
 def test_without_searches_nothing_has_vanished() -> None:
     none = Searches(*(np.empty(0, np.int64),) * 2, np.empty(0, bool), np.empty(0, "datetime64[D]"))
     assert len(vanished_points(np.empty((0, 3)), none)) == 0
