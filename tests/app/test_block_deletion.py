@@ -1,7 +1,11 @@
 """A block that is deleted: its rows and chips go, and nothing that others need."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from threading import Event
 from uuid import UUID, uuid4
 
 import pytest
@@ -187,6 +191,48 @@ def test_no_block_is_deleted_while_one_is_ingested(
             delete_block(installation, "calanques@1")
     delete_block(installation, "calanques@1")
     assert rows_left(installation.database)["point"] == points_of_a_block
+
+
+@dataclass(frozen=True)
+class BusyDatabase(Database):
+    """A database in which somebody else does something between the first transaction and the second."""
+
+    meanwhile: Callable[[], None]
+    begun: list[int] = field(default_factory=list)
+
+    @contextmanager
+    def transaction(self) -> Iterator[Connection]:
+        self.begun.append(1)
+        if len(self.begun) == 2:
+            self.meanwhile()
+        with super().transaction() as connection:
+            yield connection
+
+
+def test_a_block_that_is_ingested_between_the_rows_and_the_files_keeps_its_chips(
+    installation: Installation, withdrawn: MadeBlock, tmp_path: Path
+):
+    """It finds the files of the deleted block in the storage, and does not store them again."""
+    newer = make_block(tmp_path / "newer", version="2")
+    chips, loaded, deleted = installation.storage.keys("chips"), Event(), Event()
+
+    def ingest() -> None:
+        with installation.database.transaction() as connection:
+            lifecycle.ingest_block(connection, installation.storage, newer.folder)
+            loaded.set()
+            deleted.wait(0.5)
+
+    with ThreadPoolExecutor(1) as threads:
+
+        def meanwhile() -> None:
+            threads.submit(ingest)
+            assert loaded.wait(30.0)
+
+        busy = BusyDatabase(**vars(installation.database), meanwhile=meanwhile)
+        delete_block(replace(installation, database=busy), "calanques@1")
+        deleted.set()
+    assert rows_left(installation.database)["point"] == points_of_a_block
+    assert installation.storage.keys("chips") == chips
 
 
 def test_the_sweep_removes_the_chips_of_a_deletion_that_was_interrupted(

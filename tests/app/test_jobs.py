@@ -142,7 +142,9 @@ def test_an_owner_sees_his_jobs_and_an_administrator_all(
     assert [one["jobID"] for one in client.get("/jobs", headers=me).json()["jobs"]] == [job["jobID"]]
     assert client.get("/jobs", headers=stranger).json()["jobs"] == []
     assert len(client.get("/jobs", headers=admin).json()["jobs"]) == 1
-    for path in (here, f"{here}/results", f"{here}/results/report.json"):
+    following = f"/jobs?after={job['jobID']}"
+    assert client.get(following, headers=me).status_code == 200
+    for path in (here, f"{here}/results", f"{here}/results/report.json", following):
         assert client.get(path, headers=stranger).status_code == 404
         assert client.get(path).status_code == 401
     assert client.delete(here, headers=stranger).status_code == 404

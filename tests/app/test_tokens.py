@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import pytest
 
@@ -148,6 +149,21 @@ def test_a_name_is_taken_as_long_as_its_token_is_valid(connection, end):
     run_sql(connection, f"update token set {end}")
     second = create_token(connection, "survey office", ["read"])
     assert authenticate(connection, second.secret) == second.token
+
+
+def test_a_name_that_two_administrators_give_at_once_is_that_of_one_token(database):
+    with database.transaction() as first, ThreadPoolExecutor(1) as threads:
+        create_token(first, "office", ["read"])
+
+        def create_too() -> None:
+            with database.transaction() as second:
+                create_token(second, "office", ["admin"])
+
+        other = threads.submit(create_too)
+        wait([other], timeout=0.5)
+        first.commit()
+        with pytest.raises(Conflict, match="named 'office' already"):
+            other.result()
 
 
 @pytest.mark.parametrize(
