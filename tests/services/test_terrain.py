@@ -163,6 +163,25 @@ def test_a_line_of_sight_that_leaves_the_grid_or_enters_a_void_has_no_intersecti
         intersect_terrain(view(12.0), pixels_of(), replace(terrain(), grid=far))
 
 
+def test_the_range_of_the_ground_holds_a_geoid_whose_extremes_lie_between_its_samples() -> None:
+    """Its waves are eight samples long, so that the samples show 92 % of them."""
+    line, sample = np.indices(SHAPE)
+    corners = np.array([[0.0, 0.0], [SHAPE[0] - 1.0, SHAPE[1] - 1.0]])
+    north, south = GRID.lon_lat(corners)[:, 1]
+    place = GRID.lon_lat(np.column_stack([line.ravel(), sample.ravel()]).astype(np.float64))
+
+    def geoid(at: Array) -> Array:
+        return np.asarray(
+            30.0 + 10.0 * np.sin(np.pi * (8.0 * (at[:, 1] - south) / (north - south) + 1 / 8))
+        )
+
+    flat = Terrain(GRID, ArrayImage(np.full(SHAPE, 500.0, dtype=np.float32)), geoid)
+    low, high = flat.range_m()
+    heights = flat.height_m(place)
+    assert low < heights.min() < heights.max() < high
+    assert high - low < 2.0 * np.ptp(heights)
+
+
 def test_lines_of_sight_end_on_ground_above_a_geoid() -> None:
     model, flat = view(35.0), terrain(60.0)
     ground = replace(flat, geoid=lambda at: 40.0 * np.sin(2.0 * at[:, 0]) + 80.0 * (at[:, 1] - 43.3))

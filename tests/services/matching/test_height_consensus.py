@@ -68,6 +68,32 @@ def test_another_view_is_seen_where_nothing_is_known_of_the_displacement() -> No
     assert agrees[~wild].mean() > 0.9
 
 
+def share_of_the_window(tolerance: float, search: float) -> float:
+    """How many random displacements of a square window lie within a tolerance of one of them."""
+    drawn = np.random.default_rng(7).uniform(-search, search, (400_000, 2))
+    return float((np.hypot(*drawn.T) <= tolerance).mean())
+
+
+def test_the_chance_of_a_view_is_that_of_displacements_drawn_in_the_windows() -> None:
+    """Three points that agree: one gives the slope, the two others agree with it by chance."""
+    height_m = np.array([30.0, 40.0, 50.0])
+    displacement = height_m[:, None] * [0.1, 0.05]
+    seen = height_consensus(displacement, height_m, TOLERANCE_PX, np.full(3, 10.0))
+    chance = share_of_the_window(TOLERANCE_PX, 10.0)
+    assert seen.false_alarms == pytest.approx(3.0 * chance**2, rel=0.1)
+
+
+def test_the_chance_of_another_view_leaves_out_the_points_that_determine_it() -> None:
+    """Six points of six: fifteen quadruples, of which two further points agree by chance."""
+    rng = np.random.default_rng(9)
+    position, height_m = rng.uniform(0.0, 1000.0, (6, 2)), rng.normal(0.0, 30.0, 6)
+    displacement = position * 0.002 + height_m[:, None] * [0.02, 0.01]
+    agrees, false_alarms = view_consensus(position, displacement, height_m, TOLERANCE_PX, 10.0)
+    assert agrees.all()
+    chance = share_of_the_window(TOLERANCE_PX, 10.0)
+    assert false_alarms == pytest.approx((6 - 4) * 15 * chance**2, rel=0.1)
+
+
 def test_random_displacements_are_no_other_view() -> None:
     rng = np.random.default_rng(8)
     alarms = 0

@@ -61,6 +61,17 @@ def test_the_tiles_of_every_zoom_hold_the_scene(lon: float, lat: float) -> None:
     assert max(levels[-1].rows, levels[-1].columns) <= 2
 
 
+def test_the_tiles_hold_a_scene_through_each_of_its_models() -> None:
+    """The registered model puts it two of its widths to the east of where the delivered one does."""
+    both = [scene_at(5.25, 43.25), scene_at(5.275, 43.25)]
+    for level in choose_tiles(both, (100.0, 100.0)):
+        ends = np.array([[0.0, 0.0], np.array(SHAPE) - 1.0])
+        grid = level.grid()
+        corners = grid.lon_lat(np.array([[-0.5, -0.5], np.array(grid.shape) - 0.5]))
+        for scene in both:
+            assert inside(scene.model.locate(ends, np.full(2, 100.0))[:, :2], corners), level
+
+
 def test_a_corner_of_the_tiles_is_where_the_tile_matrix_set_has_it() -> None:
     level = choose_tiles([scene_at(5.25, 43.25)], (100.0, 100.0))[0]
     corner = level.grid().lon_lat(np.array([[-0.5, -0.5]]))[0]
@@ -113,6 +124,13 @@ def test_heights_are_linear_between_points_and_those_of_the_nearest_outside() ->
     )
     np.testing.assert_allclose(heights, [150.0, 175.0, 300.0, 0.0], atol=1.0)
     assert terrain.vertical == "interpolated between 4 control points"
+
+
+def test_the_nearest_point_is_nearest_in_metres() -> None:
+    """At 60 degrees of latitude, a degree of longitude is half as long as one of latitude."""
+    points = np.array([[10.015, 60.0, 100.0], [10.0, 60.01, 200.0]])
+    terrain = terrain_of_points(points, np.array([[9.98, 59.98], [10.02, 60.02]]))
+    np.testing.assert_allclose(terrain.height_m(np.array([[10.0, 60.0]])), [100.0], atol=a_centimetre)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -83,6 +83,9 @@ def test_bias_spread_and_le90_put_in_are_found_and_the_frame_is_judged_by_its_ow
     true_le90_m = np.quantile(np.abs(1.5 + 0.8 * rng.normal(size=1_000_000)), 0.9)
     assert on_earth.le90_m.lower < true_le90_m < on_earth.le90_m.upper
     assert_allclose(quality.normalised_frame.mean_square, (1.5 / 2.0) ** 2, rtol=2 * five_percent)
+    vague = replace(model, frame_sigma_m=1.5)
+    of_both = height_quality(height_errors(points, vague), points, vague, "flat").normalised_frame
+    assert_allclose(of_both.mean_square, 1.5**2 / (2.0**2 + 1.5**2), rtol=2 * five_percent)
     unknown = replace(points, frames=(Frame.from_sigmas(1.0, np.nan),))
     assert height_quality(height_errors(unknown, model), unknown, model, "f").normalised_frame.n == 0
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from services.quality.frames import shared_frame, weighted_frame
+from services.quality.frames import frame_in_image, shared_frame, weighted_frame
 from services.types import UNKNOWN_FRAME, Frame
 from tests.factories import control_points
 
@@ -45,6 +45,14 @@ def test_only_the_blocks_of_active_points_count():
     assert np.isnan(shared_frame(from_two, ~first_block).covariance_m2).all()
     assert np.isnan(shared_frame(from_two, np.array([True, True, True, False])).covariance_m2).all()
     assert np.isnan(shared_frame(from_two, np.zeros(4, dtype=bool)).covariance_m2).all()
+
+
+@pytest.mark.parametrize(("apart_px", "left"), [(0.0, 1.0), (1.5, 0.75), (3.0, 0.0), (9.0, 0.0)])
+def test_what_blocks_are_seen_to_be_apart_is_no_error_that_they_share(apart_px, left):
+    """The frame moves the image by 3 px a coordinate: what is seen of it counts as a square."""
+    derivative = np.array([[[0.0, -2.0, 0.3], [2.0, 0.0, -0.4]]])
+    moved = frame_in_image(Frame(np.diag([2.25, 2.25, 0.0])), derivative, apart_px)
+    assert_allclose(moved, left * 9.0 * np.eye(2)[None], atol=1e-12)
 
 
 def test_a_frame_of_sigmas_is_unknown_in_what_nobody_stated():

@@ -13,7 +13,7 @@ from services.map_grid import MapGrid
 from services.matching.reference_image import Reference
 from services.production.from_ortho import GroundHeights, OrthoPointOptions, produce_ortho_points
 from services.quality.planimetry import planimetric_quality
-from services.quality.site_errors import Site, expected_reach_m, point_errors
+from services.quality.site_errors import POINTS, Site, SiteErrors, expected_reach_m, point_errors
 from services.sensors.ortho import OrthoModel
 from services.types import Acquisition, Array, ControlPoints, Frame
 from tests.services.simulated import MemoryChips
@@ -139,6 +139,35 @@ def test_check_only_sites_are_told_apart_from_control_sites() -> None:
     assert_allclose(check_only.accuracy.ce90_m.value, np.hypot(4.0, 6.0), atol=a_centimetre)
     assert np.isnan(together.accuracy.ce90_m.upper)  # two sites bound nothing
     assert "share errors" in together.accuracy.ce90_m.note
+
+
+def test_the_ortho_images_of_several_sites_err_less_together_than_one() -> None:
+    """A shift of 3 m, of a block known to 1 m, at sites whose ortho-images are known to 2 m each."""
+
+    def at(name: str) -> SiteErrors:
+        error_m = np.random.default_rng(3).normal(0.0, 0.1, (201, 2))
+        error_m += [3.0, 0.0] - np.median(error_m, axis=0)
+        covariance_m2 = np.tile(0.01 * np.eye(2), (201, 1, 1))
+        place = np.zeros((201, 2))
+        return SiteErrors(
+            name, False, POINTS, np.nan, 201, 9.0, place, error_m, covariance_m2, 4.0 * np.eye(2), ()
+        )
+
+    frame = Frame.from_sigmas(1.0, 1.0)
+    for count in (1, 2, 4):
+        quality = planimetric_quality([at(f"site {k}") for k in range(count)], "points", frame)
+        expected = 3.0**2 / (1.0 + 4.0 / count) / 2.0
+        assert_allclose(quality.normalised_frame.mean_square, expected, rtol=1e-9)
+
+
+def test_what_an_ortho_image_states_of_its_details_is_in_the_errors_found_on_it() -> None:
+    points, chips = block()
+    sharp = site("corner", (0, 0), (700, 700))
+    blunt = replace(sharp, reference=replace(sharp.reference, sigma_m=0.6))
+    first, second = (point_errors(points, chips, one) for one in (sharp, blunt))
+    assert len(first.error_m) > 5
+    added_m2 = (0.6**2 - MATCH_SIGMA_M**2) * np.eye(2)
+    assert_allclose(second.covariance_m2, first.covariance_m2 + added_m2, atol=1e-9)
 
 
 def test_a_shift_beyond_the_near_search_is_found_when_the_frame_lets_expect_it() -> None:

@@ -9,6 +9,7 @@ from benchmarks._cape_verde import SITES, STEREO, Draw, draw
 from services.errors import InputError
 from services.geodesy import move_metres
 from services.quality.site_reach import SiteReach, site_reach
+from services.types import Frame
 
 OFF_M = 1.0
 
@@ -49,6 +50,23 @@ def test_the_known_ground_of_a_check_site_takes_no_part(one: Draw, plain: SiteRe
     np.testing.assert_allclose(
         after.checks[0].error_m - plain.checks[0].error_m, [-OFF_M, 0.0, 0.0], atol=1e-6
     )
+
+
+def test_what_is_declared_for_a_check_holds_the_frames_of_both_sites(
+    one: Draw, plain: SiteReach
+) -> None:
+    """That of a vague site counts in full as a check, and beside the images as control."""
+    site = one.sites[0]
+    frame_m2 = site.ground.frames[0].covariance_m2
+    badly = replace(site, ground=replace(site.ground, frames=(Frame(9.0 * frame_m2),)))
+    after = reach(replace(one, sites=(badly, one.sites[1])))
+    of_control, of_check = (
+        later.covariance_m2 - before.covariance_m2
+        for later, before in zip(after.checks, plain.checks, strict=True)
+    )
+    np.testing.assert_allclose(of_check, 8.0 * frame_m2, atol=1e-9)
+    assert (0.2 * 8.0 * np.diag(frame_m2) < np.diag(of_control))[:2].all()
+    assert (np.diag(of_control) < 8.0 * np.diag(frame_m2)).all()
 
 
 def test_corners_of_every_image_move_by_less_than_its_model_was_off(one: Draw, plain: SiteReach) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from services.formats.sensor_models.rpc_text import parse_rpc_text
 from services.sensors.correction import CorrectedModel, ImageCorrection, fold_into_rpc, no_correction
+from services.sensors.displacement import DisplacementGrid
 
 MODEL = parse_rpc_text((Path(__file__).parents[2] / "golden" / "invented_RPC.TXT").read_text())
 SHAPE = (26000, 26500)
@@ -85,6 +86,31 @@ def test_the_derivative_of_a_corrected_model_agrees_with_differences() -> None:
     up = np.array([[0.0, 0.0, 1.0]])
     by_steps = (model.project(at + up) - model.project(at - up))[0] / 2.0
     np.testing.assert_allclose(model.project_derivative(at)[0, :, 2], by_steps, rtol=0.0, atol=1e-6)
+
+
+def broken_grid() -> DisplacementGrid:
+    """Lines behind line 100 lie 5 lines and 2 samples farther on; along the samples it rises by 1 px."""
+    line, sample = np.array([0.0, 99.9, 100.1, 200.0]), np.array([0.0, 300.0])
+    moved = np.array([0.0, 0.0, 1.0, 1.0])[:, None, None] * [5.0, 2.0] + [[[0.0, 0.0], [0.0, 1.0]]]
+    return DisplacementGrid(line, sample, moved, np.zeros_like(moved), np.array([100.0]))
+
+
+def test_a_chip_beside_a_break_shows_the_side_of_its_middle() -> None:
+    middles = np.array([[95.0, 150.0], [99.0, 150.0], [101.0, 150.0], [105.0, 150.0]])
+    shown = broken_grid().averaged(middles, 20.0)
+    expected = [[0.0, 0.5], [0.0, 0.5], [5.0, 2.5], [5.0, 2.5]]
+    np.testing.assert_allclose(shown, expected, atol=a_nanopixel)
+
+
+def test_a_displacement_is_constant_beyond_its_nodes_and_so_is_its_derivative() -> None:
+    grid, step = broken_grid(), 0.01
+    outside = np.array([[250.0, 150.0], [50.0, -20.0], [50.0, 400.0], [-9.0, 150.0], [250.0, 400.0]])
+    at = np.concatenate([outside, [[50.0, 150.0], [100.0, 150.0]]])
+    by_difference = [(grid.at(at + one) - grid.at(at - one)) / (2.0 * step) for one in step * np.eye(2)]
+    derivative = grid.derivative(at)
+    np.testing.assert_allclose(derivative, np.stack(by_difference, axis=-1), atol=a_nanopixel)
+    assert not derivative[-3].any()
+    np.testing.assert_array_equal(grid.at(outside[4:]), grid.at(np.array([[200.0, 300.0]])))
 
 
 def test_no_correction_changes_nothing() -> None:
