@@ -45,7 +45,13 @@ def batches(storage: Storage) -> dict[str, list[str]]:
     for key in storage.keys(TRASH):
         _, batch, former_key = key.split("/", 2)
         contents.setdefault(batch, []).append(former_key)
-    return contents
+    return dict(sorted(contents.items(), key=lambda one: _age(one[0])))
+
+
+def _age(batch: str) -> tuple[str, int]:
+    """The date and the hours of a batch: those of 95 hours come before those of 310."""
+    form = BATCH.fullmatch(batch)
+    return (batch, 0) if form is None else (form[1], int(form[2]))
 
 
 def find(storage: Storage, key: str) -> str | None:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import DamagedFile, InputError, NotFound, TooLarge
-from app.storage import Storage, StoredChips, chips_key
+from app.storage import Storage, StoredChips, chips_key, trash
+from app.storage.trash import Moment
+from app.usecases.garbage_collection import Bin, Family
 from services.conventions import CHIP_SIZE
 
 
@@ -144,6 +147,50 @@ def test_a_link_is_not_followed_out_of_the_folder(storage, tmp_path):
     with pytest.raises(InputError, match="link"):
         storage.put("scenes/folder/new", [b"x"])
     assert storage.keys("scenes") == ["scenes/a"]
+
+
+def discarded(storage: Storage, content: bytes, at: Moment) -> None:
+    storage.put("scenes/a", [content])
+    trash.discard(storage, ["scenes/a"], at)
+
+
+def test_of_files_of_one_name_the_trash_gives_the_last_one_discarded(storage):
+    day = date(2026, 11, 22)
+    last = Moment(date(2026, 11, 23), 8)
+    for moment in (Moment(day, 310), Moment(day, 95), Moment(date(2026, 11, 9), 400)):
+        discarded(storage, moment.batch.encode(), moment)
+    assert list(trash.batches(storage)) == ["2026-11-09_400h", "2026-11-22_95h", "2026-11-22_310h"]
+    assert storage.open(trash.find(storage, "scenes/a")).read() == b"2026-11-22_310h"
+    discarded(storage, b"last", last)
+    assert storage.open(trash.find(storage, "scenes/a")).read() == b"last"
+    assert trash.find(storage, "scenes/b") is None
+
+
+def test_what_is_put_back_from_the_trash_replaces_nothing(storage):
+    at = Moment(date(2026, 11, 22), 310)
+    discarded(storage, b"old", at)
+    storage.put("scenes/a", [b"new"])
+    assert trash.put_back(storage, at.batch, ["scenes/a"]) == []
+    assert storage.open("scenes/a").read() == b"new"
+    storage.delete("scenes/a")
+    assert trash.put_back(storage, at.batch, ["scenes/a"]) == ["scenes/a"]
+    assert storage.open("scenes/a").read() == b"old"
+    assert storage.keys("trash") == []
+
+
+@pytest.mark.parametrize(("n_files", "most"), [(120, 100), (2000, 100), (4000, 200)])
+def test_a_sweep_removes_a_twentieth_of_the_files_or_a_hundred_and_of_more_unknown_ones_none(
+    storage, n_files, most
+):
+    """Files that a row gives up are known: of them the first ones go, and the next sweep goes on."""
+    given_up, unknown = ([f"scenes/{kind}{i}" for i in range(most + 1)] for kind in "gu")
+    rubbish = Bin(storage)
+    assert rubbish.remove_unnamed(Family("scenes", n_files, [], unknown[:most])) == unknown[:most]
+    assert rubbish.remove_unnamed(Family("scenes", n_files, [], unknown)) == []
+    assert rubbish.remove_unnamed(Family("scenes", n_files, given_up, [])) == given_up[:most]
+    assert rubbish.remove_unnamed(Family("scenes", n_files, given_up, unknown)) == given_up[:most]
+    everything = Bin(storage, limited=False).remove_unnamed(Family("scenes", n_files, given_up, unknown))
+    assert set(everything) == {*given_up, *unknown}
 
 
 def test_a_chip_file_is_stored_once_under_its_checksum(storage, tmp_path):
