@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -12,7 +14,10 @@ from app.config import Settings
 from app.db import engine
 from app.db.engine import Database
 from app.db.jobs import attempts, jobs
+from app.errors import DamagedFile
 from app.main import create_app
+from app.storage import Storage
+from app.usecases.jobs import error_details
 from tests.app.job_queue import LEASE_S, claimed, tickets
 
 Bearer = Callable[[str], dict[str, str]]
@@ -186,6 +191,18 @@ def test_a_failed_job_reports_the_reason_with_its_numbers(
     results = client.get(f"/jobs/{job['jobID']}/results", headers=me)
     assert (results.status_code, results.json()["found"]) == (409, 3)
     assert results.headers["content-type"] == "application/problem+json"
+
+
+def test_the_error_of_a_job_names_files_and_no_folder_of_the_machine(tmp_path: Path):
+    storage, scene = Storage(tmp_path / "storage"), uuid4()
+    message = (
+        f"{storage.folder}/scenes/{scene}/a.tif, {storage.folder}/results/{scene}/3/a.json and "
+        f"{gettempdir()}/amers-x1_y/b.tif cannot be read"
+    )
+    details = error_details(DamagedFile("scenes/a.tif", message), storage)
+    assert str(tmp_path) not in details["detail"]
+    assert gettempdir() not in details["detail"]
+    assert all(name in details["detail"] for name in ("a.tif", "a.json", "b.tif cannot be read"))
 
 
 def test_jobs_are_listed_page_by_page_and_by_kind_and_state(

@@ -162,6 +162,7 @@ def test_an_image_and_the_file_with_its_model_become_one_scene(
     assert reply.headers["upload-expires"]
     scene = reply.headers["amers-scene"]
     assert client.get(f"/scenes/{scene}", headers=me).json()["state"] == "uploading"
+    assert client.delete(f"/scenes/{scene}", headers=me).status_code == 409, "its upload is deleted"
     model = begun(client, me, 4, filename="RPC_IMG.XML", scene=scene)
     assert piece(client, model.headers["location"], me, 0, b"<a/>").status_code == 204
     url = reply.headers["location"]
@@ -396,6 +397,8 @@ def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
     assert piece(client, reply.headers["location"], admin | TUS, 0, bytes(40)).status_code == 204
     keys = sorted(f"uploads/{upload}/a.zip" for upload in (put, tus))
     assert storage.keys("uploads") == keys
+    execute = "/processes/ingest-block/execution"
+    job = client.post(execute, json={"inputs": {"upload": tus}}, headers=admin).json()["jobID"]
     for upload in (put, tus):
         document = client.get(f"/uploads/{upload}", headers=admin).json()
         assert (document["state"], document["purpose"], document["size_bytes"]) == (
@@ -411,8 +414,9 @@ def test_archives_are_stored_and_swept_alike_however_they_were_uploaded(
         with database.transaction() as connection:
             let_pass(connection, hours=LIFE_HOURS + 1)
         sweep_files(database, storage, 3600.0)
+        assert storage.keys("uploads") == [f"uploads/{tus}/a.zip"], "a job waits to ingest it"
+        assert client.delete(f"/jobs/{job}", headers=admin).status_code == 200
+        sweep_files(database, storage, 3600.0)
     assert storage.keys("uploads") == []
-    gone = client.post(
-        "/processes/ingest-block/execution", json={"inputs": {"upload": put}}, headers=admin
-    )
+    gone = client.post(execute, json={"inputs": {"upload": put}}, headers=admin)
     assert gone.status_code == 404
