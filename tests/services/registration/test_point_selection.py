@@ -77,6 +77,21 @@ def test_where_there_are_few_points_or_all_are_requested_all_are_tried() -> None
         np.testing.assert_array_equal(rows, np.arange(len(points)))
 
 
+@pytest.mark.parametrize("worse", ["has often failed", "is imprecise"])
+def test_of_two_points_at_one_place_the_better_one_is_tried(worse: str) -> None:
+    scene, points = small_scene(), block()[0]
+    points = points.take(np.repeat(np.arange(len(points)), 2))
+    every_second = np.arange(len(points)) % 2 == 1
+    points = replace(points, saliency=np.ones(len(points)), health=np.ones(len(points)))
+    if worse == "has often failed":
+        better = replace(points, health=np.where(every_second, 1.0, 0.5))
+    else:
+        times = np.where(every_second, 1.0, 9.0)
+        better = replace(points, covariance_m2=points.covariance_m2[:1] * times[:, None, None])
+    rows = points_to_try(scene, better, prediction_within(0.5, scene, better), FEW)
+    assert every_second[rows].all()
+
+
 def test_points_are_visible_as_far_as_the_scene_may_be_off() -> None:
     scene, points = small_scene(), block()[0]
     visible = visible_points(scene, points)
