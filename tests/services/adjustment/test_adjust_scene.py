@@ -9,6 +9,7 @@ import pytest
 from services.adjustment.affine_fit import Order
 from services.adjustment.control_observations import ControlObservations
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
+from services.adjustment.shared_errors import overlap_correlation
 from services.errors import NotEnoughPoints, UndeterminedCorrection
 from services.sensors.correction import ImageCorrection, no_correction
 from services.types import Array, BoolArray
@@ -518,6 +519,18 @@ def test_chips_that_overlap_do_not_count_twice() -> None:
     assert variance(ten_times, 100.0) > 0.9 * NOISE_PX**2 / 12.0
     assert variance(ten_times, 0.0) < 0.5 * variance(ten_times, 100.0)
     assert variance(points, 100.0) < 2.0 * NOISE_PX**2 / 12.0
+
+
+def test_overlapping_chips_share_noise_over_the_area_of_one_of_them() -> None:
+    """Summed over all places of a second chip, the shared part is one chip, which holds no direction."""
+    side_px, step_px = 40.0, 0.5
+    away = np.arange(0.0, 2.0 * side_px, step_px)
+    place = np.array([[0.6, 0.8]]) * away[:, None]
+    shared = overlap_correlation(place, side_px, np.ones(len(away)))[0]
+    area_px2 = float((shared * 2.0 * np.pi * away).sum() * step_px)
+    assert area_px2 == pytest.approx(side_px**2, rel=0.01)
+    half = overlap_correlation(place, side_px, np.full(len(away), 0.5))[0]
+    np.testing.assert_allclose(half[1:], 0.5 * shared[1:], atol=1e-12)
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 12_000.0])

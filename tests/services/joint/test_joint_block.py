@@ -20,7 +20,7 @@ from benchmarks._joint_scenes import (
 from services.geodesy import move_metres
 from services.imagery.scene import scene_gsd_m
 from services.joint.block import JointBlock, adjust_together, repeated
-from services.joint.fitting import adjust_fitting, ties_between
+from services.joint.fitting import SceneFit, adjust_fitting, ties_between
 from services.joint.measured import MeasuredScene, nothing_found
 from services.joint.registration import qualified
 from services.joint.results import (
@@ -326,3 +326,22 @@ def test_a_scene_without_control_points_is_stated_with_those_of_its_neighbours(
     assert 0.1 < qualification.predicted.worst_m < 3.0
     on_earth_m = qualification.predicted.on_the_earth_worst_m
     assert 2.0 * FRAME.sigma_m < on_earth_m < 4.0 * FRAME.sigma_m
+
+
+def test_a_point_that_one_of_the_scenes_left_shows_ties_nothing() -> None:
+    """Of four scenes the first has left: its points remain where two others show them."""
+    point, image = np.array([0, 0, 1, 1, 1, 2, 2, 3]), np.array([0, 1, 0, 2, 3, 2, 3, 1])
+    line_sample = np.arange(16.0).reshape(8, 2)
+    ties = Observations(point, image, line_sample, np.arange(8.0))
+    own = ties_between(ties, [1, 2, 3])
+    np.testing.assert_array_equal(own.point, [0, 0, 1, 1])
+    np.testing.assert_array_equal(own.image, [1, 2, 1, 2])
+    np.testing.assert_array_equal(own.line_sample, line_sample[3:7])
+    np.testing.assert_array_equal(own.sigma_px, [3.0, 4.0, 5.0, 6.0])
+
+
+def test_a_scene_fits_by_its_ties_and_by_its_control_where_either_are_enough() -> None:
+    assert SceneFit(ties=100, used_ties=90, control=10, used_control=3, normalised=1.0).used == 0.3
+    assert SceneFit(ties=100, used_ties=20, control=10, used_control=9, normalised=1.0).used == 0.2
+    assert SceneFit(ties=100, used_ties=90, control=3, used_control=0, normalised=1.0).used == 0.9
+    assert SceneFit(ties=3, used_ties=3, control=3, used_control=3, normalised=1.0).used == 0.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.adjustment.structure import Family, Structure
+from services.adjustment.structure import Family, Structure, unfollowed_variance_px2
 from services.quality.criteria import Criterion
 from services.quality.lack_of_fit import breaks_criterion, structure_criteria
 
@@ -95,3 +95,37 @@ def test_a_correction_that_follows_no_break_holds_one_part_alone() -> None:
     unfollowed = behind_breaks([10, 200, 400, 600, 900, 1200, 1400, 1600, 1700, 1900], followed=False)
     assert (unfollowed.met, unfollowed.needed_for, unfollowed.value) == (False, "usable", 50.0)
     assert "does not follow" in unfollowed.note
+
+
+def left(family: Family, line_px: float, sample_px: float, chance: float = 1e-12) -> Structure:
+    """A structure that nothing follows."""
+    size_px = np.array([line_px, sample_px])
+    return Structure(family, chance, "wave", np.nan, size_px, 3.0 * line_px, np.full(2, np.nan))
+
+
+def test_families_are_words_for_one_misfit_of_which_the_largest_counts() -> None:
+    found = [left("lines", 0.4, 0.1), left("samples", 0.3, 0.2), left("steps", 0.2, 0.0)]
+    expected = np.array([0.4, 0.2]) ** 2
+    np.testing.assert_allclose(unfollowed_variance_px2(found, np.full(2, 0.5)), expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        unfollowed_variance_px2(found[::-1], np.full(2, 0.5)), expected, rtol=1e-6
+    )
+
+
+def test_neighbours_that_err_together_may_be_points_and_lines_that_do_are_not() -> None:
+    """Of the variance of measures a quarter is the image's in lines, and all of it in samples."""
+    of_image = np.array([0.25, 1.0])
+    together = unfollowed_variance_px2([left("image", 0.4, 0.4)], of_image)
+    np.testing.assert_allclose(together, 0.16 * of_image, rtol=1e-6)
+    along_lines = unfollowed_variance_px2([left("lines", 0.4, 0.4)], of_image)
+    np.testing.assert_allclose(along_lines, [0.16, 0.16], rtol=1e-6)
+    by_height = unfollowed_variance_px2([left("height", 0.4, 0.4)], of_image)
+    np.testing.assert_array_equal(by_height, np.zeros(2))
+
+
+def test_what_chance_explains_adds_nothing_to_the_variance() -> None:
+    unclear = [left("lines", 0.4, 0.4, chance) for chance in (0.0, 1e-4, 0.01, 0.1, 0.5)]
+    variance = [unfollowed_variance_px2([one], np.ones(2))[0] for one in unclear]
+    assert variance[0] == pytest.approx(0.16)
+    assert variance[-1] == 0.0
+    assert (np.diff(variance) < 0.0).all()

@@ -1,0 +1,61 @@
+"""The scale of a block against simulated least squares, and control of several sources."""
+
+import numpy as np
+import pytest
+
+from services.adjustment.block_scale import posterior_scale
+from services.adjustment.control_ground import ControlGround, joined_ground
+from services.types import Frame, IntArray
+
+RAYS, POINTS, SHARED = 3, 30, 24
+NOISE = 1.5
+
+
+def squared_residuals(rng: np.random.Generator) -> np.ndarray:
+    """Of two coordinates a ray, after a fit of three unknowns a point and some that all points share."""
+    rows = 2 * RAYS
+    design = rng.normal(size=(POINTS * rows, SHARED + 3 * POINTS))
+    for point in range(POINTS):
+        others = np.ones(POINTS * rows, dtype=bool)
+        others[point * rows : (point + 1) * rows] = False
+        design[others, SHARED + 3 * point : SHARED + 3 * point + 3] = 0.0
+    basis = np.linalg.qr(design)[0]
+    error = NOISE * rng.normal(size=len(design))
+    residual = error - basis @ (basis.T @ error)
+    return np.asarray((residual.reshape(-1, 2) ** 2).sum(axis=1))
+
+
+def test_the_scale_is_that_of_the_noise_whatever_the_points_share() -> None:
+    """Of 180 values, the points take 90, and what they share 24: without it the scale is 0.86 of it."""
+    rng = np.random.default_rng(5)
+    point, coordinates = np.repeat(np.arange(POINTS), RAYS), np.full(POINTS, 3.0)
+    scales = [
+        posterior_scale(squared_residuals(rng), point, coordinates, float(SHARED)) for _ in range(60)
+    ]
+    assert np.mean(scales) == pytest.approx(NOISE, rel=0.04)
+
+
+def control(point: IntArray, *frames: Frame) -> ControlGround:
+    """Points that come from some sources in turn."""
+    count = len(point)
+    source = np.arange(count) % len(frames)
+    names = tuple(str(one) for one in point.tolist())
+    covariance_m2 = np.tile(np.eye(3), (count, 1, 1))
+    return ControlGround(point, np.zeros((count, 3)), covariance_m2, source, frames, names)
+
+
+def test_points_of_joined_control_keep_their_frames() -> None:
+    sigmas_m = [1.0, 2.0, 3.0, 4.0]
+    first, second, third, fourth = (Frame.from_sigmas(one, one) for one in sigmas_m)
+    parts = [control(np.arange(4), first, second), control(np.arange(4, 7), third)]
+    parts.append(control(np.arange(7, 9), fourth))
+    joined = joined_ground(parts)
+    known_to_m = [joined.frames[source].sigma_m for source in joined.source]
+    np.testing.assert_allclose(known_to_m, [1.0, 2.0, 1.0, 2.0, 3.0, 3.0, 3.0, 4.0, 4.0])
+    np.testing.assert_array_equal(joined.point, np.arange(9))
+
+
+def test_what_the_points_of_a_block_share_is_an_error_of_its_frame_as_control() -> None:
+    frame = Frame(np.diag([4.0, 4.0, 9.0]), np.diag([1.0, 2.0, 3.0]))
+    (as_control,) = control(np.arange(3), frame).frame_covariances()
+    np.testing.assert_allclose(as_control, np.diag([5.0, 6.0, 12.0]))

@@ -1,0 +1,98 @@
+"""What an elevation model tells of points, and how well, on ground whose slope is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.errors import NotEnoughPoints
+from services.imagery.scene import Scene
+from services.imagery.source import ArrayImage
+from services.map_grid import MapGrid
+from services.production.height_control import ControlHeights, known_heights, ortho_heights
+from services.sensors.ortho import OrthoModel
+from services.terrain import Terrain
+from services.types import Acquisition, Array, Frame, Observations, SurfaceHeights
+
+POSTING_M, SIDE = 10.0, 400
+DEM_SIGMA_M, SURFACE_SIGMA_M = 0.5, 0.3
+DEM_FRAME_M, PLACE_M = (3.0, 1.0), 4.0
+OFF_M = 5.0
+"""Of the places of points and model together: 4 m and 3 m."""
+ABOVE_M = 2.5
+a_millimetre = 1e-3
+a_percent = 0.01
+
+GRID = MapGrid(
+    "EPSG:32631", np.array([7e5, 4.8e6]), np.array([[0.0, POSTING_M], [-POSTING_M, 0.0]]), (SIDE, SIDE)
+)
+
+
+def ground(west: float, east: float) -> ControlHeights:
+    """Ground that rises eastwards by some metres a metre, in its western and its eastern half."""
+    along_m = (np.arange(SIDE) - SIDE / 2.0) * POSTING_M
+    heights = 500.0 + np.where(along_m < 0.0, west, east) * along_m
+    pixels = np.tile(heights, (SIDE, 1)).astype(np.float32)
+    frame = Frame.from_sigmas(*DEM_FRAME_M)
+    return ControlHeights("dem", Terrain(GRID, ArrayImage(pixels)), DEM_SIGMA_M, frame)
+
+
+def places() -> Array:
+    """Forty places in each half of the ground, away from its borders and from the edge between both."""
+    sample = np.concatenate([np.linspace(40.0, 160.0, 40), np.linspace(240.0, 360.0, 40)])
+    line = np.tile(np.linspace(60.0, 340.0, 40), 2)
+    return np.column_stack([GRID.lon_lat(np.column_stack([line, sample])), np.zeros(80)])
+
+
+def surfaces(count: int) -> SurfaceHeights:
+    return SurfaceHeights(np.full(count, ABOVE_M), np.full(count, SURFACE_SIGMA_M))
+
+
+def test_a_point_lies_as_far_below_the_model_as_the_surface_lies_above_the_point() -> None:
+    heights = ground(0.0, 0.1)
+    known = known_heights(places(), surfaces(80), PLACE_M, heights)
+    expected = heights.terrain.height_m(known.lon_lat_h[:, :2]) - ABOVE_M
+    np.testing.assert_allclose(known.lon_lat_h[:, 2], expected, atol=0.05)
+    assert not known.known[:, :2].any()
+    assert known.known[:, 2].all()
+
+
+@pytest.mark.parametrize(
+    ("west", "east", "shared", "own"),
+    [(0.0, 0.0, 0.0, 0.0), (0.2, 0.2, 0.2, 0.0), (0.2, -0.2, 0.0, 0.2), (0.3, 0.1, 0.2, 0.1)],
+)
+def test_the_mean_slope_errs_together_and_what_differs_from_it_apart(
+    west: float, east: float, shared: float, own: float
+) -> None:
+    """A model that lies off moves all heights of a slope alike, and those of two slopes apart."""
+    known = known_heights(places(), surfaces(80), PLACE_M, ground(west, east))
+    own_m2 = DEM_SIGMA_M**2 + SURFACE_SIGMA_M**2 + (own * OFF_M) ** 2
+    np.testing.assert_allclose(known.covariance_m2[:, 2, 2], own_m2, rtol=5 * a_percent)
+    frame_m2 = known.frames[0].covariance_m2[2, 2]
+    assert frame_m2 == pytest.approx(DEM_FRAME_M[1] ** 2 + (shared * OFF_M) ** 2, rel=5 * a_percent)
+
+
+def test_steep_ground_gives_no_heights() -> None:
+    known = known_heights(places(), surfaces(80), PLACE_M, ground(0.1, 0.6))
+    np.testing.assert_array_equal(known.point, np.arange(40))
+    with pytest.raises(NotEnoughPoints, match="0 of them not steep"):
+        known_heights(places(), surfaces(80), PLACE_M, ground(0.6, 0.6))
+
+
+def test_heights_of_ortho_images_err_with_the_slope_where_image_and_model_lie_off() -> None:
+    blank = ArrayImage(np.zeros((SIDE, SIDE), dtype=np.float32))
+    scene = Scene(blank, OrthoModel(GRID), Acquisition("ortho"), PLACE_M)
+    line_sample = GRID.line_sample(places()[:, :2])
+    count = len(line_sample)
+    seen = Observations(
+        np.repeat(np.arange(count), 2),
+        np.tile([0, 1], count),
+        np.repeat(line_sample, 2, axis=0),
+        np.full(2 * count, 0.3),
+    )
+    known = ortho_heights([scene, replace(scene, sigma_m=50.0)], seen, ground(0.0, 0.3))
+    expected_m2 = DEM_SIGMA_M**2 + np.repeat([0.0, 0.3 * OFF_M], 40) ** 2
+    np.testing.assert_allclose(known.covariance_m2[:, 2, 2], expected_m2, rtol=5 * a_percent)
+    np.testing.assert_allclose(
+        known.lon_lat_h[:, 2], ground(0.0, 0.3).terrain.height_m(places()), atol=a_millimetre
+    )
