@@ -10,9 +10,10 @@ from app.db import registrations
 from app.db.audit import list_changes
 from app.db.engine import Connection, Database
 from app.db.jobs import attempts, jobs
-from app.errors import InputError
+from app.errors import InputError, NotFound
 from app.request_context import Origin, working_for
 from app.storage import Storage
+from app.usecases.results import result_key
 from app.usecases.tokens import create_token
 from app.worker.sweep import sweep_records
 from tests.app.job_queue import claim
@@ -71,6 +72,9 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     database: Database, storage: Storage, settings: Settings
 ):
     job_id = successful_job(database, storage)
+    job = find(database, job_id)
+    assert job is not None
+    assert [result_key(job, "report.json")] == storage.keys("results")
     clock_jumps(database, 5000)
     sweep_records(database, storage, settings)
     assert storage.keys("results"), "the clock jumped, but the service has not run"
@@ -80,6 +84,9 @@ def test_results_then_jobs_are_removed_by_default_and_the_registration_stays(
     kept = find(database, job_id)
     assert kept is not None
     assert kept.results_removed_at is not None
+    assert kept.results is not None
+    with pytest.raises(NotFound, match=r"no result report\.json"):
+        result_key(kept, "report.json")
     service_runs(database, 275)
     sweep_records(database, storage, settings)
     assert find(database, job_id) is None

@@ -159,6 +159,10 @@ def test_files_beside_a_scene_count_for_its_owner(
     assert chunked.status_code == 200
     by_admin = client.put(f"/scenes/{scene}/files/c_RPC.TXT", content=b"x" * 100, headers=admin)
     assert by_admin.status_code == 413, "the bytes count for the owner, whoever sends them"
+    name, of = b64encode(b"c_RPC.TXT").decode(), b64encode(scene.encode()).decode()
+    announced = {"Upload-Length": "100", "Upload-Metadata": f"filename {name},scene {of}"}
+    by_admin = client.post("/uploads", headers=admin | TUS | announced)
+    assert by_admin.status_code == 413, "however they are sent"
     assert used_bytes(client, me, dsn) == bytes_in_storage(storage) == 1440
 
 

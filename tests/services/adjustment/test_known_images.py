@@ -10,12 +10,14 @@ import pytest
 from benchmarks.block_coverage import SHIFT_PX, Case, draw, whitened_square
 from services.adjustment.bundle import BlockAdjustment, adjust_block
 from services.adjustment.control_ground import NO_CONTROL, ControlGround
-from services.adjustment.known_images import tie
-from services.adjustment.parameters import ImageParameters
+from services.adjustment.known_images import known_images, tie
+from services.adjustment.parameters import ImageParameters, image_parameters
 from services.errors import InputError
 from services.geodesy import move_metres
 from services.sensors.correction import CorrectedModel, ImageCorrection
+from services.sensors.displacement import DisplacementGrid
 from services.types import Array, Frame, IntArray, Observations
+from tests.services.conftest import SHAPE, FlatModel
 from tests.services.ties import difference_m
 
 TRIALS = 10
@@ -222,3 +224,20 @@ def test_a_neighbour_and_control_place_a_block_together() -> None:
     assert both.control_active.all()
     errors, covariance = error_m(both, of.truth)
     assert whitened_square(errors, covariance + both.frames[0].covariance_m2).mean() / 3.0 < 3.0
+
+
+def test_an_image_whose_lines_one_block_followed_and_the_other_did_not_ties_nothing() -> None:
+    """Its parameters are those of the rest, and mean something else without what was followed."""
+    ends = np.array([0.0, 1000.0])
+    swing = DisplacementGrid(ends, ends, np.ones((2, 2, 2)), np.zeros((2, 2, 2)))
+    still, followed = (
+        image_parameters("a", FlatModel(), SHAPE, shift_px=5.0, slope_px=1.0, displacement=one)
+        for one in (None, swing)
+    )
+    for before, now in ((still, still), (followed, followed), (still, followed), (followed, still)):
+        known = known_images([before], np.zeros((1, 6)), np.eye(6), Frame(np.eye(3)))
+        if (before is still) == (now is still):
+            assert tie([now], known).rows.tolist() == [0]
+            continue
+        with pytest.raises(InputError, match="a: its lines or samples were followed in one block"):
+            tie([now], known)

@@ -12,10 +12,13 @@ from services.imagery.source import ArrayImage
 from services.matching.consensus import Consensus, Voters
 from services.matching.control_points import PointMatches
 from services.registration.context import SearchStage
-from services.registration.search import check_consensus, first_consensus, summarise
+from services.registration.search import check_consensus, first_consensus, predict, summarise
 from services.sensors.base import SensorModel
 from services.simulation.orbit import pushbroom_over
 from services.types import Acquisition, Array, ViewMeasures
+from tests.factories import control_points
+from tests.services.conftest import GSD_M as FLAT_GSD_M
+from tests.services.conftest import SHAPE, FlatModel, register
 
 LINES, GSD_M = 5000, 20.0
 SHIFT_PX = np.array([180.0, -165.0])
@@ -150,3 +153,23 @@ def test_a_limited_search_says_how_far_it_reached() -> None:
     limited = stage(needed_radius_m=5_000.0, search_radius_m=3_200.0)
     assert limited.limited
     assert "reached 3200 m of the 5000 m" in refusal(limited)
+
+
+def test_a_point_still_to_be_found_may_be_as_far_off_as_the_points_found() -> None:
+    """The scatter of the points found and the covariance of the correction add as squares."""
+    adjustment = register().adjustment
+    blank = ArrayImage(np.broadcast_to(np.float32(0.0), SHAPE))
+    scene = Scene(blank, FlatModel(), Acquisition("flat"), 10.0)
+    points = control_points(20, np.random.default_rng(2))
+    middle = np.random.default_rng(3).uniform(100.0, np.array(SHAPE) - 100.0, (20, 2))
+    points = replace(points, lon_lat_h=FlatModel().locate(middle, np.zeros(20)))
+    rms_px = np.sqrt(np.mean(adjustment.residual_px[adjustment.active] ** 2))
+    first_m = predict(scene, points, adjustment).uncertainty_m
+    scattered = replace(adjustment, residual_px=2.0 * adjustment.residual_px)
+    vague = replace(adjustment, covariance=4.0 * adjustment.covariance)
+    expected_m2 = first_m**2 + 3.0 * (rms_px * FLAT_GSD_M) ** 2
+    found_m2 = predict(scene, points, scattered).uncertainty_m ** 2
+    np.testing.assert_allclose(found_m2, expected_m2, rtol=0.01)
+    expected_m2 = 4.0 * first_m**2 - 3.0 * (rms_px * FLAT_GSD_M) ** 2
+    found_m2 = predict(scene, points, vague).uncertainty_m ** 2
+    np.testing.assert_allclose(found_m2, expected_m2, rtol=0.01)
