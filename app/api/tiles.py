@@ -111,7 +111,8 @@ def tile(
     """Return a vector tile; z, y and x are tile matrix, row and column."""
     refuse_other_matrix_set(matrix_set)
     with database.reading() as connection:
-        state = f"{tiles.version(connection)} {collection.id} {z} {y} {x} {viewer.is_admin}"
+        version = tiles.version(connection, collection.id, z)
+        state = f"{version} {collection.id} {z} {y} {x} {viewer.is_admin}"
         tag = f'"{hashlib.sha256(state.encode()).hexdigest()[:20]}"'
         headers = {"ETag": tag, "Cache-Control": "private, no-cache"}
         if request.headers.get("if-none-match") == tag:

@@ -13,8 +13,10 @@ from sqlalchemy import (
     LargeBinary,
     Numeric,
     SmallInteger,
+    Text,
     and_,
     bindparam,
+    case,
     cast,
     extract,
     func,
@@ -29,8 +31,9 @@ from app.db.engine import Connection, driver
 from app.db.features.collection import Viewer
 from app.db.features.outlines import BLOCKS
 from app.db.features.predicates import meets_box
+from app.db.history import HEALTH
 from app.db.points import POINTS
-from app.db.schema import audit, block, density_cell, point
+from app.db.schema import audit, block, density_cell, point, point_history, registration
 from app.db.schema.base import Double
 from app.db.statements import HotStatement, hot
 
@@ -38,9 +41,10 @@ EXTENT = 4096
 BUFFER = 64
 WORLD_M = 2.0 * 20037508.342789244
 """Side of the world in EPSG:3857."""
+COUNTED_REGISTRATIONS = 64
+"""The last of them tell whether one was added: one that began earlier may end later."""
 FIRST_POINT_ZOOM = 8
 """Below, a tile of points would contain more than a map can show apart: it contains cells instead."""
-NOBODY = Viewer()
 
 LEVEL = bindparam("level", None, SmallInteger())
 TILE = func.st_tileenvelope(*(bindparam(name, None, Integer()) for name in ("z", "x", "y")))
@@ -62,6 +66,41 @@ SIGMA_HORIZONTAL_M: ColumnElement[float] = cast(
 )
 
 
+TRIED_HEALTH: ColumnElement[float] = cast(
+    case((integer_constant(0) < point_history.c.attempts, HEALTH)), REAL()
+)
+"""Health of a point that a scene has tried; null for others, a property that a tile leaves out."""
+
+_NONE, _DASH = integer_constant(0), text_constant("-")
+_POINT_CHANGES = select(func.max(audit.c.id)).where(audit.c.kind == text_constant("point"))
+PUBLICATIONS: ColumnElement[str] = (
+    select(
+        func.concat(
+            func.count(),
+            _DASH,
+            func.coalesce(extract("epoch", func.max(block.c.state_changed_at)), _NONE),
+            _DASH,
+            func.coalesce(_POINT_CHANGES.scalar_subquery(), _NONE),
+            type_=Text(),
+        )
+    )
+    .select_from(block)
+    .scalar_subquery()
+)
+"""A text that changes when a block is published, withdrawn or replaced, or a point suspended."""
+_LAST_COUNTED = (
+    select(registration.c.id)
+    .where(registration.c.counted)
+    .order_by(registration.c.created_at.desc())
+    .limit(integer_constant(COUNTED_REGISTRATIONS))
+    .subquery("last_counted")
+)
+REGISTRATIONS: ColumnElement[str] = select(
+    func.string_agg(cast(_LAST_COUNTED.c.id, Text()), _DASH, type_=Text())
+).scalar_subquery()
+"""A text that changes when a registration counts towards the health of points."""
+
+
 @dataclass(frozen=True, eq=False)
 class Layer:
     """The features of a tile.
@@ -73,6 +112,7 @@ class Layer:
         box: of the tile with its margin, in the reference system of `indexed`.
         fields: of each feature.
         visible: which rows are drawn.
+        changes: a text that changes when the features do.
     """
 
     name: str
@@ -82,11 +122,12 @@ class Layer:
     fields: tuple[ColumnElement[Any], ...]
     visible: ColumnElement[bool]
     box: ColumnElement[Any] = TILE_LON_LAT
+    changes: ColumnElement[str] = PUBLICATIONS
 
 
 POINT_LAYER = Layer(
     name="points",
-    source=point,
+    source=point.outerjoin(point_history, point_history.c.point_id == point.c.id),
     geometry=func.st_setsrid(func.st_force2d(point.c.geom), integer_constant(4326)),
     indexed=point.c.geom,
     fields=(
@@ -95,9 +136,11 @@ POINT_LAYER = Layer(
         point.c.saliency,
         point.c.block_number,
         SIGMA_HORIZONTAL_M.label("sigma_horizontal_m"),
+        TRIED_HEALTH.label("health"),
     ),
     visible=POINTS.visible,
     box=func.st_setsrid(TILE_LON_LAT, integer_constant(4979)),
+    changes=func.concat(PUBLICATIONS, _DASH, REGISTRATIONS),
 )
 POINT_CELL_LAYER = Layer(
     name="points",
@@ -115,6 +158,7 @@ DENSITY_LAYER = Layer(
     fields=(density_cell.c.level, density_cell.c.id, *CELL_FIELDS),
     visible=density_cell.c.level == LEVEL,
 )
+"""Density cells: of 0.1 degree from zoom 6 on, twice as wide for each zoom before."""
 BLOCK_LAYER = Layer(
     name="blocks",
     source=block,
@@ -125,33 +169,21 @@ BLOCK_LAYER = Layer(
 )
 
 
-def point_tile(connection: Connection, z: int, x: int, y: int) -> bytes:
+def point_layer(z: int) -> Layer:
     """Published points, each with its id; below zoom 8 the centres of density cells that have some."""
-    layer = POINT_CELL_LAYER if z < FIRST_POINT_ZOOM else POINT_LAYER
-    return _tile(connection, layer, z, x, y)
+    return POINT_CELL_LAYER if z < FIRST_POINT_ZOOM else POINT_LAYER
 
 
-def density_tile(connection: Connection, z: int, x: int, y: int) -> bytes:
-    """Density cells: of 0.1 degree from zoom 6 on, twice as wide for each zoom before."""
-    return _tile(connection, DENSITY_LAYER, z, x, y)
-
-
-def block_tile(connection: Connection, z: int, x: int, y: int, viewer: Viewer) -> bytes:
-    """Outlines of the blocks that the viewer may see."""
-    return _tile(connection, BLOCK_LAYER, z, x, y, viewer=viewer)
-
-
-def version(connection: Connection) -> str:
-    """A text that changes when a block is published, withdrawn or replaced, or a point suspended."""
-    statement = _version_statement()
+def version(connection: Connection, layer: Layer) -> str:
+    """A text that changes with the features of a layer."""
+    statement = _version_statement(layer)
     row = driver(connection).execute(statement.sql, statement.parameters({})).fetchone()
     assert row is not None
     return str(row[0])
 
 
-def _tile(
-    connection: Connection, layer: Layer, z: int, x: int, y: int, *, viewer: Viewer = NOBODY
-) -> bytes:
+def tile(connection: Connection, layer: Layer, z: int, x: int, y: int, *, viewer: Viewer) -> bytes:
+    """The features of a layer that the viewer may see in a tile."""
     statement = _tile_statement(layer)
     place = {"z": z, "x": x, "y": y, "level": max(0, COARSEST - z)}
     parameters = {**place, "margin_m": WORLD_M / 2**z * BUFFER / EXTENT, **viewer.parameters}
@@ -181,18 +213,5 @@ def _tile_statement(layer: Layer) -> HotStatement:
 
 
 @cache
-def _version_statement() -> HotStatement:
-    dash, none = text_constant("-"), integer_constant(0)
-    changed_s = extract("epoch", func.max(block.c.state_changed_at))
-    suspended = select(func.max(audit.c.id)).where(audit.c.kind == text_constant("point"))
-    return hot(
-        select(
-            func.concat(
-                func.count(),
-                dash,
-                func.coalesce(changed_s, none),
-                dash,
-                func.coalesce(suspended.scalar_subquery(), none),
-            )
-        ).select_from(block)
-    )
+def _version_statement(layer: Layer) -> HotStatement:
+    return hot(select(layer.changes))

@@ -214,6 +214,43 @@ def test_a_tile_has_the_features_of_its_place_in_a_layer_of_the_collection(get, 
     )
 
 
+def test_a_tile_has_the_health_of_points_that_scenes_have_tried(get, connection, tmp_path):
+    """One point failed in six scenes where all others served."""
+    tried = "insert into point_history (point_id, attempts, successes, expected) values (%s, 6, %s, 6)"
+    for point, successes in ((2**26, 0), (2**26 + 1, 6)):
+        run_sql(connection, tried, [point, successes])
+    connection.commit()
+    reply = get(TILES.format("points", 8, *tile_of(5.25, 43.25, 8)))
+    (tmp_path / "tile.mvt").write_bytes(reply.content)
+    meta, _, _, values = read_features(tmp_path / "tile.mvt", layer="points")
+    fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+    health = dict(zip(fields["id"].tolist(), fields["health"].tolist(), strict=True))
+    assert health[2**26] == pytest.approx(5.0 / 11.0)
+    assert health[2**26 + 1] == 1.0
+    assert np.isnan([value for point, value in health.items() if point > 2**26 + 1]).all()
+
+
+def test_a_registration_that_counts_changes_the_tags_of_points_and_of_no_other_tile(get, connection):
+    """A registration that began before another changes them too, when it ends after the other."""
+    points = TILES.format("points", 8, *tile_of(5.25, 43.25, 8))
+    others = [
+        TILES.format(name, z, *tile_of(5.25, 43.25, z)) for name, z in (("points", 7), ("blocks", 8))
+    ]
+    tags, before = [get(points).headers["etag"]], [get(other).headers["etag"] for other in others]
+    for scene, began in (("a", "2026-01-01 12:00:01+00"), ("b", "2026-01-01 12:00:00+00")):
+        run_sql(
+            connection,
+            "insert into registration (id, block_versions, options, report, verdict, files, scene_key,"
+            " counted, created_at)"
+            " values (gen_random_uuid(), '[]', '{}', '{}', 'good', '{}', %s, true, %s)",
+            [scene, began],
+        )
+        connection.commit()
+        tags.append(get(points).headers["etag"])
+    assert len(set(tags)) == 3
+    assert [get(other).headers["etag"] for other in others] == before
+
+
 def test_a_tile_that_has_not_changed_is_not_sent_again(made, client, bearer, connection):
     headers = bearer("read")
     path = TILES.format("points", 8, *tile_of(5.25, 43.25, 8))

@@ -41,6 +41,7 @@ registration = Table(
     UniqueConstraint("job_id", "scene_id"),
     Index("registration_scene", "scene_id"),
     Index("registration_counted", "scene_key", unique=True, postgresql_where=text("counted")),
+    Index("registration_last_counted", "created_at", postgresql_where=text("counted")),
 )
 
 # Outcome of one point in one registration.

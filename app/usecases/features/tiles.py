@@ -3,6 +3,7 @@
 from app.db import tiles
 from app.db.engine import Connection
 from app.db.features.collection import Viewer
+from app.db.tiles import Layer
 from app.errors import NotFound
 
 TILED = ("points", "density", "blocks")
@@ -16,21 +17,21 @@ def tile(connection: Connection, collection: str, z: int, y: int, x: int, *, vie
     Raises:
         NotFound: the collection has no tiles, or the tile lies outside of the tile matrix.
     """
-    refuse_untiled(collection)
+    layer = _layer(collection, z)
     if not 0 <= z <= MOST_ZOOM or not (0 <= x < 2**z and 0 <= y < 2**z):
         raise NotFound(
             f"no tile {z}/{y}/{x}: expected zoom 0 to {MOST_ZOOM}, row and column 0 to 2^zoom - 1"
         )
-    if collection == "points":
-        return tiles.point_tile(connection, z, x, y)
-    if collection == "density":
-        return tiles.density_tile(connection, z, x, y)
-    return tiles.block_tile(connection, z, x, y, viewer)
+    return tiles.tile(connection, layer, z, x, y, viewer=viewer)
 
 
-def version(connection: Connection) -> str:
-    """A text that changes whenever the content of any tile changes."""
-    return tiles.version(connection)
+def version(connection: Connection, collection: str, z: int) -> str:
+    """A text that changes whenever the content of any tile of a collection and zoom changes.
+
+    Raises:
+        NotFound: the collection has no tiles.
+    """
+    return tiles.version(connection, _layer(collection, z))
 
 
 def refuse_untiled(collection: str) -> None:
@@ -41,3 +42,10 @@ def refuse_untiled(collection: str) -> None:
     """
     if collection not in TILED:
         raise NotFound(f"no tiles of {collection}: expected one of {', '.join(TILED)}")
+
+
+def _layer(collection: str, z: int) -> Layer:
+    refuse_untiled(collection)
+    if collection == "points":
+        return tiles.point_layer(z)
+    return tiles.DENSITY_LAYER if collection == "density" else tiles.BLOCK_LAYER
