@@ -8,7 +8,8 @@ from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, SecretStr, ValidationError, field_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from app.errors import InputError
@@ -18,6 +19,14 @@ MEBIBYTE = 1 << 20
 RENAMED = {"AMERS_QUOTA_UPLOAD_BYTES": "AMERS_QUOTA_STORAGE_BYTES"}
 """Former names of settings: a limit that somebody has set must not be ignored."""
 TRASH_DAYS = 7.0
+MAP_BACKGROUND = (
+    r"^(https://[A-Za-z0-9.-]+(:[0-9]+)?)?/([A-Za-z0-9._~%?&=@:+-]|\{[zxy]\})"
+    r"([A-Za-z0-9._~%?&=@:+/-]|\{[zxy]\})*$"
+)
+"""Addresses of tiles: https, or a path of the same site.
+
+No character is allowed that ends a source of the content security policy.
+"""
 
 
 def default_data_folder() -> Path:
@@ -68,6 +77,9 @@ class Settings(BaseSettings):
         quota_kept_jobs: largest number of jobs of one token, those that have ended included.
         public_metrics: whether metrics can be read without a token.
         cors_origins: web sites whose pages may call the API from a browser, `https://host`; `*` for all.
+        map_background: address of the tiles of the background of the map, `https://host/{z}/{x}/{y}.png`,
+            or a path of this site; None draws land only.
+        map_background_attribution: who made them; shown on the map.
         trusted_hosts: further names in the header `Host` that the API answers to; `*` for all.
         oidc_issuer: OpenID Connect issuer whose tokens are accepted too; None accepts none.
         oidc_audience: required audience of such a token.
@@ -116,6 +128,8 @@ class Settings(BaseSettings):
     quota_kept_jobs: int = Field(default=10_000, ge=0)
     public_metrics: bool = False
     cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
+    map_background: str | None = Field(default=None, pattern=MAP_BACKGROUND)
+    map_background_attribution: str | None = Field(default=None, max_length=200, pattern=r"\S")
     trusted_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     oidc_issuer: str | None = None
     oidc_audience: str = "amers"
@@ -145,6 +159,23 @@ class Settings(BaseSettings):
     @classmethod
     def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(str(ip_network(proxy)) for proxy in proxies)
+
+    @field_validator("map_background")
+    @classmethod
+    def _whole_tile_address(cls, address: str | None) -> str | None:
+        missing = [place for place in ("{z}", "{x}", "{y}") if address and place not in address]
+        if missing:
+            raise PydanticCustomError("places", "the address needs {missing}", {"missing": missing})
+        return address
+
+    @model_validator(mode="after")
+    def _attributed(self) -> "Settings":
+        if self.map_background and self.map_background_attribution is None:
+            raise PydanticCustomError(
+                "attribution",
+                "AMERS_MAP_BACKGROUND needs AMERS_MAP_BACKGROUND_ATTRIBUTION: who made the background",
+            )
+        return self
 
     @field_validator("result_days", "job_record_days", "audit_days", mode="before")
     @classmethod

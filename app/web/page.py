@@ -1,11 +1,17 @@
-"""The map page: files built by `make page`, under a content security policy without other sites."""
+"""The map page: files built by `make page`, under a content security policy.
+
+The policy allows no other site, except that of the background of the map where a setting names one.
+"""
 
 from hashlib import sha256
 from mimetypes import guess_type
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel
 
+from app.config import Settings
 from app.errors import NotFound
 
 router = APIRouter(include_in_schema=False)
@@ -16,7 +22,7 @@ POLICY = "; ".join(
         "default-src 'none'",
         "script-src 'self'",
         "worker-src 'self'",
-        "connect-src 'self'",
+        "connect-src 'self'{background}",
         "img-src 'self' blob: data:",
         # A report that the page opens inherits this policy; its styles are inside it.
         "style-src 'self' 'unsafe-inline'",
@@ -26,7 +32,6 @@ POLICY = "; ".join(
     )
 )
 HEADERS = {
-    "Content-Security-Policy": POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -35,16 +40,41 @@ HEADERS = {
 }
 
 
+class Background(BaseModel):
+    """The background of the map.
+
+    Attributes:
+        tiles: address with places `{z}`, `{x}` and `{y}`; None for land only.
+        attribution: who made it; None without tiles.
+    """
+
+    tiles: str | None
+    attribution: str | None
+
+
 @router.get("/map")
 def page(request: Request) -> Response:
     """Return the page."""
     return _file(request, "index.html")
 
 
+@router.get("/map/background.json")
+def background(request: Request) -> Background:
+    """Return the background of the map that the operator has chosen."""
+    settings: Settings = request.app.state.settings
+    return Background(tiles=settings.map_background, attribution=settings.map_background_attribution)
+
+
 @router.get("/map/{name}")
 def part(name: str, request: Request) -> Response:
     """Return a file of the page."""
     return _file(request, name)
+
+
+def policy(settings: Settings) -> str:
+    """The content security policy of the page of an installation."""
+    parts = urlsplit(settings.map_background or "")
+    return POLICY.format(background=f" https://{parts.netloc}" if parts.netloc else "")
 
 
 def _file(request: Request, name: str) -> Response:
@@ -57,7 +87,7 @@ def _file(request: Request, name: str) -> Response:
         raise NotFound("the page is not built in this installation: run `make page` where Node.js is")
     if name not in {file.name for file in BUILT.iterdir() if file.suffix != ".gz"}:
         raise NotFound(f"the page has no file {name:.100}")
-    headers = dict(HEADERS)
+    headers = {"Content-Security-Policy": policy(request.app.state.settings), **HEADERS}
     path = BUILT / name
     if "gzip" in request.headers.get("accept-encoding", ""):
         path = BUILT / f"{name}.gz"

@@ -150,6 +150,50 @@ def test_a_setting_is_accepted_up_to_its_limits_and_refused_beyond(monkeypatch, 
             read_settings()
 
 
+@pytest.mark.parametrize(
+    "address",
+    [
+        "https://tiles.example/{z}/{x}/{y}.png",
+        "https://tiles.example:8443/wmts?layer=a&TileMatrix={z}&TileCol={x}&TileRow={y}",
+        "/tiles/{z}/{y}/{x}.jpg",
+    ],
+)
+def test_a_background_lies_on_a_site_with_encryption_or_on_this_one(monkeypatch, address):
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND", address)
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", "its makers")
+    assert read_settings().map_background == address
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "",
+        "http://tiles.example/{z}/{x}/{y}.png",
+        "//tiles.example/{z}/{x}/{y}.png",
+        "https://tiles.example/{z}/{x}.png",
+        "https://tiles.example/{z}/{x}/{y}/{token}",
+        "https://tiles.example; script-src */{z}/{x}/{y}",
+        "https://tiles.example/{z}/{x}/{y}.png; script-src *",
+        "https://user@tiles.example/{z}/{x}/{y}",
+        "javascript:alert(1)//{z}/{x}/{y}",
+    ],
+)
+def test_a_background_elsewhere_or_with_anything_else_in_its_address_is_refused(monkeypatch, address):
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND", address)
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", "its makers")
+    with pytest.raises(InputError, match="AMERS_MAP_BACKGROUND"):
+        read_settings()
+
+
+def test_a_background_without_the_name_of_its_makers_is_refused(monkeypatch):
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND", "https://tiles.example/{z}/{x}/{y}.png")
+    with pytest.raises(InputError, match="needs AMERS_MAP_BACKGROUND_ATTRIBUTION"):
+        read_settings()
+    monkeypatch.setenv("AMERS_MAP_BACKGROUND_ATTRIBUTION", " ")
+    with pytest.raises(InputError, match="AMERS_MAP_BACKGROUND_ATTRIBUTION"):
+        read_settings()
+
+
 @pytest.mark.parametrize("name", ["RESULT_DAYS", "JOB_RECORD_DAYS", "AUDIT_DAYS"])
 def test_what_is_never_removed_has_no_number_of_days(monkeypatch, name):
     monkeypatch.setenv(f"AMERS_{name}", "Never")

@@ -8,7 +8,9 @@ from gzip import compress
 from pathlib import Path
 
 import pytest
+from fastapi.testclient import TestClient
 
+from app.main import create_app
 from app.web import page
 
 ROOT = Path(__file__).parents[2]
@@ -29,6 +31,27 @@ def test_the_page_lets_no_script_in_from_elsewhere(client, built):
     assert reply.headers["content-type"].startswith("text/html")
     policy = reply.headers["content-security-policy"].split("; ")
     assert {"default-src 'none'", "script-src 'self'", "connect-src 'self'"} <= set(policy)
+
+
+def test_the_policy_lets_in_the_site_of_the_background_and_only_for_data(settings, built):
+    """Without a setting, connections go to this site only."""
+    tiles = "https://tiles.example:8443/{z}/{x}/{y}.png"
+    for chosen, connections in (
+        ({}, "connect-src 'self'"),
+        ({"map_background": "/tiles/{z}/{x}/{y}.png"}, "connect-src 'self'"),
+        ({"map_background": tiles}, "connect-src 'self' https://tiles.example:8443"),
+    ):
+        with TestClient(create_app(settings.model_copy(update=chosen))) as client:
+            policy = (
+                client.get("/map", headers={"Accept-Encoding": "identity"})
+                .headers["content-security-policy"]
+                .split("; ")
+            )
+            told = client.get("/map/background.json").json()
+        assert connections in policy
+        assert {"script-src 'self'", "default-src 'none'"} <= set(policy)
+        assert "tiles.example" not in " ".join(set(policy) - {connections})
+        assert told["tiles"] == chosen.get("map_background")
 
 
 def test_a_file_is_compressed_only_for_those_who_take_it(client, built):
