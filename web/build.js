@@ -23,7 +23,9 @@ await build({
   legalComments: "eof",
 });
 writeFileSync(new URL("worker.js", built), withoutMap(readFileSync(`${maplibre}/maplibre-gl-worker.mjs`, "utf8")));
-writeFileSync(new URL("land.json", built), land());
+for (const [scale, decimals] of [["110m", 2], ["50m", 2], ["10m", 3]]) {
+  writeFileSync(new URL(`land-${scale}.json`, built), land(scale, decimals));
+}
 writeFileSync(new URL("countries.json", built), countries());
 writeFileSync(new URL("index.html", built), readFileSync("source/index.html"));
 for (const name of readdirSync(built)) {
@@ -35,16 +37,16 @@ function withoutMap(script) {
   return script.replace(/\n\/\/# sourceMappingURL=.*\s*$/, "\n");
 }
 
-/** Land and borders of Natural Earth as GeoJSON, rounded to 0.01 degree, the resolution of the data. */
-function land() {
-  const world = JSON.parse(readFileSync("node_modules/world-atlas/countries-50m.json", "utf8"));
+/** Land and borders of Natural Earth at a scale as GeoJSON, rounded to the resolution of the data. */
+function land(scale, decimals) {
+  const world = JSON.parse(readFileSync(`node_modules/world-atlas/countries-${scale}.json`, "utf8"));
   const polygons = feature(world, world.objects.land).features.flatMap(({ geometry }) => geometry.coordinates);
   const borders = mesh(world, world.objects.countries, (one, other) => one !== other);
   const geometries = [
     { type: "MultiPolygon", coordinates: polygons.map((rings) => rings.map((ring) => closedAtPole(unrolled(ring)))) },
     { type: "MultiLineString", coordinates: borders.coordinates.map(unrolled) },
   ];
-  return collection(geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry })));
+  return collection(geometries.map((geometry) => ({ type: "Feature", properties: {}, geometry })), decimals);
 }
 
 /** Names of countries of Natural Earth, each in the middle of its largest part, with the box and the area of that part. */
@@ -57,6 +59,7 @@ function countries() {
       const { middle, box, area } = parts.reduce((one, other) => (other.area > one.area ? other : one));
       return { type: "Feature", properties: { name, box, area }, geometry: { type: "Point", coordinates: middle } };
     }),
+    2,
   );
 }
 
@@ -76,8 +79,9 @@ function part(ring) {
   return { middle: [x0 + x / area, y0 + y / area], box, area: Math.abs(area) };
 }
 
-function collection(features) {
-  const rounded = (key, value) => (typeof value === "number" ? Math.round(value * 100) / 100 : value);
+function collection(features, decimals) {
+  const parts = 10 ** decimals;
+  const rounded = (key, value) => (typeof value === "number" ? Math.round(value * parts) / parts : value);
   return JSON.stringify({ type: "FeatureCollection", features }, rounded);
 }
 

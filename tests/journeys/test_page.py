@@ -418,6 +418,7 @@ def test_an_administrator_withdraws_a_block_and_publishes_it_again(
     until_drawn(page)
     page.screenshot(path=ARTEFACTS / "block.png")
     page.get_by_role("button", name="Withdraw").click()
+    page.get_by_role("button", name="Withdraw the block").click()
     expect(state).to_have_text("withdrawn")
     assert served() == 0
     page.screenshot(path=ARTEFACTS / "block-withdrawn.png")

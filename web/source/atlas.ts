@@ -1,4 +1,4 @@
-// The map: land, graticule, density, blocks, points, scenes and the residuals of a registration.
+// The map: background, land, graticule, density, blocks, points, scenes and the residuals of a registration.
 
 import type { Feature, FeatureCollection, Geometry, Position } from "geojson";
 import {
@@ -10,12 +10,12 @@ import {
   setWorkerUrl,
   VectorTileSource,
 } from "maplibre-gl";
-import { authorization, BASE } from "./api";
+import { authorization, BASE, get } from "./api";
 import { Comparison, type Pyramids } from "./comparison";
 import { h } from "./elements";
 import { goToField } from "./go_to";
 import { degrees, graticule, wrapped } from "./graticule";
-import { type Colouring, mapStyle } from "./style";
+import { type Colouring, landFile, mapStyle } from "./style";
 
 export type Bounds = [west: number, south: number, east: number, north: number];
 
@@ -29,6 +29,12 @@ const LABELS_PX = { left: 6, bottom: 34 };
 /** Zoom at which a coordinate is shown, if the map is not closer. */
 const COORDINATE_ZOOM = 11;
 const PLACE_DECIMALS = 6;
+/** What the operator has chosen to lie below the map; no tiles: land only. */
+interface Background {
+  tiles: string | null;
+  attribution: string | null;
+}
+
 /** Paths below which tiles are for some callers only. */
 const PROTECTED = ["collections/", "jobs/"];
 
@@ -37,6 +43,7 @@ export class Atlas {
   private readonly map: MapLibre | null;
   private readonly ready: Promise<void>;
   private colouring: Colouring = "none";
+  private land = landFile(0);
 
   constructor(container: HTMLElement, onPoint: (id: number) => void) {
     this.map = opened(container);
@@ -47,6 +54,8 @@ export class Atlas {
     }
     this.ready = new Promise((resolve) => map.once("load", () => resolve()));
     void this.ready.then(() => this.whileMoving(() => this.drawGraticule(map), new AbortController().signal));
+    void this.ready.then(() => this.whileMoving(() => this.drawLand(map), new AbortController().signal));
+    void this.ready.then(() => drawBackground(map, container)).catch((error: Error) => console.warn(error.message));
     for (const event of ["movestart", "dataloading"] as const) map.on(event, () => container.setAttribute("aria-busy", "true"));
     map.on("idle", () => container.setAttribute("aria-busy", "false"));
     map.on("click", (event) => {
@@ -143,6 +152,15 @@ export class Atlas {
     this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), COORDINATE_ZOOM) });
   }
 
+  /** Load the land of the present scale, when the scale asks for another. */
+  private drawLand(map: MapLibre): void {
+    const file = landFile(map.getZoom());
+    const source = map.getSource("land");
+    if (file === this.land || !(source instanceof GeoJSONSource)) return;
+    this.land = file;
+    source.setData(BASE + file);
+  }
+
   private drawGraticule(map: MapLibre): void {
     const seen = map.getBounds();
     const corner = map.unproject([LABELS_PX.left, map.getContainer().clientHeight - LABELS_PX.bottom]);
@@ -157,6 +175,16 @@ export class Atlas {
       for (const [name, value] of paint) this.map?.setPaintProperty(layer.id, name, value as never);
     }
   }
+}
+
+/** Draw the background that the operator has chosen above the land, and name who made it. */
+async function drawBackground(map: MapLibre, container: HTMLElement): Promise<void> {
+  const { tiles, attribution } = await get<Background>("map/background.json");
+  if (!tiles) return;
+  const address = tiles.startsWith("/") ? location.origin + tiles : tiles;
+  map.addSource("background", { type: "raster", tiles: [address], tileSize: 256 });
+  map.addLayer({ id: "background", type: "raster", source: "background" }, "density");
+  container.prepend(h("p", { class: "attribution" }, attribution));
 }
 
 function opened(container: HTMLElement): MapLibre | null {

@@ -2,6 +2,7 @@
 
 import { type Block, type FeaturePage, get, post, remove } from "./api";
 import type { BlockQuality, StatusInfo } from "./api_types";
+import type { Atlas } from "./atlas";
 import { ask } from "./confirmation";
 import { accuracy, badge, facts, figure, fill, h, plural, problem, when } from "./elements";
 import { announce, go, type Place, type ShowView } from "./place";
@@ -10,21 +11,28 @@ import { send } from "./upload";
 const ARCHIVES = ".zip,.tar,.tar.gz,.tgz";
 
 /** The blocks that the caller may see. */
-export function blocks(signal?: AbortSignal): Promise<FeaturePage<Block>> {
+function blocks(signal?: AbortSignal): Promise<FeaturePage<Block>> {
   return get<FeaturePage<Block>>("collections/blocks/items?limit=1000", signal);
+}
+
+/** Draw the outlines of the blocks on the map as they are now; the page of blocks that was drawn. */
+export async function drawBlocks(atlas: Atlas, signal?: AbortSignal): Promise<FeaturePage<Block>> {
+  const page = await blocks(signal);
+  await atlas.show("blocks", page.features);
+  return page;
 }
 
 /** Shows the blocks that the caller may see, and administrators a form to add one. */
 export const showBlocks: ShowView = async (place) => {
   const { panel, atlas, signal, scopes } = place;
-  const { features } = await blocks(signal);
-  await atlas.show("blocks", features);
+  const { features, numberMatched } = await drawBlocks(atlas, signal);
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Blocks"),
     h("p", {}, "A block is one production of points. It is published and withdrawn as a whole."),
     scopes.includes("admin") ? ingestionForm(place) : null,
     features.length === 0 ? h("p", { class: "quiet" }, "No blocks yet.") : null,
+    features.length < numberMatched ? h("p", { class: "quiet" }, `The first ${features.length} of ${figure(numberMatched)} blocks.`) : null,
     h("ul", { class: "list" }, ...features.map(row)),
   );
 };
@@ -66,14 +74,15 @@ export const showBlock: ShowView = async (place, number) => {
       "Standard deviation, height, median": figure(quality.sigma_up_m.median, "m"),
     }),
   );
+  await drawBlocks(atlas, signal);
   atlas.fit(block.geometry);
 
   async function change(): Promise<void> {
+    if (published && !(await withdrawalConfirmed(block))) return;
     act.disabled = true;
     try {
       await post(`blocks/${at}/${published ? "withdraw" : "publish"}`);
       announce(`${properties.id} is ${published ? "withdrawn" : "published"}.`);
-      await atlas.show("blocks", (await blocks(signal)).features);
       atlas.refresh();
       await showBlock(place, number);
       panel.querySelector("button")?.focus();
@@ -98,6 +107,13 @@ export const showBlock: ShowView = async (place, number) => {
     }
   }
 };
+
+/** Whether an administrator really wants points not to be served any more. */
+async function withdrawalConfirmed({ properties: { id, version, n_points, n_unserved } }: Block): Promise<boolean> {
+  const served = plural(n_points - n_unserved, "point");
+  const text = `Registrations and readers will no longer find its ${served}. The block can be published again.`;
+  return (await ask({ title: `Withdraw ${id}@${version}?`, text, act: "Withdraw the block" })) !== null;
+}
 
 function ingestionForm({ signal }: Place): HTMLElement {
   const archive = h("input", { type: "file", id: "archive", accept: ARCHIVES, required: true });

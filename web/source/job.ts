@@ -2,6 +2,8 @@
 
 import type { FeatureCollection, Point, Polygon, Position } from "geojson";
 import { blobUrl, call, get } from "./api";
+import type { Atlas } from "./atlas";
+import { drawBlocks } from "./blocks";
 import type { ResultFile, StatusInfo } from "./api_types";
 import { accuracy, badge, facts, figure, fill, h, problem, when } from "./elements";
 import { announce, pause, type Place, type ShowView } from "./place";
@@ -101,6 +103,7 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
   const pointsFile = results["control_points.geojson"];
   if (!reportFile || !pointsFile) {
     fill(body, outcome(job), assessment(results), blockLink(results), await downloads(results, signal));
+    if (blockLink(results)) await showIngested(atlas, results, signal);
     return;
   }
   const [report, points] = await Promise.all([
@@ -116,6 +119,13 @@ async function showResults(place: Place, job: StatusInfo, heading: HTMLElement, 
   await atlas.show("vectors", features);
   signal.addEventListener("abort", () => void atlas.show("vectors", []));
   atlas.fit(footprint, 17);
+}
+
+/** Draw a block that was ingested, and bring it into view. */
+async function showIngested(atlas: Atlas, { number }: Record<string, unknown>, signal: AbortSignal): Promise<void> {
+  const { features } = await drawBlocks(atlas, signal);
+  atlas.refresh();
+  atlas.fit(features.find(({ id }) => id === number)?.geometry);
 }
 
 /** What the assessment of a block found, in words. */

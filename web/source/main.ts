@@ -4,7 +4,7 @@ import { type Caller, showAccess, whoCalls } from "./access";
 import { showAdministration } from "./administration";
 import { Refused } from "./api";
 import { Atlas } from "./atlas";
-import { blocks, showBlock, showBlocks } from "./blocks";
+import { drawBlocks, showBlock, showBlocks } from "./blocks";
 import { showDrawing } from "./draw";
 import { h, problem } from "./elements";
 import { showJob } from "./job";
@@ -41,8 +41,7 @@ async function start(): Promise<void> {
 /** Show the blocks on the map, and fit it to them. */
 async function opening(atlas: Atlas): Promise<void> {
   try {
-    const { features } = await blocks();
-    await atlas.show("blocks", features);
+    const { features } = await drawBlocks(atlas);
     if (/^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features }, 11);
   } catch (error) {
     if (error instanceof Refused && error.status === 401) go("#/access");
@@ -66,6 +65,7 @@ async function route(atlas: Atlas, caller: Caller | null, moved: boolean): Promi
   } catch (error) {
     if (!signal.aborted) panel.replaceChildren(h("h1", { tabindex: -1 }, "An error occurred"), problem(error));
   }
+  if (!signal.aborted) document.title = [panel.querySelector("h1")?.textContent, "Amers"].filter(Boolean).join(" · ");
 }
 
 void start();

@@ -14,6 +14,7 @@ const SETTLED_MS = 250;
 export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
   const list = h("ul", { class: "list", "aria-label": "Points in view" });
   const count = h("p", { class: "count" }, "…");
+  const nothing = h("p", { class: "quiet", hidden: true }, "Move the map to the outline of a block, or choose one of the ", h("a", { href: "#/blocks" }, "blocks"), ".");
   fill(
     panel,
     h("h1", { tabindex: -1 }, "Control points"),
@@ -23,6 +24,7 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
     colouringField(atlas),
     h("h2", {}, "In view"),
     count,
+    nothing,
     list,
   );
   let moves = 0;
@@ -37,6 +39,7 @@ export const showPoints: ShowView = async ({ panel, atlas, signal }) => {
       const total = page.numberMatched;
       count.textContent = total > page.features.length ? `${plural(total, "point")}, the first ${page.features.length}:` : plural(total, "point");
       list.replaceChildren(...page.features.map(row));
+      nothing.hidden = total > 0;
     } catch (error) {
       if (!signal.aborted) count.replaceChildren(problem(error));
     }

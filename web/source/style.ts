@@ -27,7 +27,15 @@ export const COLOURINGS = {
     words: ["less than 1 m", "1 m to 2 m", "2 m to 4 m", "4 m or more"],
   },
   views: { label: "number of views", property: "n_views", limits: [3, 5, 8], words: ["8 or more", "5 to 7", "3 or 4", "1 or 2"] },
+  health: {
+    label: "health in registrations",
+    property: "health",
+    limits: [0.5, 0.75, 0.95],
+    words: ["0.95 or more", "0.75 to 0.95", "0.5 to 0.75", "less than 0.5: proposed for suspension", "not tried yet"],
+  },
 } as const;
+/** Properties of which more is better. */
+const MORE_IS_BETTER: Colouring[] = ["views", "health"];
 export type Colouring = keyof typeof COLOURINGS;
 
 const LIGHT = {
@@ -59,6 +67,18 @@ const DARK: typeof LIGHT = {
   quiet: "#8f9ba0",
 };
 
+/** Files of land and borders, each from its zoom: Natural Earth at 1:110 million, 50 million and 10 million. */
+const LANDS: [zoom: number, file: string][] = [
+  [0, "map/land-110m.json"],
+  [3, "map/land-50m.json"],
+  [6, "map/land-10m.json"],
+];
+
+/** The file of land and borders for a zoom. */
+export function landFile(zoom: number): string {
+  return LANDS.findLast(([from]) => zoom >= from)?.[1] ?? LANDS[0]![1];
+}
+
 export function colours(dark: boolean): typeof LIGHT {
   return dark ? DARK : LIGHT;
 }
@@ -68,7 +88,7 @@ export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecificatio
   return {
     version: 8,
     sources: {
-      land: { type: "geojson", data: `${BASE}map/land.json` },
+      land: { type: "geojson", data: BASE + landFile(0) },
       countries: { type: "geojson", data: BASE + COUNTRIES },
       graticule: empty(),
       target: empty(),
@@ -93,8 +113,9 @@ function pointColour(dark: boolean, colouring: Colouring): string | ExpressionSp
   const { point, classes } = colours(dark);
   const { property, limits } = COLOURINGS[colouring];
   if (!property) return point;
-  const [first, ...rest] = colouring === "views" ? classes.toReversed() : classes;
-  return ["step", ["get", property], first!, ...limits.flatMap((limit, at) => [limit, rest[at]!])] as ExpressionSpecification;
+  const [first, ...rest] = MORE_IS_BETTER.includes(colouring) ? classes.toReversed() : classes;
+  const classed = ["step", ["get", property], first!, ...limits.flatMap((limit, at) => [limit, rest[at]!])] as ExpressionSpecification;
+  return ["case", ["has", property], classed, colours(dark).quiet];
 }
 
 function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
