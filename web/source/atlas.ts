@@ -44,6 +44,8 @@ export class Atlas {
   private readonly ready: Promise<void>;
   private colouring: Colouring = "none";
   private land = landFile(0);
+  /** Whether the reader has gone to a place: the page then does not move the map by itself. */
+  went = false;
 
   constructor(container: HTMLElement, onPoint: (id: number) => void) {
     this.map = opened(container);
@@ -72,7 +74,10 @@ export class Atlas {
     const pointer = h("p", { class: "pointer", "aria-hidden": "true" });
     const field = goToField(
       (position) => void this.goTo(position),
-      (coordinates) => this.fit({ type: "MultiPoint", coordinates }),
+      (coordinates) => {
+        this.went = true;
+        this.fit({ type: "MultiPoint", coordinates });
+      },
     );
     container.append(pointer, field);
     map.on("mousemove", ({ lngLat }) => (pointer.textContent = place(wrapped(lngLat.lng), lngLat.lat)));
@@ -147,6 +152,7 @@ export class Atlas {
 
   /** Mark a position, and show its surroundings. */
   private async goTo(position: Position): Promise<void> {
+    this.went = true;
     await this.show("target", [{ type: "Feature", properties: {}, geometry: { type: "Point", coordinates: position } }]);
     const [longitude, latitude] = position as [number, number];
     this.map?.jumpTo({ center: [longitude, latitude], zoom: Math.max(this.map.getZoom(), COORDINATE_ZOOM) });

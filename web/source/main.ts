@@ -42,7 +42,7 @@ async function start(): Promise<void> {
 async function opening(atlas: Atlas): Promise<void> {
   try {
     const { features } = await drawBlocks(atlas);
-    if (/^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features }, 11);
+    if (!atlas.went && /^#?\/?(points)?$/.test(location.hash)) atlas.fit({ type: "FeatureCollection", features }, 11);
   } catch (error) {
     if (error instanceof Refused && error.status === 401) go("#/access");
   }
