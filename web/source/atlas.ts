@@ -24,8 +24,8 @@ type Shape = Geometry | { type: "FeatureCollection"; features: Outlined[] };
 
 const WORLD: Bounds = [-180, -85, 180, 85];
 const NEAR_PX = 6;
-/** Distance of the degrees of the graticule from the left and lower edges. */
-const LABELS_PX = { left: 6, bottom: 34 };
+/** Distance of the degrees of the graticule from the left, lower and upper edges; at the top is the field to go to a place. */
+const LABELS_PX = { left: 6, bottom: 34, top: 62 };
 /** Zoom at which a coordinate is shown, if the map is not closer. */
 const COORDINATE_ZOOM = 11;
 const PLACE_DECIMALS = 6;
@@ -170,7 +170,8 @@ export class Atlas {
   private drawGraticule(map: MapLibre): void {
     const seen = map.getBounds();
     const corner = map.unproject([LABELS_PX.left, map.getContainer().clientHeight - LABELS_PX.bottom]);
-    const labels = { longitude: corner.lng, latitude: corner.lat };
+    const top = map.unproject([LABELS_PX.left, LABELS_PX.top]).lat;
+    const labels = { longitude: corner.lng, latitude: corner.lat, top };
     const [west, south, east, north] = [seen.getWest(), seen.getSouth(), seen.getEast(), seen.getNorth()];
     void this.show("graticule", graticule({ west, south, east, north, labels }));
   }

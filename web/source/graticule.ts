@@ -11,8 +11,8 @@ interface View {
   south: number;
   east: number;
   north: number;
-  /** Where the labels are: longitude of those of parallels, latitude of those of meridians. */
-  labels: { longitude: number; latitude: number };
+  /** Where the labels are: longitude of those of parallels, which end below `top`, and latitude of those of meridians. */
+  labels: { longitude: number; latitude: number; top: number };
 }
 
 /** Lines of a view and points with their labels. */
@@ -27,7 +27,9 @@ export function graticule({ west, south, east, north, labels }: View): Feature[]
   ]);
   const parallels = multiples(low, high, step).flatMap((latitude) => [
     feature({ type: "LineString", coordinates: [[west, latitude], [end, latitude]] }),
-    feature({ type: "Point", coordinates: [labels.longitude, latitude] }, degrees(latitude, "N", "S", decimals), "left"),
+    ...(latitude < labels.top
+      ? [feature({ type: "Point", coordinates: [labels.longitude, latitude] }, degrees(latitude, "N", "S", decimals), "left")]
+      : []),
   ]);
   return [...meridians, ...parallels];
 }

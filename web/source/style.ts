@@ -87,6 +87,7 @@ export function mapStyle(dark: boolean, colouring: Colouring): StyleSpecificatio
   const empty = (): GeoJSONSourceSpecification => ({ type: "geojson", data: { type: "FeatureCollection", features: [] } });
   return {
     version: 8,
+    transition: { duration: 0, delay: 0 },
     sources: {
       land: { type: "geojson", data: BASE + landFile(0) },
       countries: { type: "geojson", data: BASE + COUNTRIES },
@@ -229,7 +230,7 @@ function layers(dark: boolean, colouring: Colouring): LayerSpecification[] {
       type: "symbol",
       source: "graticule",
       filter: ["==", ["geometry-type"], "Point"],
-      layout: { "text-field": ["get", "label"], "text-font": FONT, "text-size": 11, "text-anchor": ["get", "anchor"], "text-allow-overlap": true },
+      layout: { "text-field": ["get", "label"], "text-font": FONT, "text-size": 11, "text-anchor": ["get", "anchor"] },
       paint: { "text-color": c.text, "text-halo-color": c.halo, "text-halo-width": 1.5 },
     },
   ];
