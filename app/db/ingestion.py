@@ -10,7 +10,7 @@ from app.db import binary_copy as binary
 from app.db.blocks import ID_BITS
 from app.db.engine import Connection, driver
 from app.db.schema import chip_file, image, point, view
-from app.db.statements import CopyIn, hot
+from app.db.statements import CopyIn, hot, named
 from services.formats.block.reader import BlockContents
 from services.formats.block.tables import sigmas_from_covariance
 from services.types import IntArray, Progress, SurfaceHeights
@@ -40,7 +40,7 @@ def load_contents(
     files: Sequence[StoredChipFile],
     progress: Progress,
 ) -> None:
-    """Load the images, files of chips, points and views of a block.
+    """Load the images, files of chips, points and views of a block, and set its outline.
 
     Args:
         number: of the block.
@@ -59,6 +59,8 @@ def load_contents(
                 copy.write(piece)
                 sent += rows
                 progress(sent / total, f"loading rows of table {table.name}")
+    ids = {"first": number << ID_BITS, "end": (number + 1) << ID_BITS}
+    connection.execute(named("blocks.sql", "set_outline"), {"number": number, **ids})
 
 
 def _point_columns(number: int, contents: BlockContents, file_ids: IntArray) -> dict[str, binary.Column]:

@@ -57,7 +57,7 @@ BLOCKS = Collection(
         column_property(block.c.state_changed_at, "When its state changed last"),
     ),
     geometry_type="Polygon",
-    geometry=block.c.extent_on_map,
+    geometry=block.c.outline_on_map,
     visible=_BLOCK_VISIBLE,
     interval=("created_at", "created_at"),
     named_by=or_(

@@ -49,7 +49,7 @@ def hours(count: float) -> ColumnElement[timedelta]:
     return func.make_interval(0, 0, 0, 0, count, type_=Interval)
 
 
-def on_map(outline: str) -> Computed:
+def on_map(outline: ColumnElement[Any]) -> Computed:
     """An outline cut at 180 degrees, as RFC 7946 asks; the outline itself stays in one piece."""
-    wrapped = func.st_wrapx(func.st_wrapx(column_named(outline), 180, -360), -180, 360)
+    wrapped = func.st_wrapx(func.st_wrapx(outline, 180, -360), -180, 360)
     return Computed(func.st_forcepolygonccw(wrapped), persisted=True)

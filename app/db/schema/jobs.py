@@ -13,6 +13,7 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     Uuid,
+    column,
     text,
 )
 
@@ -67,7 +68,7 @@ scene = Table(
     Column("lines", Integer),
     Column("samples", Integer),
     Column("created_at_uptime_s", Double, nullable=False, server_default=uptime_s),
-    Column("footprint_on_map", MapOutline, on_map("footprint")),
+    Column("footprint_on_map", MapOutline, on_map(column("footprint"))),
     # Sum of the sizes in `models`.
     Column("side_file_bytes", BigInteger, nullable=False, server_default=text("0")),
     one_of("state", SceneState),

@@ -16,6 +16,8 @@ from sqlalchemy import (
     Table,
     Text,
     UniqueConstraint,
+    column,
+    func,
     text,
 )
 
@@ -43,6 +45,7 @@ block = Table(
     Column("version", Text, nullable=False),
     Column("title", Text, nullable=False, server_default=""),
     Column("state", Text, nullable=False),
+    # As its document declares it.
     Column("extent", Polygon, nullable=False),
     Column("n_points", BigInteger, nullable=False),
     Column("n_views", BigInteger, nullable=False),
@@ -57,18 +60,20 @@ block = Table(
     Column("priority", Integer, nullable=False, server_default=text("0")),
     # Points that are superseded by a better block or suspended.
     Column("n_unserved", BigInteger, nullable=False, server_default=text("0")),
-    Column("extent_on_map", MapOutline, on_map("extent")),
     # CE90 and LE90 of its median point, in its frame and on the Earth; null: unknown.
     Column("relative_ce90_m", Real),
     Column("relative_le90_m", Real),
     Column("on_the_earth_ce90_m", Real),
     Column("on_the_earth_le90_m", Real),
+    # Of its points, inside `extent`; longitudes continue across 180 degrees; null without points.
+    Column("outline", MapOutline),
+    Column("outline_on_map", MapOutline, on_map(func.coalesce(column("outline"), column("extent")))),
     UniqueConstraint("id", "version"),
     one_of("state", BlockState),
     Index(
         "block_extent", "extent", postgresql_using="gist", postgresql_where=text("state = 'published'")
     ),
-    Index("block_extent_on_map", "extent_on_map", postgresql_using="gist"),
+    Index("block_outline_on_map", "outline_on_map", postgresql_using="gist"),
 )
 
 # Images that the views of a block were cut from.
