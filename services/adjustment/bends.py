@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.adjustment.line_profile import Along, Component, Kind
-from services.adjustment.profile_solution import by_affine, padded
+from services.adjustment.displacement_components import Along, Component, Kind
+from services.adjustment.displacement_solution import by_affine, padded
 from services.adjustment.structure import Residuals
 from services.sensors.correction import no_correction
 from services.types import Array

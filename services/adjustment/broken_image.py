@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.adjustment.line_profile import Component
+from services.adjustment.displacement_components import Component
 from services.sensors.correction import ImageCorrection
 from services.types import Array, BoolArray, IntArray
 

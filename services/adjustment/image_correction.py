@@ -9,11 +9,11 @@ import numpy as np
 from services.adjustment.affine_fit import FREE, ORDERS, AffineFit, Order
 from services.adjustment.broken_image import held_parts, on_one_side, part_of_line
 from services.adjustment.control_observations import ControlObservations, declared_fit, frame_sigma_px
-from services.adjustment.line_profile import Component
+from services.adjustment.displacement_components import Component
+from services.adjustment.displacement_solution import solve_displacement
 from services.adjustment.moved_ground import MovedGround, moved_ground
 from services.adjustment.order_selection import choose_order
 from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.profile_solution import solve_profile
 from services.adjustment.robust import deactivate
 from services.adjustment.scene_motion import SceneMotion, what_moves
 from services.adjustment.scene_solution import AgreeingMeasures
@@ -236,7 +236,7 @@ def adjust_scene(
     if components:
         active = measured.agreeing(fit, seen if like is None else usable, components, expected, limit)
         active &= _in_held_parts(observations, active)
-        followed = solve_profile(measured.residuals(fit, active), components, expected, shape)
+        followed = solve_displacement(measured.residuals(fit, active), components, expected, shape)
         shared_fit, of_shared = measured.without(followed.displacement, declared), active
     shared = (
         like.shared

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from services.adjustment.affine_fit import FREE, AffineFit
-from services.adjustment.line_profile import MAX_CHANCE, Component, with_components
+from services.adjustment.displacement_components import MAX_CHANCE, Component, with_components
+from services.adjustment.displacement_solution import agreeing_with
 from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.profile_solution import agreeing_with
 from services.adjustment.scene_motion import SceneMotion
 from services.adjustment.shared_errors import likeliest_shared_errors
 from services.adjustment.structure import Residuals

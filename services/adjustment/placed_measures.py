@@ -7,8 +7,8 @@ import numpy as np
 
 from services.adjustment.affine_fit import AffineFit
 from services.adjustment.control_observations import ControlObservations
-from services.adjustment.line_profile import Component, beyond, likeliest_components
-from services.adjustment.profile_solution import agreeing_with
+from services.adjustment.displacement_components import Component, beyond, likeliest_components
+from services.adjustment.displacement_solution import agreeing_with
 from services.adjustment.shared_errors import SharedErrors, overlap_correlation
 from services.adjustment.structure import ALONG_AXES, OTHERWISE, Residuals, Structure, structures
 from services.sensors.base import SensorModel

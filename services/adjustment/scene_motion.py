@@ -6,9 +6,9 @@ import numpy as np
 
 from services.adjustment.affine_fit import AffineFit
 from services.adjustment.broken_image import placed_steps, steps_at_breaks
-from services.adjustment.line_profile import Component
+from services.adjustment.displacement_components import Component
+from services.adjustment.displacement_solution import solve_displacement
 from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.profile_solution import solve_profile
 from services.adjustment.structure import Structure
 from services.sensors.correction import no_correction
 from services.types import Array, BoolArray, IntArray
@@ -89,7 +89,7 @@ def _known_steps(
     affine = replace(no_correction(measured.shape), parameters=start[:, :3])
     steps, expected = steps_at_breaks(breaks, affine), fit.expected(np.inf)
     agreeing = measured.agreeing(fit, seen, steps, expected, tolerance)
-    solution = solve_profile(measured.residuals(fit, agreeing), steps, expected, measured.shape)
+    solution = solve_displacement(measured.residuals(fit, agreeing), steps, expected, measured.shape)
     parameters, displacement = solution.parameters[:, :3], solution.displacement
     followed = replace(affine, parameters=parameters, displacement=displacement)
     return placed_steps(breaks, steps, followed)

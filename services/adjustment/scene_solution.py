@@ -8,9 +8,9 @@ from scipy.special import ndtr
 
 from services.adjustment.affine_fit import AffineFit
 from services.adjustment.bends import bends
-from services.adjustment.line_profile import Component, unit_variance, with_components
+from services.adjustment.displacement_components import Component, unit_variance, with_components
+from services.adjustment.displacement_solution import joined, solve_displacement
 from services.adjustment.placed_measures import PlacedMeasures
-from services.adjustment.profile_solution import joined, solve_profile
 from services.adjustment.shared_errors import SharedErrors
 from services.adjustment.structure import Residuals
 from services.sensors.displacement import DisplacementGrid
@@ -75,7 +75,7 @@ class AgreeingMeasures:
     def displaced(self, expected: Array, components: Sequence[Component]) -> SceneSolution:
         """The correction with a displacement of some components; `expected` (2, k) weighs parameters."""
         moving = self._as_shown(components)
-        solution = solve_profile(self._told(), moving, expected, self.measured.shape)
+        solution = solve_displacement(self._told(), moving, expected, self.measured.shape)
         stated = [one.scaled(self._stated) for one in components]
         chi2 = unit_variance(
             with_components(self.measured.residuals(self.declared, self.active), stated)

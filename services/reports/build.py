@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from services.adjustment.affine_fit import Order
+from services.adjustment.displacement_components import Component
 from services.adjustment.image_correction import SceneAdjustment
-from services.adjustment.line_profile import Component
 from services.imagery.scene import Scene, scene_footprint, scene_gsd_m
 from services.quality.criteria import VERDICT_EXPLANATIONS, verdict_scope
 from services.registration.on_points import Registration

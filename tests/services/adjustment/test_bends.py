@@ -7,7 +7,15 @@ from services.adjustment.bends import bends
 from services.adjustment.structure import Residuals
 from services.quality.normal_law import normal_ce90
 from services.types import Array
-from tests.services.adjustment.test_line_profile import SHAPE, WRONG, Trial, both, bow, still, trial
+from tests.services.adjustment.test_displacement_components import (
+    SHAPE,
+    WRONG,
+    Trial,
+    both,
+    bow,
+    still,
+    trial,
+)
 
 ON_SAMPLES = 1.0, 0.6
 """Points on three fifths of the samples."""

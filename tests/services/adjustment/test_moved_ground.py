@@ -10,7 +10,7 @@ from services.quality.accuracy import normalised_error
 from services.quality.normal_law import normal_ce90
 from services.sensors.correction import ImageCorrection
 from services.types import Array, BoolArray
-from tests.services.adjustment.test_line_profile import (
+from tests.services.adjustment.test_displacement_components import (
     MOTIONS,
     SHAPE,
     WRONG,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.adjustment.line_profile import Along, Component, with_components
+from services.adjustment.displacement_components import Along, Component, with_components
 from services.adjustment.structure import Residuals
 from services.sensors.correction import ImageCorrection, no_correction
 from services.sensors.displacement import DisplacementGrid
@@ -85,7 +85,7 @@ def agreeing_with(
     return agrees
 
 
-def solve_profile(
+def solve_displacement(
     residuals: Residuals, components: Sequence[Component], expected: Array, shape: tuple[int, int]
 ) -> ProfileSolution:
     """Estimate and covariance of parameters and displacement.

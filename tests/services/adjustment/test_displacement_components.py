@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from services.adjustment.control_observations import ControlObservations
+from services.adjustment.displacement_components import MAX_CHANCE
 from services.adjustment.image_correction import AdjustmentOptions, SceneAdjustment, adjust_scene
-from services.adjustment.line_profile import MAX_CHANCE
 from services.adjustment.structure import Family
 from services.quality.accuracy import normalised_error
 from services.quality.normal_law import normal_ce90, overall_ce90
