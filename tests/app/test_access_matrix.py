@@ -29,7 +29,15 @@ from tests.app.hostile_installation import Installation, hostile_installation, t
 pytestmark = pytest.mark.security
 
 METHODS = ("get", "head", "options", "post", "put", "patch", "delete")
-UNDESCRIBED = {"/api", "/connect", "/map", "/map/{name}", "/sign-in", "/sign-out"}
+UNDESCRIBED = {
+    "/api",
+    "/connect",
+    "/map",
+    "/map/background.json",
+    "/map/{name}",
+    "/sign-in",
+    "/sign-out",
+}
 """Routes that are no part of the description: the description itself, and the pages for people."""
 SCOPES: dict[str, tuple[Scope, ...]] = {
     "read": (Scope.READ,),
