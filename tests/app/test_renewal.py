@@ -199,7 +199,7 @@ def test_a_later_scene_of_the_season_matches_better_and_nothing_has_moved(
     score_after = mean_score(after, new.id[has_winter])
     assert score_before < 0.8
     assert score_after > score_before + 0.15
-    assert after.active.sum() > before.active.sum()
+    assert after.matched.sum() > before.matched.sum()
 
 
 def test_evidence_of_older_versions_is_not_lost(
