@@ -21,7 +21,8 @@ LACK_OF_FIT = {
     "steps": ("along_lines", "points_elsewhere", "behind_breaks"),
     "moved": ("points_elsewhere", "structure_in_image", "second_consensus"),
     "wrong_model": ("against_height", "another view", "another scene", "swapped", "mirrored", "upside"),
-    "otherwise": ("structure_", "steps_along_lines", "points_elsewhere", "behind_breaks"),
+    "otherwise": ("structure_", "steps_along", "missed_along", "points_elsewhere", "behind_breaks"),
+    "parts": ("structure_", "steps_along", "missed_along", "points_elsewhere", "behind_breaks"),
 }
 """Parts of the names of criteria, or of why a scene is refused, that tell what a family is."""
 _OF_ANY = LACK_OF_FIT["otherwise"]

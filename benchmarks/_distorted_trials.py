@@ -11,6 +11,7 @@ from benchmarks._distortions import (
     draw_jitter,
     draw_moved,
     draw_otherwise,
+    draw_parts,
     draw_steps,
     draw_wrong_model,
 )
@@ -25,6 +26,7 @@ DISTORTED: dict[str, tuple[Draw, int]] = {
     "moved": (draw_moved, 10),
     "wrong_model": (draw_wrong_model, 11),
     "otherwise": (draw_otherwise, 12),
+    "parts": (draw_parts, 13),
 }
 """What draws the distortions of each family, and a number of its own that seeds it."""
 _SATURATED = (0.02, 0.15)

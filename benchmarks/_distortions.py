@@ -10,6 +10,7 @@ from services.simulation.distortion import (
     Distortion,
     Kink,
     MovedGround,
+    Seam,
     Step,
     Turn,
     Waves,
@@ -25,6 +26,8 @@ TILT_DEG, AWAY = (3.0, 25.0), (0.2, 0.7)
 CHIRP = (0.5, 2.0)
 """Growth of the frequency of a chirp over the image, as a share of its first one."""
 SAMPLE_TERMS_PX = (0.3, 3.0)
+SEAM_PX = (0.5, 8.0)
+DETECTORS, PARTS = (4, 12), (2, 5)
 BAND = 4.0
 """Longest over shortest period of a random oscillation."""
 _RANDOM_WAVES = 60
@@ -44,6 +47,7 @@ class Drawn:
             together; of a bend its displacement at the last pixel.
         period_px: shortest period of an oscillation, lines.
         steps, step_lines: number of steps, and lines lost or repeated at the largest.
+        parts: of the image between seams, or with an attitude rate of their own.
         moved_share, moved_m: of the image, and how far.
         tilt_deg: between the view and that of which the model is.
         away: of the scene of which the model is, sides of the image.
@@ -54,6 +58,7 @@ class Drawn:
     period_px: float = 0.0
     steps: int = 0
     step_lines: float = 0.0
+    parts: int = 0
     moved_share: float = 0.0
     moved_m: float = 0.0
     tilt_deg: float = 0.0
@@ -66,6 +71,8 @@ class Drawn:
             return self.period_px
         return float("inf") if self.kind in BENT else 0.0
 
+
+SEAMS = ("detectors", "alternating", "joined")
 
 NOT_DISTORTED = Drawn()
 
@@ -127,6 +134,23 @@ def draw_otherwise(rng: np.random.Generator, lines: int) -> Drawn:
     )
 
 
+def draw_parts(rng: np.random.Generator, lines: int) -> Drawn:
+    """What no family of the tests was made for: detectors out of place, mosaics, uneven rates.
+
+    Seams between a few detectors, or beside each other between detectors that alternate; a joint of two
+    images; an attitude rate that changes several times.
+    """
+    del lines
+    kind = str(rng.choice(["detectors", "alternating", "joined", "rates"]))
+    parts = {
+        "detectors": int(rng.integers(*PARTS)),
+        "alternating": int(rng.integers(*DETECTORS)),
+        "joined": 2,
+        "rates": int(rng.integers(*PARTS)) + 1,
+    }
+    return Drawn(kind, _log_uniform(rng, *SEAM_PX), parts=parts[kind])
+
+
 def distortion_of(
     drawn: Drawn, shape: tuple[int, int], gsd_m: float, rng: np.random.Generator
 ) -> Distortion:
@@ -143,6 +167,7 @@ def distortion_of(
         _smooth(drawn, shape, rng),
         _steps(drawn, shape, rng),
         _moved(drawn, shape, gsd_m, rng) if drawn.moved_share > 0.0 else None,
+        _seams(drawn, shape, rng) if drawn.kind in SEAMS else (),
         TURNS.get(drawn.kind, ""),
     )
 
@@ -153,6 +178,8 @@ def _smooth(drawn: Drawn, shape: tuple[int, int], rng: np.random.Generator) -> t
         return (Kink(line, drawn.amplitude_px * _direction(rng) / (shape[0] - line)),)
     if drawn.kind in BENT:
         return _bends(drawn, shape, rng)
+    if drawn.kind == "rates":
+        return _rates(drawn, shape, rng)
     if drawn.period_px == 0.0:
         return ()
     waves = _waves(drawn, shape[0], rng)
@@ -195,6 +222,32 @@ def _steps(drawn: Drawn, shape: tuple[int, int], rng: np.random.Generator) -> tu
         Step(round(line), int(rng.choice([-1, 1])) * max(1, round(n)))
         for line, n in zip(at.tolist(), lines, strict=True)
     )
+
+
+def _rates(drawn: Drawn, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Displacement, ...]:
+    """Attitude rates that change between parts; each change displaces the last line by the amplitude."""
+    lines = np.sort(rng.uniform(0.05, 0.95, drawn.parts - 1)) * shape[0]
+    size_px = drawn.amplitude_px * rng.choice([-1.0, 1.0], len(lines))
+    return tuple(
+        Kink(line, size * _direction(rng) / (shape[0] - line))
+        for line, size in zip(lines.tolist(), size_px.tolist(), strict=True)
+    )
+
+
+def _seams(drawn: Drawn, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Seam, ...]:
+    """Seams between detectors, of which every other one may be out of place, or between two images."""
+    if drawn.kind == "joined":
+        line = round(float(rng.uniform(0.15, 0.85)) * shape[0])
+        return (Seam(0, line, drawn.amplitude_px * _direction(rng)),)
+    if drawn.kind == "alternating":
+        between = np.arange(1, drawn.parts) / drawn.parts * shape[1]
+        shift_px = drawn.amplitude_px * _direction(rng)
+        return tuple(
+            Seam(1, round(at), shift_px if k % 2 == 0 else -shift_px)
+            for k, at in enumerate(between.tolist())
+        )
+    between = np.sort(rng.uniform(0.1, 0.9, drawn.parts - 1)) * shape[1]
+    return tuple(Seam(1, round(at), drawn.amplitude_px * _direction(rng)) for at in between.tolist())
 
 
 def _moved(drawn: Drawn, shape: tuple[int, int], gsd_m: float, rng: np.random.Generator) -> MovedGround:

@@ -152,6 +152,9 @@ FAMILIES = {
     "otherwise": Family(
         ("otherwise",), 60, {"distortion.amplitude_px": (0.2, 1.0, 2.0, 8.01), **_OTHERWISE}
     ),
+    "parts": Family(
+        ("parts",), 60, {"distortion.amplitude_px": (0.5, 1.0, 2.0, 4.0, 8.01), **_OTHERWISE}
+    ),
 }
 
 

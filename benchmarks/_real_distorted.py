@@ -28,9 +28,10 @@ SCENES = {
     "moved": 36,
     "wrong_model": 27,
     "otherwise": 27,
+    "parts": 36,
     CLEAN: 36,
 }
-"""Scenes of each family: 216 distorted ones, and some that are not."""
+"""Scenes of each family: 252 distorted ones, and some that are not."""
 LOCATION_M = (5.0, 30.0)
 OPTIONS = RegistrationOptions()
 _BESIDE_PX = 30.0

@@ -44,7 +44,7 @@ def main() -> None:
     """Run the missing scenes, print the tables, write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--family", choices=[*SCENES, "all"], default="all")
-    parser.add_argument("--scenes", type=int, help="of each family; by default 252 in all")
+    parser.add_argument("--scenes", type=int, help="of each family; by default 288 in all")
     parser.add_argument("--name", help="of a single scene, as family_0003")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--folder", type=Path, default=RESULTS / "distorted", help="of the outcomes")

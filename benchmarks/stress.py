@@ -5,9 +5,9 @@ that make registration difficult: a few factors over their whole range, the othe
 the conditions that SRP is described by. *Damaged* scenes have missing and saturated pixels, and each is
 registered without them too. *Points* have correlated errors, offsets between blocks, errors of the
 frame's height and distorted blocks. *Sensor* scenes have a blur, seams between detectors and a terrain
-that nothing knows. Scenes of six more families, *jitter*, *bow*, *steps*, *moved*, *wrong_model* and
-*otherwise*, are distorted in ways that their models do not say. Each result is compared with the true
-sensor over the whole image, in the frame of the points and on the Earth.
+that nothing knows. Scenes of seven more families, *jitter*, *bow*, *steps*, *moved*, *wrong_model*,
+*otherwise* and *parts*, are distorted in ways that their models do not say. Each result is compared with
+the true sensor over the whole image, in the frame of the points and on the Earth.
 
 Every scene follows from the seed and its number. The outcome of each scene is appended to a file. A
 scene is not repeated as long as the sources are the same; blocks of points are reused until their files

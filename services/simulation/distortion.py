@@ -1,8 +1,8 @@
-"""What sensor models do not describe: jitter, bows, lost lines, moved ground, swapped axes."""
+"""What sensor models do not describe: jitter, bows, lost lines, seams, moved ground, swapped axes."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, product
 from typing import Literal, Protocol
 
 import numpy as np
@@ -101,6 +101,21 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Seam:
+    """A place behind which the image was taken by another detector, or is another image.
+
+    Attributes:
+        axis: 0 for a seam between lines, 1 for one between samples.
+        at: first line, or sample, behind it.
+        shift_px: (2,) the pixels behind it show what the image in front of it has this far from them.
+    """
+
+    axis: int
+    at: int
+    shift_px: Array
+
+
+@dataclass(frozen=True)
 class MovedGround:
     """An elliptic part of the image that shows what belongs elsewhere.
 
@@ -128,13 +143,15 @@ class MovedGround:
 class Distortion:
     """A map from the pixels of a delivered image to those of the undistorted one.
 
-    A pixel first jumps, by lost lines and moved ground, is then displaced smoothly, and last turned.
+    A pixel first jumps, by lost lines, seams and moved ground, is then displaced smoothly, and last
+    turned.
 
     Attributes:
         shape: lines and samples of the delivered image.
         smooth: displacements that add up.
         steps: in the order of their lines. The middle line stays in its place.
         moved: ground that is elsewhere.
+        seams: along each axis in their order. The middle of the image stays in its place.
         turn: "swapped" lines and samples, "mirrored" along samples, "upside down" along lines.
     """
 
@@ -142,12 +159,13 @@ class Distortion:
     smooth: tuple[Displacement, ...] = ()
     steps: tuple[Step, ...] = ()
     moved: MovedGround | None = None
+    seams: tuple[Seam, ...] = ()
     turn: Turn = ""
 
     @property
     def is_none(self) -> bool:
         """Whether it leaves every pixel where it is."""
-        return not (self.smooth or self.steps or self.moved or self.turn)
+        return not (self.smooth or self.steps or self.moved or self.seams or self.turn)
 
     def undistorted(self, line_sample: Array) -> Array:
         """Positions (n, 2) in the undistorted image of pixels (n, 2)."""
@@ -191,16 +209,21 @@ class Distortion:
         """What is not smooth of the displacements (n, 2) at pixels (n, 2): a few whole values."""
         out = np.zeros(line_sample.shape)
         out[:, 0] = self._lines_before()[self._steps_passed(line_sample[:, 0])]
+        for axis in (0, 1):
+            out += self._shifts(axis)[self._seams_passed(axis, line_sample[:, axis])]
         if self.moved is not None:
             out[self.is_moved(line_sample)] += self.moved.shift_px
         return out
 
     def jumps(self) -> list[Array]:
         """All values (2,) that `jump` has."""
-        apart = [np.zeros(2)] if self.moved is None else [np.zeros(2), self.moved.shift_px]
-        lines = np.unique(self._lines_before())
-        jumps = np.array([np.array([line, 0.0]) + shift for line in lines for shift in apart])
-        return list(np.unique(jumps, axis=0))
+        lines = [np.array([line, 0.0]) for line in np.unique(self._lines_before())]
+        moved = [np.zeros(2)] if self.moved is None else [np.zeros(2), self.moved.shift_px]
+        # In the order of `jump`: equal sums are the same number.
+        parts = product(lines, self._shifts(0), self._shifts(1), moved)
+        return list(
+            np.unique([line + first + second + last for line, first, second, last in parts], axis=0)
+        )
 
     def after_jump(self, line_sample: Array) -> Array:
         """Positions (n, 2) in the undistorted image after the jump of their pixels: a smooth map."""
@@ -226,6 +249,16 @@ class Distortion:
 
     def _steps_passed(self, line: Array) -> IntArray:
         return np.asarray(np.searchsorted([step.line - 0.5 for step in self.steps], line, side="right"))
+
+    def _seams_passed(self, axis: int, position: Array) -> IntArray:
+        at = [seam.at - 0.5 for seam in self.seams if seam.axis == axis]
+        return np.asarray(np.searchsorted(at, position, side="right"))
+
+    def _shifts(self, axis: int) -> Array:
+        """Shifts (k + 1, 2) of the parts between seams along an axis, from the middle on."""
+        shifts = [np.zeros(2), *(seam.shift_px for seam in self.seams if seam.axis == axis)]
+        total = np.cumsum(shifts, axis=0)
+        return total - total[self._seams_passed(axis, np.array([(self.shape[axis] - 1.0) / 2.0]))]
 
     def _lines_before(self) -> Array:
         """Lines (k + 1,) that are lost before each part of the image, from the middle on."""

@@ -14,6 +14,7 @@ from benchmarks._distortions import (
     LONGEST_PERIOD,
     MOVED_M,
     MOVED_SHARE,
+    SEAMS,
     SHORTEST_PERIOD_PX,
     STEP_LINES,
     Drawn,
@@ -96,6 +97,18 @@ def test_every_distortion_has_an_inverse_where_pixels_show_their_place_once(fami
         assert unique.mean() > 0.2
         back = made.distorted(made.undistorted(pixels[unique]))
         np.testing.assert_allclose(back, pixels[unique], atol=few_pixels)
+
+
+def test_the_sides_of_seams_are_as_far_apart_as_drawn() -> None:
+    shape = SMALL.lines, SMALL.lines
+    for number, distortion in enumerate(drawn("parts", 40)):
+        made = distortion_of(distortion, shape, 1.0, np.random.default_rng(number))
+        assert len(made.seams) == (distortion.parts - 1 if distortion.kind in SEAMS else 0)
+        for seam in made.seams:
+            sides = np.full((2, 2), 0.0)
+            sides[:, seam.axis] = [seam.at - 1.0, seam.at]
+            apart = np.diff(made.undistorted(sides) - sides, axis=0)
+            assert np.hypot(*apart[0]) == pytest.approx(distortion.amplitude_px)
 
 
 def test_moved_ground_is_as_large_and_as_far_as_drawn() -> None:

@@ -10,6 +10,7 @@ from services.simulation.distortion import (
     Distortion,
     Kink,
     MovedGround,
+    Seam,
     Step,
     Waves,
 )
@@ -36,6 +37,9 @@ DISTORTIONS = {
     "kink": Distortion(SHAPE, (KINK,)),
     "steps": Distortion(SHAPE, steps=(Step(90, -12), Step(200, 30))),
     "moved": Distortion(SHAPE, moved=LANDSLIDE),
+    "seams": Distortion(
+        SHAPE, seams=(Seam(1, 70, np.array([1.3, -2.2])), Seam(0, 220, np.array([0.0, 4.1])))
+    ),
     "mixture": Distortion(SHAPE, (JITTER, SMILE), (Step(200, 7),), LANDSLIDE),
     "mirrored": Distortion(SHAPE, (JITTER,), turn="mirrored"),
     "upside down": Distortion(SHAPE, turn="upside down"),
@@ -77,7 +81,7 @@ def test_the_inverse_gives_back_every_pixel_that_is_shown_once(name: str) -> Non
     unknown = distortion.distorted(np.vstack([[np.nan, 5.0], distortion.undistorted(pixels[unique])]))
     assert np.isnan(unknown[0]).all()
     np.testing.assert_allclose(unknown[1:], pixels[unique], atol=1e-8)
-    jumps = distortion.steps or distortion.moved
+    jumps = distortion.steps or distortion.moved or distortion.seams
     assert unique.all() if not jumps else 0.5 < unique.mean() < 1.0
 
 
@@ -105,6 +109,18 @@ def test_bends_are_as_large_as_stated_at_the_last_line() -> None:
     np.testing.assert_allclose(BOW.at(ends), [[4.0, -2.0], [4.0, -2.0]], atol=1e-12)
     middle = BOW.at(np.array([[(SHAPE[0] - 1.0) / 2.0, 0.0]]))
     np.testing.assert_allclose(middle, [[-2.0, 1.0]], atol=1e-12)
+
+
+def test_what_lies_behind_a_seam_is_shifted_and_the_middle_is_not() -> None:
+    moved = DISTORTIONS["seams"].undistorted(pixels := pixels_of(SHAPE)) - pixels
+    by_part = {
+        (bool(line >= 220), bool(sample >= 70)): shift.tolist()
+        for (line, sample), shift in zip(pixels, moved, strict=True)
+    }
+    assert by_part[False, True] == [0.0, 0.0]
+    np.testing.assert_allclose(by_part[False, False], [-1.3, 2.2])
+    np.testing.assert_allclose(by_part[True, True], [0.0, 4.1])
+    np.testing.assert_allclose(by_part[True, False], [-1.3, 6.3])
 
 
 def test_repeated_lines_repeat_their_pixels_and_lost_ones_are_nowhere() -> None:
