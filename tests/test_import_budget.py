@@ -10,6 +10,7 @@ import pytest
 
 from app.cli import commands
 from app.cli.on_demand import Command, Tree
+from app.one_thread import ONE_THREAD
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = frozenset(
@@ -98,6 +99,27 @@ print("rich" in sys.modules)
 """
     printed = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True)
     assert printed.split() == ["number", "7", "False"]
+
+
+@pytest.mark.parametrize(("stated", "threads"), [({}, 1), ({"OPENBLAS_NUM_THREADS": "2"}, 2)])
+def test_linear_algebra_of_a_command_has_one_thread_unless_more_are_asked_for(stated, threads):
+    program = """
+import os, sys
+from app.cli.main import main
+sys.argv = ["amers", "--version"]
+try:
+    main()
+except SystemExit:
+    pass
+import numpy
+print(len(os.listdir("/proc/self/task")))
+"""
+    inherited = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
+    environment = {**inherited, **stated}
+    printed = subprocess.check_output(
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, text=True
+    )
+    assert int(printed.split()[-1]) == min(threads, os.cpu_count() or 1)
 
 
 def entries(tree: Tree, words: str = "amers") -> list[tuple[str, Command]]:

@@ -14,6 +14,7 @@ from app.cli.exit_status import FAILURE, INTERRUPTED, REFUSED
 from app.cli.failures import failure, print_traceback
 from app.cli.on_demand import GroupOnDemand
 from app.errors import AmersError
+from app.one_thread import use_one_thread
 
 OBJECTS_BEFORE_COLLECTION = 20_000
 """More than Python's 700: what is imported stays, and to look through it costs a tenth of the start."""
@@ -52,6 +53,7 @@ def amers(
 
 def main() -> None:
     """Run one command; an error is printed as one sentence, without a traceback."""
+    use_one_thread()
     gc.set_threshold(OBJECTS_BEFORE_COLLECTION)
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:

@@ -1,7 +1,6 @@
 """Where long work is computed: in processes of this machine, or on a Dask cluster."""
 
 import multiprocessing
-import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -9,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.errors import InputError
+from app.one_thread import use_one_thread
 
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _LOST_WORKERS = 3
 """How often a task is given to another worker after its own was lost."""
 _SECONDS_TO_CONNECT = 30
@@ -44,9 +43,8 @@ def open_executor(options: ComputeOptions) -> Iterator[tuple[Executor, int]]:
         with ThreadPoolExecutor(max_workers=1) as thread:
             yield thread, 1
         return
-    # Children that are forked from threads may lock up; linear algebra on one thread each.
-    for name in _ONE_THREAD:
-        os.environ.setdefault(name, "1")
+    use_one_thread()
+    # Children that are forked from threads may lock up.
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(options.jobs, mp_context=context, initializer=_begin_process) as pool:
         try:

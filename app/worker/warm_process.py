@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from types import TracebackType
 
+from app.one_thread import ONE_THREAD
+
 LIMITED_LIBRARIES = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
+    **ONE_THREAD,
     "MALLOC_ARENA_MAX": "2",
     "JE_ARROW_MALLOC_CONF": "background_thread:false",
     "GDAL_CACHEMAX": "64",
