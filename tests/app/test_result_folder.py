@@ -73,6 +73,7 @@ def killed_at(number: int, work: Callable[[], None]) -> bool:
     return os.WIFSIGNALED(status)
 
 
+@pytest.mark.endurance
 @pytest.mark.parametrize("exchanges", [True, False])
 def test_a_result_is_whole_wherever_its_writer_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool

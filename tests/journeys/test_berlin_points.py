@@ -13,6 +13,7 @@ SHIFT_ALLOWED_M = 1.0
 GSD_M = 10.0
 
 
+@pytest.mark.endurance
 def test_both_dates_of_berlin_make_one_block_that_registers_the_may_scene_too(
     real_data: Path, amers, tmp_path
 ) -> None:
@@ -35,6 +36,7 @@ def test_both_dates_of_berlin_make_one_block_that_registers_the_may_scene_too(
     assert result["matched"] > 0.9 * result["visible"]
 
 
+@pytest.mark.endurance
 def test_the_may_scene_of_berlin_is_registered_on_points_of_the_june_one(
     real_data: Path, amers, tmp_path
 ) -> None:

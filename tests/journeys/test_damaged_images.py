@@ -87,6 +87,7 @@ def ce90_px(registration: Registration) -> list[float]:
     return [c.value for c in criteria if c.name == "predicted_ce90_px"]
 
 
+@pytest.mark.endurance
 def test_a_pair_with_saturated_pixels_gives_as_many_points_of_the_same_precision(produced) -> None:
     clean, damaged = produced(0.0), produced(SATURATED_SHARE)
     assert abs(len(damaged.points) - len(clean.points)) <= five_percent * len(clean.points)

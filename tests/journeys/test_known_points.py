@@ -24,6 +24,7 @@ def amers(*words: object) -> dict:
     return dict(json.loads(done.stdout))
 
 
+@pytest.mark.endurance
 def test_a_lattice_with_heights_of_a_surface_model_gets_chips_that_register_another_view(
     real_data: Path, tmp_path: Path
 ) -> None:

@@ -48,6 +48,7 @@ def test_june_points_lie_as_far_off_the_may_scene_as_features_say(
     assert [criterion.outcome for criterion in report.criteria] == ["met", "met"]
 
 
+@pytest.mark.endurance
 def test_surfaces_of_three_views_agree_with_the_surface_model(real_data: Path, tmp_path: Path) -> None:
     triplet = real_data / "phr_calanques_triplet"
     block = tmp_path / "calanques"

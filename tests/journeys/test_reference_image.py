@@ -79,6 +79,7 @@ def _top(scores: FloatImage) -> float:
     return (before - after) / (2.0 * (before - 2.0 * at + after))
 
 
+@pytest.mark.endurance
 def test_the_local_shifts_of_maricopa_are_measured_as_pixel_against_pixel_shows_them(
     real_data: Path,
 ) -> None:

@@ -124,7 +124,8 @@ def test_a_spoiled_third_view_agrees_with_the_other_two_once_registered(
         assert (out / name).stat().st_size > 0
 
 
-@pytest.mark.parametrize("direction_deg", [30.0, pytest.param(115.0, marks=pytest.mark.endurance)])
+@pytest.mark.endurance
+@pytest.mark.parametrize("direction_deg", [30.0, 115.0])
 def test_a_third_view_five_kilometres_off_is_found(triplet, pixels, tracks, direction_deg):
     images = {
         name: replace(read_scene(path), image=ArrayImage(pixels[name])) for name, path in triplet.items()

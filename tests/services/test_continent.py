@@ -29,6 +29,8 @@ from services.simulation.archive import (
 from services.simulation.conditions import clouds_over
 from services.types import Array
 
+pytestmark = pytest.mark.endurance
+
 pytestmark = pytest.mark.long
 
 SEEDS = range(60)

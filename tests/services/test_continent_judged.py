@@ -38,6 +38,8 @@ from services.simulation.tiles import TiledView
 from services.simulation.view import ViewPlan, plan_geometry
 from services.types import Array, ControlPoints, Frame
 
+pytestmark = pytest.mark.endurance
+
 pytestmark = pytest.mark.long
 
 FRAME_M = np.array([1.6, -1.1, 2.3])

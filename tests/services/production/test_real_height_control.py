@@ -42,9 +42,8 @@ def height_bias_m(made: Production, scenes: list[Scene], dsm: Path) -> float:
     return float(model.translation(tied, tied[:, 2])[2])
 
 
-@pytest.mark.parametrize(
-    "pair", [pytest.param(("img_01", "img_02"), marks=pytest.mark.endurance), ("img_02", "img_03")]
-)
+@pytest.mark.endurance
+@pytest.mark.parametrize("pair", [("img_01", "img_02"), ("img_02", "img_03")])
 def test_the_heights_of_a_pair_become_those_of_the_model(real_data: Path, pair) -> None:
     folder = real_data / "phr_calanques_triplet"
     dsm = folder / "expected_output" / "dsm.tif"

@@ -203,6 +203,7 @@ class ElevationModel:
         return shift
 
 
+@pytest.mark.endurance
 @pytest.mark.real_data
 def test_real_surfaces_agree_with_an_elevation_model_as_stated(triplet, real_data: Path) -> None:
     with rasterio.open(real_data / "phr_calanques_triplet" / "expected_output" / "dsm.tif") as raster:

@@ -63,6 +63,7 @@ class PittedChips:
         return chips
 
 
+@pytest.mark.endurance
 def test_a_small_crop_kilometres_off_is_found_also_by_chips_with_lost_pixels() -> None:
     east, north = (4900.0 * DIRECTION).tolist()
     points, chips = wide_points(6_500.0, 220.0, (2.0, 20.0))
@@ -83,6 +84,7 @@ def test_a_mirrored_scene_hundreds_of_metres_off_is_refused_as_mirrored() -> Non
     assert [stage.name for stage in stages] == ["far"]
 
 
+@pytest.mark.endurance
 def test_a_refusal_of_a_scene_too_large_for_the_map_names_the_middle_that_was_searched() -> None:
     # 44 km, of which chips of 2 m, reduced four times, let the middle 20 km be searched.
     points, chips = wide_points(4_000.0, 1_400.0, (2.0,))
